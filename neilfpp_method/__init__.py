@@ -1,0 +1,26 @@
+"""NeILF++ for any host: geometry, material and light from posed images.
+
+The public names load their rooms when they are first asked for, so that `import neilfpp_method` is light.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+__version__ = "0.1.0"
+__all__ = ["NeilfConfig", "NeilfModel", "__version__", "attach_neilf", "load_run", "preset"]
+
+_ROOMS = {
+    "NeilfConfig": "neilfpp_method.config",
+    "NeilfModel": "neilfpp_method.model",
+    "attach_neilf": "neilfpp_method.attach",
+    "load_run": "neilfpp_method.train.run",
+    "preset": "neilfpp_method.config",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _ROOMS:
+        raise AttributeError(f"module 'neilfpp_method' has no attribute '{name}'")
+    return getattr(import_module(_ROOMS[name]), name)

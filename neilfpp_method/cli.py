@@ -1,0 +1,285 @@
+"""The command line: `neilfpp COMMAND …`. Each command is a dataclass of options and a function that runs it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from neilfpp_method.config import NeilfConfig, preset
+from neilfpp_method.errors import EarlyEnd, Stopped, UserError
+
+__all__ = ["main"]
+
+Device = Annotated[str, tyro.conf.arg(metavar="cpu|cuda|cuda:N|auto")]
+
+
+# ---------------------------------------------------------------------------------------------------------------- options
+
+
+@dataclass
+class Train:
+    """Recover geometry, material and light from posed images."""
+
+    data: Path | None = None
+    """The capture's folder. Not needed with --resume."""
+    out: Path | None = None
+    """The run's folder; none: runs/CAPTURE-PRESET."""
+    preset: str = "fast"
+    """fast (minutes on a laptop's CPU), paper-mlp or paper-ngp (the published settings)."""
+    resume: bool = False
+    """Continue the run in --out from its last checkpoint, exactly as if it had never stopped."""
+    test_every: int | None = None
+    """Hold out every k-th view for testing; none: the capture's split.json, or every 8th."""
+    response: Literal["auto", "linear", "srgb"] = "auto"
+    """What the pixels are: linear radiance (HDR) or sRGB (LDR); auto: told from the files."""
+    device: Device = "auto"
+    """Where to train; auto takes a GPU where there is one."""
+    devices: int = 1
+    """Processes that share the work, one per GPU (or CPU process)."""
+    config: NeilfConfig = field(default_factory=NeilfConfig)
+    """Any setting of the preset."""
+
+
+@dataclass
+class Eval:
+    """Measure a run on its test views; writes RUN/metrics.json."""
+
+    run: tyro.conf.Positional[Path]
+    """The run's folder."""
+    checkpoint: Literal["last", "sdf_init", "material_init", "joint"] = "last"
+    """Which weights."""
+    out: Path | None = None
+    """Where the figures go; none: RUN/metrics.json."""
+    device: Device = "auto"
+    """Where to compute."""
+
+
+@dataclass
+class Render:
+    """Write every map of a run's views as PNG and EXR."""
+
+    run: tyro.conf.Positional[Path]
+    """The run's folder."""
+    out: Path | None = None
+    """Where the pictures go; none: RUN/renders."""
+    views: Literal["test", "train", "all"] = "test"
+    """Which views."""
+    checkpoint: Literal["last", "sdf_init", "material_init", "joint"] = "last"
+    """Which weights."""
+    overwrite: bool = False
+    """Render again what is there already."""
+    device: Device = "auto"
+    """Where to compute."""
+
+
+@dataclass
+class Export:
+    """Write a run's surface as a mesh (PLY) in the capture's frame and scale."""
+
+    run: tyro.conf.Positional[Path]
+    """The run's folder."""
+    out: Path | None = None
+    """The file; none: RUN/mesh.ply."""
+    resolution: int = 256
+    """Cells along an edge of the scene's cube."""
+    checkpoint: Literal["last", "sdf_init", "material_init", "joint"] = "last"
+    """Which weights."""
+    device: Device = "auto"
+    """Where to compute."""
+
+
+@dataclass
+class Demo:
+    """Train on the scene in the package and write a report to look at."""
+
+    out: Path = Path("demo-run")
+    """Where the run and its report go."""
+    resume: bool = False
+    """Continue a demo that was stopped."""
+    short: bool = False
+    """A twentieth of the steps: shows that everything runs, not what it can do."""
+    device: Device = "auto"
+    """Where to compute."""
+
+
+# --------------------------------------------------------------------------------------------------------------- commands
+
+
+def run_train(options: Train) -> None:
+    from neilfpp_method.train.command import run_training
+
+    run_training(
+        data=options.data,
+        out=options.out,
+        config=options.config,
+        resume=options.resume,
+        test_every=options.test_every,
+        response=options.response,
+        device=options.device,
+        devices=options.devices,
+        console=Console(),
+    )
+
+
+def run_eval(options: Eval) -> None:
+    from neilfpp_method.evaluate.protocols import evaluate, write_metrics
+    from neilfpp_method.train.device import pick_device
+    from neilfpp_method.train.run import load_run
+
+    run = load_run(options.run, pick_device(options.device), options.checkpoint)
+    out = options.out or options.run / "metrics.json"
+    with _bar("evaluating") as advance:
+        metrics = evaluate(run, advance)
+    write_metrics(out, metrics)
+    console = Console()
+    for name, value in metrics.items():
+        console.print(f"{name:36} {value:8.3f}", highlight=False)
+    console.print(f"written to {out}", highlight=False)
+
+
+def run_render(options: Render) -> None:
+    from neilfpp_method.evaluate.render_views import render_run
+    from neilfpp_method.train.device import pick_device
+    from neilfpp_method.train.run import load_run
+
+    run = load_run(options.run, pick_device(options.device), options.checkpoint)
+    out = options.out or options.run / "renders"
+    with _bar("rendering") as advance:
+        render_run(run, out, options.views, overwrite=options.overwrite, on_progress=advance)
+    Console().print(f"written to {out}", highlight=False)
+
+
+def run_export(options: Export) -> None:
+    from neilfpp_method.export.mesh import export_mesh
+    from neilfpp_method.train.device import pick_device
+    from neilfpp_method.train.run import load_run
+
+    run = load_run(options.run, pick_device(options.device), options.checkpoint)
+    out = options.out or options.run / "mesh.ply"
+    mesh = export_mesh(run, out, options.resolution)
+    Console().print(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces, written to {out}", highlight=False)
+
+
+def run_demo(options: Demo) -> None:
+    from neilfpp_method.demo import run_demo as demo
+
+    demo(options.out, short=options.short, resume=options.resume, device=options.device, console=Console())
+
+
+class _bar:
+    """A progress bar that takes shares of the work done."""
+
+    def __init__(self, title: str) -> None:
+        self.progress = Progress(TextColumn(title), BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeRemainingColumn())
+        self.task = self.progress.add_task(title, total=1.0)
+
+    def __enter__(self) -> Callable[[float], None]:
+        self.progress.start()
+        return lambda share: self.progress.update(self.task, completed=share)
+
+    def __exit__(self, *_: object) -> None:
+        self.progress.stop()
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command: its options, what runs it, and examples for its help."""
+
+    options: type
+    run: Callable[[Any], None]
+    examples: Sequence[str]
+
+    @property
+    def summary(self) -> str:
+        return (self.options.__doc__ or "").strip()
+
+
+COMMANDS = {
+    "demo": Command(Demo, run_demo, ["neilfpp demo", "neilfpp demo --short --out trial"]),
+    "train": Command(
+        Train,
+        run_train,
+        [
+            "neilfpp train --data captures/teapot",
+            "neilfpp train --data captures/teapot --preset paper-ngp --out runs/teapot",
+            "neilfpp train --out runs/teapot --resume",
+            "neilfpp train --data captures/teapot --config.train.joint-steps 0   (the separate pipeline)",
+            "neilfpp train --data captures/teapot --config.inter-reflection.mode off",
+        ],
+    ),
+    "eval": Command(Eval, run_eval, ["neilfpp eval runs/teapot", "neilfpp eval runs/teapot --checkpoint material_init --out sep.json"]),
+    "render": Command(Render, run_render, ["neilfpp render runs/teapot", "neilfpp render runs/teapot --views all"]),
+    "export": Command(Export, run_export, ["neilfpp export runs/teapot", "neilfpp export runs/teapot --resolution 512 --out teapot.ply"]),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command and return the exit status: 0 done, 2 bad input, 130 stopped, 1 anything else."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_overview())
+        return 0
+    errors = Console(stderr=True)
+    name, rest = arguments[0], arguments[1:]
+    try:
+        if name == "--version":
+            from neilfpp_method import __version__
+
+            print(f"neilfpp {__version__}")
+            return 0
+        if name not in COMMANDS:
+            raise UserError(f"unknown command '{name}'", f"choose one of {', '.join(COMMANDS)}")
+        command = COMMANDS[name]
+        command.run(_parse(name, command, rest))
+    except EarlyEnd as end:
+        errors.print(f"{'error: ' if end.status != Stopped.status else ''}{end}", highlight=False, soft_wrap=True, markup=False)
+        return end.status
+    except KeyboardInterrupt:
+        errors.print("stopped")
+        return Stopped.status
+    return 0
+
+
+def _parse(name: str, command: Command, arguments: Sequence[str]) -> Any:
+    description = f"{command.summary}\n\nExamples:\n" + "\n".join(f"  {example}" for example in command.examples)
+    defaults = {}
+    if command.options is Train:
+        # The preset decides the defaults of all other settings, so it is read first.
+        defaults = {"default": Train(config=preset(_option(arguments, "--preset") or "fast"))}
+    return tyro.cli(command.options, args=arguments, prog=f"neilfpp {name}", description=description, **defaults)
+
+
+def _option(arguments: Sequence[str], name: str) -> str | None:
+    for i, argument in enumerate(arguments):
+        if argument == name and i + 1 < len(arguments):
+            return arguments[i + 1]
+        if argument.startswith(f"{name}="):
+            return argument.split("=", 1)[1]
+    return None
+
+
+def _overview() -> str:
+    lines = [
+        "neilfpp: geometry, material and light from posed images",
+        "",
+        "usage: neilfpp COMMAND [options]        neilfpp COMMAND --help",
+        "",
+        *(f"  {name:8} {command.summary}" for name, command in COMMANDS.items()),
+        "",
+        "examples:",
+        "  neilfpp demo",
+        "  neilfpp train --data captures/teapot --out runs/teapot",
+        "  neilfpp eval runs/teapot",
+    ]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

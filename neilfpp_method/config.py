@@ -1,0 +1,379 @@
+"""Every setting, one dataclass per room, and the presets.
+
+Lengths are in scene units (the object lies in the unit sphere). A setting with `kind`, `mode` or a `bool` is a switch: an
+effect that is switched off asks no network and traces no ray.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeVar, get_args, get_type_hints
+
+from neilfpp_method.errors import UserError
+
+__all__ = ["PRESETS", "NeilfConfig", "from_dict", "preset", "to_dict"]
+
+
+# ---------------------------------------------------------------------------------------------------------------- fields
+
+
+@dataclass(frozen=True)
+class HashGridConfig:
+    """Multiresolution hash grid (Müller et al. 2022)."""
+
+    levels: int = 16
+    """Number of grids, coarse to fine."""
+    features: int = 2
+    """Features per grid vertex."""
+    log2_entries: int = 19
+    """Table size of one level, as a power of two."""
+    base_resolution: int = 16
+    """Cells along an edge of the scene's cube at the coarsest level."""
+    max_resolution: int = 4096
+    """Cells along an edge at the finest level."""
+
+
+@dataclass(frozen=True)
+class SdfConfig:
+    """G: position → signed distance and a feature for R (METHOD §5)."""
+
+    encoding: Literal["frequency", "hash"] = "frequency"
+    """How positions are encoded."""
+    frequencies: int = 6
+    """Octaves of the frequency encoding."""
+    grid: HashGridConfig = field(default_factory=HashGridConfig)
+    """The grid, where `encoding` is hash."""
+    layers: int = 8
+    """Hidden layers."""
+    width: int = 256
+    """Units of a hidden layer."""
+    skip: int | None = 4
+    """The layer that sees the encoded position again."""
+    feature_width: int = 256
+    """Length of the feature handed to R."""
+    sphere_radius: float = 0.6
+    """Radius of the sphere that the field starts as."""
+
+
+@dataclass(frozen=True)
+class OutgoingRadianceConfig:
+    """R: position, direction, normal and feature of G → linear RGB (METHOD §5)."""
+
+    encoding: Literal["raw", "hash"] = "raw"
+    """How positions are encoded."""
+    grid: HashGridConfig = field(default_factory=HashGridConfig)
+    """The grid, where `encoding` is hash."""
+    direction_encoding: Literal["frequency", "spherical_harmonics"] = "frequency"
+    """How directions are encoded."""
+    direction_degree: int = 4
+    """Octaves of the frequency encoding, or bands of the spherical harmonics."""
+    layers: int = 4
+    """Hidden layers."""
+    width: int = 256
+    """Units of a hidden layer."""
+    scale: float | None = None
+    """Largest radiance that the sigmoid can reach; none: 1 for LDR, 3 for HDR captures (METHOD §5), more where the images hold more."""
+
+
+@dataclass(frozen=True)
+class BrdfConfig:
+    """B: position → base colour, roughness, metallic (METHOD §5)."""
+
+    encoding: Literal["frequency", "hash"] = "frequency"
+    """How positions are encoded."""
+    frequencies: int = 6
+    """Octaves of the frequency encoding."""
+    grid: HashGridConfig = field(default_factory=HashGridConfig)
+    """The grid, where `encoding` is hash."""
+    activation: Literal["sine", "relu"] = "sine"
+    """Hidden units; sine is SIREN's, with ω = 30."""
+    layers: int = 8
+    """Hidden layers."""
+    width: int = 512
+    """Units of a hidden layer."""
+    skip: int | None = 4
+    """The layer that sees the encoded position again."""
+
+
+@dataclass(frozen=True)
+class IncidentLightConfig:
+    """L: position, direction → linear RGB that arrives (METHOD §5): sharp in direction, smooth in position."""
+
+    activation: Literal["sine", "relu"] = "sine"
+    """Hidden units; sine is SIREN's, with ω = 30."""
+    direction_encoding: Literal["frequency", "spherical_harmonics"] = "frequency"
+    """How directions are encoded."""
+    direction_degree: int = 6
+    """Octaves of the frequency encoding, or bands of the spherical harmonics."""
+    layers: int = 8
+    """Hidden layers; the position enters at the middle one."""
+    width: int = 128
+    """Units of a hidden layer."""
+    monochrome: bool = False
+    """One channel for all three colours, for LDR input."""
+    base: float | None = None
+    """Base of the exponential at the end; none: e for LDR, 10 for HDR captures (METHOD §5)."""
+
+
+@dataclass(frozen=True)
+class BackgroundConfig:
+    """What a ray sees beyond the scene."""
+
+    kind: Literal["auto", "none", "constant", "inverted_sphere"] = "auto"
+    """none: the scene sphere is a surface that closes the scene (VolSDF). constant: one colour. inverted_sphere: a NeRF++ field. auto: constant where the borders of the images are of one colour, else inverted_sphere."""
+    color: tuple[float, float, float] | None = None
+    """Linear RGB of a constant background; none: read from the borders of the images."""
+    layers: int = 8
+    """Hidden layers of the NeRF++ field."""
+    width: int = 256
+    """Units of a hidden layer of the NeRF++ field."""
+    samples: int = 32
+    """Samples per ray beyond the scene sphere."""
+
+
+# ---------------------------------------------------------------------------------------------------------------- volume
+
+
+@dataclass(frozen=True)
+class VolumeConfig:
+    """Volume rendering of the VolSDF host (METHOD §3)."""
+
+    radius: float = 3.0
+    """Where the scene ends."""
+    beta_init: float = 0.1
+    """Scale of the Laplace density at the start."""
+    beta_floor: float = 1e-4
+    """Its smallest value."""
+    sampler: Literal["error_bounded", "uniform"] = "error_bounded"
+    """Algorithm 1 of VolSDF, or stratified samples alone."""
+    initial_samples: int = 128
+    """SDF queries per ray of the first round; also those added in each refinement."""
+    rounds: int = 5
+    """Most refinement rounds."""
+    bisections: int = 10
+    """Bisection steps on β."""
+    epsilon: float = 0.1
+    """Bound on the opacity's error."""
+    samples: int = 64
+    """Final samples per ray."""
+    hit_radius: float = 0.05
+    """The blending weight within this distance of the blended hit is its concentration: a sharp surface has nearly all."""
+
+
+# --------------------------------------------------------------------------------------------------------------- shading
+
+
+@dataclass(frozen=True)
+class ShadingConfig:
+    """The rendering equation (METHOD §1)."""
+
+    lobe: Literal["spherical_gaussian", "ggx"] = "spherical_gaussian"
+    """Distribution and masking of the specular lobe."""
+    specular: bool = True
+    """Off: a Lambertian surface; roughness and metallic are not asked for."""
+    sampler: Literal["fibonacci", "cosine", "lobe", "mis"] = "fibonacci"
+    """Who draws the incident directions: the paper's lattice, a cosine, the specular lobe, or cosine and lobe together by the balance heuristic."""
+    train_samples: int = 128
+    """Incident directions per point in training."""
+    eval_samples: int = 256
+    """Incident directions per point in evaluation."""
+    hit_share: float = 0.8
+    """Least concentration of a ray's blending weight that makes its hit a surface point; the others are not shaded."""
+    response: Literal["auto", "linear", "srgb"] = "auto"
+    """What a pixel is of radiance: the same (HDR), or clipped and sRGB-encoded (LDR). auto: from the files."""
+
+
+@dataclass(frozen=True)
+class InterReflectionConfig:
+    """L_ref: what arrives from another surface is what that surface sends (METHOD §2)."""
+
+    mode: Literal["off", "soft"] = "soft"
+    """soft: the paper's loss."""
+    rays_per_point: float = 1.0
+    """Traced directions per surface point and step, in expectation."""
+    radiance_gradient: float = 0.0
+    """Scale of the gradient that reaches R; 0 detaches it, 0.7 suits fixed geometry."""
+    max_angle_deg: float = 80.0
+    """Largest angle from the normal at which a direction is traced."""
+    offset: float = 0.02
+    """Least displacement off the surface; it grows with β and as 1/cos towards grazing."""
+
+
+# -------------------------------------------------------------------------------------------------------------- training
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the losses (METHOD §4); `schedule.py` says in which stage each counts. 0 switches a loss off."""
+
+    volume: float = 1.0
+    physical: float = 1.0
+    eikonal: float = 0.1
+    hessian: float = 1e-3
+    hessian_joint: float = 1e-4
+    surface: float = 1e-3
+    surface_joint: float = 1e-4
+    point_cloud: float = 0.0
+    inter_reflection: float = 0.1
+    smoothness: float = 5e-4
+    lambertian: float = 5e-4
+    mask: float = 0.0
+    """Binary cross-entropy between opacity and the object mask, where the capture has masks."""
+    hessian_method: Literal["analytic", "finite_difference"] = "analytic"
+    """How second derivatives of G are taken."""
+    surface_epsilon: float = 0.05
+    """Width of the smoothed delta of L_surf."""
+    position_gradient: float = 0.1
+    """Scale of the gradient from the material into the hit position, joint stage."""
+    normal_gradient: float = 1.0
+    """Scale of the gradient from the material into the hit normal, joint stage."""
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """Adam, one learning rate per field; each falls exponentially to `final` of its start over a stage."""
+
+    geometry: float = 5e-4
+    radiance: float = 5e-4
+    brdf: float = 5e-4
+    light: float = 5e-4
+    background: float = 5e-4
+    beta: float = 5e-4
+    joint: float = 0.5
+    """Factor on the rates of geometry and radiance in the joint stage."""
+    final: float = 0.1
+    """Rate at the end of a stage over its start."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """The loop."""
+
+    sdf_steps: int = 40_000
+    """Steps of the stage SDF init."""
+    material_steps: int = 20_000
+    """Steps of the stage material init."""
+    joint_steps: int = 20_000
+    """Steps of the joint stage; 0 is the paper's separate pipeline ("Sep.")."""
+    rays: int = 4096
+    """Rays per step and process."""
+    seed: int = 0
+    """Every random number of step k follows from seed and k alone."""
+    checkpoint_every: int = 500
+    """Steps between checkpoints."""
+    log_every: int = 50
+    """Steps between TensorBoard scalars."""
+    eval_chunk: int = 2048
+    """Rays rendered at once in evaluation; bounds the memory."""
+
+
+@dataclass(frozen=True)
+class NeilfConfig:
+    """Everything that decides a run, besides the capture."""
+
+    preset: str = "paper-mlp"
+    """The preset that the settings started from; a label."""
+    sdf: SdfConfig = field(default_factory=SdfConfig)
+    radiance: OutgoingRadianceConfig = field(default_factory=OutgoingRadianceConfig)
+    brdf: BrdfConfig = field(default_factory=BrdfConfig)
+    light: IncidentLightConfig = field(default_factory=IncidentLightConfig)
+    background: BackgroundConfig = field(default_factory=BackgroundConfig)
+    volume: VolumeConfig = field(default_factory=VolumeConfig)
+    shading: ShadingConfig = field(default_factory=ShadingConfig)
+    inter_reflection: InterReflectionConfig = field(default_factory=InterReflectionConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+
+
+# --------------------------------------------------------------------------------------------------------------- presets
+
+
+def paper_mlp() -> NeilfConfig:
+    """The paper's MLP setting: 80k steps, 24 h on a V100."""
+    return NeilfConfig()
+
+
+def paper_ngp() -> NeilfConfig:
+    """The paper's hash-grid setting: 30k steps, 4 h on a V100; it asks for a point cloud in SDF init."""
+    return NeilfConfig(
+        preset="paper-ngp",
+        sdf=SdfConfig(encoding="hash", layers=2, width=64, skip=None, feature_width=15),
+        radiance=OutgoingRadianceConfig(encoding="hash", layers=4, width=64, direction_encoding="spherical_harmonics"),
+        brdf=BrdfConfig(encoding="hash", activation="relu", layers=2, width=64, skip=None),
+        light=IncidentLightConfig(activation="relu", direction_encoding="spherical_harmonics", direction_degree=5),
+        loss=LossConfig(
+            point_cloud=0.1, position_gradient=0.0, normal_gradient=0.1, hessian_method="finite_difference"
+        ),
+        optimizer=OptimizerConfig(geometry=1e-2, radiance=1e-2, brdf=1e-2, light=1e-3, background=1e-3, beta=1e-3),
+        train=TrainConfig(sdf_steps=15_000, material_steps=7_500, joint_steps=7_500),
+    )
+
+
+def fast() -> NeilfConfig:
+    """Minutes on the two cores of a laptop: the same method with small hash grids and few rays."""
+    grid = HashGridConfig(levels=8, log2_entries=16, base_resolution=16, max_resolution=256)
+    return NeilfConfig(
+        preset="fast",
+        sdf=SdfConfig(encoding="hash", grid=grid, layers=1, width=64, skip=None, feature_width=15),
+        radiance=OutgoingRadianceConfig(layers=2, width=64, direction_encoding="spherical_harmonics"),
+        brdf=BrdfConfig(encoding="hash", grid=grid, activation="relu", layers=2, width=64, skip=None),
+        light=IncidentLightConfig(layers=4, width=64, direction_encoding="spherical_harmonics", direction_degree=5),
+        background=BackgroundConfig(layers=4, width=64, samples=16),
+        volume=VolumeConfig(radius=1.75, initial_samples=64, rounds=2, samples=32),
+        shading=ShadingConfig(sampler="mis", train_samples=32, eval_samples=128),
+        inter_reflection=InterReflectionConfig(rays_per_point=0.25),
+        loss=LossConfig(position_gradient=0.0, normal_gradient=0.1, hessian_method="finite_difference"),
+        optimizer=OptimizerConfig(geometry=1e-2, radiance=5e-3, brdf=1e-2, light=1e-3, background=5e-3, beta=5e-3),
+        train=TrainConfig(sdf_steps=1_000, material_steps=600, joint_steps=300, rays=512),
+    )
+
+
+PRESETS: Mapping[str, Callable[[], NeilfConfig]] = {"fast": fast, "paper-mlp": paper_mlp, "paper-ngp": paper_ngp}
+
+
+def preset(name: str) -> NeilfConfig:
+    """The settings of a preset by name.
+
+    Raises:
+        UserError: no preset has this name.
+    """
+    if name not in PRESETS:
+        raise UserError(f"unknown preset '{name}'", f"choose one of {', '.join(PRESETS)}")
+    return PRESETS[name]()
+
+
+# ---------------------------------------------------------------------------------------------------------- to and from JSON
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """The settings as plain JSON values."""
+    return dataclasses.asdict(config)
+
+
+Config = TypeVar("Config")
+
+
+def from_dict(kind: type[Config], values: Mapping[str, Any], where: str = "config") -> Config:
+    """Settings from JSON values, the inverse of `to_dict`.
+
+    Raises:
+        UserError: a key is unknown or a value has the wrong type; names the setting.
+    """
+    hints = get_type_hints(kind)
+    unknown = set(values) - set(hints)
+    if unknown:
+        raise UserError(f"{where}: unknown setting '{sorted(unknown)[0]}'", "was it written by another version?")
+    arguments = {}
+    for name, value in values.items():
+        if dataclasses.is_dataclass(hints[name]):
+            value = from_dict(hints[name], value, f"{where}.{name}")
+        elif isinstance(value, list):
+            value = tuple(value)
+        choices = get_args(hints[name])
+        if choices and all(isinstance(c, str) for c in choices) and value not in choices:
+            raise UserError(f"{where}.{name}: '{value}' is not a choice", f"choose one of {', '.join(choices)}")
+        arguments[name] = value
+    return kind(**arguments)

@@ -1,0 +1,194 @@
+"""A capture: posed images of a scene, found by one of several readers, checked, normalised and split.
+
+Everything that the headers can tell is checked here, before a run starts; pixels are checked where they are loaded.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol
+
+from neilfpp_method.data import sfm_scene
+from neilfpp_method.data.images import image_header
+from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, View, check_camera, inside
+from neilfpp_method.errors import UserError
+
+__all__ = ["READERS", "Camera", "Capture", "Normalisation", "Reader", "View", "load_capture"]
+
+TEST_EVERY = 8
+
+
+class Reader(Protocol):
+    """A module that reads one layout; `LAYOUT` says in a few words what it looks for."""
+
+    LAYOUT: str
+
+    def recognise(self, root: Path) -> bool:
+        """Whether the folder has this layout; cheap."""
+
+    def read(self, root: Path) -> CaptureFiles:
+        """The capture's files; a `UserError` where they contradict the layout."""
+
+
+READERS: Mapping[str, Reader] = {"sfm_scene": sfm_scene}
+"""In the order in which they are asked."""
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A checked capture. Cameras are in the world frame; `normalisation` leads to the scene frame.
+
+    `hdr`: pixels are linear radiance; otherwise they are display values (sRGB). `test` names the views that are held
+    out. `inputs` is the folder of masks, depth maps and other companions of the images.
+    """
+
+    root: Path
+    format: str
+    inputs: Path
+    views: tuple[View, ...]
+    normalisation: Normalisation
+    hdr: bool
+    test: frozenset[str]
+    point_cloud: Path | None = None
+
+    @property
+    def train_views(self) -> tuple[View, ...]:
+        """The views to learn from, in order."""
+        return tuple(view for view in self.views if view.name not in self.test)
+
+    @property
+    def test_views(self) -> tuple[View, ...]:
+        """The views held out, in order."""
+        return tuple(view for view in self.views if view.name in self.test)
+
+    @property
+    def summary(self) -> str:
+        """The capture in three lines, for people."""
+        sizes = sorted({(view.camera.width, view.camera.height) for view in self.views})
+        size = f"{sizes[0][0]}×{sizes[0][1]}" if len(sizes) == 1 else f"{len(sizes)} sizes"
+        masks = sum(view.mask is not None for view in self.views)
+        x, y, z = self.normalisation.centre
+        return "\n".join(
+            [
+                f"{self.root.resolve().name} ({self.format}): {len(self.views)} views of {size}, "
+                f"{len(self.train_views)} to train on and {len(self.test_views)} to test on",
+                f"pixels: {'linear HDR' if self.hdr else 'display values (sRGB)'}; masks: {masks or 'none'}; "
+                f"point cloud: {self.point_cloud.name if self.point_cloud else 'none'}",
+                f"scene: centre ({x:.3g}, {y:.3g}, {z:.3g}), 1 scene unit = {self.normalisation.scale:.4g} world units",
+            ]
+        )
+
+
+def load_capture(
+    root: Path | str,
+    format: str | None = None,
+    test_every: int | None = None,
+    test: Collection[str | int] | None = None,
+    response: Literal["auto", "linear", "srgb"] = "auto",
+) -> Capture:
+    """Find, read and check a capture.
+
+    Args:
+        root: the capture's folder.
+        format: a name in `READERS`; none: the first reader that recognises the folder.
+        test_every: hold out every k-th view, from the k-th on; 0 holds out none. Overrides `split.json`.
+        test: hold out these views, by name or by number; overrides both. Without any of the three, every 8th is.
+        response: whether pixels are linear radiance or display values; auto: floating-point files are linear.
+
+    Raises:
+        UserError: the capture cannot be used; names the file and the remedy.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise UserError(f"{root}: no such folder", "give the folder of a capture")
+    format = format or _recognise(root)
+    if format not in READERS:
+        raise UserError(f"unknown capture format '{format}'", f"choose one of {', '.join(READERS)}")
+    if not READERS[format].recognise(root):
+        raise UserError(f"{root}: not a capture of the format {format}", f"it needs {READERS[format].LAYOUT}")
+    files = READERS[format].read(root)
+    hdr = _check_views(files.views)
+    return Capture(
+        root=root,
+        format=format,
+        inputs=files.inputs,
+        views=files.views,
+        normalisation=files.normalisation,
+        hdr={"auto": hdr, "linear": True, "srgb": False}[response],
+        test=_test_views(root, files.views, test_every, test),
+        point_cloud=files.point_cloud,
+    )
+
+
+def _recognise(root: Path) -> str:
+    for name, reader in READERS.items():
+        if reader.recognise(root):
+            return name
+    layouts = "; ".join(f"{name} ({reader.LAYOUT})" for name, reader in READERS.items())
+    raise UserError(f"{root}: no capture in this folder", f"the formats are: {layouts}")
+
+
+def _check_views(views: tuple[View, ...]) -> bool:
+    """Cameras, sizes and kinds of all views; whether the files are HDR."""
+    names: dict[str, View] = {}
+    hdr: dict[bool, View] = {}
+    for view in views:
+        check_camera(view.camera, str(view.image))
+        if view.name in names:
+            raise UserError(f"{view.image} and {names[view.name].image} have the same name", "rename one of them")
+        names[view.name] = view
+        size = (view.camera.width, view.camera.height)
+        headers = {path: image_header(path) for path in (view.image, view.mask) if path}
+        hdr.setdefault(headers[view.image].hdr, view)
+        for path, header in headers.items():
+            if (header.width, header.height) != size:
+                raise UserError(
+                    f"{path}: {header.width}×{header.height} pixels where the camera has {size[0]}×{size[1]}",
+                    "resize the image, or scale the camera with it",
+                )
+    if len(hdr) > 1:
+        raise UserError(f"{hdr[True].image} is HDR and {hdr[False].image} is LDR", "use images of one kind")
+    return next(iter(hdr))
+
+
+# ---------------------------------------------------------------------------------------------------------------- split
+
+
+def _test_views(
+    root: Path, views: tuple[View, ...], test_every: int | None, test: Collection[str | int] | None
+) -> frozenset[str]:
+    split = root / "split.json"
+    if test is not None:
+        held_out = _named(views, test, "test")
+    elif test_every is None and split.is_file():
+        held_out = _named(views, _read_split(inside(root, split)), str(split))
+    else:
+        every = TEST_EVERY if test_every is None else test_every
+        if every < 0:
+            raise UserError(f"every {every}-th view cannot be held out", "give 2 or more, or 0 for none")
+        held_out = frozenset(view.name for view in views[every - 1 :: every]) if every else frozenset()
+    if len(held_out) == len(views):
+        raise UserError(f"{root}: all {len(views)} views are held out for testing", "leave some to train on")
+    return held_out
+
+
+def _named(views: tuple[View, ...], wanted: Collection[str | int], where: str) -> frozenset[str]:
+    """The names of views that are given by name or by number."""
+    names = {**{view.index: view.name for view in views}, **{view.name: view.name for view in views}}
+    for key in wanted:
+        if key not in names:
+            raise UserError(f"{where}: there is no view {key!r}", "name views by image name or number")
+    return frozenset(names[key] for key in wanted)
+
+
+def _read_split(path: Path) -> list[str | int]:
+    try:
+        test = json.loads(path.read_text("utf-8"))["test"]
+    except (ValueError, OSError, RecursionError, KeyError, TypeError) as error:
+        raise UserError(f"{path}: not a JSON object with the key 'test' ({error})", 'write {"test": [0, 8]}') from error
+    if not isinstance(test, list) or not all(isinstance(key, str | int) for key in test):
+        raise UserError(f"{path}: 'test' is not a list of view names or numbers", 'write {"test": [0, 8]}')
+    return test

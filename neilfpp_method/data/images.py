@@ -1,0 +1,281 @@
+"""Image files in and out: EXR, TIFF, PNG, JPEG, Radiance HDR → float arrays; EXR and PNG ← arrays.
+
+Files come from strangers: a header is read and its size checked before any pixel is allocated, and a file that no
+decoder understands becomes a `UserError` that names it. Pixels stay in the orientation they are stored in; an EXIF
+rotation would part them from their camera.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenEXR
+import tifffile
+from jaxtyping import Float, Shaped
+from PIL import Image
+
+from neilfpp_method.errors import UserError
+
+__all__ = [
+    "IMAGE_SUFFIXES",
+    "ImageFile",
+    "ImageHeader",
+    "image_header",
+    "read_image",
+    "replacing",
+    "write_exr",
+    "write_png",
+]
+
+MAX_SIDE = 65_536
+MAX_PIXELS = 2**30
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """What a file says about itself. `hdr` means floating-point samples, taken as linear radiance."""
+
+    width: int
+    height: int
+    hdr: bool
+
+
+@dataclass(frozen=True)
+class ImageFile:
+    """A decoded image, rows from top to bottom, contiguous.
+
+    `pixels` is RGB or one channel: as stored where `hdr`, else scaled to [0, 1] and still display values, as no curve
+    is applied. `alpha` in [0, 1] is none where the file has no alpha channel.
+    """
+
+    pixels: Float[np.ndarray, "H W C"]
+    alpha: Float[np.ndarray, "H W"] | None
+    hdr: bool
+
+
+# -------------------------------------------------------------------------------------------------------------- OpenEXR
+
+
+@dataclass(frozen=True)
+class ExrWindow:
+    """Where the stored pixels lie in the frame; both in OpenEXR's inclusive integer coordinates."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    @staticmethod
+    def of(box) -> ExrWindow:
+        (left, top), (right, bottom) = (tuple(int(v) for v in corner) for corner in box)
+        return ExrWindow(left, top, right - left + 1, bottom - top + 1)
+
+
+def _exr_header(path: Path) -> ImageHeader:
+    header = OpenEXR.File(str(path), header_only=True).header()
+    data = ExrWindow.of(header["dataWindow"])
+    _check_size(path, data.width, data.height)
+    frame = ExrWindow.of(header["displayWindow"])
+    return ImageHeader(frame.width, frame.height, hdr=True)
+
+
+def _exr_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
+    file = OpenEXR.File(str(path), separate_channels=True)
+    channels = {name: channel.pixels for name, channel in file.channels().items()}
+    names = _exr_color_channels(path, tuple(channels)) + (("A",) if "A" in channels else ())
+    stored = np.stack([channels[name].astype(np.float32) for name in names], axis=-1)
+    header = file.header()
+    data, frame = ExrWindow.of(header["dataWindow"]), ExrWindow.of(header["displayWindow"])
+    if data == frame:
+        return stored
+    # A cropped render stores a part of its frame, an overscanned one more than it; the camera speaks of the frame.
+    samples = np.zeros((frame.height, frame.width, len(names)), np.float32)
+    x, y = data.left - frame.left, data.top - frame.top
+    seen = stored[max(-y, 0) : max(frame.height - y, 0), max(-x, 0) : max(frame.width - x, 0)]
+    samples[max(y, 0) :, max(x, 0) :][: seen.shape[0], : seen.shape[1]] = seen
+    return samples
+
+
+def _exr_color_channels(path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
+    single = tuple(name for name in names if name != "A")
+    if "RY" not in names:  # luminance with subsampled chroma
+        for wanted in (("R", "G", "B"), ("X", "Y", "Z"), ("Y",), ("Z",), single[:1] if len(single) == 1 else ()):
+            if wanted and set(wanted) <= set(names):
+                return wanted
+    raise UserError(f"{path}: no RGB or single channel among {', '.join(names)}", "store the image as R, G, B")
+
+
+# ------------------------------------------------------------------------------------------------ the formats of OpenCV
+
+
+def _pillow_header(path: Path) -> ImageHeader:
+    with Image.open(path) as image:
+        return ImageHeader(*image.size, hdr=False)
+
+
+def _tiff_header(path: Path) -> ImageHeader:
+    with tifffile.TiffFile(path) as file:
+        page = file.pages[0]
+        return ImageHeader(page.imagewidth, page.imagelength, hdr=np.issubdtype(page.dtype, np.floating))
+
+
+def _radiance_header(path: Path) -> ImageHeader:
+    with path.open("rb") as file:
+        lines = file.read(4096).split(b"\n")
+    y, height, x, width = lines[lines.index(b"") + 1].split()
+    if (y, x) != (b"-Y", b"+X"):
+        raise ValueError("its rows are not stored from top to bottom")
+    return ImageHeader(int(width), int(height), hdr=True)
+
+
+def _opencv_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
+    samples = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # also: no EXIF rotation
+    if samples is None:
+        raise ValueError("damaged, or of a kind that OpenCV does not know")
+    if samples.ndim == 2:
+        return samples[..., None]
+    return samples[..., [2, 1, 0, 3][: samples.shape[2]]]
+
+
+def _jpeg_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
+    # Not OpenCV: it fills what a cut-off file lacks with grey, and says nothing.
+    with Image.open(path) as image:
+        return np.atleast_3d(np.asarray(image if image.mode == "L" else image.convert("RGB")))
+
+
+# -------------------------------------------------------------------------------------------------------------- reading
+
+
+@dataclass(frozen=True)
+class Format:
+    """How one kind of file is read: its header alone, and its samples (H, W, C) in RGB order, alpha last."""
+
+    header: Callable[[Path], ImageHeader]
+    samples: Callable[[Path], np.ndarray]
+
+
+TIFF = Format(_tiff_header, _opencv_samples)
+JPEG = Format(_pillow_header, _jpeg_samples)
+FORMATS: Mapping[str, Format] = {
+    ".exr": Format(_exr_header, _exr_samples),
+    ".hdr": Format(_radiance_header, _opencv_samples),
+    ".tif": TIFF,
+    ".tiff": TIFF,
+    ".png": Format(_pillow_header, _opencv_samples),
+    ".jpg": JPEG,
+    ".jpeg": JPEG,
+}
+IMAGE_SUFFIXES = tuple(FORMATS)
+FULL_SCALE = {"uint8": 255.0, "uint16": 65_535.0, "float32": 1.0, "float64": 1.0}
+
+
+def image_header(path: Path) -> ImageHeader:
+    """Size and kind of an image, from its first bytes.
+
+    Raises:
+        UserError: no such file, an unknown or unreadable format, or a size beyond 65536 a side or 2³⁰ pixels.
+    """
+    with _naming(path):
+        header = _format(path).header(path)
+        _check_size(path, header.width, header.height)
+        return header
+
+
+def read_image(path: Path) -> ImageFile:
+    """Decode an image.
+
+    Raises:
+        UserError: as `image_header`, or the pixels are damaged, or of a type that is not 8 or 16 bit, half or float.
+    """
+    header = image_header(path)
+    with _naming(path):
+        samples = _format(path).samples(path)
+        height, width, channels = samples.shape
+        if (width, height) != (header.width, header.height):
+            raise ValueError(f"{width}×{height} pixels where the header says {header.width}×{header.height}")
+        if samples.dtype.name not in FULL_SCALE:
+            raise ValueError(f"samples of type {samples.dtype.name}")
+    values = samples.astype(np.float32) / np.float32(FULL_SCALE[samples.dtype.name])
+    colors = channels if channels in (1, 3) else channels - 1
+    alpha = np.ascontiguousarray(values[..., colors]) if channels > colors else None
+    return ImageFile(np.ascontiguousarray(values[..., :colors]), alpha, header.hdr)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except UserError:
+        raise
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such image", "check the path") from None
+    except Exception as error:  # four decoders, each with exceptions of its own
+        reason = str(error).strip().splitlines() or [type(error).__name__]
+        raise UserError(f"{path}: cannot be read ({reason[0]})", "export the image again, as EXR or PNG") from error
+
+
+def _format(path: Path) -> Format:
+    if path.suffix.lower() not in FORMATS:
+        raise UserError(f"{path}: not an image format that is read", f"use one of {', '.join(FORMATS)}")
+    if not path.is_file():
+        raise FileNotFoundError
+    return FORMATS[path.suffix.lower()]
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
+        raise UserError(
+            f"{path}: the header says {width}×{height} pixels",
+            f"images of up to {MAX_SIDE} a side and {MAX_PIXELS} pixels are read",
+        )
+
+
+# -------------------------------------------------------------------------------------------------------------- writing
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its place in one step when the block ends, and vanishes when it fails.
+
+    A reader, or a run that is killed, never meets half a file. Folders that are missing are made.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_exr(path: Path, channels: Mapping[str, Shaped[np.ndarray, "H W ..."]]) -> None:
+    """Write channels, losslessly compressed: "RGB" or "RGBA" for (H, W, 3 | 4), any other name for (H, W).
+
+    float16 is stored as half, everything else as float.
+    """
+    kinds = {name: np.float16 if array.dtype == np.float16 else np.float32 for name, array in channels.items()}
+    arrays = {name: np.ascontiguousarray(array, kinds[name]) for name, array in channels.items()}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with replacing(path) as temporary:
+        OpenEXR.File(header, arrays).write(str(temporary))
+
+
+def write_png(path: Path, samples: Shaped[np.ndarray, "H W ..."]) -> None:
+    """Write 8- or 16-bit samples as they are: (H, W), (H, W, 1), RGB or RGBA.
+
+    Raises:
+        ValueError: the samples are of another type.
+    """
+    if samples.dtype.name not in ("uint8", "uint16"):
+        raise ValueError(f"PNG holds uint8 or uint16, not {samples.dtype.name}")
+    if samples.ndim == 3 and samples.shape[2] > 1:
+        samples = samples[..., [2, 1, 0, 3][: samples.shape[2]]]
+    encoded = cv2.imencode(".png", np.ascontiguousarray(samples))[1]
+    with replacing(path) as temporary:
+        temporary.write_bytes(encoded.tobytes())

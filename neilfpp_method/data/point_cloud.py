@@ -1,0 +1,99 @@
+"""Oriented point clouds: PLY files, ASCII or binary, whose vertices have positions and normals."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from neilfpp_method.data.views import Normalisation
+from neilfpp_method.errors import UserError
+from neilfpp_method.structures import OrientedPoints
+
+__all__ = ["load_point_cloud", "read_oriented_ply"]
+
+OLD_NAMES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
+NEW_NAMES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
+CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
+TYPES = dict(zip(OLD_NAMES + NEW_NAMES, CODES + CODES, strict=True))
+BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": None}
+HEADER_LIMIT = 65_536
+
+
+@dataclass(frozen=True)
+class WorldPoints:
+    """What the file holds: positions and normals, of any length, in the world frame."""
+
+    position: Float64[np.ndarray, "N 3"]
+    normal: Float64[np.ndarray, "N 3"]
+
+
+def load_point_cloud(path: Path, normalisation: Normalisation) -> OrientedPoints:
+    """An oriented point cloud in the scene frame.
+
+    Raises:
+        UserError: as `read_oriented_ply`.
+    """
+    points = read_oriented_ply(path)
+    position = normalisation.to_scene(torch.from_numpy(points.position))
+    normal = torch.nn.functional.normalize(torch.from_numpy(points.normal), dim=-1)
+    return OrientedPoints(position.float(), normal.float())
+
+
+def read_oriented_ply(path: Path) -> WorldPoints:
+    """The vertices of a PLY file.
+
+    Raises:
+        UserError: the file is missing, malformed or cut off, has no points or no normals, or holds a number that is not
+            finite or a normal of no length.
+    """
+    try:
+        vertices = _vertices(path.read_bytes())
+    except (OSError, ValueError, KeyError, IndexError) as error:
+        raise UserError(f"{path}: not a PLY file that can be read ({error})", "export the point cloud again") from error
+    for name in ("x", "y", "z", "nx", "ny", "nz"):
+        if name not in vertices.dtype.names:
+            raise UserError(f"{path}: the points have no {name}", "export them with positions and normals")
+    position, normal = (
+        np.stack([vertices[name].astype(np.float64) for name in names], axis=1)
+        for names in (("x", "y", "z"), ("nx", "ny", "nz"))
+    )
+    if not len(position):
+        raise UserError(f"{path}: no points", "export the point cloud again")
+    broken = ~(np.isfinite(position) & np.isfinite(normal)).all(axis=1) | (np.abs(normal).max(axis=1) < 1e-6)
+    if broken.any():
+        raise UserError(
+            f"{path}: {broken.sum()} of {len(broken)} points are not finite or have a normal of no length",
+            "remove these points",
+        )
+    return WorldPoints(position, normal)
+
+
+def _vertices(data: bytes) -> np.ndarray:
+    """The vertex table as a structured array; the vertices have to come first, as they do in every common writer."""
+    head, separator, _ = data[:HEADER_LIMIT].partition(b"end_header")
+    if not separator or not head.startswith(b"ply"):
+        raise ValueError("it has no PLY header")
+    lines = [line.split() for line in head.decode("ascii").splitlines() if line.split()]
+    order = BYTE_ORDER[next((words[1] for words in lines if words[0] == "format"), "no format")]
+    elements = [i for i, words in enumerate(lines) if words[0] == "element"]
+    if not elements or lines[elements[0]][1] != "vertex":
+        raise ValueError("its first element is not the vertices")
+    count = int(lines[elements[0]][2])
+    if count < 0:
+        raise ValueError("it announces a negative number of points")
+    own = lines[elements[0] : elements[1] if len(elements) > 1 else None]
+    properties = [(words[2], TYPES[words[1]]) for words in own if words[0] == "property"]
+    body = data.index(b"\n", len(head)) + 1
+    if order is None:
+        text = io.StringIO(data[body:].decode("ascii"))
+        rows = np.loadtxt(text, dtype=np.float64, max_rows=count, ndmin=2) if count else np.empty((0, len(properties)))
+        if rows.shape != (count, len(properties)):
+            raise ValueError(f"{count} points with {len(properties)} numbers each are announced, and not there")
+        return np.rec.fromarrays(rows.T, names=[name for name, _ in properties])
+    return np.frombuffer(data, np.dtype([(name, order + kind) for name, kind in properties]), count, body)

@@ -1,0 +1,183 @@
+"""Reader of the layout in which the NeILF datasets are published: `inputs/sfm_scene.json` and the files around it.
+
+camera_track_map.images.<i>.flg                        2: the camera is valid; others are left out
+camera_track_map.images.<i>.size                       width, height
+camera_track_map.images.<i>.camera.intrinsic           focal (one number or two), ppt (principal point), in pixels
+camera_track_map.images.<i>.camera.extrinsic           world to camera, 4×4, row-major
+image_path.file_paths.<i>                              relative to the folder `inputs`
+bbox.transform                                         4×4: full extents on the diagonal, centre in the last column
+inputs/masks/<stem>.*, inputs/model/oriented_pcd.ply   optional
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from neilfpp_method.data.images import IMAGE_SUFFIXES
+from neilfpp_method.data.point_cloud import read_oriented_ply
+from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, View, inside
+from neilfpp_method.errors import UserError
+
+__all__ = ["LAYOUT", "read", "recognise"]
+
+LAYOUT = "inputs/sfm_scene.json"
+PLACES = ("inputs/sfm_scene.json", "sfm_scene.json", "inputs/model/sfm_scene.json")
+POINT_CLOUD = "model/oriented_pcd.ply"
+VALID = 2
+
+
+def recognise(root: Path) -> bool:
+    """Whether the folder has a scene file where this layout puts it."""
+    return any((root / place).is_file() for place in PLACES)
+
+
+def read(root: Path) -> CaptureFiles:
+    """The capture's files.
+
+    Raises:
+        UserError: the scene file is malformed, or images and cameras do not match; names the file and the entry.
+    """
+    path = inside(root, next(root / place for place in PLACES if (root / place).is_file()))
+    scene = Entry.load(path)
+    tracks, files = scene["camera_track_map"]["images"], scene["image_path"]["file_paths"]
+    for key in files.entries():
+        if key not in tracks.entries():
+            raise UserError(f"{files.name(key)}: an image without a camera", "add its camera, or remove the entry")
+    valid = sorted((key for key in tracks.entries() if tracks[key]["flg"].value == VALID), key=_number_of(tracks))
+    for key in valid:
+        if key not in files.entries():
+            raise UserError(f"{tracks.name(key)}: a camera without an image", f"add its image to {files.where}")
+    if not valid:
+        raise UserError(f"{path}: no images with a valid camera", f"give at least one entry the flg {VALID}")
+    listed = {key: files[key].text() for key in files.entries()}
+    inputs = _inputs_folder(root, path, listed[valid[0]])
+    views = tuple(_view(root, inputs, int(key), tracks[key], files[key]) for key in valid)
+    _refuse_strays(views, {Path(name).stem for name in listed.values()}, path)
+    cloud = inputs / POINT_CLOUD
+    point_cloud = inside(root, cloud) if cloud.is_file() else None
+    return CaptureFiles(inputs, views, _normalisation(scene, point_cloud), point_cloud)
+
+
+def _number_of(tracks: Entry) -> Callable[[str], int]:
+    def number(key: str) -> int:
+        try:
+            return int(key)
+        except ValueError:
+            raise UserError(f"{tracks.name(key)}: an image's key is not a number", "number the images from 0") from None
+
+    return number
+
+
+def _view(root: Path, inputs: Path, index: int, track: Entry, file: Entry) -> View:
+    width, height = track["size"].numbers((2,))
+    if (width, height) != (int(width), int(height)):
+        raise UserError(f"{track.name('size')}: the image size is not whole", "give width and height in pixels")
+    intrinsic, extrinsic = track["camera"]["intrinsic"], track["camera"]["extrinsic"]
+    fx, fy = np.broadcast_to(intrinsic["focal"].numbers((), (1,), (2,)), 2)
+    cx, cy = intrinsic["ppt"].numbers((2,))
+    w2c = extrinsic.numbers((16,), (4, 4)).reshape(4, 4)
+    camera = Camera(float(fx), float(fy), float(cx), float(cy), int(width), int(height), w2c)
+    image = _stored(root, inputs / file.text())
+    if image is None:
+        raise UserError(f"{file.where}: there is no {inputs / file.text()}", "put the image there, or correct the path")
+    return View(image.stem, index, camera, image, _stored(root, inputs / "masks" / f"{image.stem}.png"))
+
+
+def _stored(root: Path, path: Path) -> Path | None:
+    """The file, or the one of its name with another suffix: published scenes list .png where the files are .exr."""
+    if inside(root, path).is_file():
+        return path
+    found = [inside(root, file) for suffix in IMAGE_SUFFIXES if (file := path.with_suffix(suffix)).is_file()]
+    if len(found) > 1:
+        names = " and ".join(file.name for file in found)
+        raise UserError(f"{path}: not there, and {names} could both be meant", "keep one of them")
+    return found[0] if found else None
+
+
+def _inputs_folder(root: Path, scene: Path, listed: str) -> Path:
+    """The folder that listed paths start from, told by the first image: the scene file may lie in other places."""
+    folders = (scene.parent, root / "inputs", root)
+    return next((folder for folder in folders if _stored(root, folder / listed) is not None), scene.parent)
+
+
+def _refuse_strays(views: tuple[View, ...], listed: set[str], scene: Path) -> None:
+    """Images beside the listed ones that the scene file does not know: somebody believes that they are used."""
+    for folder in sorted({view.image.parent for view in views}):
+        for file in sorted(folder.iterdir()):
+            shown = file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
+            if shown and file.stem not in listed:
+                raise UserError(f"{file}: an image without a camera in {scene}", "add its camera, or move it away")
+
+
+def _normalisation(scene: Entry, point_cloud: Path | None) -> Normalisation:
+    """The centre, and half of the largest extent, of the box; without a box, of the point cloud."""
+    if "bbox" in scene.entries():
+        entry = scene["bbox"]["transform"]
+        box = entry.numbers((16,), (4, 4)).reshape(4, 4)
+        extents, centre, where = np.diagonal(box)[:3], box[:3, 3], entry.where
+    elif point_cloud is not None:
+        points = read_oriented_ply(point_cloud).position
+        low, high = points.min(axis=0), points.max(axis=0)
+        extents, centre, where = high - low, (low + high) / 2, str(point_cloud)
+    else:
+        raise UserError(f"{scene.where}: no bbox and no {POINT_CLOUD}", "add one: it says where the object is")
+    if extents.min() < 0 or extents.max() == 0:
+        raise UserError(f"{where}: the box is empty or inside out", "give the full extents on the diagonal")
+    return Normalisation(float(extents.max() / 2), tuple(map(float, centre)))
+
+
+# ------------------------------------------------------------------------------------------ JSON that cannot be trusted
+
+
+class Entry:
+    """A value in a JSON file that knows where it is, so that every complaint can say so."""
+
+    def __init__(self, value: Any, where: str) -> None:
+        self.value = value
+        self.where = where
+
+    @staticmethod
+    def load(path: Path) -> Entry:
+        """The root of a file."""
+        try:
+            return Entry(json.loads(path.read_text("utf-8")), str(path))
+        except (ValueError, OSError, RecursionError) as error:
+            raise UserError(f"{path}: not valid JSON ({error})", "export the cameras again") from error
+
+    def name(self, key: str) -> str:
+        """The place of an entry below this one."""
+        return f"{self.where}: {key}" if ": " not in self.where else f"{self.where}.{key}"
+
+    def entries(self) -> Mapping[str, Any]:
+        """The entries of an object."""
+        if not isinstance(self.value, dict):
+            raise UserError(f"{self.where}: not a JSON object", "export the cameras again")
+        return self.value
+
+    def __getitem__(self, key: str) -> Entry:
+        if key not in self.entries():
+            raise UserError(f"{self.name(key)} is missing", "export the cameras again")
+        return Entry(self.value[key], self.name(key))
+
+    def text(self) -> str:
+        """A file name."""
+        if not isinstance(self.value, str) or not Path(self.value).name:
+            raise UserError(f"{self.where}: not a file name", "give a path relative to the capture")
+        return self.value
+
+    def numbers(self, *shapes: tuple[int, ...]) -> Float64[np.ndarray, " *shape"]:
+        """An array of finite numbers, of one of the shapes."""
+        try:
+            numbers = np.asarray(self.value, dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            numbers = np.full((0,), np.nan)
+        if numbers.shape not in shapes or not np.isfinite(numbers).all():
+            wanted = " or ".join(dict.fromkeys("×".join(map(str, shape)) or "1" for shape in shapes))
+            raise UserError(f"{self.where}: not {wanted} finite numbers", "export the cameras again")
+        return numbers

@@ -1,0 +1,64 @@
+"""`neilfpp demo`: train on the scene in the package, measure, and write a report to look at."""
+
+from __future__ import annotations
+
+import dataclasses
+from importlib import resources
+from pathlib import Path
+
+from rich.console import Console
+
+from neilfpp_method.config import NeilfConfig, preset
+from neilfpp_method.evaluate.protocols import evaluate, write_metrics
+from neilfpp_method.evaluate.report import write_report
+from neilfpp_method.train.command import run_training
+from neilfpp_method.train.run import load_run, read_json
+
+__all__ = ["demo_config", "demo_scene", "run_demo"]
+
+SHORT = 20
+
+
+def demo_scene() -> Path:
+    """The capture in the package: a table top under three lamps, 24 views to learn from and 4 to test on."""
+    return Path(str(resources.files("neilfpp_method") / "demo_scene"))
+
+
+def demo_config(short: bool) -> NeilfConfig:
+    """The preset `fast`; short: a twentieth of its steps."""
+    config = preset("fast")
+    if not short:
+        return config
+    steps = config.train
+    return dataclasses.replace(
+        config,
+        train=dataclasses.replace(
+            steps,
+            sdf_steps=steps.sdf_steps // SHORT,
+            material_steps=steps.material_steps // SHORT,
+            joint_steps=steps.joint_steps // SHORT,
+        ),
+    )
+
+
+def run_demo(out: Path, *, short: bool, resume: bool, device: str, console: Console) -> Path:
+    """Train, evaluate, and write `report.html` and `contact_sheet.png` into `out`. Returns the report's path."""
+    run_training(
+        data=demo_scene(),
+        out=out,
+        config=demo_config(short),
+        resume=resume,
+        test_every=None,
+        response="auto",
+        device=device,
+        devices=1,
+        console=console,
+    )
+    run = load_run(out)
+    console.print("measuring on the test views …")
+    metrics = evaluate(run)
+    write_metrics(out / "metrics.json", metrics)
+    console.print("drawing the report …")
+    report = write_report(run, out, metrics, read_json(out / "timing.json"))
+    console.print(f"done: open {report}", highlight=False)
+    return report

@@ -1,0 +1,206 @@
+"""What a run shows of a view, and what is known of it: made once, then measured, drawn or written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Shaped
+from torch import Tensor
+
+from neilfpp_method.data.capture import Capture
+from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.truth import Truth
+from neilfpp_method.data.views import View, camera_rays, project
+from neilfpp_method.errors import UserError
+from neilfpp_method.model import Maps
+from neilfpp_method.shading.color import srgb_to_linear
+from neilfpp_method.structures import PixelBatch
+from neilfpp_method.train.run import Run
+
+__all__ = [
+    "HeldOut",
+    "KnownView",
+    "RenderedView",
+    "has_material",
+    "known_test_views",
+    "mask_source",
+    "mean_observed_color",
+    "render_test_views",
+    "render_view",
+    "surface_points",
+]
+
+
+# ------------------------------------------------------------------------------------------------------------ estimates
+
+
+@dataclass(frozen=True)
+class RenderedView:
+    """The maps of one view by their names in `model.Maps`, each (H, W, C) float32. Colours are linear."""
+
+    name: str
+    maps: Mapping[str, Float[np.ndarray, "H W C"]]
+
+
+def has_material(run: Run) -> bool:
+    """Whether a step has moved the material and the light; before that they are what they start as."""
+    return run.step > run.config.train.sdf_steps
+
+
+def render_view(run: Run, view_index: int) -> RenderedView:
+    """Render view `view_index` of `run.capture.views` in full size; the same picture every time.
+
+    `config.train.eval_chunk` rays are in flight at once. A run without a material has the host's colour for `rgb`, and
+    zeros for what a material would show.
+    """
+    view = run.capture.views[view_index]
+    device = next(run.model.parameters()).device
+    rays = camera_rays(run.capture.normalisation.camera(view.camera))
+    chunk = run.config.train.eval_chunk
+    parts: dict[str, list[Tensor]] = {f.name: [] for f in fields(Maps)}
+    for start in range(0, len(rays), chunk):
+        maps = run.model.maps(rays[start : start + chunk].to(device), has_material(run))
+        for name, rows in parts.items():
+            rows.append(getattr(maps, name).float().cpu())
+    return RenderedView(view.name, {name: _image(torch.cat(rows), view) for name, rows in parts.items()})
+
+
+def render_test_views(run: Run, on_progress: Callable[[float], None] = lambda share: None) -> tuple[RenderedView, ...]:
+    """Render every view that is held out, in order; reports the share that is done after each.
+
+    Raises:
+        UserError: no view is held out.
+    """
+    held_out = [i for i, view in enumerate(run.capture.views) if view.name in run.capture.test]
+    if not held_out:
+        raise UserError(f"{run.capture.root}: no view is held out for testing", "train with --test-every 8")
+    rendered = []
+    for i in held_out:
+        rendered.append(render_view(run, i))
+        on_progress(len(rendered) / len(held_out))
+    return tuple(rendered)
+
+
+# ---------------------------------------------------------------------------------------------------------------- truth
+
+
+@dataclass(frozen=True)
+class KnownView:
+    """What is known of a view: `image` as the capture holds it, the pixels that count, and the truth that is at hand.
+
+    `depth` is along the camera's axis, scene units; `material` maps base_color, roughness and metallic.
+    """
+
+    view: View
+    image: Float[np.ndarray, "H W 3"]
+    mask: Bool[np.ndarray, "H W"]
+    depth: Float[np.ndarray, "H W"] | None
+    normal: Float[np.ndarray, "H W 3"] | None
+    material: Mapping[str, Float[np.ndarray, "H W C"]] | None
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """The test views, and what decides which of their pixels count, as `mask_source` names it."""
+
+    views: tuple[KnownView, ...]
+    mask_source: str
+
+
+def mask_source(capture: Capture) -> str:
+    """What decides which pixels of the test views count; one source for all of them.
+
+    "true depth" where every view has it; else "capture masks" where there are any; else "rendered opacity" above one
+    half, which lets the estimate choose its pixels.
+    """
+    return _mask_source(_known_depths(capture), _stored_pixels(capture))
+
+
+def known_test_views(run: Run, rendered: Sequence[RenderedView]) -> HeldOut:
+    """What is known of the test views; `rendered` are the same views, in order. Masks as `mask_source` says."""
+    capture, truth = run.capture, Truth(run.capture)
+    depths, stored = _known_depths(capture), _stored_pixels(capture)
+    source = _mask_source(depths, stored)
+    masks = {
+        "true depth": lambda i: depths[i] > 0,
+        "capture masks": lambda i: stored[i].mask > 0.5,
+        "rendered opacity": lambda i: torch.from_numpy(rendered[i].maps["opacity"] > 0.5),
+    }[source]
+    views = []
+    for i, view in enumerate(capture.test_views):
+        normal, material = truth.normal(view), truth.material(view)
+        views.append(
+            KnownView(
+                view=view,
+                image=_image(stored[i].color, view),
+                mask=_image(masks(i), view)[..., 0],
+                depth=None if depths[i] is None else _image(depths[i], view)[..., 0],
+                normal=None if normal is None else _image(normal, view),
+                material=material and {f.name: _image(getattr(material, f.name), view) for f in fields(material)},
+            )
+        )
+    return HeldOut(tuple(views), source)
+
+
+def _known_depths(capture: Capture) -> list[Float[Tensor, " P"] | None]:
+    truth = Truth(capture)
+    return [truth.depth(view) for view in capture.test_views]
+
+
+def _stored_pixels(capture: Capture) -> list[PixelBatch]:
+    pixels = PixelDataset(capture, capture.test_views)
+    return [pixels.view(i) for i in range(len(capture.test_views))]
+
+
+def _mask_source(depths: Sequence[Tensor | None], stored: Sequence[PixelBatch]) -> str:
+    if all(depth is not None for depth in depths):
+        return "true depth"
+    return "capture masks" if any((batch.mask < 1).any() for batch in stored) else "rendered opacity"
+
+
+def _image(values: Shaped[Tensor, "P ..."], view: View) -> Shaped[np.ndarray, "H W C"]:
+    return values.reshape(view.camera.height, view.camera.width, -1).numpy()
+
+
+# ------------------------------------------------------------------------------------------------- what other views saw
+
+VISIBLE = 0.02
+"""Largest difference from a view's depth map, scene units, at which the view sees a point."""
+
+
+def surface_points(capture: Capture, known: KnownView) -> Float[Tensor, "P 3"]:
+    """Where the masked pixels of a view meet the true surface, scene frame; the view must have its depth."""
+    camera = capture.normalisation.camera(known.view.camera)
+    rays = camera_rays(camera)[torch.from_numpy(known.mask).reshape(-1)]
+    along_axis = rays.directions @ torch.as_tensor(camera.w2c[2, :3], dtype=rays.directions.dtype)
+    return rays.origins + rays.directions * (torch.from_numpy(known.depth[known.mask]) / along_axis)[:, None]
+
+
+def mean_observed_color(capture: Capture, points: Float[Tensor, "P 3"]) -> Float[np.ndarray, "P 3"] | None:
+    """The mean linear colour of surface points over the training views that see them; none without true depths.
+
+    A view sees a point when its depth map, at the point's pixel, agrees within `VISIBLE`. A point that no view sees
+    takes the mean over the others.
+    """
+    truth = Truth(capture)
+    views = [view for view in capture.train_views if truth.depth(view) is not None]
+    if not views:
+        return None
+    pixels = PixelDataset(capture, views)
+    total, count = torch.zeros_like(points), torch.zeros(len(points), 1)
+    for i, view in enumerate(views):
+        size = torch.tensor([view.camera.width, view.camera.height])
+        seen = project(capture.normalisation.camera(view.camera), points)
+        inside = (seen.depth > 0) & (seen.pixel >= 0).all(-1) & (seen.pixel < size).all(-1)
+        column, row = torch.where(inside[:, None], seen.pixel, 0.0).long().unbind(-1)
+        index = row * view.camera.width + column
+        visible = inside & ((truth.depth(view)[index] - seen.depth).abs() <= VISIBLE)
+        color = pixels.view(i).color[index]
+        total += visible[:, None] * (color if capture.hdr else srgb_to_linear(color))
+        count += visible[:, None]
+    mean = total / count.clamp_min(1)
+    average = total.sum(0) / count.sum().clamp_min(1)
+    return torch.where(count > 0, mean, average).numpy()

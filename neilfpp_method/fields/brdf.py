@@ -1,0 +1,54 @@
+"""B: position → base colour, roughness, metallic (METHOD §5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from neilfpp_method.config import BrdfConfig
+from neilfpp_method.fields.encodings import position_encoding, pull_back
+from neilfpp_method.fields.mlp import Mlp
+from neilfpp_method.structures import Material
+
+__all__ = ["BrdfField", "BrdfSample"]
+
+
+@dataclass(frozen=True)
+class BrdfSample:
+    """The material at N points and how two of its parameters change in space, per scene unit."""
+
+    material: Material
+    roughness_gradient: Float[Tensor, "N 3"]
+    metallic_gradient: Float[Tensor, "N 3"]
+
+
+class BrdfField(nn.Module):
+    """Every parameter is ½ + ½ tanh of an output of the network, and starts close to ½."""
+
+    def __init__(self, config: BrdfConfig, radius: float) -> None:
+        super().__init__()
+        self.encoding = position_encoding(config.encoding, config.grid, radius, config.frequencies)
+        self.mlp = Mlp(
+            self.encoding.width, 5, config.layers, config.width, config.activation, config.skip, output_scale=1e-2
+        )
+        nn.init.zeros_(self.mlp.layers[-1].bias)
+
+    def forward(self, x: Float[Tensor, "N 3"]) -> Material:
+        return _material(torch.tanh(self.mlp(self.encoding(x))))
+
+    def with_gradients(self, x: Float[Tensor, "N 3"]) -> BrdfSample:
+        """The material and the gradients of roughness and metallic. A loss on them needs only first-order autograd."""
+        encoded = self.encoding.with_jacobian(x)
+        sample = self.mlp.with_gradient(encoded.features, slice(3, 5))
+        saturation = torch.tanh(sample.value)
+        slope = 0.5 * (1 - saturation[:, 3:].square())
+        roughness, metallic = (slope[..., None] * pull_back(sample.gradient, encoded)).unbind(1)
+        return BrdfSample(_material(saturation), roughness, metallic)
+
+
+def _material(saturation: Float[Tensor, "N 5"]) -> Material:
+    base_color, roughness, metallic = (0.5 + 0.5 * saturation).split((3, 1, 1), -1)
+    return Material(base_color, roughness, metallic)

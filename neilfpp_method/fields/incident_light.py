@@ -1,0 +1,65 @@
+"""L: the incident light field, position and direction → linear RGB that arrives (METHOD §5).
+
+Light is sharp in direction and smooth in position. So the direction enters encoded, at the first and at the middle
+layer, and the position raw, at the middle layer only.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from neilfpp_method.config import IncidentLightConfig
+from neilfpp_method.fields.encodings import direction_encoding
+from neilfpp_method.fields.mlp import Mlp
+
+__all__ = ["IncidentLightField"]
+
+LARGEST_EXPONENT = 20.0  # radiance stays within e^±20 of its start
+
+
+class IncidentLightField(nn.Module):
+    """radiance = initial_radiance · base^output. The outputs start near 0.
+
+    The middle layer is linear in what it sees, so the share of the direction and the share of the position are computed
+    apart and added: the position costs one small product per point, and the directions can be shared between points.
+    """
+
+    def __init__(self, config: IncidentLightConfig, base: float, initial_radiance: float) -> None:
+        super().__init__()
+        self.log_base = math.log(base)
+        self.initial_radiance = initial_radiance
+        self.direction = direction_encoding(config.direction_encoding, config.direction_degree)
+        middle, width = config.layers // 2, config.width
+        self.direction_part = Mlp(self.direction.width, width, middle, width, config.activation, skip=middle)
+        self.position_part = nn.Linear(3, width, bias=False)
+        outputs = 1 if config.monochrome else 3
+        self.tail = Mlp(width, outputs, config.layers - middle - 1, width, config.activation, output_scale=0.1)
+        nn.init.zeros_(self.tail.layers[-1].bias)
+        # Position and direction meet in one layer: its weights start alike. So do those of the tail, a hidden layer's.
+        bound = self.direction_part.layers[-1].weight.abs().max().item()
+        nn.init.uniform_(self.position_part.weight, -bound, bound)
+        self.tail.activation.init_(self.tail.layers[0])
+
+    def radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
+        """Radiance > 0 that arrives at x from wi, which points away from x."""
+        return self.at_positions(x, self.of_directions(wi))
+
+    def of_directions(self, wi: Float[Tensor, "... 3"]) -> Float[Tensor, "... W"]:
+        """The middle layer before its activation, as far as the direction decides it."""
+        return self.direction_part(self.direction(wi))
+
+    def at_positions(self, x: Float[Tensor, "N 3"], directions: Float[Tensor, "#N S W"]) -> Float[Tensor, "N S 3"]:
+        """The rest of the network, from the middle layer on."""
+        middle = self.tail.activation.value(directions + self.position_part(x)[:, None])
+        exponent = self.log_base * self.tail(middle)
+        radiance = self.initial_radiance * torch.exp(_limited(exponent, LARGEST_EXPONENT))
+        return radiance.expand(*radiance.shape[:-1], 3)
+
+
+def _limited(z: Float[Tensor, "N S C"], largest: float) -> Float[Tensor, "N S C"]:
+    """z clamped to ±largest, with derivative 1 everywhere: a value beyond the limit still feels the loss."""
+    return z.clamp(-largest, largest).detach() + (z - z.detach())

@@ -1,0 +1,176 @@
+"""Multilayer perceptrons, and the gradient of their outputs with respect to their input.
+
+That gradient is an adjoint pass written out in differentiable operations: a loss on it needs one ordinary backward
+pass, where autograd would have to differentiate its own backward pass.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.nn.utils import parametrizations
+
+from neilfpp_method.errors import UserError
+
+__all__ = ["ACTIVATIONS", "Activation", "Mlp", "MlpSample", "geometric_init_", "weight_normalise_"]
+
+SOFTPLUS_SHARPNESS = 100.0  # VolSDF, IDR
+SINE_FREQUENCY = 30.0  # SIREN's ω
+SPHERE_SAMPLES = 4096  # points at which the geometric start is corrected
+RIDGE = 1e-2  # price of that correction, relative to the mean square of a unit
+
+
+@dataclass(frozen=True)
+class Activation:
+    """A hidden unit, its derivative, and the start of the linear layer that feeds it."""
+
+    value: Callable[[Tensor], Tensor]
+    derivative: Callable[[Tensor], Tensor]
+    init_: Callable[[nn.Linear], object]
+
+
+def _he_(layer: nn.Linear) -> None:
+    """He et al. 2015: keeps the variance through rectifiers."""
+    nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
+    nn.init.zeros_(layer.bias)
+
+
+def _siren_(layer: nn.Linear) -> None:
+    """Sitzmann et al. 2020, theorem 1.8: keeps the distribution through sines."""
+    bound = math.sqrt(6 / layer.in_features) / SINE_FREQUENCY
+    nn.init.uniform_(layer.weight, -bound, bound)
+
+
+ACTIVATIONS: Mapping[str, Activation] = {
+    "softplus": Activation(
+        lambda z: functional.softplus(z, beta=SOFTPLUS_SHARPNESS), lambda z: torch.sigmoid(SOFTPLUS_SHARPNESS * z), _he_
+    ),
+    "relu": Activation(torch.relu, lambda z: (z > 0).to(z.dtype), _he_),
+    "sine": Activation(
+        lambda z: torch.sin(SINE_FREQUENCY * z), lambda z: SINE_FREQUENCY * torch.cos(SINE_FREQUENCY * z), _siren_
+    ),
+}
+
+
+@dataclass(frozen=True)
+class MlpSample:
+    """All outputs, and the gradient of K of them with respect to the input."""
+
+    value: Float[Tensor, "N O"]
+    gradient: Float[Tensor, "N K I"]
+
+
+class Mlp(nn.Module):
+    """`layers` hidden layers of `width` units and a linear output.
+
+    The input enters again, beside the hidden units, at layer `skip`; `skip = layers` is the output layer.
+    `output_scale` multiplies the weights that the output layer starts with.
+
+    Raises:
+        UserError: the skip lies outside the network.
+    """
+
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        layers: int,
+        width: int,
+        activation: Literal["softplus", "relu", "sine"],
+        skip: int | None = None,
+        output_scale: float = 1.0,
+    ) -> None:
+        super().__init__()
+        if layers < 1 or (skip is not None and not 1 <= skip <= layers):
+            raise UserError(f"an MLP of {layers} layers with its skip at layer {skip}", "choose 1 ≤ skip ≤ layers")
+        self.activation = ACTIVATIONS[activation]
+        self.skip = skip
+        fan_in = [inputs] + [width + (inputs if layer == skip else 0) for layer in range(1, layers + 1)]
+        self.layers = nn.ModuleList(nn.Linear(n, m) for n, m in zip(fan_in, [width] * layers + [outputs], strict=True))
+        for layer in self.layers:
+            self.activation.init_(layer)
+        with torch.no_grad():
+            if activation == "sine":  # SIREN's first layer: its input fills [−1, 1], not a sine's range of phases
+                self.layers[0].weight.uniform_(-1 / inputs, 1 / inputs)
+            self.layers[-1].weight.mul_(output_scale)
+
+    def forward(self, x: Float[Tensor, "... I"], outputs: slice = slice(None)) -> Float[Tensor, "... O"]:
+        """The chosen outputs."""
+        last = self.layers[-1]
+        return functional.linear(self.hidden(x), last.weight[outputs], last.bias[outputs])
+
+    def hidden(self, x: Float[Tensor, "... I"]) -> Float[Tensor, "... H"]:
+        """What the output layer sees."""
+        hidden = x
+        for number, layer in enumerate(self.layers[:-1]):
+            hidden = self.activation.value(layer(self._with_skip(hidden, x, number)))
+        return self._with_skip(hidden, x, len(self.layers) - 1)
+
+    def with_gradient(self, x: Float[Tensor, "N I"], outputs: slice) -> MlpSample:
+        """All outputs, and the gradient of the chosen ones with respect to x.
+
+        With z_l = W_l h_l + b_l and h_{l+1} = a(z_l), the adjoint runs g ← (g ⊙ a'(z_l)) W_l from the last layer to the
+        first; where the input entered again, its share of g is set aside and added at the end.
+        """
+        weights = [layer.weight for layer in self.layers]  # once: a normalised weight is computed when it is read
+        hidden, slopes = x, []
+        for number, layer in enumerate(self.layers[:-1]):
+            z = functional.linear(self._with_skip(hidden, x, number), weights[number], layer.bias)
+            slopes.append(self.activation.derivative(z)[:, None])
+            hidden = self.activation.value(z)
+        hidden = self._with_skip(hidden, x, len(slopes))
+        value = functional.linear(hidden, weights[-1], self.layers[-1].bias)
+
+        gradient, skipped = weights[-1][outputs], 0.0
+        for number in reversed(range(len(slopes))):
+            if number + 1 == self.skip:
+                gradient, skipped = gradient.split((slopes[number].shape[-1], x.shape[-1]), -1)
+            gradient = (gradient * slopes[number]) @ weights[number]
+        return MlpSample(value, gradient + skipped)
+
+    def _with_skip(self, hidden: Float[Tensor, "... H"], x: Float[Tensor, "... I"], number: int) -> Tensor:
+        return torch.cat((hidden, x), -1) if number == self.skip else hidden
+
+
+@torch.no_grad()
+def geometric_init_(mlp: Mlp, radius: float, extent: float, encoded: float) -> None:
+    """Start a softplus network as the signed distance to a sphere: output 0 ≈ ‖x‖ − radius where ‖x‖ ≤ extent.
+
+    The start of SAL (Atzmon & Lipman 2020, theorem 1) is exact for infinite width; at 64 units it is off by tens of per
+    cent. So the output row is then corrected by the smallest change that fits the distance: a ridge regression.
+
+    Args:
+        mlp: its first three inputs are x.
+        radius: of the sphere.
+        extent: of the scene.
+        encoded: scale of the weights on the other inputs, at the first layer and at a skip.
+    """
+    width = mlp.layers[0].out_features
+    for number, layer in enumerate(mlp.layers[:-1]):
+        nn.init.normal_(layer.weight, std=math.sqrt(2 / width))
+        layer.weight[:, 3 if number == 0 else width :] *= encoded
+        nn.init.zeros_(layer.bias)
+    row = mlp.layers[-1].weight[0]
+    nn.init.zeros_(row)
+    nn.init.normal_(row[:width], math.sqrt(math.pi / width), 1e-4)
+    nn.init.constant_(mlp.layers[-1].bias[0], -radius)
+
+    points = functional.normalize(torch.randn(SPHERE_SAMPLES, 3)) * extent * torch.rand(SPHERE_SAMPLES, 1)
+    units = mlp.hidden(functional.pad(points, (0, mlp.layers[0].in_features - 3)))[:, :width].double()
+    missing = points.norm(dim=1).double() - units @ row[:width].double()
+    gram = units.T @ units
+    ridge = RIDGE * gram.diagonal().mean() * torch.eye(width, dtype=gram.dtype)
+    row[:width] += torch.linalg.solve(gram + ridge, units.T @ missing).to(row.dtype)
+
+
+def weight_normalise_(mlp: Mlp) -> None:
+    """Split every weight row into length and direction (Salimans & Kingma 2016); the function stays as it is."""
+    for layer in mlp.layers:
+        parametrizations.weight_norm(layer)

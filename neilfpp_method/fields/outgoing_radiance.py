@@ -1,0 +1,42 @@
+"""R: what the scene sends out, position and direction → linear RGB (METHOD §5)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from neilfpp_method.config import OutgoingRadianceConfig
+from neilfpp_method.fields.encodings import direction_encoding, position_encoding
+from neilfpp_method.fields.mlp import Mlp
+
+__all__ = ["OutgoingRadianceField"]
+
+MID_GREY = 0.2  # linear radiance that the field starts at
+
+
+class OutgoingRadianceField(nn.Module):
+    """A sigmoid times `scale`, the largest radiance it reaches; starts near mid-grey, or at scale/2 if that is less."""
+
+    def __init__(self, config: OutgoingRadianceConfig, feature_width: int, radius: float, scale: float) -> None:
+        super().__init__()
+        self.scale = scale
+        self.position = position_encoding(config.encoding, config.grid, radius)
+        self.direction = direction_encoding(config.direction_encoding, config.direction_degree)
+        inputs = self.position.width + self.direction.width + 3 + feature_width
+        self.mlp = Mlp(inputs, 3, config.layers, config.width, "relu", output_scale=0.1)
+        start = min(MID_GREY / scale, 0.5)
+        nn.init.constant_(self.mlp.layers[-1].bias, math.log(start / (1 - start)))
+
+    def forward(
+        self,
+        x: Float[Tensor, "N 3"],
+        wo: Float[Tensor, "N 3"],
+        normal: Float[Tensor, "N 3"],
+        feature: Float[Tensor, "N F"],
+    ) -> Float[Tensor, "N 3"]:
+        """Radiance that leaves x towards wo; `normal` and `feature` are those of the distance field at x."""
+        inputs = torch.cat((self.position(x), self.direction(wo), normal, feature), -1)
+        return self.scale * torch.sigmoid(self.mlp(inputs))

@@ -1,0 +1,63 @@
+"""What the method asks of geometry and radiance, so that it can sit on any NeRF-like system.
+
+A host renders rays. All else is an optional capability, found by `isinstance` on one of the small protocols below: a host
+that lacks one loses what the protocol says, nothing more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import Parameter
+
+from neilfpp_method.structures import LossTerms, PixelBatch, RayBatch, SurfaceHits
+
+__all__ = ["HasParameterGroups", "HasSurfaceWidth", "Host", "Regularised", "RegularisedHits"]
+
+
+@runtime_checkable
+class Host(Protocol):
+    """Geometry and radiance of a scene."""
+
+    def render(self, rays: RayBatch) -> SurfaceHits:
+        """Colour, hit position and normal of each ray, differentiable with respect to the host's parameters."""
+        ...
+
+
+@dataclass(frozen=True)
+class RegularisedHits:
+    """Rendered rays with the host's own losses at the places that rendering visited."""
+
+    hits: SurfaceHits
+    terms: LossTerms
+
+
+@runtime_checkable
+class Regularised(Protocol):
+    """A host with losses of its own. Without: L_vol alone moves the geometry."""
+
+    def render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
+        """As `render`, and those of the named losses that the host has. A loss that is not named is not computed."""
+        ...
+
+
+@runtime_checkable
+class HasSurfaceWidth(Protocol):
+    """A host whose surface is a soft layer. Without: rays for L_ref start at a fixed distance from the surface."""
+
+    def surface_width(self) -> Float[Tensor, ""]:
+        """Scale of the layer, scene units (VolSDF's β)."""
+        ...
+
+
+@runtime_checkable
+class HasParameterGroups(Protocol):
+    """A host whose parameters are ours to optimise. Without: its own trainer moves it, or nothing does."""
+
+    def parameter_groups(self) -> Mapping[str, list[Parameter]]:
+        """Parameters by field: geometry, beta, radiance, background."""
+        ...

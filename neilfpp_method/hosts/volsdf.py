@@ -1,0 +1,200 @@
+"""The reference host: a signed distance field rendered as a volume (VolSDF, Yariv et al. 2021; METHOD §3)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from neilfpp_method import losses
+from neilfpp_method.config import NeilfConfig
+from neilfpp_method.fields.background import InvertedSphere
+from neilfpp_method.fields.outgoing_radiance import OutgoingRadianceField
+from neilfpp_method.fields.sdf import SdfField, SdfSample
+from neilfpp_method.hosts.base import RegularisedHits
+from neilfpp_method.shading.frame import safe_normalize
+from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayBatch, SurfaceHits
+from neilfpp_method.volume.compositing import Weights, composite, render_weights
+from neilfpp_method.volume.density import LaplaceDensity
+from neilfpp_method.volume.intersect import sphere_interval
+from neilfpp_method.volume.samplers import error_bounded_samples, uniform_samples
+
+__all__ = ["VolSdfHost"]
+
+
+@dataclass(frozen=True)
+class March:
+    """Samples along rays: where they are, what G says there, and how much each counts."""
+
+    points: Float[Tensor, "N M 3"]
+    surface: SdfSample
+    weights: Weights
+    hits: SurfaceHits
+
+
+class VolSdfHost(nn.Module):
+    """G and R with the Laplace density between them.
+
+    Args:
+        config: the settings.
+        radiance_scale: the largest radiance that R can reach.
+        background: "none", "constant" or "inverted_sphere" (`config.background.kind`, decided).
+        background_color: linear RGB of a constant background.
+        points: oriented cloud on the surface, scene frame, for L_pcd.
+    """
+
+    def __init__(
+        self,
+        config: NeilfConfig,
+        radiance_scale: float,
+        background: str,
+        background_color: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        points: OrientedPoints | None = None,
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.radiance_scale = radiance_scale
+        self.background_kind = background
+        self.points = points
+        radius = config.volume.radius
+        self.sdf_field = SdfField(config.sdf, radius)
+        self.radiance_field = OutgoingRadianceField(config.radiance, config.sdf.feature_width, radius, radiance_scale)
+        self.density = LaplaceDensity(config.volume.beta_init, config.volume.beta_floor)
+        self.background = (
+            InvertedSphere(config.background, radius, radiance_scale) if background == "inverted_sphere" else None
+        )
+        self.register_buffer("background_color", torch.tensor(background_color))
+
+    # -------------------------------------------------------------------------------------------------- the host contract
+
+    def render(self, rays: RayBatch) -> SurfaceHits:
+        """Colour, position and normal of each ray, blended with the rendering weights (METHOD §3)."""
+        return self._march(rays).hits
+
+    def render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
+        """As `render`, with those of eikonal, hessian, surface, point_cloud and mask that `names` holds."""
+        march = self._march(batch.rays)
+        return RegularisedHits(march.hits, self._regularisers(march, batch, names))
+
+    def surface_width(self) -> Float[Tensor, ""]:
+        """β, the scale of the Laplace density, without gradient."""
+        return self.density.beta().detach()
+
+    def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
+        """The parameters by field."""
+        groups = {
+            "geometry": list(self.sdf_field.parameters()),
+            "beta": list(self.density.parameters()),
+            "radiance": list(self.radiance_field.parameters()),
+        }
+        return groups if self.background is None else groups | {"background": list(self.background.parameters())}
+
+    # ---------------------------------------------------------------------------------------------------------- geometry
+
+    def sdf(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
+        """Signed distance of the scene's surface; with no background model the scene sphere closes it (VolSDF §3.1)."""
+        distance = self.sdf_field(x)
+        return torch.minimum(distance, self._to_sphere(x)) if self.background_kind == "none" else distance
+
+    def _surface(self, x: Float[Tensor, "P 3"]) -> SdfSample:
+        sample = self.sdf_field.with_gradient(x)
+        if self.background_kind != "none":
+            return sample
+        to_sphere = self._to_sphere(x)
+        beyond = to_sphere < sample.distance
+        inward = -safe_normalize(x)
+        return SdfSample(
+            torch.where(beyond, to_sphere, sample.distance),
+            torch.where(beyond[:, None], inward, sample.gradient),
+            sample.feature,
+        )
+
+    def _to_sphere(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
+        return self.config.volume.radius - x.square().sum(-1).clamp_min(1e-12).sqrt()
+
+    # --------------------------------------------------------------------------------------------------------- rendering
+
+    def _march(self, rays: RayBatch) -> March:
+        interval = sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
+        distances = self._sample(rays, interval.near, interval.far)
+        points = rays.origins[:, None] + distances[..., None] * rays.directions[:, None]
+        surface = self._surface(points.reshape(-1, 3))
+        density = self.density(surface.distance).reshape(distances.shape)
+        weights = render_weights(density, distances, interval.far)
+        normals = safe_normalize(surface.gradient)
+        wo = (-rays.directions)[:, None].expand_as(points).reshape(-1, 3)
+        radiance = self.radiance_field(points.reshape(-1, 3), wo, normals, surface.feature)
+        hits = self._blend(rays, points, distances, weights, normals, radiance)
+        return March(points, surface, weights, hits)
+
+    def _sample(self, rays: RayBatch, near: Float[Tensor, " N"], far: Float[Tensor, " N"]) -> Float[Tensor, "N M"]:
+        volume = self.config.volume
+        if volume.sampler == "uniform":
+            return uniform_samples(near, far, volume.samples, self.training)
+        with torch.no_grad():
+            beta = self.density.beta()
+            found = error_bounded_samples(
+                self.sdf, rays.origins, rays.directions, near, far, beta, volume, self.training
+            )
+        return found.distances
+
+    def _blend(
+        self,
+        rays: RayBatch,
+        points: Float[Tensor, "N M 3"],
+        distances: Float[Tensor, "N M"],
+        weights: Weights,
+        normals: Float[Tensor, "P 3"],
+        radiance: Float[Tensor, "P 3"],
+    ) -> SurfaceHits:
+        color = composite(weights.weights, radiance.reshape(points.shape)) + self._beyond(rays, weights.transmittance)
+        surface_weights = weights.weights
+        if self.background_kind == "none":
+            # The sphere that closes the scene is painted by R, but it is no surface of the object.
+            on_object = self._to_sphere(points.reshape(-1, 3)).reshape(distances.shape) > self.config.volume.hit_radius
+            surface_weights = surface_weights * on_object
+        opacity = surface_weights.sum(-1)
+        # A ray without weight ends at its last sample: a position that is finite and far from every surface.
+        spare = 1e-6
+        depth = ((surface_weights * distances).sum(-1) + spare * distances[:, -1]) / (opacity + spare)
+        near_hit = (distances - depth[:, None]).abs() <= self.config.volume.hit_radius
+        return SurfaceHits(
+            color=color,
+            position=rays.origins + depth[:, None] * rays.directions,
+            normal=safe_normalize(composite(surface_weights, normals.reshape(points.shape))),
+            opacity=opacity,
+            concentration=(surface_weights.detach() * near_hit).sum(-1),
+        )
+
+    def _beyond(self, rays: RayBatch, transmittance: Float[Tensor, " N"]) -> Float[Tensor, "N 3"]:
+        """What still arrives from beyond the scene sphere."""
+        if self.background is not None:
+            return transmittance[:, None] * self.background(rays.origins, rays.directions)
+        return transmittance[:, None] * self.background_color
+
+    # ------------------------------------------------------------------------------------------------------- regularisers
+
+    def _regularisers(self, march: March, batch: PixelBatch, names: Collection[str]) -> dict[str, LossTerm]:
+        settings = self.config.loss
+        terms = {}
+        if "eikonal" in names:
+            terms["eikonal"] = losses.eikonal(march.surface.gradient)
+        if "surface" in names:
+            terms["surface"] = losses.surface(march.surface.distance, settings.surface_epsilon)
+        if "hessian" in names:
+            hessian = self.sdf_field.hessian(self._near_surface(march.hits), settings.hessian_method)
+            terms["hessian"] = losses.hessian(hessian)
+        if "point_cloud" in names and self.points is not None:
+            rows = torch.randint(len(self.points.position), (len(batch),), device=batch.origins.device)
+            sample = self.sdf_field.with_gradient(self.points.position[rows])
+            terms["point_cloud"] = losses.point_cloud(sample.distance, sample.gradient, self.points.normal[rows])
+        if "mask" in names:
+            terms["mask"] = losses.mask(march.hits.opacity, batch.mask)
+        return terms
+
+    def _near_surface(self, hits: SurfaceHits) -> Float[Tensor, "N 3"]:
+        """One point per ray, scattered about its hit: where second derivatives shape the surface."""
+        return hits.position.detach() + self.config.volume.hit_radius * torch.randn_like(hits.position)

@@ -1,0 +1,108 @@
+"""The losses of METHOD §4, each unreduced and unweighted; `schedule.py` weighs and adds them up."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from neilfpp_method.shading.color import apply_response
+from neilfpp_method.structures import LossTerm, Material
+
+__all__ = [
+    "eikonal",
+    "hessian",
+    "inter_reflection",
+    "lambertian",
+    "mask",
+    "photometric",
+    "point_cloud",
+    "scale_gradient",
+    "smoothness",
+    "surface",
+]
+
+
+def photometric(
+    radiance: Float[Tensor, "N 3"],
+    pixel: Float[Tensor, "N 3"],
+    response: str,
+    weights: Float[Tensor, " N"] | None = None,
+    scale: float = 1.0,
+) -> LossTerm:
+    """L_vol and L_phys: L1 between a render and the pixel.
+
+    Args:
+        radiance: what the model sees, linear.
+        pixel: what the file holds, in the capture's `response`.
+        response: "linear" compares radiance; "srgb" clips the render and encodes it first (METHOD §6).
+        weights: how much each ray counts.
+        scale: divides the loss, so that an output activation of that range keeps the size of its gradient.
+    """
+    difference = (apply_response(radiance, response) - pixel).abs() / scale
+    return LossTerm(difference, None if weights is None else weights[:, None])
+
+
+def mask(opacity: Float[Tensor, " N"], object_mask: Float[Tensor, " N"]) -> LossTerm:
+    """Binary cross-entropy between a ray's opacity and the capture's object mask (IDR eq. 7, for volumes)."""
+    bounded = opacity.clamp(1e-4, 1.0 - 1e-4)
+    return LossTerm(functional.binary_cross_entropy(bounded, object_mask, reduction="none"))
+
+
+def eikonal(gradient: Float[Tensor, "P 3"]) -> LossTerm:
+    """L_Eik = |‖∇G‖ − 1|; finite gradients where ∇G = 0."""
+    return LossTerm((_safe_norm(gradient) - 1.0).abs())
+
+
+def hessian(matrix: Float[Tensor, "P 3 3"]) -> LossTerm:
+    """L_Hess = ‖H G‖₁, element-wise: flat surfaces cost nothing, noise does."""
+    return LossTerm(matrix.abs())
+
+
+def surface(distance: Float[Tensor, "..."], epsilon: float) -> LossTerm:
+    """L_surf = δ_ε(G), δ_ε(z) = ε / (π (ε² + z²)): the area of the zero set, against surfaces that no image asks for."""
+    return LossTerm(epsilon / (math.pi * (epsilon**2 + distance**2)))
+
+
+def point_cloud(
+    distance: Float[Tensor, " P"], gradient: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]
+) -> LossTerm:
+    """L_pcd = |G(x_D)| + 1 − cos∠(n_D, ∇G(x_D)) at the points x_D of an oriented cloud."""
+    cosine = (functional.normalize(gradient, dim=-1, eps=1e-6) * normal).sum(-1)
+    return LossTerm(distance.abs() + (1.0 - cosine))
+
+
+def inter_reflection(incident: Float[Tensor, "K 3"], outgoing: Float[Tensor, "K 3"]) -> LossTerm:
+    """L_ref = ‖L(x₁, ωi) − R(x₂, −ωi)‖₁ for rays that leave x₁ along ωi and meet the surface at x₂ (METHOD §2)."""
+    return LossTerm((incident - outgoing).abs())
+
+
+def smoothness(
+    roughness_gradient: Float[Tensor, "N 3"],
+    metallic_gradient: Float[Tensor, "N 3"],
+    image_gradient: Float[Tensor, " N"],
+) -> LossTerm:
+    """L_smth = (‖∇r‖ + ‖∇m‖) exp(−‖∇I‖): roughness and metallic change where the image does."""
+    return LossTerm((_safe_norm(roughness_gradient) + _safe_norm(metallic_gradient)) * torch.exp(-image_gradient))
+
+
+def lambertian(material: Material) -> LossTerm:
+    """L_Lam = |r − 1| + |m|: without evidence a surface is rough and not a metal."""
+    return LossTerm((material.roughness - 1.0).abs() + material.metallic.abs())
+
+
+def scale_gradient(value: Tensor, scale: float) -> Tensor:
+    """The same value with its gradient times `scale`; 0 detaches it."""
+    if scale == 1.0:
+        return value
+    if scale == 0.0:
+        return value.detach()
+    return value * scale + value.detach() * (1.0 - scale)
+
+
+def _safe_norm(vector: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
+    # The floor keeps the derivative of the root finite at zero and moves no length that matters.
+    return vector.square().sum(-1).clamp_min(1e-12).sqrt()

@@ -1,0 +1,237 @@
+"""NeILF++: a host that knows geometry and radiance, and the material and the light that explain what it sees.
+
+One training step reads top to bottom in `NeilfModel.losses`, in the order of the paper's §4.2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from neilfpp_method import losses
+from neilfpp_method.config import NeilfConfig
+from neilfpp_method.fields.brdf import BrdfField
+from neilfpp_method.fields.incident_light import IncidentLightField
+from neilfpp_method.hosts.base import HasParameterGroups, Host, Regularised
+from neilfpp_method.inter_reflection import trace_light
+from neilfpp_method.schedule import STAGES, Stage, active_losses
+from neilfpp_method.shading.brdf import LOBES
+from neilfpp_method.shading.rendering_equation import shade
+from neilfpp_method.shading.sampling import sample_directions
+from neilfpp_method.structures import LossTerm, Material, PixelBatch, RayBatch, Shading, SurfaceHits
+
+__all__ = ["Maps", "NeilfModel", "SceneFacts"]
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """What the images of a capture decide before training.
+
+    Attributes:
+        response: "linear" (HDR) or "srgb" (LDR): what a pixel is of radiance.
+        median_radiance: median linear luminance of the object's pixels; the first render matches it.
+        radiance_scale: the largest radiance that R can reach.
+        background: "none", "constant" or "inverted_sphere".
+        background_color: linear RGB of a constant background.
+    """
+
+    response: str
+    median_radiance: float
+    radiance_scale: float
+    background: str
+    background_color: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Maps:
+    """Everything that a ray shows; one row a ray. Colours are linear; rows that are no hit hold zeros but in `rgb`."""
+
+    rgb: Float[Tensor, "N 3"]
+    rgb_volume: Float[Tensor, "N 3"]
+    diffuse: Float[Tensor, "N 3"]
+    specular: Float[Tensor, "N 3"]
+    base_color: Float[Tensor, "N 3"]
+    roughness: Float[Tensor, "N 1"]
+    metallic: Float[Tensor, "N 1"]
+    normal: Float[Tensor, "N 3"]
+    depth: Float[Tensor, "N 1"]
+    opacity: Float[Tensor, "N 1"]
+
+
+class NeilfModel(nn.Module):
+    """The method on top of any host.
+
+    Args:
+        host: renders rays (`hosts.base.Host`); its parameters train with ours where it offers `parameter_groups`.
+        config: the settings.
+        facts: what the images decided.
+    """
+
+    def __init__(self, host: Host, config: NeilfConfig, facts: SceneFacts) -> None:
+        super().__init__()
+        self.host = host
+        self.config = config
+        self.facts = facts
+        self.lobe = LOBES[config.shading.lobe]
+        self.brdf = BrdfField(config.brdf, config.volume.radius)
+        base = config.light.base or (10.0 if facts.response == "linear" else math.e)
+        self.light = IncidentLightField(config.light, base, facts.median_radiance / self._first_albedo())
+
+    # -------------------------------------------------------------------------------------------------------- one step
+
+    def forward(self, batch: PixelBatch, stage: Stage) -> Mapping[str, LossTerm]:
+        """`losses`, under the name that data-parallel wrappers call."""
+        return self.losses(batch, stage)
+
+    def losses(self, batch: PixelBatch, stage: Stage) -> Mapping[str, LossTerm]:
+        """The losses that count in a stage, for a batch of pixels."""
+        names = active_losses(stage, self.config)
+        plan = STAGES[stage]
+
+        # 1. The host renders colour, hit position and normal. Without a geometry stage they are constants.
+        with torch.set_grad_enabled(torch.is_grad_enabled() and plan.moves_geometry):
+            hits, terms = self._render_host(batch, names)
+        if "volume" in names:
+            terms["volume"] = losses.photometric(
+                hits.color, batch.color, self.facts.response, scale=self.facts.radiance_scale
+            )
+        if not plan.moves_material:
+            return terms
+
+        # 2. Rays that meet one surface, on the object, are shaded; a scaled gradient goes back to where they met it.
+        rows = torch.nonzero((hits.is_hit(self.config.shading.hit_share)) & (batch.mask > 0.5))[:, 0]
+        pixels, position, normal = batch[rows], *self._surface_points(hits, rows)
+
+        # 3. The BRDF field says what the surface is made of.
+        material = self._material_and_priors(position, pixels.image_gradient, names, terms)
+
+        # 4. The incident light field says what arrives. 5. The rendering equation says what leaves.
+        shading = self.shade(position, normal, -pixels.directions, material, self.config.shading.train_samples)
+        terms["physical"] = losses.photometric(shading.color, pixels.color, self.facts.response)
+
+        # 6. What arrives from another surface is what that surface sends.
+        if "inter_reflection" in names:
+            terms["inter_reflection"] = self._inter_reflection(position, normal)
+        return terms
+
+    def _render_host(self, batch: PixelBatch, names: Mapping[str, float]) -> tuple[SurfaceHits, dict[str, LossTerm]]:
+        if isinstance(self.host, Regularised):
+            rendered = self.host.render_regularised(batch, names)
+            return rendered.hits, dict(rendered.terms)
+        return self.host.render(batch.rays), {}
+
+    def _surface_points(self, hits: SurfaceHits, rows: Tensor) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
+        settings = self.config.loss
+        return (
+            losses.scale_gradient(hits.position[rows], settings.position_gradient),
+            losses.scale_gradient(hits.normal[rows], settings.normal_gradient),
+        )
+
+    def _material_and_priors(
+        self,
+        position: Float[Tensor, "P 3"],
+        image_gradient: Float[Tensor, " P"],
+        names: Mapping[str, float],
+        terms: dict[str, LossTerm],
+    ) -> Material:
+        if "smoothness" in names:
+            sample = self.brdf.with_gradients(position)
+            material = sample.material
+            terms["smoothness"] = losses.smoothness(
+                sample.roughness_gradient, sample.metallic_gradient, image_gradient
+            )
+        else:
+            material = self.brdf(position)
+        if "lambertian" in names:
+            terms["lambertian"] = losses.lambertian(material)
+        return material
+
+    def _inter_reflection(self, position: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]) -> LossTerm:
+        traced = trace_light(
+            self.host, position, normal, self.config.inter_reflection, self.config.shading.hit_share
+        )
+        hit = torch.nonzero(traced.hit)[:, 0]
+        incident = self.light.radiance(traced.position[hit], traced.wi[hit][:, None])[:, 0]
+        return losses.inter_reflection(incident, traced.radiance[hit])
+
+    # ------------------------------------------------------------------------------------------------------- the parts
+
+    def materials(self, x: Float[Tensor, "N 3"]) -> Material:
+        """Base colour, roughness and metallic at points of the scene frame."""
+        return self.brdf(x)
+
+    def incident_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
+        """Linear radiance that arrives at x from wi."""
+        return self.light.radiance(x, wi)
+
+    def shade(
+        self,
+        position: Float[Tensor, "N 3"],
+        normal: Float[Tensor, "N 3"],
+        wo: Float[Tensor, "N 3"],
+        material: Material,
+        samples: int,
+    ) -> Shading:
+        """Outgoing radiance towards wo by the rendering equation, from `samples` incident directions per point."""
+        settings = self.config.shading
+        # Without a lobe there is nothing for a lobe to sample: the cosine has no variance left that light does not bring.
+        without_lobe = {"mis": "cosine", "lobe": "cosine"}
+        sampler = settings.sampler if settings.specular else without_lobe.get(settings.sampler, settings.sampler)
+        drawn = sample_directions(
+            sampler, normal.detach(), wo, material.roughness.detach(), samples, self.lobe, self.training
+        )
+        incident = self.light.radiance(position, drawn.wi)
+        return shade(material, normal, wo, drawn, incident, self.lobe, settings.specular)
+
+    @torch.no_grad()
+    def maps(self, rays: RayBatch, with_material: bool = True) -> Maps:
+        """Everything that the rays show, for pictures and metrics. Bound the memory by the number of rays.
+
+        `with_material` off asks neither the BRDF nor the light: `rgb` is then the host's colour.
+        """
+        hits = self.host.render(rays)
+        size = len(rays)
+        surfaces = torch.zeros(size, 11, dtype=hits.color.dtype, device=hits.color.device)
+        rgb = hits.color.clone()
+        rows = torch.nonzero(hits.is_hit(self.config.shading.hit_share))[:, 0]
+        if with_material and len(rows):
+            position, normal, wo = hits.position[rows], hits.normal[rows], -rays.directions[rows]
+            material = self.brdf(position)
+            shading = self.shade(position, normal, wo, material, self.config.shading.eval_samples)
+            rgb[rows] = shading.color
+            surfaces[rows] = torch.cat(
+                [shading.diffuse, shading.specular, material.base_color, material.roughness, material.metallic], dim=-1
+            )
+        diffuse, specular, base_color, roughness, metallic = surfaces.split([3, 3, 3, 1, 1], dim=-1)
+        depth = ((hits.position - rays.origins) * rays.directions).sum(-1, keepdim=True)
+        return Maps(
+            rgb, hits.color, diffuse, specular, base_color, roughness, metallic, hits.normal, depth, hits.opacity[:, None]
+        )
+
+    # ------------------------------------------------------------------------------------------------------- parameters
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Parameters by field, the host's among them where it offers them."""
+        host = self.host.parameter_groups() if isinstance(self.host, HasParameterGroups) else {}
+        return {**host, "brdf": list(self.brdf.parameters()), "light": list(self.light.parameters())}
+
+    def freeze_for(self, stage: Stage) -> None:
+        """Let exactly the fields move that the stage moves; the others get no gradient."""
+        for name, parameters in self.parameter_groups().items():
+            for parameter in parameters:
+                parameter.requires_grad_(name in STAGES[stage].moves)
+                parameter.grad = None
+
+    def _first_albedo(self) -> float:
+        """Directional albedo of the mid-grey material that B starts as, seen from the normal under uniform light."""
+        half = torch.full((1, 1), 0.5)
+        up = torch.tensor([[0.0, 0.0, 1.0]])
+        material = Material(half.expand(1, 3), half, half)
+        samples = sample_directions("fibonacci", up, up, half, 4096, self.lobe, stochastic=False)
+        white = torch.ones_like(samples.wi)
+        return shade(material, up, up, samples, white, self.lobe, self.config.shading.specular).color.mean().item()

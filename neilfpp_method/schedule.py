@@ -1,0 +1,151 @@
+"""The three stages and the loss table (METHOD §4, Table 1 of the paper), as data.
+
+    stage          L_ref L_vol L_Eik L_Hess L_surf L_pcd L_phys L_smth L_Lam | moves
+    SDF init         -     x     x     x      x     (x)    -      -      -   | G, R
+    material init    x     -     -     -      -      -     x      x      x   | B, L
+    joint            x     x     x     low    low    -     x      x      x   | G, R, B, L
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+from jaxtyping import Float
+from torch import Tensor
+
+from neilfpp_method.config import NeilfConfig, TrainConfig
+from neilfpp_method.structures import LossTerms
+
+__all__ = ["STAGES", "Stage", "StagePlan", "StagePosition", "Total", "active_losses", "stage_at", "stage_steps", "weigh"]
+
+
+class Stage(str, Enum):
+    """The stages, in order."""
+
+    SDF_INIT = "sdf_init"
+    MATERIAL_INIT = "material_init"
+    JOINT = "joint"
+
+
+GEOMETRY = frozenset({"geometry", "beta", "radiance", "background"})
+MATERIAL = frozenset({"brdf", "light"})
+
+
+@dataclass(frozen=True)
+class StagePlan:
+    """One row of the table: for each loss that counts the setting that weighs it, and the fields that move."""
+
+    weights: Mapping[str, str]
+    moves: frozenset[str]
+
+    @property
+    def moves_geometry(self) -> bool:
+        return bool(self.moves & GEOMETRY)
+
+    @property
+    def moves_material(self) -> bool:
+        return bool(self.moves & MATERIAL)
+
+
+STAGES: Mapping[Stage, StagePlan] = {
+    Stage.SDF_INIT: StagePlan(
+        weights={
+            "volume": "volume",
+            "mask": "mask",
+            "eikonal": "eikonal",
+            "hessian": "hessian",
+            "surface": "surface",
+            "point_cloud": "point_cloud",
+        },
+        moves=GEOMETRY,
+    ),
+    Stage.MATERIAL_INIT: StagePlan(
+        weights={
+            "physical": "physical",
+            "inter_reflection": "inter_reflection",
+            "smoothness": "smoothness",
+            "lambertian": "lambertian",
+        },
+        moves=MATERIAL,
+    ),
+    Stage.JOINT: StagePlan(
+        weights={
+            "volume": "volume",
+            "mask": "mask",
+            "eikonal": "eikonal",
+            "hessian": "hessian_joint",
+            "surface": "surface_joint",
+            "physical": "physical",
+            "inter_reflection": "inter_reflection",
+            "smoothness": "smoothness",
+            "lambertian": "lambertian",
+        },
+        moves=GEOMETRY | MATERIAL,
+    ),
+}
+
+
+def stage_steps(config: TrainConfig) -> Mapping[Stage, int]:
+    """Steps of each stage, in order."""
+    return {
+        Stage.SDF_INIT: config.sdf_steps,
+        Stage.MATERIAL_INIT: config.material_steps,
+        Stage.JOINT: config.joint_steps,
+    }
+
+
+@dataclass(frozen=True)
+class StagePosition:
+    """Where a global step lies: its stage, its number within the stage, and the stage's length."""
+
+    stage: Stage
+    step: int
+    length: int
+
+
+def stage_at(step: int, config: TrainConfig) -> StagePosition:
+    """The stage of a global step (from 0); the last stage that has steps, one past its end, when training is over."""
+    start = 0
+    lengths = [(stage, n) for stage, n in stage_steps(config).items() if n > 0]
+    for stage, length in lengths:
+        if step < start + length:
+            return StagePosition(stage, step - start, length)
+        start += length
+    stage, length = lengths[-1]
+    return StagePosition(stage, length, length)
+
+
+def active_losses(stage: Stage, config: NeilfConfig) -> Mapping[str, float]:
+    """The losses that count in a stage, with their weights.
+
+    One of weight 0, or whose effect is switched off, is absent: nothing computes it.
+    """
+    weights = {loss: getattr(config.loss, setting) for loss, setting in STAGES[stage].weights.items()}
+    if config.inter_reflection.mode == "off":
+        weights.pop("inter_reflection", None)
+    if not config.shading.specular:
+        # A Lambertian surface has neither roughness nor metallic to keep smooth or to pull back.
+        weights.pop("smoothness", None)
+        weights.pop("lambertian", None)
+    return {loss: weight for loss, weight in weights.items() if weight > 0}
+
+
+@dataclass(frozen=True)
+class Total:
+    """The weighted sum that is minimised, and each reduced term before its weight, for the log."""
+
+    loss: Float[Tensor, ""]
+    terms: Mapping[str, Float[Tensor, ""]]
+
+
+def weigh(terms: LossTerms, weights: Mapping[str, float]) -> Total:
+    """Reduce the terms and add them up.
+
+    Raises:
+        KeyError: a term has no weight: somebody computed a loss that does not count in this stage.
+    """
+    reduced = {name: term.mean() for name, term in terms.items()}
+    total = sum(weights[name] * value for name, value in reduced.items())
+    return Total(total, {name: value.detach() for name, value in reduced.items()})

@@ -1,0 +1,31 @@
+"""The rendering equation (METHOD §1): stateless mathematics, no parameters.
+
+`frame` holds directions at a surface point, `brdf` the material, `sampling` the directions and their densities,
+`rendering_equation` the estimator that joins them, `color` what a pixel is of radiance.
+"""
+
+from __future__ import annotations
+
+from neilfpp_method.shading.brdf import GGX, LOBES, SPHERICAL_GAUSSIAN, BrdfValue, Lobe, evaluate
+from neilfpp_method.shading.color import apply_response, linear_to_srgb, luminance, srgb_to_linear, tone_map
+from neilfpp_method.shading.frame import local_frame, safe_normalize
+from neilfpp_method.shading.rendering_equation import shade
+from neilfpp_method.shading.sampling import sample_directions
+
+__all__ = [
+    "GGX",
+    "LOBES",
+    "SPHERICAL_GAUSSIAN",
+    "BrdfValue",
+    "Lobe",
+    "apply_response",
+    "evaluate",
+    "linear_to_srgb",
+    "local_frame",
+    "luminance",
+    "safe_normalize",
+    "sample_directions",
+    "shade",
+    "srgb_to_linear",
+    "tone_map",
+]

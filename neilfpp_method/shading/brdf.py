@@ -1,0 +1,236 @@
+"""The simplified Disney BRDF, f = f_d + f_s (METHOD §1), with two microfacet lobes.
+
+    f_d = (1 − m)/π · b
+    f_s = D(n·h) · F(wo·h) · V(n·wi, n·wo),  V = G / (4 (n·wi)(n·wo))
+
+V is always taken in the form in which the cosines have cancelled: it has no 0/0 at grazing angles. All is computed, and
+returned, in at least float32.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neilfpp_method.shading.frame import at_least_float32, dot
+from neilfpp_method.structures import Material
+
+__all__ = [
+    "GGX",
+    "LOBES",
+    "SPHERICAL_GAUSSIAN",
+    "BrdfValue",
+    "Cosines",
+    "Lobe",
+    "SpecularTerms",
+    "cosines",
+    "diffuse_reflectance",
+    "evaluate",
+    "normal_reflectance",
+    "roughness_floor",
+    "specular_terms",
+]
+
+
+# ---------------------------------------------------------------------------------------------------------------- lobes
+
+
+@dataclass(frozen=True)
+class Lobe:
+    """A microfacet lobe: functions of cosines (N, S) and roughness (N, 1), each (N, S).
+
+    A lobe keeps r at or above `roughness_floor`: a smoother surface shades as one of that roughness, and sends no
+    gradient to r.
+    """
+
+    distribution: Callable[[Tensor, Tensor], Tensor]
+    """D(n·h, r), density of microfacet area per steradian."""
+    visibility: Callable[[Tensor, Tensor, Tensor], Tensor]
+    """V(n·wi, n·wo, r), for cosines ≥ 0."""
+    sample_cos_h: Callable[[Tensor, Tensor], Tensor]
+    """n·h for uniform numbers in [0, 1), such that h, at a uniform azimuth, has the density `pdf_h`."""
+    pdf_h: Callable[[Tensor, Tensor], Tensor]
+    """Density of h per steradian of the hemisphere about n, for n·h ≥ 0."""
+
+
+def roughness_floor(dtype: torch.dtype) -> float:
+    """The smallest roughness that a lobe can resolve: (32 ε)^¼, which is 0.044 in float32 and 2.9e-4 in float64.
+
+    D varies on the scale 1 − n·h ~ r⁴/2, and n·h, a number near 1, is rounded to ε/2. At the floor that rounding moves
+    D by 3 %; below, D would be noise. The floor also bounds the lobe: in float32 D ≤ 8.4e4 and V ≤ 1/r⁴ = 2.6e5.
+    """
+    return (32 * torch.finfo(dtype).eps) ** 0.25
+
+
+def _alpha(roughness: Float[Tensor, "N 1"]) -> Float[Tensor, "N 1"]:
+    """Microfacet width α = r², floored."""
+    wide = at_least_float32(roughness)
+    return wide.clamp_min(roughness_floor(wide.dtype)).square()
+
+
+# The paper's lobe. ∫ D (n·h) dh = 1 − (r⁴/2)(1 − e^(−2/r⁴)): it loses energy, 43 % of it at r = 1.
+
+
+def _sg_distribution(cos_h: Float[Tensor, "N S"], roughness: Float[Tensor, "N 1"]) -> Float[Tensor, "N S"]:
+    """D = 1/(π r⁴) · exp(2/r⁴ · (n·h − 1))."""
+    alpha_squared = _alpha(roughness).square()
+    return torch.exp(2 * (cos_h - 1) / alpha_squared) / (math.pi * alpha_squared)
+
+
+def _sg_visibility(
+    cos_i: Float[Tensor, "N S"], cos_o: Float[Tensor, "N 1"], roughness: Float[Tensor, "N 1"]
+) -> Float[Tensor, "N S"]:
+    """V = 1/((2 − r²) n·wi + r²) · 1/((2 − r²) n·wo + r²), from G1(z) = 2z/((2 − r²) z + r²)."""
+    alpha = _alpha(roughness)
+    return 1 / (((2 - alpha) * cos_i + alpha) * ((2 - alpha) * cos_o + alpha))
+
+
+def _sg_pdf_h(cos_h: Float[Tensor, "N S"], roughness: Float[Tensor, "N 1"]) -> Float[Tensor, "N S"]:
+    """D over its integral without the cosine, 1 − e^(−2/r⁴): this density can be inverted in closed form."""
+    return _sg_distribution(cos_h, roughness) / -torch.expm1(-2 / _alpha(roughness).square())
+
+
+def _sg_sample_cos_h(u: Float[Tensor, "N S"], roughness: Float[Tensor, "N 1"]) -> Float[Tensor, "N S"]:
+    """n·h = 1 + (r⁴/2) log(1 − u (1 − e^(−2/r⁴)))."""
+    half_width = _alpha(roughness).square() / 2
+    return (1 + half_width * torch.log1p(u * torch.expm1(-1 / half_width))).clamp_min(0)
+
+
+# Trowbridge-Reitz (GGX), α = r², with Smith's height-correlated masking and shadowing (Heitz 2014, eq. 99).
+
+
+def _ggx_distribution(cos_h: Float[Tensor, "N S"], roughness: Float[Tensor, "N 1"]) -> Float[Tensor, "N S"]:
+    """D = α² / (π (sin²θ + α² cos²θ)²), θ the angle between n and h."""
+    alpha_squared = _alpha(roughness).square()
+    # (1 − c)(1 + c) keeps the digits that 1 − c² loses near c = 1.
+    spread = (1 - cos_h) * (1 + cos_h) + alpha_squared * cos_h.square()
+    return alpha_squared / (math.pi * spread.square())
+
+
+def _ggx_visibility(
+    cos_i: Float[Tensor, "N S"], cos_o: Float[Tensor, "N 1"], roughness: Float[Tensor, "N 1"]
+) -> Float[Tensor, "N S"]:
+    """V = ½ / (n·wo √(α² + (1 − α²)(n·wi)²) + n·wi √(α² + (1 − α²)(n·wo)²))."""
+    alpha_squared = _alpha(roughness).square()
+
+    def masking(cosine: Tensor) -> Tensor:
+        return (alpha_squared + (1 - alpha_squared) * cosine.square()).sqrt()
+
+    # V grows as 1/(n·wi + n·wo) towards the horizon; the bound acts where both directions lie within 0.03° of it.
+    return 0.5 / (cos_o * masking(cos_i) + cos_i * masking(cos_o)).clamp_min(1e-6)
+
+
+def _ggx_pdf_h(cos_h: Float[Tensor, "N S"], roughness: Float[Tensor, "N 1"]) -> Float[Tensor, "N S"]:
+    """D (n·h), whose integral is 1."""
+    return _ggx_distribution(cos_h, roughness) * cos_h
+
+
+def _ggx_sample_cos_h(u: Float[Tensor, "N S"], roughness: Float[Tensor, "N 1"]) -> Float[Tensor, "N S"]:
+    """n·h = √((1 − u)/(1 − u + α² u))."""
+    return ((1 - u) / (1 - u + _alpha(roughness).square() * u)).sqrt()
+
+
+SPHERICAL_GAUSSIAN = Lobe(_sg_distribution, _sg_visibility, _sg_sample_cos_h, _sg_pdf_h)
+GGX = Lobe(_ggx_distribution, _ggx_visibility, _ggx_sample_cos_h, _ggx_pdf_h)
+LOBES: Mapping[str, Lobe] = {"spherical_gaussian": SPHERICAL_GAUSSIAN, "ggx": GGX}
+
+
+# ------------------------------------------------------------------------------------------------------------- geometry
+
+
+@dataclass(frozen=True)
+class Cosines:
+    """`i` = n·wi, `o` = n·wo, `h` = n·h, `d` = wo·h = wi·h ≥ 0, with the half vector h = (wi + wo)/|wi + wo|."""
+
+    i: Float[Tensor, "N S"]
+    o: Float[Tensor, "N 1"]
+    h: Float[Tensor, "N S"]
+    d: Float[Tensor, "N S"]
+
+
+def cosines(n: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Cosines:
+    """The cosines that the BRDF is a function of, for unit vectors.
+
+    h is never formed: |wi + wo| = 2 wo·h and (wo·h)² = (1 + wi·wo)/2. For wi = −wo there is no h; the floor on (wo·h)²
+    keeps value and gradient finite there.
+    """
+    i, o = dot(wi, n), dot(wo.unsqueeze(1), n)
+    d = ((1 + dot(wi, wo)) / 2).clamp(1e-8, 1).sqrt()
+    return Cosines(i, o, ((i + o) / (2 * d)).clamp(-1, 1), d)
+
+
+# ----------------------------------------------------------------------------------------------------------------- BRDF
+
+
+@dataclass(frozen=True)
+class BrdfValue:
+    """f per steradian, without the cosine, as `diffuse` + `specular`."""
+
+    diffuse: Float[Tensor, "N S 3"]
+    specular: Float[Tensor, "N S 3"]
+
+
+@dataclass(frozen=True)
+class SpecularTerms:
+    """f_s = F0 · `facing` + `grazing`: a scalar pair per direction, with the colour of the surface, F0, set aside."""
+
+    facing: Float[Tensor, "N S"]
+    grazing: Float[Tensor, "N S"]
+
+
+def diffuse_reflectance(material: Material, specular: bool = True) -> Float[Tensor, "N 3"]:
+    """π f_d: (1 − m) b, or b for a surface without a specular part."""
+    base_color = at_least_float32(material.base_color)
+    return base_color * (1 - material.metallic) if specular else base_color
+
+
+def normal_reflectance(material: Material) -> Float[Tensor, "N 3"]:
+    """F0 = 0.04 (1 − m) + b m."""
+    base_color, metallic = at_least_float32(material.base_color), material.metallic
+    return 0.04 * (1 - metallic) + base_color * metallic
+
+
+def specular_terms(
+    roughness: Float[Tensor, "N 1"],
+    n: Float[Tensor, "N 3"],
+    wo: Float[Tensor, "N 3"],
+    wi: Float[Tensor, "N S 3"],
+    lobe: Lobe,
+) -> SpecularTerms:
+    """The scalars of the specular lobe; zero for wi at or below the horizon.
+
+    With s = (1 − wo·h)⁵, Schlick's F0 + (1 − F0) s is F0 (1 − s) + s. (The power is on the whole bracket; the
+    supplement of the paper misprints it.) A viewer below the horizon, which blended normals can bring about, counts as
+    one at the horizon.
+    """
+    cos = cosines(n, wo, wi)
+    reflected = lobe.distribution(cos.h, roughness) * lobe.visibility(cos.i.clamp_min(0), cos.o.clamp_min(0), roughness)
+    reflected = torch.where(cos.i > 0, reflected, 0.0)
+    grazing = reflected * (1 - cos.d).pow(5)
+    return SpecularTerms(reflected - grazing, grazing)
+
+
+def evaluate(
+    material: Material,
+    n: Float[Tensor, "N 3"],
+    wo: Float[Tensor, "N 3"],
+    wi: Float[Tensor, "N S 3"],
+    lobe: Lobe,
+    specular: bool = True,
+) -> BrdfValue:
+    """f(wo, wi) of METHOD §1; exactly zero for wi at or below the horizon.
+
+    `n`, `wo`, `wi` are unit and point away from the surface. With `specular=False` the surface is Lambertian: f = b/π.
+    """
+    above = (dot(wi, n) > 0).unsqueeze(-1)
+    diffuse = (diffuse_reflectance(material, specular) / math.pi).unsqueeze(1) * above
+    if not specular:
+        return BrdfValue(diffuse, torch.zeros_like(diffuse))
+    terms = specular_terms(material.roughness, n, wo, wi, lobe)
+    facing, grazing = terms.facing.unsqueeze(-1), terms.grazing.unsqueeze(-1)
+    return BrdfValue(diffuse, normal_reflectance(material).unsqueeze(1) * facing + grazing)

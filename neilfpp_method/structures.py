@@ -1,0 +1,148 @@
+"""What travels between the rooms of the package.
+
+N rays or surface points, S incident directions per point. Positions are in the scene frame (the object lies in the
+unit sphere, see docs/conventions.md); directions are unit vectors in that frame; radiance is linear RGB.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple, TypeVar
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+__all__ = ["IncidentSamples", "Indexable", "LossTerm", "LossTerms", "Material", "OrientedPoints", "PixelBatch", "RayBatch", "Shading", "SurfaceHits"]
+
+Structure = TypeVar("Structure", bound="Indexable")
+
+
+class Indexable:
+    """Tensors that share their first axis: row selection and moves between devices in one call."""
+
+    def _map(self: Structure, function) -> Structure:
+        tensors = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{name: function(t) for name, t in tensors.items() if isinstance(t, Tensor)})
+
+    def __getitem__(self: Structure, rows: Tensor | slice) -> Structure:
+        return self._map(lambda t: t[rows])
+
+    def to(self: Structure, device: torch.device | str) -> Structure:
+        return self._map(lambda t: t.to(device, non_blocking=True))
+
+    def detach(self: Structure) -> Structure:
+        return self._map(Tensor.detach)
+
+    def __len__(self) -> int:
+        return getattr(self, fields(self)[0].name).shape[0]
+
+
+@dataclass(frozen=True)
+class RayBatch(Indexable):
+    """Rays in the scene frame; `directions` are unit vectors, so a distance along the ray is a length."""
+
+    origins: Float[Tensor, "N 3"]
+    directions: Float[Tensor, "N 3"]
+
+
+@dataclass(frozen=True)
+class PixelBatch(Indexable):
+    """Rays with what the images say about them.
+
+    `color` is what the file holds: linear radiance for an HDR capture, display values (sRGB) for an LDR one.
+    `mask` is 1 on the object, 0 off it, and all ones where the capture has no masks; `image_gradient` is the length of
+    the gradient of the image's luminance at the pixel, per pixel.
+    """
+
+    origins: Float[Tensor, "N 3"]
+    directions: Float[Tensor, "N 3"]
+    color: Float[Tensor, "N 3"]
+    mask: Float[Tensor, " N"]
+    image_gradient: Float[Tensor, " N"]
+    view: Int[Tensor, " N"]
+
+    @property
+    def rays(self) -> RayBatch:
+        return RayBatch(self.origins, self.directions)
+
+
+@dataclass(frozen=True)
+class OrientedPoints(Indexable):
+    """Points on the surface with their unit normals, away from it, in the scene frame."""
+
+    position: Float[Tensor, "P 3"]
+    normal: Float[Tensor, "P 3"]
+
+
+@dataclass(frozen=True)
+class SurfaceHits(Indexable):
+    """Where rays meet the surface, and what they see there.
+
+    `color` is the linear radiance that the host renders for the whole ray, background included; `position` and `normal`
+    are blended along the ray and `normal` is unit, away from the surface; `opacity` is the share of the ray that the
+    surface stops; `concentration` is the share of the blending weight that lies close to `position` (1 for a host with
+    a sharp surface), which tells a hit from a miss and from an average over two surfaces. The normal of a miss is zero.
+    """
+
+    color: Float[Tensor, "N 3"]
+    position: Float[Tensor, "N 3"]
+    normal: Float[Tensor, "N 3"]
+    opacity: Float[Tensor, " N"]
+    concentration: Float[Tensor, " N"]
+
+    def is_hit(self, share: float) -> Bool[Tensor, " N"]:
+        """Which rays meet one surface: at least `share` of their weight lies close to the hit."""
+        return self.concentration >= share
+
+
+@dataclass(frozen=True)
+class Material(Indexable):
+    """The simplified Disney parameters at a point, each in [0, 1]. `roughness` r has microfacet width α = r²."""
+
+    base_color: Float[Tensor, "N 3"]
+    roughness: Float[Tensor, "N 1"]
+    metallic: Float[Tensor, "N 1"]
+
+
+@dataclass(frozen=True)
+class IncidentSamples(Indexable):
+    """Directions towards the light with the density that drew them.
+
+    `wi` points away from the surface. `pdf` is per steradian and is that of the whole set, so that the mean over S of
+    f(wi)/pdf(wi) estimates the integral of f over the hemisphere, whatever the sampler. A direction below the horizon is
+    allowed; the shading gives it no weight.
+    """
+
+    wi: Float[Tensor, "N S 3"]
+    pdf: Float[Tensor, "N S"]
+
+
+@dataclass(frozen=True)
+class Shading(Indexable):
+    """Outgoing radiance of a point towards the viewer, and its two parts: `color` = `diffuse` + `specular`."""
+
+    color: Float[Tensor, "N 3"]
+    diffuse: Float[Tensor, "N 3"]
+    specular: Float[Tensor, "N 3"]
+
+
+class LossTerm(NamedTuple):
+    """One loss before reduction: `values` of any shape and, where not all count alike, `weights` that broadcast to it.
+
+    A named tuple, because the wrappers of data-parallel training look for tensors in those and not in frozen dataclasses.
+    """
+
+    values: Float[Tensor, "..."]
+    weights: Float[Tensor, "..."] | Bool[Tensor, "..."] | None = None
+
+    def mean(self) -> Float[Tensor, ""]:
+        """The weighted mean; 0, with a zero gradient, when nothing counts."""
+        if self.weights is None:
+            return self.values.mean() if self.values.numel() else self.values.sum()
+        weights = self.weights.to(self.values.dtype).expand_as(self.values)
+        return (self.values * weights).sum() / weights.sum().clamp_min(1e-6)
+
+
+LossTerms = Mapping[str, LossTerm]

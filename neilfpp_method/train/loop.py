@@ -1,0 +1,211 @@
+"""The training loop: three stages, one optimiser, and a step that depends on seed and number alone."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from lightning_fabric import Fabric
+from torch import Tensor
+
+from neilfpp_method.config import NeilfConfig, OptimizerConfig
+from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.errors import Diverged, Stopped
+from neilfpp_method.model import NeilfModel
+from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, stage_at, stage_steps, weigh
+from neilfpp_method.structures import LossTerms
+from neilfpp_method.train.progress import Reporter
+from neilfpp_method.train.run import load_checkpoint, read_json, save_checkpoint, write_json
+
+__all__ = ["Training", "make_optimizer", "seed_step", "train"]
+
+# So many steps in a row without a finite gradient are no accident.
+MOST_SKIPPED = 10
+
+
+@dataclass
+class Training:
+    """A run in progress."""
+
+    path: Path
+    config: NeilfConfig
+    model: NeilfModel
+    pixels: PixelDataset
+    fabric: Fabric
+    reporter: Reporter
+    should_stop: Callable[[], bool]
+    preview: Callable[[NeilfModel, Stage], None]
+    skipped: int = 0
+    skipped_in_a_row: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def train(run: Training) -> None:
+    """Train from the last checkpoint, or from the start, to the end.
+
+    Raises:
+        Stopped: `run.should_stop` said so; the state is saved, and training continues from it bit for bit.
+        Diverged: ten steps in a row were not finite; the last good checkpoint is kept.
+    """
+    settings = run.config.train
+    model = run.model.to(run.fabric.device).train()
+    optimizer = make_optimizer(model, run.config.optimizer)
+    step = _restore(run, optimizer)
+    total = sum(stage_steps(settings).values())
+    optimizer = run.fabric.setup_optimizers(optimizer)
+    while step < total:
+        position = stage_at(step, settings)
+        step = _train_stage(run, model, optimizer, step, position)
+        _save(run, optimizer, step, also=position.stage.value)
+        model.eval()
+        run.preview(model, position.stage)
+        model.train()
+
+
+def _train_stage(
+    run: Training, model: NeilfModel, optimizer: torch.optim.Optimizer, step: int, position: StagePosition
+) -> int:
+    """The rest of a stage. Returns the number of the step that follows it."""
+    settings = run.config.train
+    stage = position.stage
+    weights = active_losses(stage, run.config)
+    model.freeze_for(stage)
+    # Set up anew in each stage: data-parallel wrappers fix the set of moving parameters when they are made.
+    wrapped = run.fabric.setup_module(model, move_to_device=False)
+    run.reporter.begin_stage(stage.value, position.step, position.length)
+    started = time.perf_counter()
+    before = run.seconds.get(stage.value, 0.0)
+    for number in range(position.step, position.length):
+        seed_step(settings.seed, step, run.fabric.global_rank)
+        _set_rates(optimizer, run.config.optimizer, stage, number / position.length)
+        batch = run.pixels.sample(settings.rays)
+        terms = wrapped(batch, stage)
+        total = weigh(terms, weights)
+        _update(run, model, optimizer, total, terms, step)
+        step += 1
+        run.seconds[stage.value] = before + time.perf_counter() - started
+        if step % settings.checkpoint_every == 0:
+            _save(run, optimizer, step)
+        if run.should_stop():
+            _save(run, optimizer, step)
+            raise Stopped(f"stopped after step {step}", f"continue with: neilfpp train --out {run.path} --resume")
+    return step
+
+
+def _update(
+    run: Training,
+    model: NeilfModel,
+    optimizer: torch.optim.Optimizer,
+    total: Total,
+    terms: LossTerms,
+    step: int,
+) -> None:
+    """One step down the gradient; a step whose loss or gradient is not finite is left out, counted and named."""
+    optimizer.zero_grad(set_to_none=True)
+    if total.loss.requires_grad:
+        run.fabric.backward(total.loss)
+    norms = _gradient_norms(model)
+    psnr = _psnr(terms, run.model.facts.radiance_scale)
+    # The one transfer of the step: everything that the loop and the person must know.
+    known = torch.stack([total.loss.detach(), psnr, *norms.values()]).tolist()
+    loss, decibels, found = known[0], known[1], dict(zip(norms, known[2:], strict=True))
+    if all(math.isfinite(value) for value in (loss, *found.values())):
+        optimizer.step()
+        run.skipped_in_a_row = 0
+    else:
+        _skip(run, total, found, step)
+    run.reporter.step(loss, decibels)
+    if step % run.config.train.log_every == 0:
+        _log(run, model, total, decibels, loss, step)
+
+
+def _skip(run: Training, total: Total, norms: Mapping[str, float], step: int) -> None:
+    run.skipped += 1
+    run.skipped_in_a_row += 1
+    culprits = [name for name, value in total.terms.items() if not math.isfinite(value.item())]
+    fields = [name for name, value in norms.items() if not math.isfinite(value)]
+    where = f"loss {', '.join(culprits)}" if culprits else f"the gradient of {', '.join(fields)}"
+    run.reporter.say(f"[yellow]step {step} skipped: {where} is not finite ({run.skipped} skipped so far)[/yellow]")
+    if run.skipped_in_a_row >= MOST_SKIPPED:
+        raise Diverged(
+            f"{MOST_SKIPPED} steps in a row were not finite, the last one in {where}",
+            f"the last good checkpoint is kept in {run.path / 'checkpoints'}; look at the capture's brightest pixels "
+            "or lower the learning rates",
+        )
+
+
+# -------------------------------------------------------------------------------------------------------------- optimiser
+
+
+def make_optimizer(model: NeilfModel, config: OptimizerConfig) -> torch.optim.Optimizer:
+    """Adam with a named group for each field; frozen parameters get no gradient and do not move."""
+    groups = [
+        {"params": parameters, "name": name, "lr": getattr(config, name)}
+        for name, parameters in model.parameter_groups().items()
+        if parameters
+    ]
+    return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
+
+
+def _set_rates(optimizer: torch.optim.Optimizer, config: OptimizerConfig, stage: Stage, share: float) -> None:
+    factor = (config.joint if stage is Stage.JOINT else 1.0) * config.final**share
+    for group in optimizer.param_groups:
+        group["lr"] = getattr(config, group["name"]) * factor
+
+
+def seed_step(seed: int, step: int, rank: int = 0) -> None:
+    """Seed every random number of a step: what a step draws depends on these three numbers alone."""
+    torch.manual_seed((seed * 1_000_003 + step) * 4_099 + rank)
+
+
+def _gradient_norms(model: NeilfModel) -> dict[str, Tensor]:
+    """Length of the gradient of each field that has one."""
+    norms = {}
+    for name, parameters in model.parameter_groups().items():
+        gradients = [p.grad for p in parameters if p.grad is not None]
+        if gradients:
+            norms[name] = torch.stack([g.norm() for g in gradients]).norm()
+    return norms
+
+
+def _psnr(terms: LossTerms, scale: float) -> Tensor:
+    """PSNR of the pixels that the stage compares, dB, peak 1, in the capture's own response."""
+    term, unit = (terms["physical"], 1.0) if "physical" in terms else (terms["volume"], scale)
+    error = (term.values.detach() * unit).square()
+    return -10.0 * torch.log10((error.sum() / max(error.numel(), 1)).clamp_min(1e-10))
+
+
+# ------------------------------------------------------------------------------------------------------- state and record
+
+
+def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str | None = None) -> None:
+    if run.fabric.is_global_zero:
+        for name in filter(None, ("last", also)):
+            save_checkpoint(run.path / "checkpoints" / f"{name}.pt", run.model, optimizer, step)
+        write_json(run.path / "timing.json", run.seconds)
+    run.fabric.barrier()
+
+
+def _restore(run: Training, optimizer: torch.optim.Optimizer) -> int:
+    path = run.path / "checkpoints" / "last.pt"
+    if not path.exists():
+        return 0
+    saved = load_checkpoint(path)
+    run.model.load_state_dict(saved["model"])
+    optimizer.load_state_dict(saved["optimizer"])
+    if (run.path / "timing.json").exists():
+        run.seconds.update(read_json(run.path / "timing.json"))
+    return saved["step"]
+
+
+def _log(run: Training, model: NeilfModel, total: Total, decibels: float, loss: float, step: int) -> None:
+    values = {"loss/total": loss, "psnr": decibels, "steps_skipped": float(run.skipped)}
+    values |= {f"loss/{name}": value.item() for name, value in total.terms.items()}
+    width = getattr(model.host, "surface_width", None)
+    if width is not None:
+        values["beta"] = width().item()
+    run.reporter.scalars(step, values)

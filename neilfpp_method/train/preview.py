@@ -1,0 +1,68 @@
+"""A picture at the end of a stage: the photograph, and beside it what the model makes of that view."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neilfpp_method.config import NeilfConfig
+from neilfpp_method.data.capture import Capture
+from neilfpp_method.data.images import read_image, write_png
+from neilfpp_method.data.views import View, camera_rays
+from neilfpp_method.model import NeilfModel
+from neilfpp_method.schedule import STAGES, Stage
+from neilfpp_method.shading.color import tone_map
+from neilfpp_method.structures import RayBatch
+
+__all__ = ["write_preview"]
+
+MOST_PIXELS = 160
+
+
+def write_preview(model: NeilfModel, capture: Capture, stage: Stage, path: Path) -> np.ndarray:
+    """Render the first test view (or training view) small, write it, and return the picture, (H, W, 3) uint8.
+
+    From left to right: photograph, R, normals; once there is a material also the PBR image, base colour, roughness and
+    metallic.
+    """
+    view = (capture.test_views or capture.train_views)[0]
+    step = max(1, -(-max(view.camera.width, view.camera.height) // MOST_PIXELS))
+    shape = (len(range(0, view.camera.height, step)), len(range(0, view.camera.width, step)), 3)
+    panels = [_photograph(view, capture.hdr)[::step, ::step]]
+    rays = _rays(capture, view, step)
+    panels += [p.reshape(shape) for p in _panels(model, rays, model.config, STAGES[stage].moves_material)]
+    picture = np.concatenate([(p.clip(0.0, 1.0) * 255.0 + 0.5).astype(np.uint8) for p in panels], axis=1)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_png(path, picture)
+    return picture
+
+
+def _photograph(view: View, hdr: bool) -> np.ndarray:
+    pixels = torch.from_numpy(read_image(view.image).pixels)
+    return (tone_map(pixels) if hdr else pixels).expand(*pixels.shape[:2], 3).numpy()
+
+
+def _rays(capture: Capture, view: View, step: int) -> RayBatch:
+    camera = capture.normalisation.camera(view.camera)
+    kept = torch.arange(camera.height * camera.width).reshape(camera.height, camera.width)[::step, ::step].reshape(-1)
+    return camera_rays(camera)[kept]
+
+
+def _panels(model: NeilfModel, rays: RayBatch, config: NeilfConfig, with_material: bool) -> list[np.ndarray]:
+    device = next(model.parameters()).device
+    chunks = [
+        model.maps(rays[start : start + config.train.eval_chunk].to(device), with_material)
+        for start in range(0, len(rays), config.train.eval_chunk)
+    ]
+
+    def joined(name: str) -> Tensor:
+        return torch.cat([getattr(chunk, name) for chunk in chunks]).float().cpu()
+
+    panels = [tone_map(joined("rgb_volume")), (joined("normal") + 1.0) / 2.0 * joined("opacity")]
+    if with_material:
+        panels += [tone_map(joined("rgb")), joined("base_color")]
+        panels += [joined(name).expand(-1, 3) for name in ("roughness", "metallic")]
+    return [panel.numpy() for panel in panels]

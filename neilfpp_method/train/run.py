@@ -1,0 +1,211 @@
+"""A run folder: everything that made a result, and the result.
+
+    config.json       every setting               environment.json  versions, hardware, command
+    capture.json      where the images are        timing.json       seconds of each stage
+    scene.json        what the images decided     checkpoints/      last.pt, and one at the end of each stage
+    previews/         a picture per stage         tensorboard/      scalars and pictures
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import pickle
+import platform
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from neilfpp_method.config import NeilfConfig, from_dict, to_dict
+from neilfpp_method.data.capture import Capture, load_capture
+from neilfpp_method.errors import UserError
+from neilfpp_method.model import NeilfModel, SceneFacts
+from neilfpp_method.train.build import build_model
+
+__all__ = ["CaptureSource", "Run", "create_run", "load_checkpoint", "load_run", "read_json", "save_checkpoint", "write_json"]
+
+FORMAT = 1
+PACKAGES = ("neilfpp-method", "torch", "numpy", "opencv-contrib-python-headless", "OpenEXR", "trimesh", "scikit-image")
+
+
+@dataclass(frozen=True)
+class CaptureSource:
+    """How the capture of a run is read again."""
+
+    root: str
+    test_every: int | None = None
+    response: str = "auto"
+
+    def load(self) -> Capture:
+        return load_capture(Path(self.root), test_every=self.test_every, response=self.response)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A trained run, ready to be asked: `model` is in evaluation mode and holds the weights of step `step`."""
+
+    path: Path
+    config: NeilfConfig
+    capture: Capture
+    facts: SceneFacts
+    model: NeilfModel
+    step: int
+
+
+def create_run(path: Path, config: NeilfConfig, source: CaptureSource, facts: SceneFacts) -> None:
+    """Write the description of a new run.
+
+    Raises:
+        UserError: the folder is there already and not empty.
+    """
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise UserError(f"{path}: exists already", "choose another --out, or continue it with --resume")
+    path.mkdir(parents=True, exist_ok=True)
+    write_json(path / "capture.json", dataclasses.asdict(source))
+    write_json(path / "scene.json", dataclasses.asdict(facts))
+    write_json(path / "environment.json", environment())
+    # The settings come last: a folder that has them is a run.
+    write_json(path / "config.json", {"format": FORMAT, "config": to_dict(config)})
+
+
+def load_run(path: Path | str, device: torch.device | str = "cpu", checkpoint: str = "last") -> Run:
+    """A run from its folder.
+
+    Args:
+        path: the run folder.
+        device: where the model goes.
+        checkpoint: "last", or the name of a stage for the weights at its end.
+
+    Raises:
+        UserError: no run there, one of another version, or one without the checkpoint.
+    """
+    path = Path(path)
+    described = read_description(path)
+    saved = load_checkpoint(path / "checkpoints" / f"{checkpoint}.pt")
+    capture = described.source.load()
+    model = build_model(capture, described.facts, described.config)
+    try:
+        model.load_state_dict(saved["model"])
+    except RuntimeError as error:
+        raise UserError(
+            f"{path}: the checkpoint does not fit the settings", "use the version of neilfpp that wrote it"
+        ) from error
+    return Run(path, described.config, capture, described.facts, model.to(device).eval(), saved["step"])
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a run was made of."""
+
+    config: NeilfConfig
+    source: CaptureSource
+    facts: SceneFacts
+
+def read_description(path: Path) -> Description:
+    """The settings, the capture's whereabouts and the scene facts of a run folder.
+
+    Raises:
+        UserError: no run there, or one of another version.
+    """
+    if not (path / "config.json").is_file():
+        raise UserError(f"{path}: no run here (config.json is missing)", "give the folder that `neilfpp train` wrote")
+    stored = read_json(path / "config.json")
+    if stored.get("format") != FORMAT:
+        raise UserError(
+            f"{path}: written in run format {stored.get('format')}, this version reads {FORMAT}",
+            "use the version of neilfpp that wrote it, or train again",
+        )
+    config = from_dict(NeilfConfig, stored["config"], f"{path / 'config.json'}: config")
+    source = from_dict(CaptureSource, read_json(path / "capture.json"), str(path / "capture.json"))
+    facts = from_dict(SceneFacts, read_json(path / "scene.json"), str(path / "scene.json"))
+    return Description(config, source, facts)
+
+
+# ------------------------------------------------------------------------------------------------------------ checkpoints
+
+
+def save_checkpoint(path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer, step: int) -> None:
+    """Weights and optimiser of step `step`, written under a temporary name and renamed: never half a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".partial")
+    contents = {"format": FORMAT, "step": step, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
+    torch.save(contents, temporary)
+    os.replace(temporary, path)
+
+
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """A checkpoint's contents; a file that holds more than tensors and plain values is refused.
+
+    Raises:
+        UserError: missing, unreadable, or of another version.
+    """
+    if not path.is_file():
+        raise UserError(f"{path}: no checkpoint", "train the run first, or continue it with --resume")
+    try:
+        contents = torch.load(path, map_location="cpu", weights_only=True)
+    except (RuntimeError, pickle.UnpicklingError, EOFError, OSError) as error:
+        raise UserError(f"{path}: not a readable checkpoint", "delete it and continue from another, or train again") from error
+    if not isinstance(contents, dict) or contents.get("format") != FORMAT:
+        raise UserError(f"{path}: a checkpoint of another version", "use the version of neilfpp that wrote it")
+    return contents
+
+
+# ------------------------------------------------------------------------------------------------------------------ files
+
+
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
+    """JSON under a temporary name, then renamed."""
+    temporary = path.with_suffix(".partial")
+    temporary.write_text(json.dumps(value, indent=2) + "\n")
+    os.replace(temporary, path)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object.
+
+    Raises:
+        UserError: missing or malformed.
+    """
+    try:
+        value = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: not readable as JSON ({error})", "restore the file or train again") from error
+    if not isinstance(value, dict):
+        raise UserError(f"{path}: holds no JSON object", "restore the file or train again")
+    return value
+
+
+def environment() -> dict[str, Any]:
+    """Versions and hardware, so that a figure can be traced."""
+    versions = {}
+    for package in PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            versions[package] = "not installed as a package"
+    gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    return {
+        "command": sys.argv,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "gpus": gpus,
+        "packages": versions,
+    }
+
+
+def _processor() -> str:
+    information = Path("/proc/cpuinfo")
+    if information.is_file():
+        for line in information.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()

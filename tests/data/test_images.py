@@ -1,0 +1,173 @@
+"""Image files: what is written by one library is read back by the package, and the other way round."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+
+from neilfpp_method.data.images import image_header, read_image, replacing, write_exr, write_png
+from neilfpp_method.errors import UserError
+
+HEIGHT, WIDTH = 5, 7
+RGB = np.random.default_rng(0).uniform(0, 4, (HEIGHT, WIDTH, 3)).astype(np.float32)
+BYTES = np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+
+
+def openexr(path: Path, channels: dict, **header) -> Path:
+    OpenEXR.File({"type": OpenEXR.scanlineimage, **header}, channels).write(str(path))
+    return path
+
+
+def test_exr_float_and_half(tmp_path: Path) -> None:
+    write_exr(tmp_path / "float.exr", {"RGB": RGB[:, ::-1]})  # not contiguous
+    write_exr(tmp_path / "half.exr", {"RGB": RGB.astype(np.float16), "Z": RGB[..., 0]})
+    assert np.array_equal(OpenEXR.File(str(tmp_path / "float.exr")).channels()["RGB"].pixels, RGB[:, ::-1])
+    assert np.array_equal(read_image(tmp_path / "float.exr").pixels, RGB[:, ::-1])
+    half = read_image(tmp_path / "half.exr")
+    assert np.array_equal(half.pixels, RGB.astype(np.float16).astype(np.float32))
+    assert half.hdr
+    assert half.alpha is None
+    assert half.pixels.flags.c_contiguous
+
+
+def test_exr_channels(tmp_path: Path) -> None:
+    planes = {name: np.ascontiguousarray(RGB[..., i]) for i, name in enumerate("RGB")}
+    alpha = np.full((HEIGHT, WIDTH), 0.25, np.float32)
+    mixed = {**planes, "R": planes["R"].astype(np.float16), "A": alpha, "normal.X": planes["G"]}
+    image = read_image(openexr(tmp_path / "mixed.exr", mixed))
+    assert np.array_equal(image.pixels[..., 1:], RGB[..., 1:])
+    assert np.allclose(image.pixels[..., 0], RGB[..., 0], rtol=1e-3)
+    assert (image.alpha == 0.25).all()
+    for name in ("Y", "Z", "depth"):
+        assert np.array_equal(read_image(openexr(tmp_path / "one.exr", {name: planes["R"]})).pixels, RGB[..., :1])
+    xyz = dict(zip("XYZ", planes.values(), strict=True))
+    assert np.array_equal(read_image(openexr(tmp_path / "xyz.exr", xyz)).pixels, RGB)
+    with pytest.raises(UserError, match=r"two\.exr.*u, v"):
+        read_image(openexr(tmp_path / "two.exr", {"u": planes["R"], "v": planes["G"]}))
+
+
+@pytest.mark.parametrize(("left", "top"), [(2, 3), (-4, -1), (3, -2), (20, 0)])
+def test_exr_stored_window_is_placed_in_its_frame(tmp_path: Path, left: int, top: int) -> None:
+    data = ((left, top), (left + WIDTH - 1, top + HEIGHT - 1))
+    path = openexr(tmp_path / "crop.exr", {"RGB": RGB}, dataWindow=data, displayWindow=((0, 0), (9, 5)))
+    expected = np.zeros((6, 10, 3), np.float32)
+    for y in range(6):
+        for x in range(10):
+            if 0 <= y - top < HEIGHT and 0 <= x - left < WIDTH:
+                expected[y, x] = RGB[y - top, x - left]
+    assert np.array_equal(read_image(path).pixels, expected)
+    assert (image_header(path).width, image_header(path).height) == (10, 6)
+
+
+@pytest.mark.parametrize(("dtype", "full"), [(np.uint8, 255), (np.uint16, 65535)])
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_integer_samples_scale_to_one(tmp_path: Path, suffix: str, dtype: type, full: int) -> None:
+    samples = np.random.default_rng(2).integers(0, full + 1, (HEIGHT, WIDTH, 4)).astype(dtype)
+    samples[0, 0] = full
+    cv2.imwrite(str(tmp_path / f"i{suffix}"), samples)  # BGRA
+    image = read_image(tmp_path / f"i{suffix}")
+    assert np.allclose(image.pixels, samples[..., [2, 1, 0]] / full, atol=1e-7)
+    assert np.allclose(image.alpha, samples[..., 3] / full, atol=1e-7)
+    assert image.pixels[0, 0, 0] == 1
+    assert not image.hdr
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".hdr"])
+def test_floating_point_files_are_hdr(tmp_path: Path, suffix: str) -> None:
+    cv2.imwrite(str(tmp_path / f"f{suffix}"), RGB)
+    image = read_image(tmp_path / f"f{suffix}")
+    assert image.hdr
+    assert image_header(tmp_path / f"f{suffix}").hdr
+    assert np.allclose(image.pixels, RGB[..., ::-1], atol=0 if suffix == ".tif" else 4 / 128)
+
+
+@pytest.mark.parametrize("mode", ["L", "LA", "P", "1"])
+def test_png_kinds(tmp_path: Path, mode: str) -> None:
+    Image.fromarray(BYTES).convert(mode).save(tmp_path / "kind.png")
+    expected = np.asarray(Image.fromarray(BYTES).convert(mode).convert("RGB")) / 255
+    assert np.allclose(read_image(tmp_path / "kind.png").pixels, expected[..., : 1 if mode in "L1" else 3], atol=1e-6)
+
+
+def test_jpeg_keeps_the_stored_orientation(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6  # "rotate by 90° to show"
+    flat = np.full((HEIGHT, WIDTH, 3), (200, 100, 50), np.uint8)
+    Image.fromarray(flat).save(tmp_path / "turned.jpg", exif=exif, quality=100)
+    assert np.allclose(read_image(tmp_path / "turned.jpg").pixels, flat / 255, atol=3 / 255)
+    assert (image_header(tmp_path / "turned.jpg").width, image_header(tmp_path / "turned.jpg").height) == (
+        WIDTH,
+        HEIGHT,
+    )
+
+
+def test_written_png_is_rgb(tmp_path: Path) -> None:
+    write_png(tmp_path / "new" / "a.png", BYTES)
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "new" / "a.png")), BYTES)
+    write_png(tmp_path / "deep.png", BYTES[..., 0].astype(np.uint16) * 257)
+    assert np.allclose(read_image(tmp_path / "deep.png").pixels[..., 0], BYTES[..., 0] / 255, atol=1e-7)
+    with pytest.raises(ValueError, match="float32"):
+        write_png(tmp_path / "no.png", RGB)
+
+
+def test_a_failed_write_leaves_the_old_file_alone(tmp_path: Path) -> None:
+    path = tmp_path / "kept.txt"
+    path.write_text("old")
+
+    def killed() -> None:
+        with replacing(path) as temporary:
+            temporary.write_text("half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        killed()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+# ------------------------------------------------------------------------------------------------- files from strangers
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".png", ".tif", ".jpg", ".hdr"])
+@pytest.mark.parametrize("damage", ["cut", "empty", "garbage", "missing"])
+def test_damaged_files_are_named(tmp_path: Path, suffix: str, damage: str) -> None:
+    path = tmp_path / f"bad{suffix}"
+    noise = np.random.default_rng(3).uniform(0, 1, (64, 64, 3)).astype(np.float32)
+    if suffix == ".exr":
+        write_exr(path, {"RGB": noise})
+    else:
+        cv2.imwrite(str(path), noise if suffix == ".hdr" else (noise * 255).astype(np.uint8))
+    content = {"cut": path.read_bytes()[: path.stat().st_size // 2], "empty": b"", "garbage": b"no image at all " * 9}
+    path.unlink() if damage == "missing" else path.write_bytes(content[damage])
+    with pytest.raises(UserError, match=rf"bad\{suffix}: (cannot be read|no such image)"):
+        read_image(path)
+
+
+def test_a_forged_size_is_refused_before_anything_is_allocated(tmp_path: Path) -> None:
+    write_exr(tmp_path / "a.exr", {"RGB": RGB})
+    data = (tmp_path / "a.exr").read_bytes()
+    for window in (b"dataWindow", b"displayWindow"):
+        at = data.index(window + b"\0box2i\0") + len(window) + 7 + 4
+        (tmp_path / "a.exr").write_bytes(data[:at] + struct.pack("<4i", 0, 0, 199_999, 199_999) + data[at + 16 :])
+        with pytest.raises(UserError, match=r"a\.exr: the header says 200000×200000"):
+            read_image(tmp_path / "a.exr")
+    cv2.imwrite(str(tmp_path / "a.hdr"), RGB)
+    (tmp_path / "a.hdr").write_bytes((tmp_path / "a.hdr").read_bytes().replace(b"-Y 5 +X 7", b"-Y 40000 +X 40000"))
+    with pytest.raises(UserError, match="40000×40000"):
+        image_header(tmp_path / "a.hdr")
+    write_png(tmp_path / "a.png", BYTES)
+    data = (tmp_path / "a.png").read_bytes()
+    (tmp_path / "a.png").write_bytes(data[:16] + struct.pack(">2I", 60_000, 60_000) + data[24:])
+    with pytest.raises(UserError, match=r"a\.png"):
+        read_image(tmp_path / "a.png")
+
+
+def test_unknown_formats_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.webp").write_bytes(b"RIFF")
+    with pytest.raises(UserError, match=r"a\.webp: not an image format that is read; use one of \.exr"):
+        image_header(tmp_path / "a.webp")

@@ -1,0 +1,155 @@
+"""The pixel dataset: colours and rays against the analytic sphere, its statistics, and its draws."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.images import write_exr
+from neilfpp_method.data.pixels import PixelDataset
+from tests.data.make_capture import RADIUS, SCALE, make_capture, radiance, srgb
+
+SPHERE = RADIUS / SCALE
+WIDTH, HEIGHT = 24, 18
+
+
+def dataset(root: Path, **options) -> PixelDataset:
+    capture = load_capture(make_capture(root, **options))
+    return PixelDataset(capture, capture.views)
+
+
+def sphere_normals(batch) -> tuple[np.ndarray, np.ndarray]:
+    """Where the rays of a batch meet the sphere at the scene's origin: hit or not, and the normal there."""
+    o, d = batch.origins.double().numpy(), batch.directions.double().numpy()
+    b = (o * d).sum(-1)
+    inside = b**2 - (o**2).sum(-1) + SPHERE**2
+    t = -b - np.sqrt(inside.clip(0))
+    return inside > 1e-4, (o + t[:, None] * d) / SPHERE
+
+
+@pytest.mark.parametrize("hdr", [True, False])
+def test_rays_see_what_the_pixels_show(tmp_path: Path, hdr: bool) -> None:
+    pixels = dataset(tmp_path, hdr=hdr, masks=True)
+    for batch in (*(pixels.view(i) for i in range(6)), pixels.sample(500)):
+        hit, normal = sphere_normals(batch)
+        expected = radiance(normal) if hdr else srgb(radiance(normal))
+        assert np.allclose(batch.color.numpy()[hit], expected[hit], atol=2e-4 if hdr else 0.6 / 255)
+        assert (batch.mask.numpy()[hit] == 1).all()
+        assert hit.mean() > 0.2
+    background = pixels.view(0).mask == 0
+    assert (pixels.view(0).color[background] == 0).all()
+
+
+def test_views_are_row_major_and_numbered(tmp_path: Path) -> None:
+    pixels = dataset(tmp_path)
+    assert len(pixels) == 6 * WIDTH * HEIGHT
+    batch = pixels.view(5)
+    assert (batch.view == 5).all()
+    right, down = batch.directions[1] - batch.directions[0], batch.directions[WIDTH] - batch.directions[0]
+    w2c = torch.from_numpy(pixels.views[5].camera.w2c).float()
+    assert (w2c[:3, :3] @ right)[0] > 0
+    assert (w2c[:3, :3] @ down)[1] > 0
+
+
+def test_views_of_different_sizes(tmp_path: Path) -> None:
+    small = load_capture(make_capture(tmp_path / "small", size=(10, 8)))
+    large = load_capture(make_capture(tmp_path / "large", size=(24, 18)))
+    pixels = PixelDataset(small, [small.views[1], large.views[2], small.views[3]])
+    assert len(pixels) == 80 + 432 + 80
+    for i, (capture, view) in enumerate([(small, 1), (large, 2), (small, 3)]):
+        alone = PixelDataset(capture, [capture.views[view]]).view(0)
+        assert torch.equal(pixels.view(i).color, alone.color)
+        assert torch.equal(pixels.view(i).directions, alone.directions)
+
+
+def test_samples_are_uniform_and_follow_the_global_seed(tmp_path: Path) -> None:
+    pixels = dataset(tmp_path)
+    torch.manual_seed(3)
+    first = pixels.sample(12_000)
+    torch.manual_seed(3)
+    assert torch.equal(first.color, pixels.sample(12_000).color)
+    assert stats.chisquare(np.bincount(first.view, minlength=6)).pvalue > 1e-3
+    local = torch.from_numpy(np.stack([view.camera.w2c[:3, :3] for view in pixels.views])).float()[first.view]
+    plane = torch.einsum("nij,nj->ni", local, first.directions)
+    left = int(
+        (plane[:, 0] < -plane[:, 2] * 0.5 / 25.2).sum()
+    )  # the principal point lies half a pixel right of the middle
+    assert stats.binomtest(left, 12_000, 0.5).pvalue > 1e-3
+
+
+def test_masks(tmp_path: Path) -> None:
+    assert (dataset(tmp_path / "none").view(0).mask == 1).all()
+    root = make_capture(tmp_path / "alpha")
+    color = np.ones((HEIGHT, WIDTH, 4), np.float32)
+    color[:, :10, 3] = 0.2
+    write_exr(root / "inputs" / "images" / "002.exr", {"RGBA": color})
+    capture = load_capture(root)
+    mask = PixelDataset(capture, [capture.views[2]]).view(0).mask.reshape(HEIGHT, WIDTH)
+    assert (mask[:, :10] == 0).all()
+    assert (mask[:, 10:] == 1).all()
+
+
+def test_image_gradient_of_a_ramp(tmp_path: Path) -> None:
+    root = make_capture(tmp_path)
+    x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    display = 0.1 + 0.02 * x + 0.01 * y
+    linear = ((display + 0.055) / 1.055) ** 2.4  # the sRGB curve, inverted
+    write_exr(root / "inputs" / "images" / "000.exr", {"RGB": np.repeat(linear[..., None], 3, axis=2)})
+    capture = load_capture(root)
+    gradient = PixelDataset(capture, [capture.views[0]]).view(0).image_gradient.reshape(HEIGHT, WIDTH)
+    assert np.allclose(gradient[1:-1, 1:-1], np.hypot(0.02, 0.01), atol=1e-5)
+    assert np.allclose(gradient[1:-1, 0], np.hypot(0.01, 0.01), atol=1e-5)  # half a difference at the border
+
+
+# ----------------------------------------------------------------------------------------------------------- statistics
+
+
+@pytest.mark.parametrize("hdr", [True, False])
+def test_median_radiance_is_linear_and_of_the_object(tmp_path: Path, hdr: bool) -> None:
+    pixels = dataset(tmp_path, hdr=hdr, masks=True, background=0.9)
+    batches = [pixels.view(i) for i in range(6)]
+    normal = np.concatenate([sphere_normals(batch)[1][batch.mask.numpy() == 1] for batch in batches])
+    seen = radiance(normal) if hdr else radiance(normal).clip(0, 1)
+    assert pixels.median_radiance() == pytest.approx(np.median(seen @ [0.2126, 0.7152, 0.0722]), rel=0.02)
+
+
+def test_black_pixels_do_not_count_in_the_median(tmp_path: Path) -> None:
+    without_masks = dataset(tmp_path / "a").median_radiance()
+    assert without_masks == pytest.approx(dataset(tmp_path / "b", masks=True).median_radiance(), rel=1e-6)
+
+
+def test_radiance_quantile_counts_linear_values(tmp_path: Path) -> None:
+    hdr, ldr = dataset(tmp_path / "a"), dataset(tmp_path / "b", hdr=False)
+    values = np.sort(np.concatenate([hdr.view(i).color.numpy().ravel() for i in range(6)]))
+    assert hdr.radiance_quantile(1.0) == values[-1] > 1
+    assert (values <= hdr.radiance_quantile(0.9)).mean() == pytest.approx(0.9, abs=1e-3)
+    assert ldr.radiance_quantile(1.0) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("hdr", [True, False])
+@pytest.mark.parametrize("background", [0.0, 0.5])
+def test_border_color_is_linear(tmp_path: Path, hdr: bool, background: float) -> None:
+    color = dataset(tmp_path, hdr=hdr, background=background).border_color()
+    assert np.allclose(color, background, atol=0.004)
+
+
+def test_no_border_color_where_the_border_varies(tmp_path: Path) -> None:
+    root = make_capture(tmp_path)
+    noise = np.random.default_rng(0)
+    for i in range(6):
+        image = noise.uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
+        write_exr(root / "inputs" / "images" / f"{i:03d}.exr", {"RGB": image})
+    capture = load_capture(root)
+    assert PixelDataset(capture, capture.views).border_color() is None
+
+
+def test_loading_reports_each_view(tmp_path: Path) -> None:
+    capture = load_capture(make_capture(tmp_path))
+    names: list[str] = []
+    PixelDataset(capture, capture.train_views, on_view=names.append)
+    assert names == ["001", "002", "003", "004", "005"]

@@ -1,0 +1,238 @@
+"""The report and the renders of a small run: a sphere, untrained, before a capture whose truth is known."""
+
+from __future__ import annotations
+
+import base64
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+
+from neilfpp_method.data.capture import load_capture
+from neilfpp_method.errors import UserError
+from neilfpp_method.evaluate import protocols
+from neilfpp_method.evaluate.glossary import explain
+from neilfpp_method.evaluate.panels import albedo_scale, light_sections, view_sections
+from neilfpp_method.evaluate.pictures import display
+from neilfpp_method.evaluate.render_views import render_run, view_names
+from neilfpp_method.evaluate.report import write_report
+from neilfpp_method.evaluate.views import RenderedView, known_test_views, render_test_views, render_view
+from neilfpp_method.train.run import Run
+from tests.data.make_capture import make_capture
+from tests.scenes import sphere_model, tiny_config
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    return make_capture(tmp_path_factory.mktemp("captures") / "ball & <stick>", views=4, test=(0, 2))
+
+
+def make_run(root: Path, step: int = 12) -> Run:
+    model = sphere_model().eval()
+    return Run(Path("run"), tiny_config(), load_capture(root), model.facts, model, step)
+
+
+def without_truth(root: Path, copy: Path) -> Path:
+    shutil.copytree(root, copy)
+    for part in ("inputs/depth_maps", "inputs/normal_maps", "ground_truths"):
+        shutil.rmtree(copy / part)
+    return copy
+
+
+def sections_of(run: Run):
+    rendered = render_test_views(run)
+    known = known_test_views(run, rendered).views
+    return view_sections(run, rendered, known, albedo_scale(rendered, known))
+
+
+class Page(HTMLParser):
+    """The text of a page, its pictures, and whatever it would load from elsewhere."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.text, self.pictures, self.loaded = "", [], []
+        self.feed(html)
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        sources = [value for name, value in attributes if name in ("src", "href")]
+        self.pictures += [value for value in sources if value.startswith("data:image/png;base64,")]
+        self.loaded += [value for value in sources if not value.startswith("data:")]
+        self.loaded += [tag] if tag in ("script", "link") else []
+
+
+# --------------------------------------------------------------------------------------------------------------- report
+
+
+def test_report_holds_its_pictures_and_explains_every_figure(root: Path, tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(protocols, "SURFACE_POINTS", 1000)
+    monkeypatch.setattr(protocols, "MESH_RESOLUTION", 32)
+    run = make_run(root)
+    figures = protocols.evaluate(run)
+    path = write_report(run, tmp_path, figures, {"sdf_init": 61.0, "material_init": 3601.0, "joint": 0.25})
+    page = Page(path.read_text())
+    assert page.loaded == []
+    assert "ball & <stick>" in page.text
+    assert "4 views of 24×18, 2 to train on and 2 to test on" in page.text
+    for duration in ("1 min 01 s", "1 h 00 min", "0.2 s"):
+        assert duration in page.text
+    for name, value in figures.items():
+        entry = explain(name.removesuffix("_frame"))
+        assert entry.meaning, name
+        assert entry.format(value) in page.text, name
+    assert len(page.pictures) == 2
+    for picture in page.pictures:
+        data = base64.b64decode(picture.split(",")[1], validate=True)
+        assert data.startswith(b"\x89PNG\r\n")
+        assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).std() > 5
+    assert cv2.imread(str(tmp_path / "contact_sheet.png")).shape[1] > 1000
+
+
+def test_report_of_a_run_without_material_shows_geometry_alone(root: Path, tmp_path: Path):
+    run = make_run(root, step=4)
+    titles = [row.title for section in sections_of(run) for row in section.rows]
+    assert titles == ["Image", "Normal"]
+    assert len(Page(write_report(run, tmp_path, {}, {}).read_text()).pictures) == 1
+
+
+def test_report_of_a_capture_that_holds_nothing_out_shows_training_views(root: Path, tmp_path: Path):
+    run = replace(make_run(root), capture=load_capture(root, test_every=0))
+    page = Page(write_report(run, tmp_path, {}, {}).read_text())
+    assert len(page.pictures) == 2
+    assert "4 to train on and 0 to test on" in page.text
+
+
+def test_maps_without_truth_have_no_truth_column(root: Path, tmp_path: Path):
+    known = sections_of(make_run(root))
+    assert [[row.title for row in s.rows] for s in known] == [
+        ["Image", "Base colour", "Base colour", "Roughness", "Metallic", "Normal"]
+    ]
+    blind = sections_of(make_run(without_truth(root, tmp_path / "blind")))
+    assert [[row.title for row in s.rows] for s in blind] == [
+        ["Image"],
+        ["Base colour", "Roughness", "Metallic", "Normal"],
+    ]
+    assert [group.columns for group in blind[1].groups] == 2 * [("estimate",)]
+    assert all(len(row.pictures) == 2 for row in blind[1].rows)
+
+
+def test_pictures_stand_beside_their_truth_with_their_difference(root: Path):
+    run = make_run(root)
+    roughness = sections_of(run)[0].rows[3]
+    truth, estimate, error = roughness.pictures[:3]
+    middle = truth.shape[0] // 2, truth.shape[1] // 2
+    assert truth[middle][0] == 153  # the sphere of the capture has roughness 0.6 · 255
+    shown = display("roughness", render_view(run, 0).maps["roughness"])
+    assert estimate[middle][0] == shown[middle][0]
+    colors = cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_INFERNO)[:, 0, ::-1]
+    # Full brightness is an error of 0.5.
+    expected = round(min(abs(153 - int(shown[middle][0])) / 255 / 0.5, 1.0) * 255)
+    np.testing.assert_array_equal(error[middle], colors[expected])
+
+
+def test_albedo_scale_undoes_a_factor_per_channel(root: Path):
+    run = make_run(root)
+    known = known_test_views(run, render_test_views(run)).views
+    factors = np.array([0.5, 0.8, 1.25])
+    halved = [
+        RenderedView(k.view.name, {"base_color": (k.material["base_color"] * factors).astype(np.float32)})
+        for k in known
+    ]
+    np.testing.assert_allclose(albedo_scale(halved, known), 1.0 / factors, rtol=1e-5)
+
+
+# ---------------------------------------------------------------------------------------------------------------- light
+
+
+def write_light_field(root: Path, sky: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Three points with known light: what arrives is `sky`, everywhere."""
+    generator = np.random.default_rng(0)
+    wi = generator.normal(size=(3, 6000, 3))
+    wi /= np.linalg.norm(wi, axis=-1, keepdims=True)
+    normals = np.eye(3)
+    wi *= np.sign((wi * normals[:, None]).sum(-1, keepdims=True))
+    arrays = {
+        "points": np.zeros((3, 3)),
+        "normals": normals,
+        "base_color": np.full((3, 3), 0.5),
+        "roughness": np.full(3, 0.5),
+        "metallic": np.zeros(3),
+        "wi": wi,
+        "incident": sky(wi),
+        "wo": wi[:, :2],
+        "outgoing": np.ones((3, 2, 3)),
+    }
+    (root / "light").mkdir()
+    np.savez(root / "light" / "light_field_gt.npz", **{name: a.astype(np.float32) for name, a in arrays.items()})
+
+
+def test_known_light_stands_beside_the_estimate_of_it(root: Path, tmp_path: Path, monkeypatch):
+    lit = Path(shutil.copytree(root, tmp_path / "lit"))
+    write_light_field(lit, lambda wi: 1.0 + 0.5 * wi)
+    run = make_run(lit)
+    monkeypatch.setattr(run.model, "incident_light", lambda x, wi: 1.0 + 0.5 * wi)
+    (section,) = light_sections(run, render_test_views(run), scale=np.array([2.0, 1.0, 1.0]))
+    assert [group.columns for group in section.groups] == 3 * [("truth", "estimate", "estimate, scaled")]
+    pictures = section.rows[0].pictures
+    for truth, estimate, scaled in (pictures[3 * i : 3 * i + 3] for i in range(3)):
+        # The known directions lie 1.9° apart: the sky changes by less than 2 % on the way to the nearest.
+        assert np.abs(truth.astype(int) - estimate).max() <= 6
+        lit_pixels = (estimate != scaled).any(-1)
+        # Half of all directions, which are not half of the pixels where the poles are in view.
+        assert 0.4 < lit_pixels.mean() < 0.6
+        assert (scaled[lit_pixels][:, 0] < estimate[lit_pixels][:, 0]).all()
+        np.testing.assert_array_equal(scaled[..., 1:], estimate[..., 1:])
+
+
+def test_without_known_light_points_of_the_surface_are_shown(root: Path):
+    run = make_run(root)
+    (section,) = light_sections(run, render_test_views(run), scale=None)
+    assert [group.columns for group in section.groups] == 3 * [("estimate",)]
+    for group in section.groups:
+        position = np.array(eval(group.title.removeprefix("Light at ")))
+        # The sphere that every field starts as, seen at β = 0.02 and written with two digits.
+        assert np.linalg.norm(position) == pytest.approx(0.6, abs=0.1)
+
+
+# -------------------------------------------------------------------------------------------------------------- renders
+
+
+def test_renders_hold_the_values_and_go_on_where_they_stopped(root: Path, tmp_path: Path):
+    run = make_run(root)
+    shares: list[float] = []
+    written = render_run(run, tmp_path, "test", on_progress=shares.append)
+    assert [path.name for path in written] == ["000.exr", "002.exr"]
+    assert shares == [0.5, 1.0]
+    maps = render_view(run, 0).maps
+    channels = OpenEXR.File(str(written[0]), separate_channels=True).channels()
+    np.testing.assert_array_equal(channels["base_color.G"].pixels, maps["base_color"][..., 1])
+    np.testing.assert_array_equal(channels["normal.Z"].pixels, maps["normal"][..., 2])
+    np.testing.assert_array_equal(channels["depth"].pixels, maps["depth"][..., 0])
+    png = cv2.imread(str(tmp_path / "roughness" / "002.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(png, display("roughness", render_view(run, 2).maps["roughness"])[..., 0])
+    assert {path.name for path in tmp_path.iterdir() if path.is_dir()} == set(maps)
+
+    (tmp_path / "000.exr").unlink()
+    kept = (tmp_path / "002.exr").stat().st_mtime_ns
+    render_run(run, tmp_path, "test")
+    assert (tmp_path / "000.exr").is_file()
+    assert (tmp_path / "002.exr").stat().st_mtime_ns == kept
+    render_run(run, tmp_path, ["002"], overwrite=True)
+    assert (tmp_path / "002.exr").stat().st_mtime_ns > kept
+
+
+def test_views_are_chosen_by_group_or_by_name(root: Path):
+    capture = load_capture(root)
+    assert view_names(capture, "train") == {"001", "003"}
+    assert view_names(capture, "all") == {"000", "001", "002", "003"}
+    assert view_names(capture, "003") == {"003"}
+    with pytest.raises(UserError, match="no view '9'"):
+        view_names(capture, ["000", "9"])

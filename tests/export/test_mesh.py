@@ -1,0 +1,132 @@
+"""The mesh against the closed forms of a sphere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from skimage.measure import marching_cubes
+
+from neilfpp_method.data.capture import load_capture
+from neilfpp_method.errors import UserError
+from neilfpp_method.export.mesh import export_mesh, extract_mesh
+from neilfpp_method.model import NeilfModel, SceneFacts
+from neilfpp_method.structures import Material, RayBatch, SurfaceHits
+from neilfpp_method.train.run import Run
+from tests.data.make_capture import CENTRE, SCALE, make_capture, srgb
+from tests.scenes import tiny_config
+
+RADIUS = 0.6
+
+
+def sphere(x: torch.Tensor) -> torch.Tensor:
+    return x.norm(dim=-1) - RADIUS
+
+
+def test_sphere_has_its_radius_volume_and_outward_faces():
+    mesh = extract_mesh(sphere, radius=1.0, resolution=64)
+    step = 2.0 / 63
+    distance = np.linalg.norm(mesh.vertices, axis=-1)
+    # A vertex lies on a chord of the distance along one edge: off by at most step² / (8 r) = 2.1e-4.
+    np.testing.assert_allclose(distance, RADIUS, atol=step**2 / (8 * RADIUS) + 1e-6)
+    # Chords cut off a shell of that order: 3 · 2.1e-4 / 0.6 = 0.1 %, and faces as much again.
+    assert mesh.volume == pytest.approx(4.0 / 3.0 * np.pi * RADIUS**3, rel=3e-3)
+    assert mesh.is_watertight
+    cosines = (mesh.vertex_normals * mesh.vertices).sum(-1) / distance
+    assert cosines.min() > 0.98
+    assert ((mesh.face_normals * mesh.triangles_center).sum(-1) > 0).all()
+
+
+def test_few_points_are_asked_and_nothing_is_lost():
+    asked = []
+
+    def counted(x: torch.Tensor) -> torch.Tensor:
+        asked.append(len(x))
+        # Two balls and a plane that leaves the sphere of the scene: a field with edges, of slope 1.
+        balls = torch.minimum(x.norm(dim=-1) - 0.3, (x - torch.tensor([0.0, 0.5, 0.0])).norm(dim=-1) - 0.1)
+        return torch.minimum(balls, x[:, 2] + 0.35)
+
+    mesh = extract_mesh(counted, radius=1.0, resolution=128, chunk=50_000)
+    assert max(asked) <= 50_000
+    assert sum(asked) < 128**3 / 3
+    # The oracle asks every point. It keeps the faces within the sphere, as the mesh does.
+    axis = torch.linspace(-1.0, 1.0, 128)
+    dense = counted(torch.cartesian_prod(axis, axis, axis)).reshape(128, 128, 128).numpy()
+    vertices, faces, _, _ = marching_cubes(dense, 0.0, allow_degenerate=False)
+    vertices = vertices * (2.0 / 127) - 1.0
+    inside = np.linalg.norm(vertices, axis=-1) <= 1.0
+    whole = trimesh.Trimesh(vertices, faces[inside[faces].all(-1)], process=False)
+    assert len(mesh.faces) == len(whole.faces)
+    assert mesh.area == pytest.approx(whole.area, rel=1e-5)
+    assert mesh.bounds == pytest.approx(whole.bounds, abs=1e-5)
+
+
+def test_steep_field_keeps_its_surface():
+    mesh = extract_mesh(lambda x: 1.25 * sphere(x), radius=1.0, resolution=64)
+    assert mesh.is_watertight
+
+
+@pytest.mark.parametrize("value", [1.0, -1.0, float("nan")])
+def test_field_without_a_surface_is_an_error(value: float):
+    with pytest.raises(UserError, match="no surface"):
+        extract_mesh(lambda x: torch.full((len(x),), value), radius=1.0, resolution=16)
+
+
+def test_surface_outside_the_scene_is_an_error():
+    with pytest.raises(UserError, match="no surface"):
+        # Only the corners of the cube around the scene see it.
+        extract_mesh(lambda x: 1.3 - x.norm(dim=-1), radius=1.0, resolution=32)
+
+
+# ---------------------------------------------------------------------------------------------------------------- a run
+
+
+class Ball(torch.nn.Module):
+    """A host that is a sphere."""
+
+    def render(self, rays: RayBatch) -> SurfaceHits:
+        raise NotImplementedError
+
+    def sdf(self, x: torch.Tensor) -> torch.Tensor:
+        return sphere(x)
+
+
+class Fog(torch.nn.Module):
+    """A host without a distance field."""
+
+    def render(self, rays: RayBatch) -> SurfaceHits:
+        raise NotImplementedError
+
+
+def make_run(folder: Path, host: torch.nn.Module, step: int) -> Run:
+    config = tiny_config()
+    model = NeilfModel(host, config, SceneFacts("linear", 0.2, 3.0, "constant")).eval()
+    model.materials = lambda x: Material(0.5 + 0.5 * x, torch.ones(len(x), 1), torch.zeros(len(x), 1))
+    return Run(folder, config, load_capture(make_capture(folder / "capture")), model.facts, model, step)
+
+
+def test_export_is_in_the_frame_of_the_capture_with_colours(tmp_path: Path):
+    run = make_run(tmp_path, Ball(), step=12)
+    export_mesh(run, tmp_path / "mesh.ply", resolution=64)
+    mesh = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
+    from_centre = mesh.vertices - CENTRE
+    distance = np.linalg.norm(from_centre, axis=-1)
+    # One scene unit is SCALE world units, and the scene's origin is CENTRE.
+    np.testing.assert_allclose(distance, SCALE * RADIUS, atol=2e-3)
+    assert ((mesh.vertex_normals * from_centre).sum(-1) / distance).min() > 0.98
+    linear = 0.5 + 0.5 * from_centre / SCALE
+    np.testing.assert_allclose(mesh.visual.vertex_colors[:, :3], 255 * srgb(linear), atol=0.51)
+    assert {path.name for path in tmp_path.iterdir()} == {"capture", "mesh.ply"}
+
+
+def test_export_before_the_material_stage_has_no_colours(tmp_path: Path):
+    export_mesh(make_run(tmp_path, Ball(), step=4), tmp_path / "mesh.ply", resolution=32)
+    assert trimesh.load_mesh(tmp_path / "mesh.ply").visual.kind is None
+
+
+def test_export_needs_a_distance_field(tmp_path: Path):
+    with pytest.raises(UserError, match="no distance field"):
+        export_mesh(make_run(tmp_path, Fog(), step=4), tmp_path / "mesh.ply")

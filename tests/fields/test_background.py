@@ -1,0 +1,64 @@
+"""The inverted sphere: its chart and its compositing."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from neilfpp_method.config import BackgroundConfig
+from neilfpp_method.fields.background import InvertedSphere
+
+CONFIG = BackgroundConfig(layers=2, width=16, samples=8)
+
+
+def rays(radius: float, count: int = 20) -> tuple[torch.Tensor, torch.Tensor]:
+    """Origins everywhere within the sphere."""
+    generator = torch.Generator().manual_seed(1)
+    outwards, directions = torch.nn.functional.normalize(torch.randn(2, count, 3, generator=generator).double(), dim=-1)
+    origins = 0.99 * radius * outwards * torch.rand(count, 1, generator=generator)
+    return origins, directions
+
+
+@pytest.mark.parametrize("density", [-50.0, 0.0, 3.0, 50.0])
+def test_a_constant_colour_is_seen_whatever_the_density(density):
+    torch.manual_seed(0)
+    field = InvertedSphere(CONFIG, radius=3.0, scale=2.0)
+    with torch.no_grad():
+        field.trunk.layers[-1].bias[0] = density
+        field.head.layers[-1].weight.zero_()
+        field.head.layers[-1].bias.copy_(torch.logit(torch.tensor([0.1, 0.2, 0.9])))
+    color = field(*(t.float() for t in rays(3.0)))
+    torch.testing.assert_close(color, torch.tensor([0.2, 0.4, 1.8]).expand(20, 3))
+
+
+def test_samples_lie_on_the_rays_in_equal_steps_of_inverse_radius():
+    field = InvertedSphere(CONFIG, radius=2.0, scale=1.0).double()
+    seen = []
+    field.position.register_forward_hook(lambda _, given, __: seen.append(given[0]))
+    origins, directions = rays(2.0)
+    field(origins, directions)
+    unit, inverse = seen[0].split((3, 1), -1)
+    torch.testing.assert_close(unit.norm(dim=-1), torch.ones_like(unit[..., 0]))
+    expected = torch.tensor([(1 - (k + 0.5) / 8) / 2 for k in range(8)], dtype=torch.float64)
+    torch.testing.assert_close(inverse[..., 0], expected.expand(20, 8))
+    travelled = unit / inverse - origins[:, None]
+    along = (travelled * directions[:, None]).sum(-1, keepdim=True)
+    assert along.min() > 0
+    torch.testing.assert_close(travelled, along * directions[:, None])
+
+
+def test_two_samples_by_hand():
+    """An optical depth of ln 2 over the whole chart: half of the light would pass all of it, √½ each half of it."""
+    torch.manual_seed(0)
+    field = InvertedSphere(BackgroundConfig(layers=2, width=16, samples=2), radius=4.0, scale=1.0)
+    with torch.no_grad():
+        field.trunk.layers[-1].weight[0].zero_()
+        field.trunk.layers[-1].bias[0] = 0  # softplus(0) = ln 2
+        field.head.layers[-1].weight.normal_()
+    colors = []
+    field.head.register_forward_hook(lambda _, __, out: colors.append(torch.sigmoid(out)))
+    got = field(*(t.float() for t in rays(4.0)))
+    near, far = colors[0].unbind(1)
+    # samples at 1/4 and 3/4 of the chart: the near one covers half of it, exp(−ln 2 / 2) = 0.7071 passes; the far one
+    # covers the rest, and what passes it has its colour too
+    torch.testing.assert_close(got, (1 - 0.5**0.5) * near + 0.5**0.5 * far)

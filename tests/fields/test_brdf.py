@@ -1,0 +1,55 @@
+"""B: its start, its range and its gradients."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from neilfpp_method.config import BrdfConfig, HashGridConfig, preset
+from neilfpp_method.fields.brdf import BrdfField
+
+GRID = HashGridConfig(levels=3, log2_entries=9, base_resolution=4, max_resolution=16)
+SMALL = {
+    "sine": BrdfConfig(frequencies=2, layers=3, width=16, skip=2),
+    "hash": BrdfConfig(encoding="hash", grid=GRID, activation="relu", layers=2, width=16, skip=None),
+}
+
+
+def positions(count: int = 8) -> torch.Tensor:
+    return torch.empty(count, 3, dtype=torch.float64).uniform_(-1, 1, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize("name", ["paper-mlp", "paper-ngp", "fast"])
+def test_starts_at_mid_grey(name):
+    torch.manual_seed(0)
+    config = preset(name)
+    material = BrdfField(config.brdf, config.volume.radius)(positions(200).float())
+    for values, width in ((material.base_color, 3), (material.roughness, 1), (material.metallic, 1)):
+        assert values.shape == (200, width)
+        assert (values - 0.5).abs().max() < 0.05
+
+
+@pytest.mark.parametrize("kind", SMALL)
+def test_gradients_agree_with_autograd(kind):
+    torch.manual_seed(0)
+    field, x = BrdfField(SMALL[kind], 1.75).double(), positions().requires_grad_()
+    with torch.no_grad():
+        field.mlp.layers[-1].weight.mul_(50)  # away from grey, where tanh bends
+    sample = field.with_gradients(x)
+    for name in ("base_color", "roughness", "metallic"):
+        torch.testing.assert_close(getattr(sample.material, name), getattr(field(x), name))
+    for name in ("roughness", "metallic"):
+        expected = torch.autograd.grad(getattr(field(x), name).sum(), x)[0]
+        assert expected.abs().max() > 1e-4
+        torch.testing.assert_close(getattr(sample, f"{name}_gradient"), expected)
+
+
+@pytest.mark.parametrize("kind", SMALL)
+def test_range_holds_for_any_output(kind):
+    field = BrdfField(SMALL[kind], 1.75)
+    with torch.no_grad():
+        field.mlp.layers[-1].weight.normal_(std=1e3)
+    material = field(positions(100).float())
+    for values in (material.base_color, material.roughness, material.metallic):
+        assert values.min() >= 0
+        assert values.max() <= 1

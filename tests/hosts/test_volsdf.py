@@ -1,0 +1,82 @@
+"""The reference host on a sphere whose picture is known."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from neilfpp_method.hosts.base import HasParameterGroups, HasSurfaceWidth, Host, Regularised
+from neilfpp_method.hosts.volsdf import VolSdfHost
+from neilfpp_method.structures import OrientedPoints, RayBatch
+from tests.scenes import sphere_batch, sphere_model, tiny_config
+
+RADIUS = 0.6
+
+
+@pytest.fixture
+def sharp() -> VolSdfHost:
+    """The sphere with a thin surface layer."""
+    config = tiny_config()
+    config = dataclasses.replace(
+        config, volume=dataclasses.replace(config.volume, beta_init=2e-3, initial_samples=64, rounds=4, samples=64)
+    )
+    return sphere_model(config).eval().host
+
+
+def test_it_keeps_the_contracts(sharp):
+    assert isinstance(sharp, Host)
+    assert isinstance(sharp, Regularised)
+    assert isinstance(sharp, HasSurfaceWidth)
+    assert isinstance(sharp, HasParameterGroups)
+
+
+def test_hits_lie_on_the_sphere_with_its_normals(sharp):
+    hits = sharp.render(sphere_batch(spread=0.3).rays)
+    assert hits.is_hit(0.8).all()
+    assert hits.opacity.min() > 0.99
+    torch.testing.assert_close(hits.position.norm(dim=-1), torch.full((48,), RADIUS), atol=0.01, rtol=0.0)
+    cosine = (hits.normal * normalize(hits.position, dim=-1)).sum(-1)
+    assert cosine.min() > 0.99
+    torch.testing.assert_close(hits.normal.norm(dim=-1), torch.ones(48))
+
+
+def test_a_miss_is_no_hit_and_shows_the_background(sharp):
+    sharp.background_color.fill_(0.25)
+    misses = RayBatch(torch.tensor([[0.0, 0.0, -3.0], [0.0, 9.0, -3.0]]), torch.tensor([[0.0, 1.0, 0.0]] * 2))
+    hits = sharp.render(misses)
+    assert not hits.is_hit(0.8).any()
+    torch.testing.assert_close(hits.color, torch.full((2, 3), 0.25), atol=1e-3, rtol=0.0)
+    assert hits.position.isfinite().all()
+
+
+def test_without_a_background_the_sphere_of_the_scene_closes_it():
+    host = sphere_model(background="none").eval().host
+    hits = host.render(sphere_batch(spread=4.0).rays)
+    beyond = hits.position.norm(dim=-1) > 1.0
+    assert beyond.any()
+    assert not hits.is_hit(0.8)[beyond].any()  # painted by R, but no surface of the object
+    x = torch.tensor([[1.7, 0.0, 0.0], [0.0, 0.0, 0.9]])
+    torch.testing.assert_close(host.sdf(x), torch.tensor([1.75 - 1.7, 0.9 - RADIUS]), atol=0.02, rtol=0.0)
+
+
+def test_only_the_named_losses_are_computed(sharp):
+    batch = sphere_batch(8)
+    assert set(sharp.render_regularised(batch, ["eikonal", "surface"]).terms) == {"eikonal", "surface"}
+    assert sharp.render_regularised(batch, []).terms == {}
+
+
+def test_a_cloud_on_the_surface_costs_little_and_one_off_it_its_distance():
+    direction = normalize(torch.randn(64, 3), dim=-1)
+    for radius, expected in ((RADIUS, 0.0), (RADIUS + 0.2, 0.2)):
+        host = sphere_model().host
+        host.points = OrientedPoints(radius * direction, direction)
+        term = host.render_regularised(sphere_batch(8), ["point_cloud"]).terms["point_cloud"]
+        assert term.mean().item() == pytest.approx(expected, abs=0.02)
+
+
+def test_the_background_field_moves_only_where_it_is_the_background():
+    assert "background" in sphere_model(background="inverted_sphere").host.parameter_groups()
+    assert "background" not in sphere_model(background="constant").host.parameter_groups()

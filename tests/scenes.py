@@ -1,0 +1,56 @@
+"""Small things to train on and look at, shared by the tests."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch.nn.functional import normalize
+
+from neilfpp_method.config import HashGridConfig, NeilfConfig, TrainConfig, preset
+from neilfpp_method.hosts.volsdf import VolSdfHost
+from neilfpp_method.model import NeilfModel, SceneFacts
+from neilfpp_method.structures import PixelBatch
+
+
+def tiny_config(**changes) -> NeilfConfig:
+    """The preset `fast`, cut down to milliseconds a step."""
+    config = preset("fast")
+    grid = HashGridConfig(levels=3, log2_entries=10, base_resolution=8, max_resolution=32)
+    small = dataclasses.replace(
+        config,
+        sdf=dataclasses.replace(config.sdf, grid=grid, width=16, feature_width=4),
+        radiance=dataclasses.replace(config.radiance, layers=1, width=16),
+        brdf=dataclasses.replace(config.brdf, grid=grid, layers=1, width=16),
+        light=dataclasses.replace(config.light, layers=4, width=16, direction_degree=3),
+        background=dataclasses.replace(config.background, layers=2, width=16, samples=4),
+        volume=dataclasses.replace(config.volume, initial_samples=24, rounds=1, samples=16, beta_init=0.02),
+        shading=dataclasses.replace(config.shading, train_samples=8, eval_samples=8),
+        inter_reflection=dataclasses.replace(config.inter_reflection, rays_per_point=0.5),
+        train=TrainConfig(sdf_steps=4, material_steps=4, joint_steps=4, rays=48, checkpoint_every=3, log_every=2),
+    )
+    return dataclasses.replace(small, **changes)
+
+
+def sphere_model(config: NeilfConfig | None = None, response: str = "linear", background: str = "constant") -> NeilfModel:
+    """An untrained model: its surface is the sphere of radius 0.6 that every field starts as, β = 0.02."""
+    torch.manual_seed(0)
+    config = config or tiny_config()
+    facts = SceneFacts(response, 0.2, 1.0 if response == "srgb" else 3.0, background)
+    return NeilfModel(VolSdfHost(config, facts.radiance_scale, background), config, facts)
+
+
+def sphere_batch(count: int = 48, spread: float = 0.8, color: float = 0.3) -> PixelBatch:
+    """Rays from z = −3 towards a square around the origin; with the default spread most hit the sphere."""
+    generator = torch.Generator().manual_seed(1)
+    origins = torch.tensor([[0.0, 0.0, -3.0]]).expand(count, 3)
+    targets = torch.rand(count, 3, generator=generator) * 2.0 - 1.0
+    targets = targets * torch.tensor([spread, spread, 0.0])
+    return PixelBatch(
+        origins=origins,
+        directions=normalize(targets - origins, dim=-1),
+        color=torch.full((count, 3), color),
+        mask=torch.ones(count),
+        image_gradient=torch.zeros(count),
+        view=torch.zeros(count, dtype=torch.long),
+    )

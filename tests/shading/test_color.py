@@ -1,0 +1,45 @@
+"""The sRGB curve against its standard, and what an image response does."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from neilfpp_method.errors import UserError
+from neilfpp_method.shading.color import apply_response, linear_to_srgb, luminance, srgb_to_linear, tone_map
+
+
+def test_known_values():
+    linear = torch.tensor([0.0, 0.001, 0.214041, 1.0], dtype=torch.float64)
+    srgb = torch.tensor([0.0, 0.01292, 0.5, 1.0], dtype=torch.float64)
+    assert linear_to_srgb(linear).allclose(srgb, atol=1e-6)
+    assert srgb_to_linear(srgb).allclose(linear, atol=1e-6)
+
+
+def test_round_trip_outside_the_unit_interval_too():
+    color = torch.linspace(-0.5, 4, 1001, dtype=torch.float64)
+    assert srgb_to_linear(linear_to_srgb(color)).allclose(color, atol=2e-7)
+
+
+@pytest.mark.parametrize("curve", [linear_to_srgb, srgb_to_linear])
+def test_gradcheck(curve):
+    color = torch.tensor([-1.0, 0.0, 1e-3, 0.1, 1.0, 5.0], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(curve, color)
+
+
+def test_responses():
+    color = torch.tensor([-1.0, 0.0, 0.25, 1.0, 7.0])
+    assert torch.equal(apply_response(color, "linear"), color)
+    # 1.055 · 0.25^(1/2.4) − 0.055 = 0.53710
+    assert apply_response(color, "srgb").allclose(torch.tensor([0.0, 0.0, 0.53710, 1.0, 1.0]), atol=1e-5)
+    assert torch.equal(tone_map(color), apply_response(color, "srgb"))
+
+
+def test_an_unsettled_response_is_refused():
+    with pytest.raises(UserError, match="choose linear or srgb"):
+        apply_response(torch.zeros(3), "auto")
+
+
+def test_luminance():
+    assert luminance(torch.eye(3)).allclose(torch.tensor([0.2126, 0.7152, 0.0722]))
+    assert luminance(torch.ones(2, 3)).allclose(torch.ones(2))

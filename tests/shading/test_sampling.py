@@ -1,0 +1,104 @@
+"""Every sampler draws from the density it reports (χ²), and its lattice is what it says."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from neilfpp_method.errors import UserError
+from neilfpp_method.shading import sampling
+from neilfpp_method.shading.brdf import GGX, LOBES, SPHERICAL_GAUSSIAN
+from neilfpp_method.shading.sampling import sample_directions
+from tests import oracles
+
+KINDS = ("fibonacci", "cosine", "lobe", "mis")
+CASES = [(kind, "ggx", 0.5) for kind in ("fibonacci", "cosine")] + [
+    (kind, lobe, r) for kind in ("lobe", "mis") for lobe in LOBES for r in (0.35, 0.6, 1.0)
+]
+# The viewer is at +z and the surface turns: at −wo, a pole of the χ² cells, the density of the lobe is infinite.
+NORMALS = {"frontal": (0.0, 0.0, 1.0), "oblique": (0.8, 0.0, 0.6), "grazing": (0.0, 0.9992, 0.04)}
+POINTS, PER_POINT = 20_000, 6
+
+
+def points(n, wo, count: int, roughness: float = 0.5, dtype=torch.float64):
+    return tuple(torch.tensor([v], dtype=dtype).expand(count, -1) for v in (n, wo, (roughness,)))
+
+
+def density(kind, lobe, wi, n, wo, r):
+    return {
+        "fibonacci": lambda: sampling.pdf_fibonacci(wi, n),
+        "cosine": lambda: sampling.pdf_cosine(wi, n),
+        "lobe": lambda: sampling.pdf_specular_lobe(wi, n, wo, r, lobe),
+        "mis": lambda: sampling.pdf_mis(wi, n, wo, r, lobe),
+    }[kind]()
+
+
+@pytest.mark.parametrize("view", NORMALS)
+@pytest.mark.parametrize(("kind", "lobe", "r"), CASES)
+def test_chi2(kind, lobe, r, view):
+    torch.manual_seed(3)
+    many = points(NORMALS[view], (0.0, 0.0, 1.0), POINTS, r)
+    one = tuple(t[:1] for t in many)
+    result = oracles.chi2_test(
+        lambda: sample_directions(kind, *many, PER_POINT, LOBES[lobe], stochastic=True).wi.reshape(-1, 3).numpy(),
+        lambda wi: density(kind, LOBES[lobe], torch.from_numpy(wi)[None], *one)[0].numpy(),
+        tests=len(CASES) * len(NORMALS),
+    )
+    assert result.passed, result
+    assert result.total == pytest.approx(1, abs=1e-4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_reported_pdf_is_the_density_at_the_directions(kind):
+    torch.manual_seed(4)
+    n, wo, r = points((0.6, 0.0, 0.8), (0.0, 0.6, 0.8), 5)
+    samples = sample_directions(kind, n, wo, r, 16, GGX, stochastic=True)
+    assert torch.equal(samples.pdf, density(kind, GGX, samples.wi, n, wo, r))
+    assert samples.wi.norm(dim=-1).allclose(torch.ones(5, 16, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_determinism(kind):
+    scene = points((0.6, 0.0, 0.8), (0.0, 0.6, 0.8), 2)
+    still = [sample_directions(kind, *scene, 8, GGX, stochastic=False).wi for _ in range(2)]
+    assert torch.equal(*still)
+    moving = sample_directions(kind, *scene, 8, GGX, stochastic=True).wi
+    assert not torch.equal(moving[0], moving[1])
+    torch.manual_seed(5)
+    first = sample_directions(kind, *scene, 8, GGX, stochastic=True).wi
+    torch.manual_seed(5)
+    assert torch.equal(first, sample_directions(kind, *scene, 8, GGX, stochastic=True).wi)
+
+
+def test_fibonacci_lies_at_cell_midpoints():
+    n, _, _ = points((0.0, 0.0, 1.0), (0.0, 0.0, 1.0), 1)
+    wi = sampling.fibonacci(n, 4, stochastic=False).wi[0]
+    assert wi[:, 2].allclose(torch.tensor([0.875, 0.625, 0.375, 0.125], dtype=torch.float64))
+    azimuth = torch.atan2(wi[:, 1], wi[:, 0])
+    golden = math.pi * (3 - math.sqrt(5))
+    assert (azimuth[1:] - azimuth[:-1] - golden).cos().allclose(torch.ones(3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 8, 9])
+def test_mis_holds_for_odd_counts(count):
+    """The mean of (n·wi)/pdf estimates ∫ n·wi dwi = π; at one sample the mixture is the cosine alone."""
+    torch.manual_seed(6)
+    n, wo, r = points((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), 20_000)
+    samples = sampling.mis(n, wo, r, count, SPHERICAL_GAUSSIAN, stochastic=True)
+    assert samples.pdf.shape == (20_000, count)
+    estimate = (samples.wi[..., 2].clamp_min(0) / samples.pdf).mean().item()
+    assert estimate == pytest.approx(math.pi, rel=5e-3)
+
+
+def test_samples_carry_no_gradient():
+    n, wo, r = (t.clone().requires_grad_() for t in points((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), 2))
+    samples = sample_directions("mis", n, wo, r, 8, GGX, stochastic=True)
+    assert not samples.wi.requires_grad
+    assert not samples.pdf.requires_grad
+
+
+def test_an_unknown_sampler_is_refused():
+    with pytest.raises(UserError, match="choose fibonacci, cosine, lobe or mis"):
+        sample_directions("uniform", *points((0, 0, 1.0), (0, 0, 1.0), 1), 4, GGX, False)

@@ -1,0 +1,98 @@
+"""The losses of METHOD §4, each against a number worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from neilfpp_method import losses
+from neilfpp_method.structures import LossTerm, Material
+
+
+def test_photometric_is_l1_over_the_scale_in_linear_radiance():
+    radiance = torch.tensor([[0.5, 1.5, 2.0]])
+    pixel = torch.tensor([[0.2, 1.0, 3.0]])
+    term = losses.photometric(radiance, pixel, "linear", scale=3.0)
+    assert term.values.tolist()[0] == pytest.approx([0.3 / 3, 0.5 / 3, 1.0 / 3])
+
+
+def test_photometric_clips_and_encodes_for_ldr_pixels():
+    term = losses.photometric(torch.tensor([[0.0, 0.5, 7.0]]), torch.tensor([[0.0, 0.735357, 1.0]]), "srgb")
+    assert term.values.abs().max() < 1e-5  # sRGB(0.5) = 0.735357; 7 clips to 1
+
+
+def test_eikonal_is_the_distance_of_the_slope_from_one():
+    gradient = torch.tensor([[3.0, 4.0, 0.0], [0.0, 1.0, 0.0]])
+    assert losses.eikonal(gradient).values.tolist() == pytest.approx([4.0, 0.0])
+
+
+def test_surface_is_a_delta_of_unit_mass():
+    z = torch.linspace(-200.0, 200.0, 400_001, dtype=torch.float64)
+    values = losses.surface(z, 0.05).values
+    assert torch.trapezoid(values, z).item() == pytest.approx(1.0, abs=2e-4)
+    assert values.max().item() == pytest.approx(1.0 / (math.pi * 0.05))
+
+
+def test_point_cloud_adds_distance_and_angle():
+    distance = torch.tensor([0.1, -0.2])
+    gradient = torch.tensor([[0.0, 0.0, 2.0], [1.0, 0.0, 0.0]])
+    normal = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+    assert losses.point_cloud(distance, gradient, normal).values.tolist() == pytest.approx([0.1, 0.2 + 1.0])
+
+
+def test_smoothness_fades_where_the_image_changes():
+    gradient = torch.tensor([[0.0, 3.0, 4.0]])
+    term = losses.smoothness(gradient, 2.0 * gradient, torch.tensor([1.0]))
+    assert term.values.item() == pytest.approx((5.0 + 10.0) * math.exp(-1.0))
+
+
+def test_lambertian_is_zero_for_a_rough_dielectric_only():
+    one, zero = torch.ones(1, 1), torch.zeros(1, 1)
+    assert losses.lambertian(Material(torch.ones(1, 3), one, zero)).values.item() == 0.0
+    assert losses.lambertian(Material(torch.ones(1, 3), 0.25 * one, 0.5 * one)).values.item() == pytest.approx(1.25)
+
+
+def test_mask_is_cross_entropy():
+    term = losses.mask(torch.tensor([0.75, 0.75]), torch.tensor([1.0, 0.0]))
+    assert term.values.tolist() == pytest.approx([-math.log(0.75), -math.log(0.25)])
+
+
+def test_scale_gradient_keeps_the_value():
+    x = torch.tensor([2.0], requires_grad=True)
+    for scale in (0.1, 1.0):
+        scaled = losses.scale_gradient(x, scale)
+        assert scaled.item() == pytest.approx(2.0)
+        assert torch.autograd.grad(scaled.sum(), x)[0].item() == pytest.approx(scale)
+    assert not losses.scale_gradient(x, 0.0).requires_grad
+
+
+def test_a_weighted_mean_counts_what_has_weight():
+    values = torch.tensor([[1.0, 3.0], [10.0, 30.0]])
+    assert LossTerm(values, torch.tensor([[1.0], [0.0]])).mean().item() == pytest.approx(2.0)
+
+
+def test_a_term_without_values_is_zero_with_a_zero_gradient():
+    x = torch.ones(0, 3, requires_grad=True)
+    mean = LossTerm(x).mean()
+    mean.backward()
+    assert mean.item() == 0.0
+
+
+@pytest.mark.parametrize("loss", [losses.eikonal, lambda g: losses.smoothness(g, g, torch.zeros(len(g)))])
+def test_a_zero_gradient_of_the_field_is_no_trap(loss):
+    gradient = torch.zeros(2, 3, requires_grad=True)
+    loss(gradient).values.sum().backward()
+    assert gradient.grad.isfinite().all()
+
+
+def test_losses_are_differentiable():
+    torch.manual_seed(0)
+    vector = torch.randn(4, 3, dtype=torch.float64, requires_grad=True)
+    scalar = torch.rand(4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda v: losses.eikonal(v).values, vector)
+    assert torch.autograd.gradcheck(lambda s: losses.surface(s, 0.05).values, scalar)
+    normal = torch.nn.functional.normalize(torch.randn(4, 3, dtype=torch.float64), dim=-1)
+    assert torch.autograd.gradcheck(lambda s, v: losses.point_cloud(s, v, normal).values, (scalar, vector))
+    assert torch.autograd.gradcheck(lambda v, s: losses.smoothness(v, 2.0 * v, s).values, (vector, scalar))

@@ -1,0 +1,211 @@
+"""The method on a host: what each step computes, what a switch saves, and what each stage moves."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+
+import pytest
+import torch
+
+from neilfpp_method.inter_reflection import trace_light
+from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.structures import RayBatch, SurfaceHits
+from neilfpp_method.train.loop import make_optimizer
+from tests.scenes import sphere_batch, sphere_model, tiny_config
+
+
+def count_queries(model, run) -> Counter:
+    """Points that each field is asked for, and rays that the host renders, while `run` runs."""
+    counts = Counter()
+    handles = []
+    for name, field in (("sdf", model.host.sdf_field), ("brdf", model.brdf)):
+        for method in ("forward", "with_gradient", "with_gradients", "hessian"):
+            if hasattr(field, method):
+                handles.append((field, method, getattr(field, method)))
+                setattr(field, method, _counted(getattr(field, method), counts, name))
+    handles += [(model.light, "radiance", model.light.radiance), (model.host, "_march", model.host._march)]
+    model.light.radiance = _counted(model.light.radiance, counts, "light")
+    model.host._march = _counted(model.host._march, counts, "rays")
+    run()
+    for owner, method, original in handles:
+        setattr(owner, method, original)
+    return counts
+
+
+def _counted(function, counts, name):
+    def call(first, *rest):
+        counts[name] += len(rest[0].flatten(0, -2)) if name == "light" else len(first)
+        return function(first, *rest)
+
+    return call
+
+
+def test_an_effect_that_is_off_asks_nothing():
+    base = tiny_config()
+    off = dataclasses.replace(base.inter_reflection, mode="off")
+    batch = sphere_batch()
+
+    def queries(config):
+        model = sphere_model(config)
+        return count_queries(model, lambda: model.losses(batch, Stage.MATERIAL_INIT))
+
+    on, without = queries(base), queries(dataclasses.replace(base, inter_reflection=off))
+    assert without["rays"] == len(batch)  # the camera's rays and no others
+    assert on["rays"] > without["rays"]
+    assert without["light"] % base.shading.train_samples == 0
+
+    model = sphere_model(base)
+    first_stage = count_queries(model, lambda: model.losses(batch, Stage.SDF_INIT))
+    assert first_stage["brdf"] == first_stage["light"] == 0
+
+    no_hessian = dataclasses.replace(base, loss=dataclasses.replace(base.loss, hessian=0.0))
+    plain = sphere_model(no_hessian)
+    fewer = count_queries(plain, lambda: plain.losses(batch, Stage.SDF_INIT))
+    assert fewer["sdf"] < first_stage["sdf"]
+
+
+def test_a_picture_of_r_alone_asks_no_material():
+    model = sphere_model().eval()
+    counts = count_queries(model, lambda: model.maps(sphere_batch().rays, with_material=False))
+    assert counts["brdf"] == counts["light"] == 0
+
+
+@pytest.mark.parametrize("stage", Stage)
+def test_a_stage_moves_what_the_table_says_and_nothing_else(stage):
+    moves = {
+        Stage.SDF_INIT: {"geometry", "beta", "radiance"},
+        Stage.MATERIAL_INIT: {"brdf", "light"},
+        Stage.JOINT: {"geometry", "beta", "radiance", "brdf", "light"},
+    }[stage]
+    config = tiny_config()
+    model = sphere_model(config)
+    optimizer = make_optimizer(model, config.optimizer)
+    # Momentum from an earlier stage must not move what this stage holds still.
+    weigh(model.losses(sphere_batch(), Stage.JOINT), active_losses(Stage.JOINT, config)).loss.backward()
+    optimizer.step()
+    before = {name: [p.detach().clone() for p in group] for name, group in model.parameter_groups().items()}
+    model.freeze_for(stage)
+    for _ in range(2):
+        optimizer.zero_grad()
+        weigh(model.losses(sphere_batch(), stage), active_losses(stage, config)).loss.backward()
+        optimizer.step()
+    for name, group in model.parameter_groups().items():
+        moved = any(not torch.equal(old, new) for old, new in zip(before[name], group, strict=True))
+        assert moved == (name in moves), name
+
+
+def test_the_first_render_matches_the_median_of_the_images():
+    config = tiny_config()
+    config = dataclasses.replace(config, shading=dataclasses.replace(config.shading, eval_samples=256))
+    model = sphere_model(config).eval()
+    maps = model.maps(sphere_batch(spread=0.1).rays)
+    assert maps.rgb.mean().item() == pytest.approx(model.facts.median_radiance, rel=0.15)
+
+
+def test_pbr_colour_of_a_white_furnace():
+    """Under light of 1 from everywhere a Lambertian surface shows its base colour, whatever the host."""
+    config = tiny_config()
+    config = dataclasses.replace(config, shading=dataclasses.replace(config.shading, specular=False))
+    model = sphere_model(config).eval()
+    model.light.radiance = lambda x, wi: torch.ones_like(wi)
+    maps = model.maps(sphere_batch(spread=0.3).rays)
+    torch.testing.assert_close(maps.rgb, maps.base_color, atol=1e-4, rtol=0.0)
+
+
+class Room:
+    """A host: a closed room whose walls, 2 scene units from the origin, all send out their own normal as a colour."""
+
+    def render(self, rays: RayBatch) -> SurfaceHits:
+        along = (rays.origins * rays.directions).sum(-1)
+        depth = (along**2 + 4.0 - rays.origins.square().sum(-1)).sqrt() - along
+        position = rays.origins + depth[:, None] * rays.directions
+        ones = torch.ones(len(rays))
+        return SurfaceHits(position / 2.0, position, -position / 2.0, ones, ones)
+
+
+def test_traced_light_is_what_the_wall_sends_back():
+    torch.manual_seed(0)
+    position, normal = torch.zeros(500, 3), torch.tensor([[0.0, 0.0, 1.0]]).expand(500, 3)
+    settings = dataclasses.replace(tiny_config().inter_reflection, rays_per_point=2.5, offset=1e-4)
+    traced = trace_light(Room(), position, normal, settings, hit_share=0.8)
+    assert len(traced.wi) == 1250  # each point twice, and half of them once more
+    torch.testing.assert_close(traced.radiance, traced.wi, atol=1e-3, rtol=0.0)
+    cosine = traced.wi[:, 2]
+    least = torch.cos(torch.deg2rad(torch.tensor(80.0)))
+    assert cosine.min() >= least
+    # Uniform in solid angle: the cosine is uniform on [cos 80°, 1].
+    assert cosine.mean().item() == pytest.approx((1.0 + least.item()) / 2.0, abs=0.02)
+
+
+def test_a_ray_starts_further_out_towards_grazing_and_for_a_thicker_surface():
+    class Recorder(Room):
+        width = torch.tensor(0.01)
+
+        def surface_width(self):
+            return self.width
+
+        def render(self, rays):
+            self.rays = rays
+            return super().render(rays)
+
+    host, settings = Recorder(), dataclasses.replace(tiny_config().inter_reflection, rays_per_point=1.0)
+    normal = torch.tensor([[0.0, 0.0, 1.0]]).expand(200, 3)
+    trace_light(host, torch.zeros(200, 3), normal, settings, 0.8)
+    torch.testing.assert_close(host.rays.origins[:, 2], torch.full((200,), settings.offset + 4 * 0.01))
+    assert host.rays.origins.norm(dim=-1).max() > 2.0 * host.rays.origins.norm(dim=-1).min()
+
+
+def test_the_gradient_into_outgoing_radiance_is_scaled():
+    batch = sphere_batch()
+    config = tiny_config()
+    gradients = {}
+    for scale in (0.0, 0.35, 0.7):
+        model = sphere_model(dataclasses.replace(
+            config,
+            inter_reflection=dataclasses.replace(config.inter_reflection, radiance_gradient=scale),
+            shading=dataclasses.replace(config.shading, hit_share=0.0),  # every ray counts as a hit
+        ))
+        torch.manual_seed(3)
+        hits = model.host.render(batch.rays).detach()
+        term = model._inter_reflection(hits.position, hits.normal)
+        weight = model.host.radiance_field.mlp.layers[-1].weight
+        (gradient,) = torch.autograd.grad(term.mean(), weight, allow_unused=True)
+        gradients[scale] = gradient
+    assert gradients[0.0] is None
+    torch.testing.assert_close(2.0 * gradients[0.35], gradients[0.7])
+
+
+def test_material_gradients_reach_the_geometry_by_their_scales():
+    batch = sphere_batch()
+    config = tiny_config()
+
+    def geometry_moves(position: float, normal: float) -> bool:
+        loss = dataclasses.replace(config.loss, position_gradient=position, normal_gradient=normal)
+        model = sphere_model(dataclasses.replace(config, loss=loss))
+        term = model.losses(batch, Stage.JOINT)["physical"]
+        gradients = torch.autograd.grad(term.mean(), list(model.host.sdf_field.parameters()), allow_unused=True)
+        return any(g is not None and bool(g.abs().max() > 0.0) for g in gradients)
+
+    assert not geometry_moves(0.0, 0.0)
+    assert geometry_moves(0.1, 0.0)
+    assert geometry_moves(0.0, 0.1)
+
+
+def test_a_batch_without_a_hit_trains_what_it_can():
+    model = sphere_model()
+    batch = sphere_batch(spread=0.3)
+    away = dataclasses.replace(batch, directions=-batch.directions)
+    for stage in Stage:
+        terms = model.losses(away, stage)
+        loss = weigh(terms, active_losses(stage, model.config)).loss
+        loss.backward()
+        assert loss.isfinite()
+        assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
+
+
+def test_shading_has_two_parts():
+    model = sphere_model().eval()
+    maps = model.maps(sphere_batch(spread=0.3).rays)
+    torch.testing.assert_close(maps.rgb, maps.diffuse + maps.specular)
+    assert (maps.specular > 0).any()

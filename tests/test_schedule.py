@@ -1,0 +1,88 @@
+"""The stage table (METHOD §4) and what follows from it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from neilfpp_method.config import PRESETS, TrainConfig, from_dict, preset, to_dict
+from neilfpp_method.errors import UserError
+from neilfpp_method.schedule import Stage, active_losses, stage_at, weigh
+from neilfpp_method.structures import LossTerm
+
+# Table 1 of the paper, in its own words.
+TABLE = {
+    Stage.SDF_INIT: "volume eikonal hessian surface point_cloud",
+    Stage.MATERIAL_INIT: "inter_reflection physical smoothness lambertian",
+    Stage.JOINT: "inter_reflection volume eikonal hessian surface physical smoothness lambertian",
+}
+
+
+@pytest.mark.parametrize("stage", Stage)
+def test_paper_ngp_computes_the_losses_of_the_table(stage):
+    assert set(active_losses(stage, preset("paper-ngp"))) == set(TABLE[stage].split())
+
+
+def test_the_joint_stage_lowers_hessian_and_surface():
+    config = preset("paper-mlp")
+    first, last = active_losses(Stage.SDF_INIT, config), active_losses(Stage.JOINT, config)
+    assert (first["hessian"], last["hessian"]) == (1e-3, 1e-4)
+    assert (first["surface"], last["surface"]) == (1e-3, 1e-4)
+
+
+def test_an_effect_that_is_off_has_no_loss():
+    config = preset("fast")
+    off = dataclasses.replace(config, inter_reflection=dataclasses.replace(config.inter_reflection, mode="off"))
+    assert "inter_reflection" not in active_losses(Stage.JOINT, off)
+    matte = dataclasses.replace(config, shading=dataclasses.replace(config.shading, specular=False))
+    assert not {"smoothness", "lambertian"} & set(active_losses(Stage.JOINT, matte))
+
+
+def test_stages_follow_one_another():
+    config = TrainConfig(sdf_steps=2, material_steps=3, joint_steps=1)
+    stages = [stage_at(step, config) for step in range(7)]
+    assert [(p.stage.value, p.step) for p in stages[:6]] == [
+        ("sdf_init", 0),
+        ("sdf_init", 1),
+        ("material_init", 0),
+        ("material_init", 1),
+        ("material_init", 2),
+        ("joint", 0),
+    ]
+    assert stages[6].step == stages[6].length  # over
+
+
+def test_the_separate_pipeline_has_no_joint_stage():
+    config = TrainConfig(sdf_steps=1, material_steps=1, joint_steps=0)
+    assert stage_at(5, config).stage is Stage.MATERIAL_INIT
+
+
+def test_weigh_adds_up_and_refuses_what_has_no_weight():
+    terms = {"volume": LossTerm(torch.tensor([1.0, 3.0])), "eikonal": LossTerm(torch.tensor([10.0]))}
+    total = weigh(terms, {"volume": 2.0, "eikonal": 0.1})
+    assert total.loss.item() == pytest.approx(2.0 * 2.0 + 0.1 * 10.0)
+    assert {name: value.item() for name, value in total.terms.items()} == {"volume": 2.0, "eikonal": 10.0}
+    with pytest.raises(KeyError):
+        weigh(terms, {"volume": 1.0})
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_settings_survive_json(name):
+    import json
+
+    config = preset(name)
+    assert from_dict(type(config), json.loads(json.dumps(to_dict(config)))) == config
+
+
+def test_settings_of_another_version_are_refused_by_name():
+    with pytest.raises(UserError, match=r"config.train: unknown setting 'warp'"):
+        from_dict(type(preset("fast")), {"train": {"warp": 9}})
+    with pytest.raises(UserError, match=r"config.shading.lobe: 'blinn' is not a choice"):
+        from_dict(type(preset("fast")), {"shading": {"lobe": "blinn"}})
+
+
+def test_an_unknown_preset_is_named():
+    with pytest.raises(UserError, match=r"unknown preset 'turbo'; choose one of fast, paper-mlp, paper-ngp"):
+        preset("turbo")

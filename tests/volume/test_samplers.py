@@ -1,0 +1,305 @@
+"""Ray samplers: the distributions they draw from, and the error bound against quadrature of the true density."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import chisquare, kstest, laplace
+
+from neilfpp_method.config import VolumeConfig
+from neilfpp_method.volume import samplers
+from neilfpp_method.volume.compositing import render_weights
+from neilfpp_method.volume.density import laplace_density
+from neilfpp_method.volume.samplers import cut, error_bounded_samples, inverse_cdf_samples, uniform_samples
+
+F64 = torch.float64
+CONFIG = VolumeConfig()
+TILT = torch.tensor([0.36, 0.48, 0.8], dtype=F64)  # a unit vector
+
+
+def sphere(x):
+    return x.norm(dim=-1) - 0.6
+
+
+def thin_plate(x):
+    return (x[:, 0] - 0.1).abs() - 0.01
+
+
+def tilted_plane(x):
+    return x @ TILT.to(x) - 0.2
+
+
+SURFACES = [sphere, thin_plate, tilted_plane]
+
+
+def ray_bundle(count, dtype=F64):
+    """Rays from a shell of radius 2.5 towards the object; some pass it."""
+    generator = torch.Generator().manual_seed(3)
+    origins = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=F64), dim=-1) * 2.5
+    targets = 0.4 * torch.randn(count, 3, generator=generator, dtype=F64)
+    directions = torch.nn.functional.normalize(targets - origins, dim=-1)
+    return origins.to(dtype), directions.to(dtype), torch.zeros(count, dtype=dtype), torch.full((count,), 5.0).to(dtype)
+
+
+def sample(sdf, rays, beta, config=CONFIG, stochastic=False):
+    return error_bounded_samples(sdf, *rays, torch.tensor(beta, dtype=rays[0].dtype), config, stochastic)
+
+
+# ------------------------------------------------------------------------------------------------------ simple samplers
+
+
+def test_uniform_samples_are_the_middles_of_equal_parts():
+    samples = uniform_samples(torch.tensor([0.0, 1.0]), torch.tensor([4.0, 1.0]), 4, False)
+    assert samples.tolist() == [[0.5, 1.5, 2.5, 3.5], [1.0, 1.0, 1.0, 1.0]]
+
+
+def test_uniform_samples_at_random_fall_evenly_one_in_each_part():
+    torch.manual_seed(0)
+    samples = uniform_samples(torch.full((4000,), 2.0), torch.full((4000,), 6.0), 4, True)
+    assert (samples.floor() == torch.tensor([2.0, 3.0, 4.0, 5.0])).all()
+    assert kstest((samples - samples.floor()).flatten().numpy(), "uniform").pvalue > 1e-3
+
+
+def test_inverse_cdf_by_hand():
+    edges, mass = torch.tensor([[0.0, 1.0, 3.0]]), torch.tensor([[2.0, 2.0]])
+    # u = 1/8, 3/8 | 5/8, 7/8: half of the mass lies in [0, 1], half in [1, 3].
+    assert inverse_cdf_samples(edges, mass, 4, False).tolist() == [[0.25, 0.75, 1.5, 2.5]]
+
+
+def test_inverse_cdf_draws_from_a_piecewise_constant_density():
+    torch.manual_seed(0)
+    edges = torch.tensor([0.0, 0.5, 0.6, 1.5, 1.5, 2.0, 4.0], dtype=F64)
+    mass = torch.tensor([0.1, 0.4, 0.0, 0.0, 0.3, 0.2], dtype=F64)
+    draws = 20_000
+    # One sample per row: independent, as the χ² test asks.
+    samples = inverse_cdf_samples(edges.expand(draws, 7), mass.expand(draws, 6), 1, True)[:, 0].numpy()
+    counts = np.histogram(samples, edges.numpy()[[0, 1, 2, 4, 5, 6]])[0]
+    assert counts[2] == 0  # the flat part of the CDF
+    assert chisquare(counts[[0, 1, 3, 4]], draws * np.array([0.1, 0.4, 0.3, 0.2])).pvalue > 1e-3
+    within = samples[(samples > 2.0)] / 2.0 - 1.0
+    assert kstest(within, "uniform").pvalue > 1e-3
+
+
+@pytest.mark.parametrize("stochastic", [False, True])
+def test_inverse_cdf_gives_one_sample_to_each_share_and_none_to_flat_parts(stochastic):
+    mass = torch.tensor([[0.0, 1.0, 0.0, 0.0, 3.0, 0.0]])
+    samples = inverse_cdf_samples(torch.arange(7.0)[None], mass, 64, stochastic)
+    assert ((samples >= 1.0) & (samples <= 2.0)).sum() == 16
+    assert ((samples >= 4.0) & (samples <= 5.0)).sum() == 48
+    assert (samples.diff(dim=-1) >= 0.0).all()
+
+
+def test_inverse_cdf_without_mass_is_even_in_length_not_in_bins():
+    samples = inverse_cdf_samples(torch.tensor([[0.0, 3.0, 4.0]]), torch.zeros(1, 2), 4, False)
+    torch.testing.assert_close(samples, torch.tensor([[0.5, 1.5, 2.5, 3.5]]))
+
+
+@pytest.mark.parametrize(("u", "mass", "where"), [(0.0, [0.0, 1.0, 1.0], 1.0), (1.0, [1.0, 1.0, 0.0], 2.0)])
+def test_inverse_cdf_at_its_ends_stays_where_the_mass_is(monkeypatch, u, mass, where):
+    monkeypatch.setattr(samplers, "strata", lambda like, count, stochastic: torch.full((1, count), u))
+    samples = inverse_cdf_samples(torch.arange(4.0)[None], torch.tensor([mass]), 1, True)
+    assert samples.item() == pytest.approx(where, abs=1e-6)
+
+
+# ------------------------------------------------------------------------------------------------------ the error bound
+
+
+def distance_beyond_two_balls(width, a, b):
+    """Brute force: from the segment [0, width] on an axis to the nearest point outside the discs at its two ends."""
+    angle = np.linspace(0.0, np.pi, 20_001)
+    first = np.stack([a * np.cos(angle), a * np.sin(angle)], -1)
+    second = np.stack([width + b * np.cos(angle), b * np.sin(angle)], -1)
+    outline = np.concatenate([first[np.hypot(first[:, 0] - width, first[:, 1]) >= b], second[np.hypot(*second.T) >= a]])
+    return np.hypot(outline[:, 0] - outline[:, 0].clip(0.0, width), outline[:, 1]).min()
+
+
+def test_least_distance_is_that_to_the_outline_of_the_two_balls():
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        width, a = rng.uniform(0.1, 1.0, 2)
+        b = rng.uniform(max(a - width, 0.0), a + width)  # a distance changes by no more than the step
+        if a + b < width:
+            continue
+        found = cut(torch.tensor([[0.0, width]], dtype=F64), torch.tensor([[a, b]], dtype=F64)).least_distance
+        assert found.item() == pytest.approx(distance_beyond_two_balls(width, a, b), abs=2e-4)
+
+
+@pytest.mark.parametrize("ends", [(0.1, 0.2), (-0.8, 0.9), (0.9, -0.8), (0.0, 1.0)])
+def test_least_distance_is_zero_where_the_surface_may_cross(ends):
+    found = cut(torch.tensor([[0.0, 1.0]]), torch.tensor([ends])).least_distance
+    assert found.item() == 0.0
+
+
+def test_the_bound_is_that_of_the_theorem():
+    """Transcribed: on interval k, exp(−Σ_{j<k} σ_j δ_j) · (exp(Σ_{j≤k} δ_j² exp(−d*_j/β) / 4β²) − 1)."""
+    rng = np.random.default_rng(0)
+    beta, distances = 0.2, np.sort(rng.uniform(0.0, 2.0, 12))
+    sdf = 0.9 - 0.8 * distances
+    partition = cut(torch.from_numpy(distances)[None], torch.from_numpy(sdf)[None])
+    least, width = partition.least_distance[0].numpy(), np.diff(distances)
+    density = laplace.cdf(-sdf, scale=beta) / beta
+    expected = max(
+        math.exp(-sum(density[:k] * width[:k]))
+        * (math.exp(sum(width[: k + 1] ** 2 * np.exp(-least[: k + 1] / beta)) / (4 * beta**2)) - 1.0)
+        for k in range(11)
+    )
+    found = samplers.log_error_bound(partition, torch.tensor([[beta]], dtype=F64))
+    assert found.exp().item() == pytest.approx(expected, rel=1e-9)
+
+
+def opacity_error(sdf, rays, beta, cuts):
+    """max_t |O(t) − Ô(t)| of one ray: O by fine quadrature, Ô with the density constant from each cut to the next."""
+    origin, direction, near, far = (part[0] for part in rays)
+    t = torch.linspace(near.item(), far.item(), 400_001, dtype=F64)
+    density = laplace.cdf(-sdf(origin + t[:, None] * direction).numpy(), scale=beta) / beta
+    step = (t[1] - t[0]).item()
+    truth = -np.expm1(-np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * step)]))
+    at_cuts = laplace.cdf(-sdf(origin + cuts[:, None] * direction).numpy(), scale=beta) / beta
+    cuts = cuts.numpy()
+    depth = np.concatenate([[0.0], np.cumsum(at_cuts[:-1] * np.diff(cuts))])
+    last = (np.searchsorted(cuts, t.numpy(), side="right") - 1).clip(0)
+    return np.abs(truth + np.expm1(-(depth[last] + (t.numpy() - cuts[last]) * at_cuts[last]))).max()
+
+
+@pytest.mark.parametrize("sdf", SURFACES)
+@pytest.mark.parametrize("beta", [0.1, 0.02, 0.005])
+@pytest.mark.parametrize("rounds", [0, 5])
+def test_the_opacity_is_within_the_bound_and_the_bound_within_epsilon(sdf, beta, rounds):
+    config = dataclasses.replace(CONFIG, rounds=rounds)
+    bundle = ray_bundle(4)
+    for i in range(4):
+        ray = [part[i : i + 1] for part in bundle]
+        asked = []
+
+        def recorded(x, ray=ray, asked=asked):
+            asked.append((x - ray[0]) @ ray[1][0])
+            return sdf(x)
+
+        found = sample(recorded, ray, beta, config)
+        error = opacity_error(sdf, ray, beta, torch.cat(asked).sort().values)
+        assert error <= found.error_bound.item() + 1e-5
+        if rounds:
+            assert found.error_bound.item() <= config.epsilon
+
+
+def test_the_bound_says_when_the_rounds_were_too_few():
+    found = sample(sphere, ray_bundle(16), 1e-4, dataclasses.replace(CONFIG, rounds=0))
+    assert (found.error_bound > CONFIG.epsilon).any()
+    assert found.distances.isfinite().all()
+
+
+# -------------------------------------------------------------------------------------------- the error-bounded sampler
+
+
+@pytest.mark.parametrize("stochastic", [False, True])
+def test_samples_gather_at_the_surface(stochastic):
+    torch.manual_seed(0)
+    origins, directions, _, far = rays = ray_bundle(200, torch.float32)
+    closest = -(origins * directions).sum(-1)
+    gap = (origins.square().sum(-1) - closest.square()).sqrt()
+    hits = gap < 0.5
+    exact = (closest - (0.36 - gap.square()).clamp_min(0.0).sqrt())[hits]
+
+    beta = 0.002
+    distances = sample(sphere, rays, beta, stochastic=stochastic).distances
+    points = origins[:, None] + distances[..., None] * directions[:, None]
+    density = laplace_density(sphere(points.reshape(-1, 3)).reshape(distances.shape), torch.tensor(beta))
+    weights = render_weights(density, distances, far).weights
+    depth = ((weights * distances).sum(-1) / weights.sum(-1))[hits]
+    assert hits.sum() > 100
+    assert (weights.sum(-1)[hits] > 0.999).all()
+    assert (depth - exact).abs().max() < 3 * beta
+    assert (distances.median(dim=-1).values[hits] - exact).abs().max() < 3 * beta
+
+
+def test_a_thin_plate_is_not_missed():
+    origins, directions, _, far = rays = ray_bundle(64, torch.float32)
+    crossing = (0.1 - origins[:, 0]) / directions[:, 0]
+    crosses = (crossing > 0.1) & (crossing < 4.9)
+    found = sample(thin_plate, rays, 0.002)
+    points = origins[:, None] + found.distances[..., None] * directions[:, None]
+    density = laplace_density(thin_plate(points.reshape(-1, 3)).reshape(points.shape[:2]), torch.tensor(0.002))
+    opacity = render_weights(density, found.distances, far).opacity
+    # Along the normal the plate's optical depth is 0.02 / 0.002, so exp(−10) passes at most.
+    assert crosses.sum() > 10
+    assert (opacity[crosses] > 0.99).all()
+
+
+def test_samples_follow_the_true_opacity():
+    """In a soft plane that stops all light, the share of samples before t is the opacity up to t, within ε."""
+    origins, directions = torch.zeros(1, 3, dtype=F64), torch.tensor([[0.0, 0.0, 1.0]], dtype=F64)
+    rays = (origins, directions, torch.zeros(1, dtype=F64), torch.full((1,), 4.0, dtype=F64))
+    beta = 0.1
+    found = sample(lambda x: 1.0 - x[:, 2], rays, beta, dataclasses.replace(CONFIG, samples=512))
+    t = found.distances[0].numpy()
+    # The antiderivative of Ψ(t − 1)/β: ½ e^{(t−1)/β} before the plane, ½ e^{−(t−1)/β} + (t − 1)/β behind it.
+    depth = np.where(t < 1, 0.5 * np.exp((t - 1) / beta), 0.5 * np.exp(-(t - 1) / beta) + (t - 1) / beta)
+    share = (np.arange(512) + 0.5) / 512
+    assert np.abs(share + np.expm1(-(depth - 0.5 * math.exp(-1 / beta)))).max() <= found.error_bound.item()
+
+
+def test_queries_are_counted_and_asked_only_once():
+    asked = []
+
+    def recorded(x):
+        asked.append(x)
+        return sphere(x)
+
+    found = sample(recorded, ray_bundle(50), 0.01)
+    points = torch.cat(asked)
+    assert found.sdf_queries == len(points) / 50
+    assert len(points.unique(dim=0)) == len(points)
+    assert 128 <= found.sdf_queries < 128 * 6  # easy rays leave early
+
+
+def test_a_ray_does_not_depend_on_its_neighbours():
+    bundle = ray_bundle(20)
+    together = sample(sphere, bundle, 0.005)
+    for i in range(20):
+        alone = sample(sphere, [part[i : i + 1] for part in bundle], 0.005)
+        torch.testing.assert_close(together.distances[i : i + 1], alone.distances)
+        torch.testing.assert_close(together.error_bound[i : i + 1], alone.error_bound)
+
+
+def test_without_leaving_early_the_bound_is_met_as_well(monkeypatch):
+    monkeypatch.setattr(samplers, "can_leave_early", lambda device: False)
+    found = sample(sphere, ray_bundle(50), 0.01)
+    assert found.sdf_queries == 128 * (1 + 5)
+    assert (found.error_bound <= CONFIG.epsilon).all()
+    assert (found.distances.diff(dim=-1) >= 0.0).all()
+
+
+def test_new_cuts_pay_more_than_cuts_in_proportion_to_the_bound(monkeypatch):
+    """The rule of the paper, transcribed: it needs more queries for the same bound."""
+
+    def bound_itself(partition, beta):
+        error, depth = samplers.depth_error(partition, beta), samplers.optical_depth(partition, beta)
+        return torch.expm1(error.clamp_max(80.0)) * torch.exp(-depth)
+
+    ours = sample(sphere, ray_bundle(200), 0.01)
+    monkeypatch.setattr(samplers, "bound_shares", bound_itself)
+    papers = sample(sphere, ray_bundle(200), 0.01)
+    assert (ours.error_bound <= CONFIG.epsilon).float().mean() >= (papers.error_bound <= CONFIG.epsilon).float().mean()
+    assert ours.sdf_queries < papers.sdf_queries
+
+
+def test_middles_repeat_and_jitter_follows_the_seed():
+    rays = ray_bundle(4)
+    assert torch.equal(sample(sphere, rays, 0.02).distances, sample(sphere, rays, 0.02).distances)
+    draws = []
+    for seed in (1, 1, 2):
+        torch.manual_seed(seed)
+        draws.append(sample(sphere, rays, 0.02, stochastic=True).distances)
+    assert torch.equal(draws[0], draws[1])
+    assert not torch.equal(draws[0], draws[2])
+
+
+def test_nothing_is_differentiated():
+    beta = torch.tensor(0.02, dtype=F64, requires_grad=True)
+    found = error_bounded_samples(sphere, *ray_bundle(2), beta, CONFIG, True)
+    assert not found.distances.requires_grad
+    assert not found.error_bound.requires_grad
