@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 RUN := $(VENV)/bin
 
-.PHONY: demo demo-short test test-slow lint results clean
+.PHONY: demo demo-short test test-slow lint results clean test-nerfstudio
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(RUN)/python || $(PYTHON) -m venv $(VENV)
@@ -23,8 +23,22 @@ test: $(VENV)/.installed
 test-slow: $(VENV)/.installed
 	$(RUN)/python -m pytest -m slow
 
+# Nerfstudio pins another OpenCV, so it has an environment of its own.
+NERFSTUDIO := .venv-nerfstudio
+NERFSTUDIO_PINS := tests_nerfstudio/requirements.txt tests_nerfstudio/requirements-no-deps.txt
+
+$(NERFSTUDIO)/.installed: pyproject.toml $(NERFSTUDIO_PINS)
+	test -x $(NERFSTUDIO)/bin/python || $(PYTHON) -m venv $(NERFSTUDIO)
+	$(NERFSTUDIO)/bin/python -m pip install --quiet --disable-pip-version-check -r tests_nerfstudio/requirements.txt
+	$(NERFSTUDIO)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps \
+		-r tests_nerfstudio/requirements-no-deps.txt --editable .
+	touch $@
+
+test-nerfstudio: $(NERFSTUDIO)/.installed
+	$(NERFSTUDIO)/bin/python -m pytest tests_nerfstudio
+
 lint: $(VENV)/.installed
 	$(RUN)/ruff check .
 
 clean:
-	rm -rf $(VENV) build demo-run
+	rm -rf $(VENV) $(NERFSTUDIO) build demo-run

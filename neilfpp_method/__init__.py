@@ -16,7 +16,7 @@ _ROOMS = {
     "NeilfModel": "neilfpp_method.model",
     "attach_neilf": "neilfpp_method.attach",
     "load_run": "neilfpp_method.train.run",
-    "preset": "neilfpp_method.config",
+    "preset": "neilfpp_method.presets",
 }
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import io
+import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from contextlib import redirect_stderr
+from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,15 +16,17 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from neilfpp_method.config import NeilfConfig, preset
+from neilfpp_method.config import NeilfConfig
 from neilfpp_method.errors import EarlyEnd, Stopped, UserError
+from neilfpp_method.presets import fixed_geometry, preset
 
 __all__ = ["main"]
 
+DEFAULT_PRESET = "fast"
 Device = Annotated[str, tyro.conf.arg(metavar="cpu|cuda|cuda:N|auto")]
 
 
-# ---------------------------------------------------------------------------------------------------------------- options
+# -------------------------------------------------------------------------------------------------------------- options
 
 
 @dataclass
@@ -31,8 +37,12 @@ class Train:
     """The capture's folder. Not needed with --resume."""
     out: Path | None = None
     """The run's folder; none: runs/CAPTURE-PRESET."""
-    preset: str = "fast"
-    """fast (minutes on a laptop's CPU), paper-mlp or paper-ngp (the published settings)."""
+    preset: str | None = None
+    """fast (minutes on a laptop's CPU), paper-mlp or paper-ngp (the published settings); none: fast."""
+    host: Literal["volsdf", "mesh"] = "volsdf"
+    """Where geometry comes from: volsdf recovers it; mesh takes it as given and recovers material and light."""
+    mesh: Path | None = None
+    """The mesh of --host mesh, in the capture's world frame; none: the capture's inputs/model/mesh.ply."""
     resume: bool = False
     """Continue the run in --out from its last checkpoint, exactly as if it had never stopped."""
     test_every: int | None = None
@@ -109,16 +119,22 @@ class Demo:
     """Where to compute."""
 
 
-# --------------------------------------------------------------------------------------------------------------- commands
+# ------------------------------------------------------------------------------------------------------------- commands
 
 
 def run_train(options: Train) -> None:
     from neilfpp_method.train.command import run_training
 
+    config = options.config
+    if options.mesh is not None:
+        if config.host != "mesh":
+            raise UserError(f"--mesh {options.mesh}: the host {config.host} takes no mesh", "add --host mesh")
+        config = replace(config, mesh=replace(config.mesh, path=str(options.mesh.resolve())))
+    as_before = options.resume and options.preset is None and config == preset(DEFAULT_PRESET)
     run_training(
         data=options.data,
         out=options.out,
-        config=options.config,
+        config=None if as_before else config,
         resume=options.resume,
         test_every=options.test_every,
         response=options.response,
@@ -177,7 +193,8 @@ class _bar:
     """A progress bar that takes shares of the work done."""
 
     def __init__(self, title: str) -> None:
-        self.progress = Progress(TextColumn(title), BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeRemainingColumn())
+        share = TextColumn("{task.percentage:3.0f} %")
+        self.progress = Progress(TextColumn(title), BarColumn(), share, TimeRemainingColumn())
         self.task = self.progress.add_task(title, total=1.0)
 
     def __enter__(self) -> Callable[[float], None]:
@@ -209,14 +226,23 @@ COMMANDS = {
         [
             "neilfpp train --data captures/teapot",
             "neilfpp train --data captures/teapot --preset paper-ngp --out runs/teapot",
+            "neilfpp train --data captures/teapot --host mesh --mesh scans/teapot.ply",
             "neilfpp train --out runs/teapot --resume",
             "neilfpp train --data captures/teapot --config.train.joint-steps 0   (the separate pipeline)",
             "neilfpp train --data captures/teapot --config.inter-reflection.mode off",
         ],
     ),
-    "eval": Command(Eval, run_eval, ["neilfpp eval runs/teapot", "neilfpp eval runs/teapot --checkpoint material_init --out sep.json"]),
+    "eval": Command(
+        Eval,
+        run_eval,
+        ["neilfpp eval runs/teapot", "neilfpp eval runs/teapot --checkpoint material_init --out sep.json"],
+    ),
     "render": Command(Render, run_render, ["neilfpp render runs/teapot", "neilfpp render runs/teapot --views all"]),
-    "export": Command(Export, run_export, ["neilfpp export runs/teapot", "neilfpp export runs/teapot --resolution 512 --out teapot.ply"]),
+    "export": Command(
+        Export,
+        run_export,
+        ["neilfpp export runs/teapot", "neilfpp export runs/teapot --resolution 512 --out teapot.ply"],
+    ),
 }
 
 
@@ -226,7 +252,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview())
         return 0
-    errors = Console(stderr=True)
+    # Beside the first process of a parallel run the others keep silent, and leave the status to it.
+    first = os.environ.get("LOCAL_RANK", "0") == "0"
+    errors = Console(stderr=True, quiet=not first)
     name, rest = arguments[0], arguments[1:]
     try:
         if name == "--version":
@@ -239,8 +267,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command = COMMANDS[name]
         command.run(_parse(name, command, rest))
     except EarlyEnd as end:
-        errors.print(f"{'error: ' if end.status != Stopped.status else ''}{end}", highlight=False, soft_wrap=True, markup=False)
-        return end.status
+        text = str(end) if isinstance(end, Stopped) else f"error: {end}"
+        errors.print(text, highlight=False, soft_wrap=True, markup=False)
+        return end.status if first else 0
+    except SystemExit:  # tyro has shown a command's help
+        return 0
     except KeyboardInterrupt:
         errors.print("stopped")
         return Stopped.status
@@ -251,9 +282,30 @@ def _parse(name: str, command: Command, arguments: Sequence[str]) -> Any:
     description = f"{command.summary}\n\nExamples:\n" + "\n".join(f"  {example}" for example in command.examples)
     defaults = {}
     if command.options is Train:
-        # The preset decides the defaults of all other settings, so it is read first.
-        defaults = {"default": Train(config=preset(_option(arguments, "--preset") or "fast"))}
-    return tyro.cli(command.options, args=arguments, prog=f"neilfpp {name}", description=description, **defaults)
+        # Preset and host decide the defaults of all other settings, so they are read first.
+        start = _starting_point(_option(arguments, "--preset"), _option(arguments, "--host"))
+        defaults = {"default": Train(config=start)}
+    known = {"args": arguments, "prog": f"neilfpp {name}", "description": description, **defaults}
+    complaint = io.StringIO()
+    try:
+        with redirect_stderr(complaint):
+            return tyro.cli(command.options, **known)
+    except SystemExit as end:
+        if not complaint.getvalue():  # --help
+            raise
+        raise UserError(_first_paragraph(complaint.getvalue()), f"see neilfpp {name} --help") from end
+
+
+def _starting_point(name: str | None, host: str | None) -> NeilfConfig:
+    """The settings of a preset for a host."""
+    config = preset(name or DEFAULT_PRESET)
+    return fixed_geometry(config) if host == "mesh" else config
+
+
+def _first_paragraph(boxed: str) -> str:
+    """What a complaint says first, as one line, without the box around it."""
+    lines = [line.strip("│ ") for line in boxed.splitlines() if line.startswith("│")] or boxed.split("\n")
+    return " ".join(takewhile(lambda line: line.strip("─"), lines)).rstrip(".")
 
 
 def _option(arguments: Sequence[str], name: str) -> str | None:

@@ -1,4 +1,4 @@
-"""Every setting, one dataclass per room, and the presets.
+"""Every setting, one dataclass per room; `presets.py` has the sets of them.
 
 Lengths are in scene units (the object lies in the unit sphere). A setting with `kind`, `mode` or a `bool` is a switch: an
 effect that is switched off asks no network and traces no ray.
@@ -7,13 +7,13 @@ effect that is switched off asks no network and traces no ray.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
 from neilfpp_method.errors import UserError
 
-__all__ = ["PRESETS", "NeilfConfig", "from_dict", "preset", "to_dict"]
+__all__ = ["NeilfConfig", "from_dict", "to_dict"]
 
 
 # ---------------------------------------------------------------------------------------------------------------- fields
@@ -61,8 +61,10 @@ class SdfConfig:
 class OutgoingRadianceConfig:
     """R: position, direction, normal and feature of G → linear RGB (METHOD §5)."""
 
-    encoding: Literal["raw", "hash"] = "raw"
+    encoding: Literal["raw", "frequency", "hash"] = "raw"
     """How positions are encoded."""
+    frequencies: int = 6
+    """Octaves of the frequency encoding of positions."""
     grid: HashGridConfig = field(default_factory=HashGridConfig)
     """The grid, where `encoding` is hash."""
     direction_encoding: Literal["frequency", "spherical_harmonics"] = "frequency"
@@ -74,7 +76,7 @@ class OutgoingRadianceConfig:
     width: int = 256
     """Units of a hidden layer."""
     scale: float | None = None
-    """Largest radiance that the sigmoid can reach; none: 1 for LDR, 3 for HDR captures (METHOD §5), more where the images hold more."""
+    """Largest radiance that the sigmoid can reach; none: 1 for LDR, 3 for HDR captures, more where the images hold more."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,10 @@ class BrdfConfig:
 class IncidentLightConfig:
     """L: position, direction → linear RGB that arrives (METHOD §5): sharp in direction, smooth in position."""
 
+    kind: Literal["free", "distant"] = "free"
+    """free: the paper's field, its own light at every point. distant: an environment map, with inter-reflection hard or off."""
+    environment_height: int = 32
+    """Rows of the environment map; it has twice as many columns."""
     activation: Literal["sine", "relu"] = "sine"
     """Hidden units; sine is SIREN's, with ω = 30."""
     direction_encoding: Literal["frequency", "spherical_harmonics"] = "frequency"
@@ -122,7 +128,8 @@ class BackgroundConfig:
     """What a ray sees beyond the scene."""
 
     kind: Literal["auto", "none", "constant", "inverted_sphere"] = "auto"
-    """none: the scene sphere is a surface that closes the scene (VolSDF). constant: one colour. inverted_sphere: a NeRF++ field. auto: constant where the borders of the images are of one colour, else inverted_sphere."""
+    """none: the scene sphere is a surface that closes the scene (VolSDF). constant: one colour. inverted_sphere: a NeRF++
+    field. auto: constant where the borders of the images are of one colour, else inverted_sphere."""
     color: tuple[float, float, float] | None = None
     """Linear RGB of a constant background; none: read from the borders of the images."""
     layers: int = 8
@@ -133,7 +140,17 @@ class BackgroundConfig:
     """Samples per ray beyond the scene sphere."""
 
 
-# ---------------------------------------------------------------------------------------------------------------- volume
+# ---------------------------------------------------------------------------------------------------------------- hosts
+
+
+@dataclass(frozen=True)
+class MeshConfig:
+    """The mesh host: geometry is given."""
+
+    path: str | None = None
+    """The triangle mesh, in the world frame of the capture; none: the capture's inputs/model/mesh.ply."""
+    smooth_normals: bool = True
+    """Normals interpolated between the vertices; off: those of the triangles."""
 
 
 @dataclass(frozen=True)
@@ -174,23 +191,24 @@ class ShadingConfig:
     specular: bool = True
     """Off: a Lambertian surface; roughness and metallic are not asked for."""
     sampler: Literal["fibonacci", "cosine", "lobe", "mis"] = "fibonacci"
-    """Who draws the incident directions: the paper's lattice, a cosine, the specular lobe, or cosine and lobe together by the balance heuristic."""
+    """Who draws the incident directions: the paper's lattice, a cosine, the specular lobe, or cosine, lobe and (where it can
+    be sampled) light together by the balance heuristic."""
     train_samples: int = 128
     """Incident directions per point in training."""
     eval_samples: int = 256
     """Incident directions per point in evaluation."""
     hit_share: float = 0.8
     """Least concentration of a ray's blending weight that makes its hit a surface point; the others are not shaded."""
-    response: Literal["auto", "linear", "srgb"] = "auto"
-    """What a pixel is of radiance: the same (HDR), or clipped and sRGB-encoded (LDR). auto: from the files."""
 
 
 @dataclass(frozen=True)
 class InterReflectionConfig:
     """L_ref: what arrives from another surface is what that surface sends (METHOD §2)."""
 
-    mode: Literal["off", "soft"] = "soft"
-    """soft: the paper's loss."""
+    mode: Literal["off", "soft", "hard"] = "soft"
+    """soft: the paper's loss. hard: a direction that meets the scene brings what R says there; only the others ask the light."""
+    grid_resolution: int = 96
+    """Vertices along an edge of the grid that hard inter-reflection traces in a distance field."""
     rays_per_point: float = 1.0
     """Traced directions per surface point and step, in expectation."""
     radiance_gradient: float = 0.0
@@ -208,6 +226,9 @@ class InterReflectionConfig:
 class LossConfig:
     """Weights of the losses (METHOD §4); `schedule.py` says in which stage each counts. 0 switches a loss off."""
 
+    unit: Literal["activation", "median"] = "activation"
+    """What radiance is measured in. activation: L_vol in the range of R's output, all else absolute, as the paper has it.
+    median: all in the median of the images, so that the weights do not depend on the exposure."""
     volume: float = 1.0
     physical: float = 1.0
     eikonal: float = 0.1
@@ -220,7 +241,7 @@ class LossConfig:
     smoothness: float = 5e-4
     lambertian: float = 5e-4
     mask: float = 0.0
-    """Binary cross-entropy between opacity and the object mask, where the capture has masks."""
+    """Opacity against the object mask, where the capture has masks or shows exactly its background."""
     hessian_method: Literal["analytic", "finite_difference"] = "analytic"
     """How second derivatives of G are taken."""
     surface_epsilon: float = 0.05
@@ -275,74 +296,20 @@ class NeilfConfig:
 
     preset: str = "paper-mlp"
     """The preset that the settings started from; a label."""
+    host: Literal["volsdf", "mesh"] = "volsdf"
+    """Where geometry comes from: volsdf trains a distance field; mesh takes triangles as they are."""
     sdf: SdfConfig = field(default_factory=SdfConfig)
     radiance: OutgoingRadianceConfig = field(default_factory=OutgoingRadianceConfig)
     brdf: BrdfConfig = field(default_factory=BrdfConfig)
     light: IncidentLightConfig = field(default_factory=IncidentLightConfig)
     background: BackgroundConfig = field(default_factory=BackgroundConfig)
     volume: VolumeConfig = field(default_factory=VolumeConfig)
+    mesh: MeshConfig = field(default_factory=MeshConfig)
     shading: ShadingConfig = field(default_factory=ShadingConfig)
     inter_reflection: InterReflectionConfig = field(default_factory=InterReflectionConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
-
-
-# --------------------------------------------------------------------------------------------------------------- presets
-
-
-def paper_mlp() -> NeilfConfig:
-    """The paper's MLP setting: 80k steps, 24 h on a V100."""
-    return NeilfConfig()
-
-
-def paper_ngp() -> NeilfConfig:
-    """The paper's hash-grid setting: 30k steps, 4 h on a V100; it asks for a point cloud in SDF init."""
-    return NeilfConfig(
-        preset="paper-ngp",
-        sdf=SdfConfig(encoding="hash", layers=2, width=64, skip=None, feature_width=15),
-        radiance=OutgoingRadianceConfig(encoding="hash", layers=4, width=64, direction_encoding="spherical_harmonics"),
-        brdf=BrdfConfig(encoding="hash", activation="relu", layers=2, width=64, skip=None),
-        light=IncidentLightConfig(activation="relu", direction_encoding="spherical_harmonics", direction_degree=5),
-        loss=LossConfig(
-            point_cloud=0.1, position_gradient=0.0, normal_gradient=0.1, hessian_method="finite_difference"
-        ),
-        optimizer=OptimizerConfig(geometry=1e-2, radiance=1e-2, brdf=1e-2, light=1e-3, background=1e-3, beta=1e-3),
-        train=TrainConfig(sdf_steps=15_000, material_steps=7_500, joint_steps=7_500),
-    )
-
-
-def fast() -> NeilfConfig:
-    """Minutes on the two cores of a laptop: the same method with small hash grids and few rays."""
-    grid = HashGridConfig(levels=8, log2_entries=16, base_resolution=16, max_resolution=256)
-    return NeilfConfig(
-        preset="fast",
-        sdf=SdfConfig(encoding="hash", grid=grid, layers=1, width=64, skip=None, feature_width=15),
-        radiance=OutgoingRadianceConfig(layers=2, width=64, direction_encoding="spherical_harmonics"),
-        brdf=BrdfConfig(encoding="hash", grid=grid, activation="relu", layers=2, width=64, skip=None),
-        light=IncidentLightConfig(layers=4, width=64, direction_encoding="spherical_harmonics", direction_degree=5),
-        background=BackgroundConfig(layers=4, width=64, samples=16),
-        volume=VolumeConfig(radius=1.75, initial_samples=64, rounds=2, samples=32),
-        shading=ShadingConfig(sampler="mis", train_samples=32, eval_samples=128),
-        inter_reflection=InterReflectionConfig(rays_per_point=0.25),
-        loss=LossConfig(position_gradient=0.0, normal_gradient=0.1, hessian_method="finite_difference"),
-        optimizer=OptimizerConfig(geometry=1e-2, radiance=5e-3, brdf=1e-2, light=1e-3, background=5e-3, beta=5e-3),
-        train=TrainConfig(sdf_steps=1_000, material_steps=600, joint_steps=300, rays=512),
-    )
-
-
-PRESETS: Mapping[str, Callable[[], NeilfConfig]] = {"fast": fast, "paper-mlp": paper_mlp, "paper-ngp": paper_ngp}
-
-
-def preset(name: str) -> NeilfConfig:
-    """The settings of a preset by name.
-
-    Raises:
-        UserError: no preset has this name.
-    """
-    if name not in PRESETS:
-        raise UserError(f"unknown preset '{name}'", f"choose one of {', '.join(PRESETS)}")
-    return PRESETS[name]()
 
 
 # ---------------------------------------------------------------------------------------------------------- to and from JSON
@@ -372,8 +339,22 @@ def from_dict(kind: type[Config], values: Mapping[str, Any], where: str = "confi
             value = from_dict(hints[name], value, f"{where}.{name}")
         elif isinstance(value, list):
             value = tuple(value)
-        choices = get_args(hints[name])
-        if choices and all(isinstance(c, str) for c in choices) and value not in choices:
-            raise UserError(f"{where}.{name}: '{value}' is not a choice", f"choose one of {', '.join(choices)}")
+        else:
+            _check(value, hints[name], f"{where}.{name}")
         arguments[name] = value
     return kind(**arguments)
+
+
+def _check(value: Any, hint: Any, where: str) -> None:
+    """That a JSON value is one of the choices, or of one of the plain types, that a hint names."""
+    choices = get_args(hint)
+    if choices and all(isinstance(choice, str) for choice in choices):
+        if value not in choices:
+            raise UserError(f"{where}: '{value}' is not a choice", f"choose one of {', '.join(choices)}")
+        return
+    plain = [kind for kind in choices or (hint,) if isinstance(kind, type)]
+    # JSON has one kind of number, and bool is an int to Python but to nobody else.
+    fits = any(isinstance(value, (int, float) if kind is float else kind) for kind in plain)
+    if plain and (not fits or (isinstance(value, bool) and bool not in plain)):
+        names = " or ".join("nothing" if kind is type(None) else kind.__name__ for kind in plain)
+        raise UserError(f"{where}: {value!r} where {names} belongs", "correct the file, or train again")

@@ -8,9 +8,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from neilfpp_method.config import NeilfConfig, preset
+from neilfpp_method.config import NeilfConfig
 from neilfpp_method.evaluate.protocols import evaluate, write_metrics
 from neilfpp_method.evaluate.report import write_report
+from neilfpp_method.presets import preset
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.run import load_run, read_json
 
@@ -46,13 +47,14 @@ def run_demo(out: Path, *, short: bool, resume: bool, device: str, console: Cons
     run_training(
         data=demo_scene(),
         out=out,
-        config=demo_config(short),
+        config=None if resume else demo_config(short),
         resume=resume,
         test_every=None,
         response="auto",
         device=device,
         devices=1,
         console=console,
+        command="neilfpp demo",
     )
     run = load_run(out)
     console.print("measuring on the test views …")

@@ -10,12 +10,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from neilfpp_method.config import InterReflectionConfig
-from neilfpp_method.hosts.base import HasSurfaceWidth, Host
+from neilfpp_method.hosts.base import HasSurfaceWidth, Host, LightsItself
 from neilfpp_method.losses import scale_gradient
 from neilfpp_method.shading.frame import local_frame
-from neilfpp_method.structures import RayBatch
+from neilfpp_method.structures import RayBatch, SceneLight
 
-__all__ = ["TracedLight", "trace_light"]
+__all__ = ["TracedLight", "scene_light", "trace_light"]
 
 # A layer of scale β still absorbs along a ray that leaves it: from a height h, the optical depth is exp(−h/β) / (2 cos θ).
 # Four scales up it is 1 % along the normal and 5 % at 80°.
@@ -62,6 +62,25 @@ def trace_light(
         hits = host.render(RayBatch(start, wi))
     radiance = scale_gradient(hits.color, config.radiance_gradient)
     return TracedLight(position, wi, radiance, hits.is_hit(hit_share))
+
+
+@torch.no_grad()
+def scene_light(
+    host: Host,
+    x: Float[Tensor, "N 3"],
+    wi: Float[Tensor, "N S 3"],
+    config: InterReflectionConfig,
+    hit_share: float,
+) -> SceneLight:
+    """What the scene itself sends to surface points: by the host's own tracing, or by rendering all N·S rays."""
+    x = x.detach()
+    if isinstance(host, LightsItself):
+        return host.scene_light(x, wi)
+    start = x[:, None] + config.offset * wi
+    hits = host.render(RayBatch(start.reshape(-1, 3), wi.reshape(-1, 3)))
+    hit = hits.is_hit(hit_share)
+    radiance = torch.where(hit[:, None], hits.color, 0.0)
+    return SceneLight(hit.view(wi.shape[:2]), radiance.view(wi.shape))
 
 
 def _random_rows(points: int, per_point: float, device: torch.device) -> Tensor:

@@ -30,8 +30,7 @@ def photometric(
     radiance: Float[Tensor, "N 3"],
     pixel: Float[Tensor, "N 3"],
     response: str,
-    weights: Float[Tensor, " N"] | None = None,
-    scale: float = 1.0,
+    unit: float = 1.0,
 ) -> LossTerm:
     """L_vol and L_phys: L1 between a render and the pixel.
 
@@ -39,17 +38,18 @@ def photometric(
         radiance: what the model sees, linear.
         pixel: what the file holds, in the capture's `response`.
         response: "linear" compares radiance; "srgb" clips the render and encodes it first (METHOD §6).
-        weights: how much each ray counts.
-        scale: divides the loss, so that an output activation of that range keeps the size of its gradient.
+        unit: what the difference is measured in: with the range of an output activation, the gradient keeps its size.
     """
-    difference = (apply_response(radiance, response) - pixel).abs() / scale
-    return LossTerm(difference, None if weights is None else weights[:, None])
+    return LossTerm((apply_response(radiance, response) - pixel).abs() / unit)
 
 
-def mask(opacity: Float[Tensor, " N"], object_mask: Float[Tensor, " N"]) -> LossTerm:
-    """Binary cross-entropy between a ray's opacity and the capture's object mask (IDR eq. 7, for volumes)."""
-    bounded = opacity.clamp(1e-4, 1.0 - 1e-4)
-    return LossTerm(functional.binary_cross_entropy(bounded, object_mask, reduction="none"))
+def mask(opacity: Float[Tensor, " N"], object_mask: Float[Tensor, " N"], known: Float[Tensor, " N"]) -> LossTerm:
+    """L1 between a ray's opacity and the object mask, where the mask is known.
+
+    Not the cross-entropy of IDR: its gradient grows without bound where an opaque surface meets a mask of 0, which is what
+    a mask that is wrong by a pixel brings about along every silhouette.
+    """
+    return LossTerm((opacity - object_mask).abs() * known)
 
 
 def eikonal(gradient: Float[Tensor, "P 3"]) -> LossTerm:
@@ -62,7 +62,7 @@ def hessian(matrix: Float[Tensor, "P 3 3"]) -> LossTerm:
     return LossTerm(matrix.abs())
 
 
-def surface(distance: Float[Tensor, "..."], epsilon: float) -> LossTerm:
+def surface(distance: Float[Tensor, ...], epsilon: float) -> LossTerm:
     """L_surf = δ_ε(G), δ_ε(z) = ε / (π (ε² + z²)): the area of the zero set, against surfaces that no image asks for."""
     return LossTerm(epsilon / (math.pi * (epsilon**2 + distance**2)))
 
@@ -75,9 +75,9 @@ def point_cloud(
     return LossTerm(distance.abs() + (1.0 - cosine))
 
 
-def inter_reflection(incident: Float[Tensor, "K 3"], outgoing: Float[Tensor, "K 3"]) -> LossTerm:
-    """L_ref = ‖L(x₁, ωi) − R(x₂, −ωi)‖₁ for rays that leave x₁ along ωi and meet the surface at x₂ (METHOD §2)."""
-    return LossTerm((incident - outgoing).abs())
+def inter_reflection(incident: Float[Tensor, "K 3"], outgoing: Float[Tensor, "K 3"], unit: float = 1.0) -> LossTerm:
+    """L_ref = ‖L(x₁, ωi) − R(x₂, −ωi)‖₁ for rays that leave x₁ along ωi and meet the surface at x₂, in a unit of radiance."""
+    return LossTerm((incident - outgoing).abs() / unit)
 
 
 def smoothness(

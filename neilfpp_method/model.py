@@ -16,16 +16,19 @@ from torch import Tensor, nn
 from neilfpp_method import losses
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.fields.brdf import BrdfField
+from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.incident_light import IncidentLightField
-from neilfpp_method.hosts.base import HasParameterGroups, Host, Regularised
-from neilfpp_method.inter_reflection import trace_light
-from neilfpp_method.schedule import STAGES, Stage, active_losses
+from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised
+from neilfpp_method.hosts.outputs import OutputCheck
+from neilfpp_method.inter_reflection import scene_light, trace_light
+from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, active_losses
 from neilfpp_method.shading.brdf import LOBES
+from neilfpp_method.shading.color import apply_response
 from neilfpp_method.shading.rendering_equation import shade
-from neilfpp_method.shading.sampling import sample_directions
-from neilfpp_method.structures import LossTerm, Material, PixelBatch, RayBatch, Shading, SurfaceHits
+from neilfpp_method.shading.sampling import pdf_mis, sample_directions
+from neilfpp_method.structures import IncidentSamples, LossTerm, Material, PixelBatch, RayBatch, Shading, SurfaceHits
 
-__all__ = ["Maps", "NeilfModel", "SceneFacts"]
+__all__ = ["Maps", "NeilfModel", "RadianceUnits", "SceneFacts"]
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,23 @@ class Maps:
     opacity: Float[Tensor, "N 1"]
 
 
+@dataclass(frozen=True)
+class RadianceUnits:
+    """What the losses on radiance are measured in, each in the units that it compares (METHOD §4, last line)."""
+
+    volume: float
+    physical: float
+    incident: float
+
+
+def radiance_units(config: NeilfConfig, facts: SceneFacts) -> RadianceUnits:
+    """The units that `config.loss.unit` names."""
+    if config.loss.unit == "activation":
+        return RadianceUnits(facts.radiance_scale, 1.0, 1.0)
+    pixel = apply_response(torch.tensor(facts.median_radiance), facts.response).item()
+    return RadianceUnits(pixel, pixel, facts.median_radiance)
+
+
 class NeilfModel(nn.Module):
     """The method on top of any host.
 
@@ -70,17 +90,31 @@ class NeilfModel(nn.Module):
         host: renders rays (`hosts.base.Host`); its parameters train with ours where it offers `parameter_groups`.
         config: the settings.
         facts: what the images decided.
+        borrowed: the host belongs to another trainer. Its parameters, its device and its mode are then none of this
+            module's, though gradients reach it in the joint stage.
     """
 
-    def __init__(self, host: Host, config: NeilfConfig, facts: SceneFacts) -> None:
+    def __init__(self, host: Host, config: NeilfConfig, facts: SceneFacts, borrowed: bool = False) -> None:
         super().__init__()
-        self.host = host
+        if borrowed:
+            object.__setattr__(self, "host", host)  # past nn.Module, which would take it in
+        else:
+            self.host = host
+        self.borrowed = borrowed
+        self.stages = host.stages if isinstance(host, HasStages) else BORROWED_HOST if borrowed else STAGES
+        self.check_outputs = OutputCheck(host, config.shading.hit_share)
         self.config = config
         self.facts = facts
+        self.units = radiance_units(config, facts)
         self.lobe = LOBES[config.shading.lobe]
         self.brdf = BrdfField(config.brdf, config.volume.radius)
         base = config.light.base or (10.0 if facts.response == "linear" else math.e)
-        self.light = IncidentLightField(config.light, base, facts.median_radiance / self._first_albedo())
+        first_radiance = facts.median_radiance / self._first_albedo()
+        self.light: IncidentLightField | EnvironmentLight
+        if config.light.kind == "distant":
+            self.light = EnvironmentLight(config.light.environment_height, first_radiance)
+        else:
+            self.light = IncidentLightField(config.light, base, first_radiance)
 
     # -------------------------------------------------------------------------------------------------------- one step
 
@@ -90,16 +124,16 @@ class NeilfModel(nn.Module):
 
     def losses(self, batch: PixelBatch, stage: Stage) -> Mapping[str, LossTerm]:
         """The losses that count in a stage, for a batch of pixels."""
-        names = active_losses(stage, self.config)
-        plan = STAGES[stage]
+        names = active_losses(stage, self.config, self.stages)
+        plan = self.stages[stage]
+        if not names:
+            return {}
 
         # 1. The host renders colour, hit position and normal. Without a geometry stage they are constants.
-        with torch.set_grad_enabled(torch.is_grad_enabled() and plan.moves_geometry):
+        with torch.set_grad_enabled(torch.is_grad_enabled() and plan.moves_host):
             hits, terms = self._render_host(batch, names)
         if "volume" in names:
-            terms["volume"] = losses.photometric(
-                hits.color, batch.color, self.facts.response, scale=self.facts.radiance_scale
-            )
+            terms["volume"] = losses.photometric(hits.color, batch.color, self.facts.response, self.units.volume)
         if not plan.moves_material:
             return terms
 
@@ -112,7 +146,7 @@ class NeilfModel(nn.Module):
 
         # 4. The incident light field says what arrives. 5. The rendering equation says what leaves.
         shading = self.shade(position, normal, -pixels.directions, material, self.config.shading.train_samples)
-        terms["physical"] = losses.photometric(shading.color, pixels.color, self.facts.response)
+        terms["physical"] = losses.photometric(shading.color, pixels.color, self.facts.response, self.units.physical)
 
         # 6. What arrives from another surface is what that surface sends.
         if "inter_reflection" in names:
@@ -122,8 +156,11 @@ class NeilfModel(nn.Module):
     def _render_host(self, batch: PixelBatch, names: Mapping[str, float]) -> tuple[SurfaceHits, dict[str, LossTerm]]:
         if isinstance(self.host, Regularised):
             rendered = self.host.render_regularised(batch, names)
-            return rendered.hits, dict(rendered.terms)
-        return self.host.render(batch.rays), {}
+            hits, terms = rendered.hits, dict(rendered.terms)
+        else:
+            hits, terms = self.host.render(batch.rays), {}
+        self.check_outputs(batch.rays, hits, color_moves="volume" in names and torch.is_grad_enabled())
+        return hits, terms
 
     def _surface_points(self, hits: SurfaceHits, rows: Tensor) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
         settings = self.config.loss
@@ -157,7 +194,7 @@ class NeilfModel(nn.Module):
         )
         hit = torch.nonzero(traced.hit)[:, 0]
         incident = self.light.radiance(traced.position[hit], traced.wi[hit][:, None])[:, 0]
-        return losses.inter_reflection(incident, traced.radiance[hit])
+        return losses.inter_reflection(incident, traced.radiance[hit], self.units.incident)
 
     # ------------------------------------------------------------------------------------------------------- the parts
 
@@ -166,8 +203,13 @@ class NeilfModel(nn.Module):
         return self.brdf(x)
 
     def incident_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
-        """Linear radiance that arrives at x from wi."""
-        return self.light.radiance(x, wi)
+        """Linear radiance that arrives at x from wi: from the light, or in hard inter-reflection from the scene before it."""
+        if self.config.inter_reflection.mode != "hard":
+            return self.light.radiance(x, wi)
+        scene = scene_light(self.host, x, wi, self.config.inter_reflection, self.config.shading.hit_share)
+        point, direction = torch.nonzero(~scene.hit, as_tuple=True)
+        light = self.light.radiance(x[point], wi[point, direction][:, None])[:, 0]
+        return scene.radiance.index_put((point, direction), light)
 
     def shade(
         self,
@@ -182,11 +224,28 @@ class NeilfModel(nn.Module):
         # Without a lobe there is nothing for a lobe to sample: the cosine has no variance left that light does not bring.
         without_lobe = {"mis": "cosine", "lobe": "cosine"}
         sampler = settings.sampler if settings.specular else without_lobe.get(settings.sampler, settings.sampler)
-        drawn = sample_directions(
-            sampler, normal.detach(), wo, material.roughness.detach(), samples, self.lobe, self.training
-        )
-        incident = self.light.radiance(position, drawn.wi)
+        about, roughness = normal.detach(), material.roughness.detach()
+        drawn = self._sample(sampler, about, wo, roughness, samples)
+        incident = self.incident_light(position, drawn.wi)
         return shade(material, normal, wo, drawn, incident, self.lobe, settings.specular)
+
+    def _sample(
+        self,
+        sampler: str,
+        normal: Float[Tensor, "N 3"],
+        wo: Float[Tensor, "N 3"],
+        roughness: Float[Tensor, "N 1"],
+        count: int,
+    ) -> IncidentSamples:
+        """Directions by the sampler of the settings; "mis" also asks a light that can be sampled, for a third of them."""
+        if sampler != "mis" or not isinstance(self.light, EnvironmentLight):
+            return sample_directions(sampler, normal, wo, roughness, count, self.lobe, self.training)
+        bright = self.light.sample(normal, count // 3, self.training)
+        others = sample_directions(sampler, normal, wo, roughness, count - count // 3, self.lobe, self.training)
+        wi = torch.cat((bright.wi, others.wi), 1)
+        share = (count // 3) / count
+        pdf = share * self.light.pdf(wi) + (1 - share) * pdf_mis(wi, normal, wo, roughness, self.lobe)
+        return IncidentSamples(wi, pdf)
 
     @torch.no_grad()
     def maps(self, rays: RayBatch, with_material: bool = True) -> Maps:
@@ -216,15 +275,16 @@ class NeilfModel(nn.Module):
     # ------------------------------------------------------------------------------------------------------- parameters
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Parameters by field, the host's among them where it offers them."""
-        host = self.host.parameter_groups() if isinstance(self.host, HasParameterGroups) else {}
+        """Parameters by field, the host's among them where it offers them and is not borrowed."""
+        offered = isinstance(self.host, HasParameterGroups) and not self.borrowed
+        host = self.host.parameter_groups() if offered else {}
         return {**host, "brdf": list(self.brdf.parameters()), "light": list(self.light.parameters())}
 
     def freeze_for(self, stage: Stage) -> None:
         """Let exactly the fields move that the stage moves; the others get no gradient."""
         for name, parameters in self.parameter_groups().items():
             for parameter in parameters:
-                parameter.requires_grad_(name in STAGES[stage].moves)
+                parameter.requires_grad_(name in self.stages[stage].moves)
                 parameter.grad = None
 
     def _first_albedo(self) -> float:

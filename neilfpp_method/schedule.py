@@ -4,6 +4,9 @@
     SDF init         -     x     x     x      x     (x)    -      -      -   | G, R
     material init    x     -     -     -      -      -     x      x      x   | B, L
     joint            x     x     x     low    low    -     x      x      x   | G, R, B, L
+
+Two more tables are for hosts whose geometry is not ours to train: where it is given, R is a surface light field and
+moves with the material; where the host belongs to another trainer, that one sees to the first stage.
 """
 
 from __future__ import annotations
@@ -18,7 +21,20 @@ from torch import Tensor
 from neilfpp_method.config import NeilfConfig, TrainConfig
 from neilfpp_method.structures import LossTerms
 
-__all__ = ["STAGES", "Stage", "StagePlan", "StagePosition", "Total", "active_losses", "stage_at", "stage_steps", "weigh"]
+__all__ = [
+    "BORROWED_HOST",
+    "FIXED_GEOMETRY",
+    "STAGES",
+    "Stage",
+    "StagePlan",
+    "StagePosition",
+    "StageTable",
+    "Total",
+    "active_losses",
+    "stage_at",
+    "stage_steps",
+    "weigh",
+]
 
 
 class Stage(str, Enum):
@@ -29,8 +45,12 @@ class Stage(str, Enum):
     JOINT = "joint"
 
 
-GEOMETRY = frozenset({"geometry", "beta", "radiance", "background"})
+LIGHT_FIELD = frozenset({"radiance", "background"})
+GEOMETRY = LIGHT_FIELD | {"geometry", "beta"}
 MATERIAL = frozenset({"brdf", "light"})
+
+# Each loss of the material stages with the setting that weighs it.
+MATERIAL_LOSSES = {name: name for name in ("physical", "inter_reflection", "smoothness", "lambertian")}
 
 
 @dataclass(frozen=True)
@@ -41,7 +61,7 @@ class StagePlan:
     moves: frozenset[str]
 
     @property
-    def moves_geometry(self) -> bool:
+    def moves_host(self) -> bool:
         return bool(self.moves & GEOMETRY)
 
     @property
@@ -49,7 +69,9 @@ class StagePlan:
         return bool(self.moves & MATERIAL)
 
 
-STAGES: Mapping[Stage, StagePlan] = {
+StageTable = Mapping[Stage, StagePlan]
+
+STAGES: StageTable = {
     Stage.SDF_INIT: StagePlan(
         weights={
             "volume": "volume",
@@ -61,15 +83,7 @@ STAGES: Mapping[Stage, StagePlan] = {
         },
         moves=GEOMETRY,
     ),
-    Stage.MATERIAL_INIT: StagePlan(
-        weights={
-            "physical": "physical",
-            "inter_reflection": "inter_reflection",
-            "smoothness": "smoothness",
-            "lambertian": "lambertian",
-        },
-        moves=MATERIAL,
-    ),
+    Stage.MATERIAL_INIT: StagePlan(weights=MATERIAL_LOSSES, moves=MATERIAL),
     Stage.JOINT: StagePlan(
         weights={
             "volume": "volume",
@@ -77,13 +91,26 @@ STAGES: Mapping[Stage, StagePlan] = {
             "eikonal": "eikonal",
             "hessian": "hessian_joint",
             "surface": "surface_joint",
-            "physical": "physical",
-            "inter_reflection": "inter_reflection",
-            "smoothness": "smoothness",
-            "lambertian": "lambertian",
+            **MATERIAL_LOSSES,
         },
         moves=GEOMETRY | MATERIAL,
     ),
+}
+
+TOGETHER = StagePlan({"volume": "volume", **MATERIAL_LOSSES}, LIGHT_FIELD | MATERIAL)
+
+# Geometry is given (a mesh). The first stage, where somebody wants it, is R alone.
+FIXED_GEOMETRY: StageTable = {
+    Stage.SDF_INIT: StagePlan({"volume": "volume"}, LIGHT_FIELD),
+    Stage.MATERIAL_INIT: TOGETHER,
+    Stage.JOINT: TOGETHER,
+}
+
+# Somebody else trains the host. Nothing is computed before there is a material, so that adding it on costs nothing.
+BORROWED_HOST: StageTable = {
+    Stage.SDF_INIT: StagePlan({}, frozenset()),
+    Stage.MATERIAL_INIT: STAGES[Stage.MATERIAL_INIT],
+    Stage.JOINT: StagePlan({"volume": "volume", **MATERIAL_LOSSES}, GEOMETRY | MATERIAL),
 }
 
 
@@ -117,13 +144,13 @@ def stage_at(step: int, config: TrainConfig) -> StagePosition:
     return StagePosition(stage, length, length)
 
 
-def active_losses(stage: Stage, config: NeilfConfig) -> Mapping[str, float]:
+def active_losses(stage: Stage, config: NeilfConfig, stages: StageTable = STAGES) -> Mapping[str, float]:
     """The losses that count in a stage, with their weights.
 
     One of weight 0, or whose effect is switched off, is absent: nothing computes it.
     """
-    weights = {loss: getattr(config.loss, setting) for loss, setting in STAGES[stage].weights.items()}
-    if config.inter_reflection.mode == "off":
+    weights = {loss: getattr(config.loss, setting) for loss, setting in stages[stage].weights.items()}
+    if config.inter_reflection.mode != "soft":
         weights.pop("inter_reflection", None)
     if not config.shading.specular:
         # A Lambertian surface has neither roughness nor metallic to keep smooth or to pull back.

@@ -14,7 +14,19 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-__all__ = ["IncidentSamples", "Indexable", "LossTerm", "LossTerms", "Material", "OrientedPoints", "PixelBatch", "RayBatch", "Shading", "SurfaceHits"]
+__all__ = [
+    "IncidentSamples",
+    "Indexable",
+    "LossTerm",
+    "LossTerms",
+    "Material",
+    "OrientedPoints",
+    "PixelBatch",
+    "RayBatch",
+    "SceneLight",
+    "Shading",
+    "SurfaceHits",
+]
 
 Structure = TypeVar("Structure", bound="Indexable")
 
@@ -52,14 +64,16 @@ class PixelBatch(Indexable):
     """Rays with what the images say about them.
 
     `color` is what the file holds: linear radiance for an HDR capture, display values (sRGB) for an LDR one.
-    `mask` is 1 on the object, 0 off it, and all ones where the capture has no masks; `image_gradient` is the length of
-    the gradient of the image's luminance at the pixel, per pixel.
+    `mask` is 1 on the object and 0 off it, as far as `mask_known` is 1: everywhere in a capture with masks, only where the
+    image shows exactly its background in one without (there the other pixels have mask 1). `image_gradient` is the length
+    of the gradient of the image's luminance at the pixel, per pixel.
     """
 
     origins: Float[Tensor, "N 3"]
     directions: Float[Tensor, "N 3"]
     color: Float[Tensor, "N 3"]
     mask: Float[Tensor, " N"]
+    mask_known: Float[Tensor, " N"]
     image_gradient: Float[Tensor, " N"]
     view: Int[Tensor, " N"]
 
@@ -128,14 +142,23 @@ class Shading(Indexable):
     specular: Float[Tensor, "N 3"]
 
 
+@dataclass(frozen=True)
+class SceneLight(Indexable):
+    """What the scene itself sends to N points from S directions: where a direction meets the scene, and the linear radiance
+    that arrives from there (zero where it meets nothing)."""
+
+    hit: Bool[Tensor, "N S"]
+    radiance: Float[Tensor, "N S 3"]
+
+
 class LossTerm(NamedTuple):
     """One loss before reduction: `values` of any shape and, where not all count alike, `weights` that broadcast to it.
 
     A named tuple, because the wrappers of data-parallel training look for tensors in those and not in frozen dataclasses.
     """
 
-    values: Float[Tensor, "..."]
-    weights: Float[Tensor, "..."] | Bool[Tensor, "..."] | None = None
+    values: Float[Tensor, ...]
+    weights: Float[Tensor, ...] | Bool[Tensor, ...] | None = None
 
     def mean(self) -> Float[Tensor, ""]:
         """The weighted mean; 0, with a zero gradient, when nothing counts."""

@@ -7,9 +7,10 @@ import dataclasses
 import torch
 from torch.nn.functional import normalize
 
-from neilfpp_method.config import HashGridConfig, NeilfConfig, TrainConfig, preset
+from neilfpp_method.config import HashGridConfig, NeilfConfig, TrainConfig
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel, SceneFacts
+from neilfpp_method.presets import preset
 from neilfpp_method.structures import PixelBatch
 
 
@@ -51,6 +52,7 @@ def sphere_batch(count: int = 48, spread: float = 0.8, color: float = 0.3) -> Pi
         directions=normalize(targets - origins, dim=-1),
         color=torch.full((count, 3), color),
         mask=torch.ones(count),
+        mask_known=torch.zeros(count),
         image_gradient=torch.zeros(count),
         view=torch.zeros(count, dtype=torch.long),
     )

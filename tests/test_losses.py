@@ -14,7 +14,7 @@ from neilfpp_method.structures import LossTerm, Material
 def test_photometric_is_l1_over_the_scale_in_linear_radiance():
     radiance = torch.tensor([[0.5, 1.5, 2.0]])
     pixel = torch.tensor([[0.2, 1.0, 3.0]])
-    term = losses.photometric(radiance, pixel, "linear", scale=3.0)
+    term = losses.photometric(radiance, pixel, "linear", unit=3.0)
     assert term.values.tolist()[0] == pytest.approx([0.3 / 3, 0.5 / 3, 1.0 / 3])
 
 
@@ -54,9 +54,10 @@ def test_lambertian_is_zero_for_a_rough_dielectric_only():
     assert losses.lambertian(Material(torch.ones(1, 3), 0.25 * one, 0.5 * one)).values.item() == pytest.approx(1.25)
 
 
-def test_mask_is_cross_entropy():
-    term = losses.mask(torch.tensor([0.75, 0.75]), torch.tensor([1.0, 0.0]))
-    assert term.values.tolist() == pytest.approx([-math.log(0.75), -math.log(0.25)])
+def test_mask_counts_where_it_is_known():
+    opacity = torch.tensor([0.75, 0.75, 0.75])
+    term = losses.mask(opacity, torch.tensor([1.0, 0.0, 1.0]), known=torch.tensor([1.0, 1.0, 0.0]))
+    assert term.values.tolist() == pytest.approx([0.25, 0.75, 0.0])
 
 
 def test_scale_gradient_keeps_the_value():

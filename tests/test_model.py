@@ -8,7 +8,9 @@ from collections import Counter
 import pytest
 import torch
 
+from neilfpp_method.hosts.base import LightsItself
 from neilfpp_method.inter_reflection import trace_light
+from neilfpp_method.model import NeilfModel, SceneFacts
 from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.structures import RayBatch, SurfaceHits
 from neilfpp_method.train.loop import make_optimizer
@@ -209,3 +211,59 @@ def test_shading_has_two_parts():
     maps = model.maps(sphere_batch(spread=0.3).rays)
     torch.testing.assert_close(maps.rgb, maps.diffuse + maps.specular)
     assert (maps.specular > 0).any()
+
+
+class HalfRoom(Room):
+    """The room, but only where z < 0 does a ray meet its wall."""
+
+    def render(self, rays: RayBatch) -> SurfaceHits:
+        hits = super().render(rays)
+        met = (rays.directions[:, 2] < 0).float()
+        return dataclasses.replace(hits, opacity=met, concentration=met)
+
+
+def test_hard_inter_reflection_asks_the_scene_first_and_the_light_for_the_rest():
+    config = tiny_config()
+    hard = dataclasses.replace(config.inter_reflection, mode="hard", offset=1e-4)
+    distant = dataclasses.replace(config.light, kind="distant")
+    config = dataclasses.replace(config, inter_reflection=hard, light=distant)
+    model = NeilfModel(HalfRoom(), config, SceneFacts("linear", 0.2, 3.0, "constant"))
+    wi = torch.nn.functional.normalize(torch.randn(1, 64, 3), dim=-1)
+    arriving = model.incident_light(torch.zeros(1, 3), wi)[0]
+    below = wi[0, :, 2] < 0
+    torch.testing.assert_close(arriving[below], wi[0][below], atol=1e-3, rtol=0.0)
+    sky = model.light.radiance(torch.zeros(1, 3), wi)[0]
+    torch.testing.assert_close(arriving[~below], sky[~below])
+
+
+def test_an_sdf_host_sees_itself_by_its_grid():
+    """From a point on a sphere no direction meets it again; from between two plates every steep one does."""
+    config = tiny_config()
+    hard = dataclasses.replace(config.inter_reflection, mode="hard", grid_resolution=48)
+    config = dataclasses.replace(config, inter_reflection=hard)
+    host = sphere_model(config).host
+    assert isinstance(host, LightsItself)
+    out = torch.tensor([[0.0, 0.0, 1.0]])
+    on_sphere = host.render(RayBatch(3.0 * out, -out)).position.detach()
+    up = torch.nn.functional.normalize(torch.tensor([[[0.0, 0.0, 1.0], [0.5, 0.0, 1.0], [0.0, -1.0, 1.0]]]), dim=-1)
+    assert not host.scene_light(on_sphere, up).hit.any()
+    towards = host.scene_light(3.0 * out / 2, -up)
+    assert towards.hit[0, 0]
+    # What it brings is what R sends from there.
+    hits = host.render(RayBatch(3.0 * out / 2, -out))
+    torch.testing.assert_close(towards.radiance[0, 0], hits.color[0], atol=0.05, rtol=0.0)
+    assert not towards.radiance.requires_grad
+
+
+def test_the_tracing_grid_is_renewed_as_the_geometry_moves_and_survives_a_checkpoint():
+    config = tiny_config()
+    hard = dataclasses.replace(config.inter_reflection, mode="hard", grid_resolution=16)
+    model = sphere_model(dataclasses.replace(config, inter_reflection=hard))
+    model.losses(sphere_batch(), Stage.MATERIAL_INIT)
+    assert model.host.grid_age == 0
+    model.losses(sphere_batch(), Stage.JOINT)
+    assert model.host.grid_age == 1
+    again = sphere_model(dataclasses.replace(config, inter_reflection=hard))
+    again.load_state_dict(model.state_dict())
+    assert again.host.grid_age == 1
+    assert torch.equal(again.host.distance_grid, model.host.distance_grid)

@@ -7,8 +7,9 @@ import dataclasses
 import pytest
 import torch
 
-from neilfpp_method.config import PRESETS, TrainConfig, from_dict, preset, to_dict
+from neilfpp_method.config import TrainConfig, from_dict, to_dict
 from neilfpp_method.errors import UserError
+from neilfpp_method.presets import PRESETS, preset
 from neilfpp_method.schedule import Stage, active_losses, stage_at, weigh
 from neilfpp_method.structures import LossTerm
 
@@ -79,6 +80,8 @@ def test_settings_survive_json(name):
 def test_settings_of_another_version_are_refused_by_name():
     with pytest.raises(UserError, match=r"config.train: unknown setting 'warp'"):
         from_dict(type(preset("fast")), {"train": {"warp": 9}})
+    with pytest.raises(UserError, match=r"config.train.rays: 'many' where int belongs"):
+        from_dict(type(preset("fast")), {"train": {"rays": "many"}})
     with pytest.raises(UserError, match=r"config.shading.lobe: 'blinn' is not a choice"):
         from_dict(type(preset("fast")), {"shading": {"lobe": "blinn"}})
 

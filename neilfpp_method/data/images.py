@@ -210,7 +210,8 @@ def read_image(path: Path) -> ImageFile:
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
     try:
-        yield
+        with _decoders_silent():
+            yield
     except UserError:
         raise
     except FileNotFoundError:
@@ -218,6 +219,19 @@ def _naming(path: Path) -> Iterator[None]:
     except Exception as error:  # four decoders, each with exceptions of its own
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise UserError(f"{path}: cannot be read ({reason[0]})", "export the image again, as EXR or PNG") from error
+
+
+@contextmanager
+def _decoders_silent() -> Iterator[None]:
+    """What the native decoders print on their own goes nowhere; the `UserError` says it in one line."""
+    kept = os.dup(2)
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def _format(path: Path) -> Format:

@@ -53,10 +53,12 @@ class PixelDataset:
         self.capture = capture
         self.views = tuple(views)
         loaded = _load(self.views, capture.hdr, on_view)
-        self._color, self._mask, self._gradient = (tensor.to(device) for tensor in loaded)
+        self._color, self._mask, self._mask_known, self._gradient = (tensor.to(device) for tensor in loaded)
         cameras = [capture.normalisation.camera(view.camera) for view in views]
         sizes = [camera.width * camera.height for camera in cameras]
         self._starts = tuple(itertools.accumulate(sizes, initial=0))
+        if not self._mask_known.any():
+            self._mask_from_background()
         self._first = torch.tensor(self._starts[:-1], device=device)
         self._width = torch.tensor([camera.width for camera in cameras], device=device)
         self._intrinsics = torch.tensor(np.stack([c.intrinsics for c in cameras]), dtype=torch.float32, device=device)
@@ -83,9 +85,21 @@ class PixelDataset:
             directions=rays.directions,
             color=self._color[index],
             mask=self._mask[index].to(self._color.dtype),
+            mask_known=self._mask_known[index].to(self._color.dtype),
             image_gradient=self._gradient[index],
             view=view,
         )
+
+    def _mask_from_background(self) -> None:
+        """Without masks, pixels of exactly the colour of most of the border are off the object; of the others nothing is known.
+
+        Rendered captures, and clipped backdrops, have such pixels; in front of a noisy backdrop hardly any pixel is exact.
+        """
+        border = torch.cat([self._border(i) for i in range(len(self.views))])
+        color = border.median(dim=0).values
+        background = (self._color == color).all(dim=-1)
+        if (border == color).all(dim=-1).float().mean() >= BORDER_SHARE and not background.all():
+            self._mask, self._mask_known = ~background, background
 
     # ------------------------------------------------------------------------------------------------------- statistics
 
@@ -132,12 +146,14 @@ class LoadedPixels(NamedTuple):
 
     color: Float32[Tensor, "P 3"]
     mask: Bool[Tensor, " P"]
+    mask_known: Bool[Tensor, " P"]
     image_gradient: Float32[Tensor, " P"]
 
 
 def _load(views: Sequence[View], hdr: bool, on_view: Callable[[str], None] | None) -> LoadedPixels:
     total = sum(view.camera.width * view.camera.height for view in views)
-    pixels = LoadedPixels(torch.empty(total, 3), torch.empty(total, dtype=torch.bool), torch.empty(total))
+    mask, known = torch.ones(total, dtype=torch.bool), torch.zeros(total, dtype=torch.bool)
+    pixels = LoadedPixels(torch.empty(total, 3), mask, known, torch.empty(total))
     broken: list[tuple[View, int]] = []
     start = 0
     for view in views:
@@ -147,7 +163,8 @@ def _load(views: Sequence[View], hdr: bool, on_view: Callable[[str], None] | Non
             broken.append((view, count))
         rows = slice(start, start := start + view.camera.width * view.camera.height)
         pixels.color[rows] = color.reshape(-1, 3)
-        pixels.mask[rows] = _mask(view, image).reshape(-1)
+        if (object_mask := _mask(view, image)) is not None:
+            mask[rows], known[rows] = object_mask.reshape(-1), True
         pixels.image_gradient[rows] = _gradient(luminance(tone_map(color) if hdr else color)).reshape(-1)
         if on_view:
             on_view(view.name)
@@ -169,11 +186,11 @@ def _read(view: View) -> ImageFile:
     return image
 
 
-def _mask(view: View, image: ImageFile) -> Bool[Tensor, "H W"]:
-    """The object: where the mask file, or without one the image's alpha, is above one half; without either, all."""
+def _mask(view: View, image: ImageFile) -> Bool[Tensor, "H W"] | None:
+    """The object: where the mask file, or without one the image's alpha, is above one half; none without either."""
     height, width = image.pixels.shape[:2]
     if view.mask is None and image.alpha is None:
-        return torch.ones(height, width, dtype=torch.bool)
+        return None
     source = view.mask or view.image
     values = image.alpha if view.mask is None else read_image(view.mask).pixels.max(axis=-1)
     if values.shape != (height, width):

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
-from torch import Tensor
+from jaxtyping import Float64
 
 from neilfpp_method.data.views import Normalisation
 from neilfpp_method.errors import UserError

@@ -17,25 +17,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import trimesh
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.images import read_image
+from neilfpp_method.data.mesh import Mesh, read_mesh
 from neilfpp_method.data.views import View, inside
 from neilfpp_method.errors import UserError
 from neilfpp_method.structures import Material
 
-__all__ = ["LightField", "Mesh", "Truth"]
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """Triangles in the scene frame."""
-
-    vertices: Float[Tensor, "V 3"]
-    faces: Int[Tensor, "F 3"]
+__all__ = ["LightField", "Truth"]
 
 
 @dataclass(frozen=True)
@@ -93,17 +85,7 @@ class Truth:
     def mesh(self) -> Mesh | None:
         """The surface."""
         path = self._file(self.capture.inputs / "model" / "mesh.ply")
-        if path is None:
-            return None
-        try:
-            mesh = trimesh.load_mesh(path, process=False)
-            vertices = torch.as_tensor(np.array(mesh.vertices), dtype=torch.float32)
-            faces = torch.as_tensor(np.array(mesh.faces), dtype=torch.int64)
-        except Exception as error:  # whatever trimesh meets in a damaged file
-            raise UserError(f"{path}: not a mesh that can be read ({error})", "export it again as PLY") from error
-        if not len(faces) or not vertices.isfinite().all() or faces.min() < 0 or faces.max() >= len(vertices):
-            raise UserError(f"{path}: no triangles, or triangles of vertices that are not there", "export it again")
-        return Mesh(self.capture.normalisation.to_scene(vertices), faces)
+        return None if path is None else read_mesh(path, self.capture.normalisation)
 
     def light_field(self) -> LightField | None:
         """Incident and outgoing radiance at surface points."""

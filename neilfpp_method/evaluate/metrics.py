@@ -39,6 +39,9 @@ SSIM_WINDOW = 11
 LOG_FLOOR = 1e-3
 """Radiance added before a logarithm: true radiance can be 0, and differences far below it are of no visible effect."""
 
+QUERIES = 20_000
+"""Points of a surface that look for their neighbour on the other. Two surfaces far apart make one query slow."""
+
 
 # --------------------------------------------------------------------------------------------------------------- images
 
@@ -154,10 +157,17 @@ class Chamfer:
 
 
 def chamfer(estimate: Float[np.ndarray, "P 3"], truth: Float[np.ndarray, "Q 3"]) -> Chamfer:
-    """Distances from the points of each surface to the nearest point of the other."""
-    accuracy = cKDTree(truth).query(estimate)[0].mean()
-    completeness = cKDTree(estimate).query(truth)[0].mean()
-    return Chamfer(float(accuracy), float(completeness))
+    """Distances from the points of each surface to the nearest point of the other.
+
+    All points are there to be found, but of a large set only every k-th looks for its neighbour, fewer than twice
+    `QUERIES` of them: dense sets keep the distance between samples small, and the mean needs no more terms.
+    """
+    return Chamfer(_mean_distance(estimate, truth), _mean_distance(truth, estimate))
+
+
+def _mean_distance(points: Float[np.ndarray, "P 3"], surface: Float[np.ndarray, "Q 3"]) -> float:
+    asking = points[:: max(1, len(points) // QUERIES)]
+    return float(cKDTree(surface).query(asking)[0].mean())
 
 
 def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int = 0) -> Float[np.ndarray, "count 3"]:

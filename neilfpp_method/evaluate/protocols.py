@@ -29,7 +29,8 @@ from jaxtyping import Bool, Float
 
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.images import replacing
-from neilfpp_method.data.truth import LightField, Mesh, Truth
+from neilfpp_method.data.mesh import Mesh
+from neilfpp_method.data.truth import LightField, Truth
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.evaluate.views import (
     KnownView,
@@ -189,8 +190,8 @@ def _pooled(pairs: Pairs, name: str) -> Float[np.ndarray, "P C"]:
 def chamfer_metrics(run: Run, truth: Mesh) -> dict[str, float]:
     """Chamfer distance between the run's surface and the true mesh, scene units.
 
-    Both are sampled by area; of the estimate only what lies within `MARGIN` of the truth's box counts. Absent where none
-    does.
+    Both are sampled by area; of the estimate only what lies within `MARGIN` of the truth's box counts. Absent where
+    none does.
     """
     true = trimesh.Trimesh(truth.vertices.numpy(), truth.faces.numpy(), process=False)
     margin = MARGIN * np.linalg.norm(true.extents)

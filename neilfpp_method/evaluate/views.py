@@ -113,8 +113,8 @@ class HeldOut:
 def mask_source(capture: Capture) -> str:
     """What decides which pixels of the test views count; one source for all of them.
 
-    "true depth" where every view has it; else "capture masks" where there are any; else "rendered opacity" above one
-    half, which lets the estimate choose its pixels.
+    "true depth" where every view has it; else "capture masks" where there are any, or where pixels that show exactly the
+    background stand for them; else "rendered opacity" above one half, which lets the estimate choose its pixels.
     """
     return _mask_source(_known_depths(capture), _stored_pixels(capture))
 

@@ -23,7 +23,7 @@ class OutgoingRadianceField(nn.Module):
     def __init__(self, config: OutgoingRadianceConfig, feature_width: int, radius: float, scale: float) -> None:
         super().__init__()
         self.scale = scale
-        self.position = position_encoding(config.encoding, config.grid, radius)
+        self.position = position_encoding(config.encoding, config.grid, radius, config.frequencies)
         self.direction = direction_encoding(config.direction_encoding, config.direction_degree)
         inputs = self.position.width + self.direction.width + 3 + feature_width
         self.mlp = Mlp(inputs, 3, config.layers, config.width, "relu", output_scale=0.1)

@@ -14,9 +14,18 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import Parameter
 
-from neilfpp_method.structures import LossTerms, PixelBatch, RayBatch, SurfaceHits
+from neilfpp_method.schedule import StageTable
+from neilfpp_method.structures import LossTerms, PixelBatch, RayBatch, SceneLight, SurfaceHits
 
-__all__ = ["HasParameterGroups", "HasSurfaceWidth", "Host", "Regularised", "RegularisedHits"]
+__all__ = [
+    "HasParameterGroups",
+    "HasStages",
+    "HasSurfaceWidth",
+    "Host",
+    "LightsItself",
+    "Regularised",
+    "RegularisedHits",
+]
 
 
 @runtime_checkable
@@ -46,6 +55,15 @@ class Regularised(Protocol):
 
 
 @runtime_checkable
+class LightsItself(Protocol):
+    """A host that traces many rays cheaply. Without: hard inter-reflection renders every ray, at the price of rendering."""
+
+    def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
+        """What arrives at surface points x from the scene's own surfaces in the directions wi; constants, no gradient."""
+        ...
+
+
+@runtime_checkable
 class HasSurfaceWidth(Protocol):
     """A host whose surface is a soft layer. Without: rays for L_ref start at a fixed distance from the surface."""
 
@@ -61,3 +79,10 @@ class HasParameterGroups(Protocol):
     def parameter_groups(self) -> Mapping[str, list[Parameter]]:
         """Parameters by field: geometry, beta, radiance, background."""
         ...
+
+
+@runtime_checkable
+class HasStages(Protocol):
+    """A host that does not train as a distance field does. Without: the stages of the paper."""
+
+    stages: StageTable

@@ -16,13 +16,17 @@ from neilfpp_method.fields.outgoing_radiance import OutgoingRadianceField
 from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.base import RegularisedHits
 from neilfpp_method.shading.frame import safe_normalize
-from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayBatch, SurfaceHits
+from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayBatch, SceneLight, SurfaceHits
 from neilfpp_method.volume.compositing import Weights, composite, render_weights
 from neilfpp_method.volume.density import LaplaceDensity
+from neilfpp_method.volume.distance_grid import cell_size, sample_grid, trace_grid
 from neilfpp_method.volume.intersect import sphere_interval
 from neilfpp_method.volume.samplers import error_bounded_samples, uniform_samples
 
 __all__ = ["VolSdfHost"]
+
+GRID_LIFE = 100
+"""Steps in which the geometry moves before the distance grid is sampled again."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,9 @@ class VolSdfHost(nn.Module):
         self.config = config
         self.radiance_scale = radiance_scale
         self.background_kind = background
-        self.points = points
+        # Buffers, to follow the host to its device; not stored, as the capture has them.
+        self.register_buffer("point_position", None if points is None else points.position, persistent=False)
+        self.register_buffer("point_normal", None if points is None else points.normal, persistent=False)
         radius = config.volume.radius
         self.sdf_field = SdfField(config.sdf, radius)
         self.radiance_field = OutgoingRadianceField(config.radiance, config.sdf.feature_width, radius, radiance_scale)
@@ -67,6 +73,11 @@ class VolSdfHost(nn.Module):
             InvertedSphere(config.background, radius, radiance_scale) if background == "inverted_sphere" else None
         )
         self.register_buffer("background_color", torch.tensor(background_color))
+        hard = config.inter_reflection.mode == "hard"
+        resolution = config.inter_reflection.grid_resolution if hard else 0
+        # Kept in checkpoints, with its age: a resumed run must trace the very same grid.
+        self.register_buffer("distance_grid", torch.zeros(resolution, resolution, resolution))
+        self.grid_age: int | None = None
 
     # -------------------------------------------------------------------------------------------------- the host contract
 
@@ -77,6 +88,8 @@ class VolSdfHost(nn.Module):
     def render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
         """As `render`, with those of eikonal, hessian, surface, point_cloud and mask that `names` holds."""
         march = self._march(batch.rays)
+        if self.grid_age is not None and march.surface.distance.requires_grad:
+            self.grid_age += 1
         return RegularisedHits(march.hits, self._regularisers(march, batch, names))
 
     def surface_width(self) -> Float[Tensor, ""]:
@@ -92,7 +105,46 @@ class VolSdfHost(nn.Module):
         }
         return groups if self.background is None else groups | {"background": list(self.background.parameters())}
 
+    @torch.no_grad()
+    def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
+        """What arrives at surface points from the scene: rays are traced on a grid of the SDF, and read R where they hit.
+
+        A ray starts one cell of the grid above the surface, along the normal. The grid is sampled when first asked for, and
+        again after `GRID_LIFE` steps in which the geometry moved.
+        """
+        radius = self.config.volume.radius
+        grid = self._grid()
+        normal = safe_normalize(self.sdf_field.with_gradient(x).gradient)
+        origins = (x + cell_size(grid, radius) * normal)[:, None].expand_as(wi).reshape(-1, 3)
+        directions = wi.reshape(-1, 3)
+        found = trace_grid(grid, radius, origins, directions)
+        rows = torch.nonzero(found.hit)[:, 0]
+        points = origins[rows] + found.distance[rows, None] * directions[rows]
+        surface = self.sdf_field.with_gradient(points)
+        radiance = torch.zeros_like(directions)
+        radiance[rows] = self.radiance_field(
+            points, -directions[rows], safe_normalize(surface.gradient), surface.feature
+        )
+        return SceneLight(found.hit.view(wi.shape[:2]), radiance.view(wi.shape))
+
+    def get_extra_state(self) -> dict[str, int | None]:
+        """The age of the distance grid, for checkpoints."""
+        return {"grid_age": self.grid_age}
+
+    def set_extra_state(self, state: dict[str, int | None]) -> None:
+        """The inverse of `get_extra_state`."""
+        self.grid_age = state["grid_age"]
+
     # ---------------------------------------------------------------------------------------------------------- geometry
+
+    def _grid(self) -> Float[Tensor, "R R R"]:
+        if self.grid_age is None or self.grid_age >= GRID_LIFE:
+            fresh = sample_grid(
+                self.sdf_field, self.config.volume.radius, self.distance_grid.shape[0], self.distance_grid
+            )
+            self.distance_grid.copy_(fresh)
+            self.grid_age = 0
+        return self.distance_grid
 
     def sdf(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
         """Signed distance of the scene's surface; with no background model the scene sphere closes it (VolSDF §3.1)."""
@@ -187,12 +239,12 @@ class VolSdfHost(nn.Module):
         if "hessian" in names:
             hessian = self.sdf_field.hessian(self._near_surface(march.hits), settings.hessian_method)
             terms["hessian"] = losses.hessian(hessian)
-        if "point_cloud" in names and self.points is not None:
-            rows = torch.randint(len(self.points.position), (len(batch),), device=batch.origins.device)
-            sample = self.sdf_field.with_gradient(self.points.position[rows])
-            terms["point_cloud"] = losses.point_cloud(sample.distance, sample.gradient, self.points.normal[rows])
+        if "point_cloud" in names and self.point_position is not None:
+            rows = torch.randint(len(self.point_position), (len(batch),), device=self.point_position.device)
+            sample = self.sdf_field.with_gradient(self.point_position[rows])
+            terms["point_cloud"] = losses.point_cloud(sample.distance, sample.gradient, self.point_normal[rows])
         if "mask" in names:
-            terms["mask"] = losses.mask(march.hits.opacity, batch.mask)
+            terms["mask"] = losses.mask(march.hits.opacity, batch.mask, batch.mask_known)
         return terms
 
     def _near_surface(self, hits: SurfaceHits) -> Float[Tensor, "N 3"]:

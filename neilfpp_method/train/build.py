@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
 import torch
 
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import Capture
+from neilfpp_method.data.mesh import read_mesh
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.point_cloud import load_point_cloud
+from neilfpp_method.data.truth import Truth
+from neilfpp_method.data.views import camera_rays
 from neilfpp_method.errors import UserError
+from neilfpp_method.hosts.base import Host
+from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel, SceneFacts
 from neilfpp_method.structures import OrientedPoints
@@ -20,6 +28,9 @@ __all__ = ["build_model", "scene_facts"]
 LDR_SCALE = 1.0
 HDR_SCALE = 3.0
 BRIGHT_QUANTILE = 0.999
+
+# Of the pixels of every view, one in so many asks whether a mesh is where the cameras look.
+SEEN_EVERY = 67
 
 
 def scene_facts(capture: Capture, pixels: PixelDataset, config: NeilfConfig) -> SceneFacts:
@@ -41,10 +52,37 @@ def build_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> Nei
     """An untrained model for a capture.
 
     Raises:
-        UserError: the settings ask for a point cloud that the capture does not have.
+        UserError: the settings ask for a point cloud or a mesh that the capture does not have.
     """
-    host = VolSdfHost(config, facts.radiance_scale, facts.background, facts.background_color, _points(capture, config))
-    return NeilfModel(host, config, facts)
+    return NeilfModel(HOSTS[config.host](capture, facts, config), config, facts)
+
+
+def _volsdf(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> VolSdfHost:
+    return VolSdfHost(config, facts.radiance_scale, facts.background, facts.background_color, _points(capture, config))
+
+
+def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
+    path = config.mesh.path
+    mesh = Truth(capture).mesh() if path is None else read_mesh(Path(path), capture.normalisation)
+    if mesh is None:
+        raise UserError(f"{capture.root}: no inputs/model/mesh.ply for the mesh host", "name a mesh with --mesh PATH")
+    host = MeshHost(mesh, config, facts.radiance_scale, facts.background, facts.background_color)
+    _check_seen(host, capture, path or "inputs/model/mesh.ply")
+    return host
+
+
+HOSTS: Mapping[str, Callable[[Capture, SceneFacts, NeilfConfig], Host]] = {"volsdf": _volsdf, "mesh": _mesh}
+
+
+def _check_seen(host: MeshHost, capture: Capture, path: str) -> None:
+    """That the cameras see the outside of the mesh."""
+    cameras = [capture.normalisation.camera(view.camera) for view in capture.train_views]
+    met = [host.cross(camera_rays(camera)[::SEEN_EVERY]).outside for camera in cameras]
+    outside = torch.cat(met)
+    if not len(outside):
+        raise UserError(f"{path}: no camera sees this mesh", "give it in the world frame of the capture")
+    if outside.float().mean() < 0.5:
+        raise UserError(f"{path}: the cameras see the inside of this mesh", "turn its faces: they are wound outwards")
 
 
 def _points(capture: Capture, config: NeilfConfig) -> OrientedPoints | None:

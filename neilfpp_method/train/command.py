@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
+import shlex
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -25,7 +25,14 @@ from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.loop import Training, seed_step, train
 from neilfpp_method.train.preview import write_preview
 from neilfpp_method.train.progress import Reporter, reporting
-from neilfpp_method.train.run import CaptureSource, create_run, read_description
+from neilfpp_method.train.run import (
+    CaptureSource,
+    Description,
+    check_free,
+    create_run,
+    load_checkpoint,
+    read_description,
+)
 
 __all__ = ["run_training"]
 
@@ -34,55 +41,103 @@ def run_training(
     *,
     data: Path | None,
     out: Path | None,
-    config: NeilfConfig,
+    config: NeilfConfig | None,
     resume: bool,
     test_every: int | None,
     response: str,
     device: str,
     devices: int,
     console: Console,
+    command: str = "neilfpp train",
 ) -> Path:
-    """Train a run to its end and return its folder.
+    """Train a run to its end and return its folder. A run that is finished is left as it is.
+
+    Args:
+        config: the settings; none, with `resume`: those of the run.
+        command: what a person types to get here, for the line that says how a stopped run continues.
 
     Raises:
-        UserError: bad input.
+        UserError: bad input; no run folder is left behind.
         Stopped: a person asked for it; names the command that continues.
         Diverged: see `train.loop.train`.
     """
-    fabric = _launch(device, devices)
+    place = pick_device(device)
+    # Whatever the headers and the settings can tell is told before other processes start.
     if resume:
         if out is None:
             raise UserError("--resume needs the run's folder", "give it with --out RUN")
         described = read_description(out)
+        _refuse_changes(out, described, data, config, test_every, response)
         config, source = described.config, described.source
-        capture, facts = source.load(), described.facts
-        pixels = _load_pixels(capture, fabric, console)
+        if _is_finished(out, config):
+            console.print(f"run folder {out}: finished already, nothing to continue", highlight=False, soft_wrap=True)
+            return out
     else:
-        if data is None:
+        if data is None or config is None:
             raise UserError("no capture given", "name its folder with --data DIR")
         _check(config)
         source = CaptureSource(str(data.resolve()), test_every, response)
-        capture = source.load()
-        pixels = _load_pixels(capture, fabric, console)
-        facts = scene_facts(capture, pixels, config)
         out = out or Path("runs") / f"{data.resolve().name}-{config.preset}"
+        check_free(out)
+    capture = source.load()
+    fabric = _launch(place, devices)
+    pixels = _load_pixels(capture, fabric, console)
+    facts = described.facts if resume else scene_facts(capture, pixels, config)
     seed_step(config.train.seed, step=-1)
     model = build_model(capture, facts, config)
-    if not resume and fabric.is_global_zero:
-        create_run(out, config, source, facts)
-    fabric.barrier()
     if fabric.is_global_zero:
+        if not resume:
+            create_run(out, config, source, facts)
         console.print(capture.summary, highlight=False)
-        console.print(f"run folder {out}", highlight=False)
+        console.print(f"run folder {out}", highlight=False, soft_wrap=True)
+    fabric.barrier()
+    continue_with = _continue_with(command, out, device, devices)
     with reporting(out, console, fabric.is_global_zero) as reporter, _stop_request() as stopped:
-        train(Training(out, config, model, pixels, fabric, reporter, stopped, _preview(out, capture, fabric, reporter)))
+        preview = _preview(out, capture, fabric, reporter)
+        train(Training(out, config, model, pixels, fabric, reporter, stopped, preview, continue_with))
     return out
 
 
-def _launch(device: str, devices: int) -> Fabric:
-    place = pick_device(device)
+def _refuse_changes(
+    out: Path,
+    described: Description,
+    data: Path | None,
+    config: NeilfConfig | None,
+    test_every: int | None,
+    response: str,
+) -> None:
+    """That what is given beside --resume, where something is, is what the run was made of."""
+    source = described.source
+    given = CaptureSource(
+        source.root if data is None else str(data.resolve()),
+        source.test_every if test_every is None else test_every,
+        source.response if response == "auto" else response,
+    )
+    if given != source or config not in (None, described.config):
+        raise UserError(
+            f"{out}: a run keeps its capture and its settings, and others are given with --resume",
+            "leave them out, or start a new run in another --out",
+        )
+
+
+def _is_finished(out: Path, config: NeilfConfig) -> bool:
+    last = out / "checkpoints" / "last.pt"
+    return last.exists() and load_checkpoint(last)["step"] >= sum(stage_steps(config.train).values())
+
+
+def _continue_with(command: str, out: Path, device: str, devices: int) -> str:
+    chosen = ["--device", device] if device != "auto" else []
+    chosen += ["--devices", str(devices)] if devices != 1 else []
+    return f"{command} {shlex.join(['--out', str(out), '--resume', *chosen])}"
+
+
+def _launch(place: torch.device, devices: int) -> Fabric:
+    if devices < 1:
+        raise UserError(f"{devices} processes cannot share the work", "set --devices to 1 or more")
+    if place.type == "cuda" and devices > (torch.cuda.device_count() if place.index is None else 1):
+        raise UserError(f"{place} is not {devices} GPUs", "use --device cuda, and --devices up to the number of GPUs")
+    chosen = devices if place.index is None else [place.index]
     strategy = DDPStrategy(find_unused_parameters=True) if devices > 1 else "auto"
-    chosen = [place.index] if place.index is not None and devices == 1 else devices
     fabric = Fabric(accelerator=place.type, devices=chosen, strategy=strategy)
     fabric.launch()
     return fabric
@@ -91,8 +146,14 @@ def _launch(device: str, devices: int) -> Fabric:
 def _check(config: NeilfConfig) -> None:
     if min(stage_steps(config.train).values()) < 0 or sum(stage_steps(config.train).values()) == 0:
         raise UserError("the stages have no steps", "set --config.train.sdf-steps and the others to 0 or more")
-    if config.train.rays < 1:
-        raise UserError("a step needs rays", "set --config.train.rays to 1 or more")
+    for name in ("rays", "checkpoint_every", "log_every", "eval_chunk"):
+        if getattr(config.train, name) < 1:
+            option = f"--config.train.{name.replace('_', '-')}"
+            raise UserError(f"{option} is {getattr(config.train, name)}", "set it to 1 or more")
+    steps = config.train
+    for name, needed in {"volume": steps.sdf_steps, "physical": steps.material_steps + steps.joint_steps}.items():
+        if needed and getattr(config.loss, name) <= 0.0:
+            raise UserError(f"--config.loss.{name} is off, so nothing compares with the images", "set it above 0")
 
 
 def _load_pixels(capture: Capture, fabric: Fabric, console: Console) -> PixelDataset:
@@ -104,7 +165,7 @@ def _load_pixels(capture: Capture, fabric: Fabric, console: Console) -> PixelDat
         )
 
 
-def _preview(out: Path, capture: Capture, fabric: Fabric, reporter: Reporter):
+def _preview(out: Path, capture: Capture, fabric: Fabric, reporter: Reporter) -> Callable[[NeilfModel, Stage], None]:
     def preview(model: NeilfModel, stage: Stage) -> None:
         if fabric.is_global_zero:
             pixels = write_preview(model, capture, stage, out / "previews" / f"{stage.value}.png")
@@ -114,7 +175,7 @@ def _preview(out: Path, capture: Capture, fabric: Fabric, reporter: Reporter):
 
 
 @contextmanager
-def _stop_request() -> Iterator:
+def _stop_request() -> Iterator[Callable[[], bool]]:
     """Ctrl-C and SIGTERM ask for a stop after the step in progress; a second Ctrl-C does not wait."""
     asked = []
 

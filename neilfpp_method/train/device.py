@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import torch
 
 from neilfpp_method.errors import UserError
@@ -18,8 +20,9 @@ def pick_device(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
-        device = torch.device(name)
-        torch.empty(0, device=device)
+        if not re.fullmatch(r"cpu|cuda(:\d+)?", name):
+            raise RuntimeError("neither a CPU nor a CUDA device")
+        torch.empty(0, device=name)
     except (RuntimeError, AssertionError) as error:
         raise UserError(f"no device '{name}' here", "use cpu, cuda, cuda:N or auto") from error
-    return device
+    return torch.device(name)

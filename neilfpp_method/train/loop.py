@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,11 +15,11 @@ from torch import Tensor
 from neilfpp_method.config import NeilfConfig, OptimizerConfig
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.errors import Diverged, Stopped
-from neilfpp_method.model import NeilfModel
+from neilfpp_method.model import NeilfModel, RadianceUnits
 from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, stage_at, stage_steps, weigh
 from neilfpp_method.structures import LossTerms
 from neilfpp_method.train.progress import Reporter
-from neilfpp_method.train.run import load_checkpoint, read_json, save_checkpoint, write_json
+from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, save_checkpoint, write_json
 
 __all__ = ["Training", "make_optimizer", "seed_step", "train"]
 
@@ -29,7 +29,7 @@ MOST_SKIPPED = 10
 
 @dataclass
 class Training:
-    """A run in progress."""
+    """A run in progress; `continue_with` is the command that goes on with it after a stop."""
 
     path: Path
     config: NeilfConfig
@@ -39,6 +39,7 @@ class Training:
     reporter: Reporter
     should_stop: Callable[[], bool]
     preview: Callable[[NeilfModel, Stage], None]
+    continue_with: str
     skipped: int = 0
     skipped_in_a_row: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
@@ -72,7 +73,7 @@ def _train_stage(
     """The rest of a stage. Returns the number of the step that follows it."""
     settings = run.config.train
     stage = position.stage
-    weights = active_losses(stage, run.config)
+    weights = active_losses(stage, run.config, model.stages)
     model.freeze_for(stage)
     # Set up anew in each stage: data-parallel wrappers fix the set of moving parameters when they are made.
     wrapped = run.fabric.setup_module(model, move_to_device=False)
@@ -84,35 +85,35 @@ def _train_stage(
         _set_rates(optimizer, run.config.optimizer, stage, number / position.length)
         batch = run.pixels.sample(settings.rays)
         terms = wrapped(batch, stage)
-        total = weigh(terms, weights)
-        _update(run, model, optimizer, total, terms, step)
+        stop = _update(run, model, optimizer, terms, weigh(terms, weights), step)
         step += 1
         run.seconds[stage.value] = before + time.perf_counter() - started
-        if step % settings.checkpoint_every == 0:
+        if number + 1 == position.length:
+            break  # The end of a stage is saved under its name, and a stop waits for that.
+        if stop or step % settings.checkpoint_every == 0:
             _save(run, optimizer, step)
-        if run.should_stop():
-            _save(run, optimizer, step)
-            raise Stopped(f"stopped after step {step}", f"continue with: neilfpp train --out {run.path} --resume")
+        if stop:
+            raise Stopped(f"stopped after step {step}", f"continue with: {run.continue_with}")
     return step
 
 
 def _update(
-    run: Training,
-    model: NeilfModel,
-    optimizer: torch.optim.Optimizer,
-    total: Total,
-    terms: LossTerms,
-    step: int,
-) -> None:
-    """One step down the gradient; a step whose loss or gradient is not finite is left out, counted and named."""
+    run: Training, model: NeilfModel, optimizer: torch.optim.Optimizer, terms: LossTerms, total: Total, step: int
+) -> bool:
+    """One step down the gradient; a step whose loss or gradient is not finite is left out, counted and named.
+
+    Returns whether a person has asked to stop.
+    """
     optimizer.zero_grad(set_to_none=True)
     if total.loss.requires_grad:
         run.fabric.backward(total.loss)
     norms = _gradient_norms(model)
-    psnr = _psnr(terms, run.model.facts.radiance_scale)
-    # The one transfer of the step: everything that the loop and the person must know.
-    known = torch.stack([total.loss.detach(), psnr, *norms.values()]).tolist()
-    loss, decibels, found = known[0], known[1], dict(zip(norms, known[2:], strict=True))
+    psnr = _psnr(terms, run.model.units)
+    stop = torch.full_like(psnr, run.should_stop())
+    # The one transfer of the step: everything that the loop and the person must know. Every process takes the mean
+    # over all of them, so that all leave out the same steps and all stop after the same one.
+    known = run.fabric.all_reduce(torch.stack([total.loss.detach(), psnr, stop, *norms.values()])).tolist()
+    loss, decibels, asked, found = known[0], known[1], known[2], dict(zip(norms, known[3:], strict=True))
     if all(math.isfinite(value) for value in (loss, *found.values())):
         optimizer.step()
         run.skipped_in_a_row = 0
@@ -121,6 +122,7 @@ def _update(
     run.reporter.step(loss, decibels)
     if step % run.config.train.log_every == 0:
         _log(run, model, total, decibels, loss, step)
+    return asked > 0.0
 
 
 def _skip(run: Training, total: Total, norms: Mapping[str, float], step: int) -> None:
@@ -128,7 +130,7 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], step: int) ->
     run.skipped_in_a_row += 1
     culprits = [name for name, value in total.terms.items() if not math.isfinite(value.item())]
     fields = [name for name, value in norms.items() if not math.isfinite(value)]
-    where = f"loss {', '.join(culprits)}" if culprits else f"the gradient of {', '.join(fields)}"
+    where = f"loss {', '.join(culprits)}" if culprits else f"the gradient of {', '.join(fields) or 'another process'}"
     run.reporter.say(f"[yellow]step {step} skipped: {where} is not finite ({run.skipped} skipped so far)[/yellow]")
     if run.skipped_in_a_row >= MOST_SKIPPED:
         raise Diverged(
@@ -138,7 +140,7 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], step: int) ->
         )
 
 
-# -------------------------------------------------------------------------------------------------------------- optimiser
+# ------------------------------------------------------------------------------------------------------------ optimiser
 
 
 def make_optimizer(model: NeilfModel, config: OptimizerConfig) -> torch.optim.Optimizer:
@@ -172,19 +174,22 @@ def _gradient_norms(model: NeilfModel) -> dict[str, Tensor]:
     return norms
 
 
-def _psnr(terms: LossTerms, scale: float) -> Tensor:
-    """PSNR of the pixels that the stage compares, dB, peak 1, in the capture's own response."""
-    term, unit = (terms["physical"], 1.0) if "physical" in terms else (terms["volume"], scale)
-    error = (term.values.detach() * unit).square()
-    return -10.0 * torch.log10((error.sum() / max(error.numel(), 1)).clamp_min(1e-10))
+def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
+    """PSNR of the pixels that the stage compares, dB, in the capture's own response; NaN where there is none.
+
+    The peak is 1, and no error counts for more: a few HDR highlights would otherwise be all that the figure shows.
+    """
+    term, unit = (terms["physical"], units.physical) if "physical" in terms else (terms["volume"], units.volume)
+    error = (term.values.detach() * unit).clamp_max(1.0).square().mean()
+    return -10.0 * torch.log10(error.clamp_min(1e-10))
 
 
-# ------------------------------------------------------------------------------------------------------- state and record
+# ----------------------------------------------------------------------------------------------------- state and record
 
 
 def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str | None = None) -> None:
     if run.fabric.is_global_zero:
-        for name in filter(None, ("last", also)):
+        for name in filter(None, (also, "last")):
             save_checkpoint(run.path / "checkpoints" / f"{name}.pt", run.model, optimizer, step)
         write_json(run.path / "timing.json", run.seconds)
     run.fabric.barrier()
@@ -195,7 +200,7 @@ def _restore(run: Training, optimizer: torch.optim.Optimizer) -> int:
     if not path.exists():
         return 0
     saved = load_checkpoint(path)
-    run.model.load_state_dict(saved["model"])
+    load_weights(run.model, saved, run.path)
     optimizer.load_state_dict(saved["optimizer"])
     if (run.path / "timing.json").exists():
         run.seconds.update(read_json(run.path / "timing.json"))

@@ -13,7 +13,7 @@ from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.images import read_image, write_png
 from neilfpp_method.data.views import View, camera_rays
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.schedule import STAGES, Stage
+from neilfpp_method.schedule import Stage
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.structures import RayBatch
 
@@ -33,7 +33,7 @@ def write_preview(model: NeilfModel, capture: Capture, stage: Stage, path: Path)
     shape = (len(range(0, view.camera.height, step)), len(range(0, view.camera.width, step)), 3)
     panels = [_photograph(view, capture.hdr)[::step, ::step]]
     rays = _rays(capture, view, step)
-    panels += [p.reshape(shape) for p in _panels(model, rays, model.config, STAGES[stage].moves_material)]
+    panels += [p.reshape(shape) for p in _panels(model, rays, model.config, model.stages[stage].moves_material)]
     picture = np.concatenate([(p.clip(0.0, 1.0) * 255.0 + 0.5).astype(np.uint8) for p in panels], axis=1)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_png(path, picture)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -9,7 +10,15 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from torch.utils.tensorboard import SummaryWriter
 
 __all__ = ["Reporter", "reporting"]
@@ -32,15 +41,17 @@ class Reporter:
             self.task = self.progress.add_task(TITLES[stage], total=length, completed=done, loss="–", psnr="–")
 
     def step(self, loss: float, psnr: float) -> None:
-        """One step further."""
+        """One step further; `psnr` is NaN where the step compared no pixel."""
         if self.progress is not None and self.task is not None:
-            self.progress.update(self.task, advance=1, loss=f"{loss:.4f}", psnr=f"{psnr:.1f} dB")
+            shown = f"{psnr:.1f} dB" if math.isfinite(psnr) else "–"
+            self.progress.update(self.task, advance=1, loss=f"{loss:.4f}", psnr=shown)
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
-        """Values for TensorBoard."""
+        """Values for TensorBoard, where they are finite."""
         if self.writer is not None:
             for name, value in values.items():
-                self.writer.add_scalar(name, value, step)
+                if math.isfinite(value):
+                    self.writer.add_scalar(name, value, step)
 
     def picture(self, step: int, name: str, pixels: np.ndarray) -> None:
         """A picture (H, W, 3) uint8 for TensorBoard."""

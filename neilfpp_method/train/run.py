@@ -11,27 +11,50 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import pickle
 import platform
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
 from neilfpp_method.config import NeilfConfig, from_dict, to_dict
 from neilfpp_method.data.capture import Capture, load_capture
+from neilfpp_method.data.images import replacing
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel, SceneFacts
 from neilfpp_method.train.build import build_model
 
-__all__ = ["CaptureSource", "Run", "create_run", "load_checkpoint", "load_run", "read_json", "save_checkpoint", "write_json"]
+__all__ = [
+    "CaptureSource",
+    "Description",
+    "Run",
+    "check_free",
+    "create_run",
+    "load_checkpoint",
+    "load_run",
+    "load_weights",
+    "read_description",
+    "read_json",
+    "save_checkpoint",
+    "write_json",
+]
 
 FORMAT = 1
-PACKAGES = ("neilfpp-method", "torch", "numpy", "opencv-contrib-python-headless", "OpenEXR", "trimesh", "scikit-image")
+PACKAGES = (
+    "neilfpp-method",
+    "torch",
+    "lightning-fabric",
+    "numpy",
+    "opencv-contrib-python-headless",
+    "OpenEXR",
+    "trimesh",
+    "scikit-image",
+)
+CHECKPOINT_KEYS = {"format", "step", "model", "optimizer"}
 
 
 @dataclass(frozen=True)
@@ -58,14 +81,19 @@ class Run:
     step: int
 
 
-def create_run(path: Path, config: NeilfConfig, source: CaptureSource, facts: SceneFacts) -> None:
-    """Write the description of a new run.
+def check_free(path: Path) -> None:
+    """That a new run may take this folder.
 
     Raises:
         UserError: the folder is there already and not empty.
     """
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise UserError(f"{path}: exists already", "choose another --out, or continue it with --resume")
+
+
+def create_run(path: Path, config: NeilfConfig, source: CaptureSource, facts: SceneFacts) -> None:
+    """Write the description of a new run into a folder that is missing or empty."""
+    check_free(path)
     path.mkdir(parents=True, exist_ok=True)
     write_json(path / "capture.json", dataclasses.asdict(source))
     write_json(path / "scene.json", dataclasses.asdict(facts))
@@ -90,12 +118,7 @@ def load_run(path: Path | str, device: torch.device | str = "cpu", checkpoint: s
     saved = load_checkpoint(path / "checkpoints" / f"{checkpoint}.pt")
     capture = described.source.load()
     model = build_model(capture, described.facts, described.config)
-    try:
-        model.load_state_dict(saved["model"])
-    except RuntimeError as error:
-        raise UserError(
-            f"{path}: the checkpoint does not fit the settings", "use the version of neilfpp that wrote it"
-        ) from error
+    load_weights(model, saved, path)
     return Run(path, described.config, capture, described.facts, model.to(device).eval(), saved["step"])
 
 
@@ -106,6 +129,7 @@ class Description:
     config: NeilfConfig
     source: CaptureSource
     facts: SceneFacts
+
 
 def read_description(path: Path) -> Description:
     """The settings, the capture's whereabouts and the scene facts of a run folder.
@@ -118,25 +142,34 @@ def read_description(path: Path) -> Description:
     stored = read_json(path / "config.json")
     if stored.get("format") != FORMAT:
         raise UserError(
-            f"{path}: written in run format {stored.get('format')}, this version reads {FORMAT}",
+            f"{path / 'config.json'}: written in run format {stored.get('format')}, this version reads {FORMAT}",
             "use the version of neilfpp that wrote it, or train again",
         )
-    config = from_dict(NeilfConfig, stored["config"], f"{path / 'config.json'}: config")
-    source = from_dict(CaptureSource, read_json(path / "capture.json"), str(path / "capture.json"))
-    facts = from_dict(SceneFacts, read_json(path / "scene.json"), str(path / "scene.json"))
-    return Description(config, source, facts)
+    return Description(
+        _described(NeilfConfig, stored.get("config"), f"{path / 'config.json'}: config"),
+        _described(CaptureSource, read_json(path / "capture.json"), str(path / "capture.json")),
+        _described(SceneFacts, read_json(path / "scene.json"), str(path / "scene.json")),
+    )
 
 
-# ------------------------------------------------------------------------------------------------------------ checkpoints
+Part = TypeVar("Part")
+
+
+def _described(kind: type[Part], values: Any, where: str) -> Part:
+    try:
+        return from_dict(kind, values, where)
+    except (TypeError, AttributeError) as error:  # Something that must be there is missing, or is no object.
+        raise UserError(f"{where}: not a complete description ({error})", "restore the file or train again") from error
+
+
+# ---------------------------------------------------------------------------------------------------------- checkpoints
 
 
 def save_checkpoint(path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer, step: int) -> None:
-    """Weights and optimiser of step `step`, written under a temporary name and renamed: never half a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".partial")
+    """Weights and optimiser after `step` steps, in one step: never half a file."""
     contents = {"format": FORMAT, "step": step, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
-    torch.save(contents, temporary)
-    os.replace(temporary, path)
+    with replacing(path) as temporary:
+        torch.save(contents, temporary)
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
@@ -149,21 +182,36 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         raise UserError(f"{path}: no checkpoint", "train the run first, or continue it with --resume")
     try:
         contents = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, pickle.UnpicklingError, EOFError, OSError) as error:
-        raise UserError(f"{path}: not a readable checkpoint", "delete it and continue from another, or train again") from error
-    if not isinstance(contents, dict) or contents.get("format") != FORMAT:
+    except Exception as error:  # A damaged or forged file can fail anywhere in the unpickler.
+        remedy = "copy a stage's checkpoint over it, or train again"
+        raise UserError(f"{path}: not a readable checkpoint", remedy) from error
+    if not isinstance(contents, dict) or contents.get("format") != FORMAT or CHECKPOINT_KEYS - set(contents):
         raise UserError(f"{path}: a checkpoint of another version", "use the version of neilfpp that wrote it")
     return contents
 
 
-# ------------------------------------------------------------------------------------------------------------------ files
+def load_weights(model: torch.nn.Module, saved: Mapping[str, Any], run: Path) -> None:
+    """Put the weights of a checkpoint into the model that the settings of its run describe.
+
+    Raises:
+        UserError: they do not fit.
+    """
+    try:
+        model.load_state_dict(saved["model"])
+    except (RuntimeError, TypeError) as error:
+        raise UserError(
+            f"{run}: the checkpoint does not fit the settings in config.json",
+            "restore that file, or use the version of neilfpp that wrote the run",
+        ) from error
+
+
+# ---------------------------------------------------------------------------------------------------------------- files
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """JSON under a temporary name, then renamed."""
-    temporary = path.with_suffix(".partial")
-    temporary.write_text(json.dumps(value, indent=2) + "\n")
-    os.replace(temporary, path)
+    """A JSON object, in one step."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(value, indent=2) + "\n")
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -83,7 +83,6 @@ def test_samples_are_uniform_and_follow_the_global_seed(tmp_path: Path) -> None:
 
 
 def test_masks(tmp_path: Path) -> None:
-    assert (dataset(tmp_path / "none").view(0).mask == 1).all()
     root = make_capture(tmp_path / "alpha")
     color = np.ones((HEIGHT, WIDTH, 4), np.float32)
     color[:, :10, 3] = 0.2
@@ -125,7 +124,8 @@ def test_black_pixels_do_not_count_in_the_median(tmp_path: Path) -> None:
 
 def test_radiance_quantile_counts_linear_values(tmp_path: Path) -> None:
     hdr, ldr = dataset(tmp_path / "a"), dataset(tmp_path / "b", hdr=False)
-    values = np.sort(np.concatenate([hdr.view(i).color.numpy().ravel() for i in range(6)]))
+    views = [hdr.view(i) for i in range(6)]
+    values = np.sort(np.concatenate([view.color[view.mask > 0.5].numpy().ravel() for view in views]))
     assert hdr.radiance_quantile(1.0) == values[-1] > 1
     assert (values <= hdr.radiance_quantile(0.9)).mean() == pytest.approx(0.9, abs=1e-3)
     assert ldr.radiance_quantile(1.0) == pytest.approx(1)
@@ -153,3 +153,17 @@ def test_loading_reports_each_view(tmp_path: Path) -> None:
     names: list[str] = []
     PixelDataset(capture, capture.train_views, on_view=names.append)
     assert names == ["001", "002", "003", "004", "005"]
+
+
+def test_exact_background_pixels_are_off_the_object(tmp_path: Path) -> None:
+    pixels = dataset(tmp_path, background=0.5)
+    for i in range(6):
+        view = pixels.view(i)
+        background = (view.color == view.color[0]).all(dim=-1)
+        assert torch.equal(view.mask_known.bool(), background)
+        assert torch.equal(view.mask.bool(), ~background)
+
+
+def test_a_mask_file_is_known_everywhere(tmp_path: Path) -> None:
+    capture = load_capture(make_capture(tmp_path, masks=True))
+    assert PixelDataset(capture, capture.views).view(0).mask_known.all()

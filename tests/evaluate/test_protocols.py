@@ -14,9 +14,9 @@ import pytest
 import torch
 from torch import nn
 
-from neilfpp_method.config import preset
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.truth import LightField, Mesh, Truth
+from neilfpp_method.data.mesh import Mesh
+from neilfpp_method.data.truth import LightField, Truth
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import protocols
 from neilfpp_method.evaluate.protocols import evaluate, light_metrics, protocol, write_metrics
@@ -28,6 +28,7 @@ from neilfpp_method.evaluate.views import (
     surface_points,
 )
 from neilfpp_method.model import Maps, NeilfModel, SceneFacts
+from neilfpp_method.presets import preset
 from neilfpp_method.structures import Material, RayBatch
 from neilfpp_method.train.run import Run
 from tests.data import make_capture as scene
@@ -166,7 +167,7 @@ def test_without_truth_the_images_alone_are_compared(captures, tmp_path):
     for name in ("depth_maps", "normal_maps", "model", "masks"):
         shutil.rmtree(root / "inputs" / name)
     run = make_run(load_capture(root))
-    assert protocol(run)["mask_source"] == "rendered opacity"
+    assert protocol(run)["mask_source"] == "capture masks"  # the background of the capture is exactly black
     names = {"psnr", "psnr_linear", "ssim"}
     assert evaluate(run).keys() == {f"{kind}_{name}" for kind in ("volume", "pbr") for name in names}
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from neilfpp_method.config import preset
 from neilfpp_method.fields.outgoing_radiance import OutgoingRadianceField
+from neilfpp_method.presets import preset
 
 
 def inputs(feature_width: int) -> list[torch.Tensor]:

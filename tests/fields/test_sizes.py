@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 from torch import nn
 
-from neilfpp_method.config import preset
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.incident_light import IncidentLightField
 from neilfpp_method.fields.outgoing_radiance import OutgoingRadianceField
 from neilfpp_method.fields.sdf import SdfField
+from neilfpp_method.presets import preset
 
 
 def linear(inputs: int, outputs: int) -> int:

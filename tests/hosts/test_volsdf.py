@@ -33,13 +33,15 @@ def test_it_keeps_the_contracts(sharp):
     assert isinstance(sharp, HasParameterGroups)
 
 
-def test_hits_lie_on_the_sphere_with_its_normals(sharp):
+def test_hits_lie_on_the_zero_set_with_its_normals(sharp):
     hits = sharp.render(sphere_batch(spread=0.3).rays)
     assert hits.is_hit(0.8).all()
     assert hits.opacity.min() > 0.99
-    torch.testing.assert_close(hits.position.norm(dim=-1), torch.full((48,), RADIUS), atol=0.01, rtol=0.0)
-    cosine = (hits.normal * normalize(hits.position, dim=-1)).sum(-1)
-    assert cosine.min() > 0.99
+    assert sharp.sdf(hits.position).abs().max() < 0.01
+    torch.testing.assert_close(hits.position.norm(dim=-1), torch.full((48,), RADIUS), atol=0.1, rtol=0.0)
+    steps = 1e-2 * torch.eye(3)
+    slope = torch.stack([sharp.sdf(hits.position + e) - sharp.sdf(hits.position - e) for e in steps], dim=-1)
+    assert (hits.normal * normalize(slope, dim=-1)).sum(-1).min() > 0.98
     torch.testing.assert_close(hits.normal.norm(dim=-1), torch.ones(48))
 
 
@@ -59,7 +61,7 @@ def test_without_a_background_the_sphere_of_the_scene_closes_it():
     assert beyond.any()
     assert not hits.is_hit(0.8)[beyond].any()  # painted by R, but no surface of the object
     x = torch.tensor([[1.7, 0.0, 0.0], [0.0, 0.0, 0.9]])
-    torch.testing.assert_close(host.sdf(x), torch.tensor([1.75 - 1.7, 0.9 - RADIUS]), atol=0.02, rtol=0.0)
+    torch.testing.assert_close(host.sdf(x), torch.tensor([1.75 - 1.7, 0.9 - RADIUS]), atol=0.1, rtol=0.0)
 
 
 def test_only_the_named_losses_are_computed(sharp):
@@ -70,11 +72,10 @@ def test_only_the_named_losses_are_computed(sharp):
 
 def test_a_cloud_on_the_surface_costs_little_and_one_off_it_its_distance():
     direction = normalize(torch.randn(64, 3), dim=-1)
-    for radius, expected in ((RADIUS, 0.0), (RADIUS + 0.2, 0.2)):
-        host = sphere_model().host
-        host.points = OrientedPoints(radius * direction, direction)
+    for radius, expected in ((RADIUS, 0.0), (RADIUS + 0.3, 0.3)):
+        host = VolSdfHost(tiny_config(), 3.0, "constant", points=OrientedPoints(radius * direction, direction))
         term = host.render_regularised(sphere_batch(8), ["point_cloud"]).terms["point_cloud"]
-        assert term.mean().item() == pytest.approx(expected, abs=0.02)
+        assert term.mean().item() == pytest.approx(expected, abs=0.15)  # the field starts as a rough sphere
 
 
 def test_the_background_field_moves_only_where_it_is_the_background():

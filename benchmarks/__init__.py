@@ -1,0 +1,1 @@
+"""Measurements that take minutes: each a command whose output goes into docs/."""

@@ -1,0 +1,57 @@
+"""Material and light on top of a function that renders, in a loop of your own: the three lines are marked."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import nn
+from torch.nn.functional import normalize
+
+from neilfpp_method import attach_neilf, preset
+from neilfpp_method.attach import pixel_batch
+
+
+class Ball(nn.Module):
+    """Stands for your model: rays to colour, hit position and normal; zero normals where a ray meets nothing."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.radius = nn.Parameter(torch.tensor(0.5))
+        self.paint = nn.Sequential(nn.Linear(3, 64), nn.ReLU(), nn.Linear(64, 3), nn.Softplus())
+
+    def forward(self, origins, directions):
+        middle = -(origins * directions).sum(-1, keepdim=True)
+        half_chord = self.radius**2 + middle**2 - origins.square().sum(-1, keepdim=True)
+        hit = (half_chord > 1e-4) & (middle > 0.0)
+        position = origins + (middle - half_chord.clamp_min(1e-4).sqrt()) * directions
+        return torch.where(hit, self.paint(position), 0.0), position, torch.where(hit, normalize(position, dim=-1), 0.0)
+
+
+def photograph(count: int):
+    """Rays towards the origin from all sides, and what a red ball under a white sky sends along them."""
+    origins = 3.0 * normalize(torch.randn(count, 3), dim=-1)
+    directions = normalize(0.3 * torch.randn(count, 3) - origins, dim=-1)
+    _, _, normal = Ball()(origins, directions)
+    sky = 0.5 + 0.5 * normal[:, 2:]  # the share of the sky that a point sees
+    return origins, directions, sky * torch.tensor([0.8, 0.2, 0.1]) * normal.norm(dim=-1, keepdim=True)
+
+
+torch.manual_seed(0)
+host = Ball()
+optimizer = torch.optim.Adam(host.parameters(), lr=5e-3)
+steps = dataclasses.replace(preset("fast").train, sdf_steps=60, material_steps=80, joint_steps=20)
+
+neilf = attach_neilf(host, dataclasses.replace(preset("fast"), train=steps), median_radiance=0.2)  # 1
+optimizer.add_param_group({"params": neilf.parameters(), "lr": 2e-3})  # 2
+for step in range(160):
+    origins, directions, color = photograph(256)
+    own = (host(origins, directions)[0] - color).abs().mean()
+    total = neilf.losses(pixel_batch(origins, directions, color), step)
+    optimizer.zero_grad()
+    (own + total.loss).backward()  # 3
+    optimizer.step()
+    if step % 40 == 39:
+        terms = ", ".join(f"{name} {value.item():.3f}" for name, value in total.terms.items())
+        print(f"step {step + 1}: own loss {own.item():.3f}; {terms or 'nothing yet'}")
+print("base colour at the top:", neilf.materials(torch.tensor([[0.0, 0.0, 0.5]])).base_color)

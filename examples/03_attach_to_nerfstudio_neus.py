@@ -1,0 +1,57 @@
+"""Material and light on top of nerfstudio's NeuS: first NeuS alone, then the add-on in the same loop.
+
+    python examples/03_attach_to_nerfstudio_neus.py [steps]
+
+NeuS's hash grid is tiny-cuda-nn's, so this needs a GPU: set DEVICE.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+
+import torch
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.models.neus import NeuSModelConfig
+
+from neilfpp_method import attach_neilf, preset
+from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.demo import demo_scene
+from neilfpp_method.hosts.nerfstudio import NerfstudioHost
+
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+STEPS = int(sys.argv[1]) if len(sys.argv) > 1 else 2000
+RAYS = 128
+
+capture = load_capture(demo_scene())
+pixels = PixelDataset(capture, capture.train_views, device=DEVICE)
+box = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+neus = NeuSModelConfig().setup(scene_box=box, num_train_data=len(pixels.views)).to(DEVICE)
+
+# Your trainer, whatever it is. This one is six lines.
+optimizer = torch.optim.Adam([p for group in neus.get_param_groups().values() for p in group if p.requires_grad], 5e-4)
+own = NerfstudioHost(neus, response="linear")
+for _ in range(STEPS):
+    rendered = own.render_regularised(batch := pixels.sample(RAYS), {"eikonal"})
+    loss = (rendered.hits.color - batch.color).abs().mean() + 0.1 * rendered.terms["eikonal"].mean()
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+print(f"NeuS: loss {loss.item():.4f}")
+
+# The add-on: three lines, and the same kind of step. The host is trained already, so its stage has no steps.
+config = preset("fast")
+config = dataclasses.replace(config, train=dataclasses.replace(config.train, sdf_steps=0, material_steps=STEPS))
+neilf = attach_neilf(neus, config, response="linear", median_radiance=pixels.median_radiance()).to(DEVICE)
+optimizer = torch.optim.Adam(neilf.parameters(), 1e-3)
+for step in range(STEPS):
+    loss = neilf.losses(pixels.sample(RAYS), step).loss
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+print(f"NeuS with material and light: loss {loss.item():.4f}")
+
+maps = neilf.eval().model.maps(pixels.sample(RAYS).rays)
+seen = maps.roughness[:, 0] > 0
+print(f"{int(seen.sum())} of {RAYS} rays meet one surface; mean base colour {maps.base_color[seen].mean(0).tolist()}")

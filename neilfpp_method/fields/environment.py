@@ -1,0 +1,93 @@
+"""L for light from far away: an environment map, the same at every point, which can be importance-sampled.
+
+The map is in latitude and longitude about +z: row j is at the angle θ = π j/(h − 1) from +z, column i at the azimuth
+φ = 2π (i + ½)/w, and the direction there is (sin φ sin θ, cos φ sin θ, cos θ).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn import functional
+
+from neilfpp_method.shading.color import luminance
+from neilfpp_method.structures import IncidentSamples
+
+__all__ = ["EnvironmentLight"]
+
+UNIFORM_SHARE = 0.1
+"""Share of the samples that is spread evenly over the sphere, so that no direction is left out of the density."""
+
+
+class EnvironmentLight(nn.Module):
+    """A grid of log radiance; radiance between the texels is the exponential of the bilinear interpolation.
+
+    Args:
+        height: rows of the map; it has twice as many columns.
+        initial_radiance: what every texel starts at.
+    """
+
+    def __init__(self, height: int, initial_radiance: float) -> None:
+        super().__init__()
+        self.log_radiance = nn.Parameter(torch.full((3, height, 2 * height), math.log(initial_radiance)))
+        edges = (torch.arange(height + 1) - 0.5).clamp(0, height - 1) * math.pi / (height - 1)
+        self.register_buffer("cos_edges", edges.cos(), persistent=False)
+
+    def radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
+        """Radiance > 0 from wi, whatever x; what stands between is not this model's."""
+        column, row = self._columns_and_rows(wi)
+        _, height, width = self.log_radiance.shape
+        # One column more on each side closes the map; the azimuth of a column is at its middle.
+        closed = torch.cat((self.log_radiance[..., -1:], self.log_radiance, self.log_radiance[..., :1]), -1)
+        at = torch.stack((2 * (column + 1) / (width + 1) - 1, 2 * row / (height - 1) - 1), -1)
+        values = functional.grid_sample(closed[None], at[None].to(closed.dtype), align_corners=True)
+        return values[0].permute(1, 2, 0).exp()
+
+    @torch.no_grad()
+    def sample(self, like: Float[Tensor, "N 3"], count: int, stochastic: bool) -> IncidentSamples:
+        """`count` directions for each row of `like`, in proportion to the radiance; half of them may be below a horizon."""
+        shape = (len(like), count)
+        strata = torch.arange(count, device=like.device, dtype=like.dtype)
+        within = torch.rand(3, *shape, device=like.device, dtype=like.dtype) if stochastic else like.new_full((3, *shape), 0.5)
+        cell = torch.searchsorted(self._texel_shares().cumsum(0), (strata + within[0]) / count)
+        width = self.log_radiance.shape[2]
+        row, column = self._in_map(cell)
+        cos_theta = torch.lerp(self.cos_edges[row], self.cos_edges[row + 1], within[1])
+        phi = 2 * math.pi * (column + within[2]) / width
+        sin_theta = ((1 - cos_theta) * (1 + cos_theta)).clamp_min(0).sqrt()
+        wi = torch.stack((phi.sin() * sin_theta, phi.cos() * sin_theta, cos_theta), -1)
+        return IncidentSamples(wi, self.pdf(wi))
+
+    @torch.no_grad()
+    def pdf(self, wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S"]:
+        """Density of `sample`, per steradian of the sphere: constant on each texel."""
+        column, row = self._columns_and_rows(wi)
+        _, height, width = self.log_radiance.shape
+        cell = (row + 0.5).long().clamp(0, height - 1) * width + (column + 0.5).floor().long() % width
+        return (self._texel_shares() / self._texel_solid_angles())[cell]
+
+    def _columns_and_rows(self, wi: Float[Tensor, "*B 3"]) -> tuple[Float[Tensor, "*B"], Float[Tensor, "*B"]]:
+        """Where a direction lies in the map, in texels: column in [−½, w − ½), row in [0, h − 1]."""
+        x, y, z = wi.unbind(-1)
+        _, height, width = self.log_radiance.shape
+        turn = torch.atan2(x, y) / (2 * math.pi)
+        return (turn - turn.floor()) * width - 0.5, torch.acos(z.clamp(-1, 1)) / math.pi * (height - 1)
+
+    def _in_map(self, cell: Int[Tensor, "N S"]) -> tuple[Int[Tensor, "N S"], Int[Tensor, "N S"]]:
+        _, height, width = self.log_radiance.shape
+        cell = cell.clamp_max(height * width - 1)
+        return cell // width, cell % width
+
+    def _texel_solid_angles(self) -> Float[Tensor, " T"]:
+        width = self.log_radiance.shape[2]
+        rows = (self.cos_edges[:-1] - self.cos_edges[1:]) * 2 * math.pi / width
+        return rows[:, None].expand(-1, width).reshape(-1)
+
+    def _texel_shares(self) -> Float[Tensor, " T"]:
+        """The probability of each texel."""
+        solid_angles = self._texel_solid_angles()
+        power = luminance(self.log_radiance.detach().permute(1, 2, 0).exp()).reshape(-1) * solid_angles
+        return (1 - UNIFORM_SHARE) * power / power.sum() + UNIFORM_SHARE * solid_angles / (4 * math.pi)

@@ -1,0 +1,137 @@
+"""Geometry that is given: a triangle mesh that shows a surface light field (METHOD §5)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from neilfpp_method.config import NeilfConfig
+from neilfpp_method.data.mesh import Mesh
+from neilfpp_method.fields.background import InvertedSphere
+from neilfpp_method.fields.outgoing_radiance import OutgoingRadianceField
+from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_tracer, meet, tree_tracer
+from neilfpp_method.schedule import FIXED_GEOMETRY
+from neilfpp_method.shading.frame import safe_normalize
+from neilfpp_method.structures import RayBatch, SurfaceHits
+
+__all__ = ["MeshHost"]
+
+TINY = 1e-18
+"""Length under which a sum of edge products has no direction: triangles may be small."""
+
+
+@dataclass(frozen=True)
+class Crossings:
+    """The rays that meet the mesh: their rows, where they meet it, its normal there, and whether on its outside."""
+
+    rows: Int[Tensor, " K"]
+    position: Float[Tensor, "K 3"]
+    normal: Float[Tensor, "K 3"]
+    outside: Bool[Tensor, " K"]
+
+
+class MeshHost(nn.Module):
+    """A mesh and R on it. Positions and normals are constants; the colour moves R.
+
+    Faces are wound outwards: their inside stops a ray, but is no surface point. Geometry is no part of the weights.
+
+    Args:
+        mesh: triangles in the scene frame.
+        config: the settings.
+        radiance_scale: the largest radiance that R can reach.
+        background: "inverted_sphere", or whatever else for a constant one.
+        background_color: linear RGB of a constant background.
+    """
+
+    stages = FIXED_GEOMETRY
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        config: NeilfConfig,
+        radiance_scale: float,
+        background: str = "constant",
+        background_color: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        super().__init__()
+        radius = config.volume.radius
+        self.radiance_field = OutgoingRadianceField(config.radiance, 0, radius, radiance_scale)
+        self.background = (
+            InvertedSphere(config.background, radius, radiance_scale) if background == "inverted_sphere" else None
+        )
+        self.register_buffer("background_color", torch.tensor(background_color))
+        triangles = mesh.vertices[mesh.faces]
+        across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        outward = safe_normalize(across, eps=TINY)
+        smooth = _vertex_normals(mesh, across)[mesh.faces] if config.mesh.smooth_normals else outward[:, None]
+        self.register_buffer("triangles", triangles, persistent=False)
+        self.register_buffer("outward", outward, persistent=False)
+        self.register_buffer("corner_normals", smooth.expand(-1, 3, -1), persistent=False)
+        self._tracers: dict[torch.device, FirstHits] = {}
+
+    # ------------------------------------------------------------------------------------------------ the host contract
+
+    def render(self, rays: RayBatch) -> SurfaceHits:
+        """What each ray meets first, and R there; what lies beyond where it meets nothing."""
+        with torch.no_grad():
+            met = self.cross(rays)
+        wo = -rays.directions[met.rows]
+        radiance = self.radiance_field(met.position, wo, met.normal, met.position[:, :0])
+        nothing, zeros = torch.zeros_like(rays.origins), torch.zeros_like(rays.origins[:, 0])
+        return SurfaceHits(
+            color=self._beyond(rays, met.rows).to(radiance.dtype).index_put((met.rows,), radiance),
+            position=rays.origins.index_put((met.rows,), met.position),
+            normal=nothing.index_put((met.rows,), met.normal),
+            opacity=zeros.index_fill(0, met.rows, 1.0),
+            concentration=zeros.index_put((met.rows,), met.outside.to(zeros.dtype)),
+        )
+
+    def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
+        """R, and the background where it is a field."""
+        groups = {"radiance": list(self.radiance_field.parameters())}
+        return groups if self.background is None else groups | {"background": list(self.background.parameters())}
+
+    # --------------------------------------------------------------------------------------------------------- geometry
+
+    def cross(self, rays: RayBatch) -> Crossings:
+        """Where rays meet the mesh first."""
+        numbers = self._first_hits()(rays.origins, rays.directions)
+        rows = torch.nonzero(numbers >= 0)[:, 0]
+        numbers, origins, directions = numbers[rows], rays.origins[rows], rays.directions[rows]
+        meeting = meet(origins, directions, self.triangles[numbers].to(origins.dtype))
+        flat = self.outward[numbers].to(origins.dtype)
+        smooth = safe_normalize((meeting.weights[..., None] * self.corner_normals[numbers].to(origins.dtype)).sum(1))
+        # Seen along the surface, the interpolated normal can point away from the viewer; the triangle's does not.
+        faces_viewer = (smooth * directions).sum(-1, keepdim=True) < 0.0
+        return Crossings(
+            rows=rows,
+            position=origins + meeting.distance[:, None] * directions,
+            normal=torch.where(faces_viewer, smooth, flat),
+            outside=(flat * directions).sum(-1) < 0.0,
+        )
+
+    def _first_hits(self) -> FirstHits:
+        """Embree on a CPU, the tree anywhere else; made when the first ray comes to a device."""
+        device = self.triangles.device
+        if device not in self._tracers:
+            embree = embree_tracer(self.triangles) if device.type == "cpu" else None
+            self._tracers[device] = embree or tree_tracer(build_tree(self.triangles))
+        return self._tracers[device]
+
+    def _beyond(self, rays: RayBatch, met: Int[Tensor, " K"]) -> Float[Tensor, "N 3"]:
+        """What the rays see that meet nothing."""
+        if self.background is None:
+            return self.background_color.expand(len(rays), 3)
+        missed = torch.nonzero(torch.ones_like(rays.origins[:, 0]).index_fill(0, met, 0.0))[:, 0]
+        beyond = self.background(rays.origins[missed], rays.directions[missed])
+        return beyond.new_zeros(len(rays), 3).index_put((missed,), beyond)
+
+
+def _vertex_normals(mesh: Mesh, across: Float[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
+    """Unit normals of vertices: of the faces around each, by area. Vertices that faces do not share make edges."""
+    around = torch.zeros_like(mesh.vertices).index_add(0, mesh.faces.reshape(-1), across.repeat_interleave(3, dim=0))
+    return safe_normalize(around, eps=TINY)

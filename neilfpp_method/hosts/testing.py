@@ -1,0 +1,218 @@
+"""The host contract as a test, for whoever writes a host: `check_host(host, rays)`.
+
+What it cannot see is whether colours are linear: that takes a photograph whose radiance is known. It does see the
+commonest symptom, colours that stop at 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor, nn
+
+from neilfpp_method.errors import UserError
+from neilfpp_method.hosts.base import HasStages, Host
+from neilfpp_method.hosts.outputs import check_normals, check_tensors, host_name
+from neilfpp_method.schedule import STAGES
+from neilfpp_method.structures import RayBatch, SurfaceHits
+
+__all__ = ["HostReport", "check_host"]
+
+HIT_SHARE = 0.8
+OFF_RAY = 1e-2
+"""How far a hit may lie from its ray, in shares of its distance."""
+FACING = 0.9
+"""Least share of hits whose normal must face the viewer: blended normals at a silhouette may not."""
+CLIPPED = 0.01
+"""Share of colour values at exactly 1, their maximum, that is no chance."""
+FAR = 100.0
+"""Distance of rays that lead away from the scene, scene units."""
+
+
+@dataclass(frozen=True)
+class HostReport:
+    """A host that kept the contract: how many rays hit, what was checked, and whether its geometry is trained."""
+
+    host: str
+    hits: int
+    rays: int
+    checks: tuple[str, ...]
+    trains_geometry: bool
+
+
+@dataclass(frozen=True)
+class Case:
+    """A host under test, and what it made of the rays."""
+
+    host: Host
+    name: str
+    rays: RayBatch
+    parameters: Sequence[nn.Parameter]
+    trains_geometry: bool
+    hits: SurfaceHits
+    hit: Tensor
+
+    def require(self, kept: bool | Tensor, broken: str) -> None:
+        """Raise what is broken, unless it is kept."""
+        if not kept:
+            raise AssertionError(f"{self.name}: {broken}")
+
+
+def check_host(host: Host, rays: RayBatch, parameters: Sequence[nn.Parameter] | None = None) -> HostReport:
+    """Hold a host to `hosts.base.Host`.
+
+    Args:
+        host: the host; its mode is left as it is.
+        rays: some hundred rays in the scene frame, from outside the object; several must hit it.
+        parameters: what the host trains; none: its own parameters, where it is a module.
+
+    Raises:
+        AssertionError: it breaks the contract; names the host and what it does.
+    """
+    if parameters is None:
+        parameters = list(host.parameters()) if isinstance(host, nn.Module) else []
+    parameters = [p for p in parameters if p.requires_grad]
+    name = host_name(host)
+    before = rays.origins.clone(), rays.directions.clone()
+    hits = _render(host, name, rays)
+    stages = host.stages if isinstance(host, HasStages) else STAGES
+    trains_geometry = any("geometry" in plan.moves for plan in stages.values())
+    case = Case(host, name, rays, parameters, trains_geometry, hits, hits.is_hit(HIT_SHARE).detach())
+    case.require(torch.equal(before[0], rays.origins) and torch.equal(before[1], rays.directions), "changes its input")
+    for check in CHECKS:
+        check(case)
+    names = ("tensors", *(check.__name__.strip("_") for check in CHECKS))
+    return HostReport(name, int(case.hit.sum()), len(rays), names, trains_geometry)
+
+
+def _render(host: Host, name: str, rays: RayBatch) -> SurfaceHits:
+    """What the host renders, with the shapes and the device of the contract."""
+    try:
+        hits = host.render(rays)
+        check_tensors(name, rays, {f.name: getattr(hits, f.name, None) for f in fields(SurfaceHits)})
+    except UserError as error:
+        raise AssertionError(str(error)) from error
+    return hits
+
+
+# --------------------------------------------------------------------------------------------------------------- checks
+
+
+def _precision(case: Case) -> None:
+    for field in fields(SurfaceHits):
+        dtype, wanted = getattr(case.hits, field.name).dtype, case.rays.origins.dtype
+        case.require(dtype == wanted, f"its {field.name} is {dtype}, the rays are {wanted}")
+
+
+def _hits(case: Case) -> None:
+    case.require(case.hit.any(), f"{len(case.rays)} rays hit nothing: aim them at the surface, in the scene frame")
+    for share in ("opacity", "concentration"):
+        value = getattr(case.hits, share).detach()
+        case.require(((value >= 0.0) & (value <= 1.0 + 1e-3)).all(), f"its {share} leaves [0, 1]")
+
+
+def _normals(case: Case) -> None:
+    try:
+        check_normals(case.name, case.hits, HIT_SHARE)
+    except UserError as error:
+        raise AssertionError(str(error)) from error
+    facing = (case.hits.normal.detach() * case.rays.directions).sum(-1)[case.hit] < 0.0
+    share = facing.float().mean().item()
+    case.require(share >= FACING, f"{1.0 - share:.0%} of its normals point away from the viewer: turned inwards?")
+
+
+def _positions(case: Case) -> None:
+    offset = (case.hits.position.detach() - case.rays.origins)[case.hit]
+    directions = case.rays.directions[case.hit]
+    depth = (offset * directions).sum(-1)
+    case.require((depth > 0.0).all(), "hits lie behind the origin of their ray")
+    beside = (offset - depth[:, None] * directions).norm(dim=-1)
+    case.require((beside <= OFF_RAY * depth).all(), "hits do not lie on their ray: is the depth a distance along it?")
+
+
+def _colors(case: Case) -> None:
+    color = case.hits.color.detach()
+    case.require(color.isfinite().all(), "its colour is not finite")
+    case.require((color >= 0.0).all(), "its colour is negative")
+    seen = color[case.hit]
+    clipped = (seen == 1.0).float().mean().item()
+    stops = seen.max() == 1.0 and CLIPPED < clipped < 1.0
+    case.require(not stops, f"{clipped:.0%} of its colours are exactly 1 and none is above: return them unclipped")
+
+
+def _misses(case: Case) -> None:
+    outward = -case.rays.directions
+    away = RayBatch(case.rays.origins + FAR * outward, outward)
+    missed = _render(case.host, case.name, away)
+    for field in fields(SurfaceHits):
+        finite = getattr(missed, field.name).isfinite().all()
+        case.require(finite, f"its {field.name} is not finite where a ray meets nothing")
+    case.require(not missed.is_hit(HIT_SHARE).any(), "hits something with rays that lead away from the scene")
+
+
+def _no_rays(case: Case) -> None:
+    try:
+        none = _render(case.host, case.name, case.rays[:0])
+    except AssertionError:
+        raise
+    except Exception as error:
+        raise AssertionError(f"{case.name}: cannot render a batch without rays ({error})") from error
+    case.require(len(none) == 0, "renders something from a batch without rays")
+
+
+def _repeatable(case: Case) -> None:
+    with torch.random.fork_rng(devices=[case.rays.origins.device] if case.rays.origins.is_cuda else []):
+        both = []
+        for _ in range(2):
+            torch.manual_seed(0)
+            both.append(case.host.render(case.rays))
+    same = torch.allclose(both[0].color, both[1].color, rtol=1e-4, atol=1e-6)
+    case.require(same, "renders differently after the same seed: draw from torch's global generator")
+
+
+def _gradients_flow(case: Case) -> None:
+    if not case.parameters:
+        return
+    case.require(_reaches(case, case.hits.color[case.hit]), "no gradient leads from its colour to its parameters")
+    if case.trains_geometry:
+        shape = torch.cat([case.hits.position[case.hit], case.hits.normal[case.hit]], dim=-1)
+        case.require(_reaches(case, shape), "no gradient leads from its hits to its parameters: L_phys moves nothing")
+
+
+def _gradients_stop(case: Case) -> None:
+    before = [p.grad for p in case.parameters]
+    with torch.no_grad():
+        held = case.host.render(case.rays)
+    for field in fields(SurfaceHits):
+        leaks = getattr(held, field.name).requires_grad
+        case.require(not leaks, f"its {field.name} carries a gradient under torch.no_grad: detach it there")
+    kept = all(p.requires_grad and p.grad is g for p, g in zip(case.parameters, before, strict=True))
+    case.require(kept, "rendering changes requires_grad or grad of its parameters")
+
+
+def _reaches(case: Case, output: Tensor) -> bool:
+    """Whether a gradient of the output reaches a parameter, and is finite."""
+    if not output.requires_grad:
+        return False
+    # Weights of both signs, for sums that are constant, such as the squares of a unit vector.
+    weights = torch.linspace(-1.0, 1.5, output.numel(), dtype=output.dtype, device=output.device).reshape(output.shape)
+    gradients = torch.autograd.grad((weights * output).sum(), case.parameters, retain_graph=True, allow_unused=True)
+    found = [g for g in gradients if g is not None]
+    case.require(all(g.isfinite().all() for g in found), "a gradient of its parameters is not finite")
+    return any(bool(g.abs().max() > 0.0) for g in found)
+
+
+CHECKS: tuple[Callable[[Case], None], ...] = (
+    _precision,
+    _hits,
+    _normals,
+    _positions,
+    _colors,
+    _misses,
+    _no_rays,
+    _repeatable,
+    _gradients_flow,
+    _gradients_stop,
+)

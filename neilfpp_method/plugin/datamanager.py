@@ -1,0 +1,77 @@
+"""Pixels for nerfstudio's own data manager: float images, and with each pixel what the losses ask of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from jaxtyping import Float
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from torch import Tensor
+
+from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.errors import UserError
+from neilfpp_method.plugin.dataparser import capture_of
+from neilfpp_method.structures import PixelBatch
+
+__all__ = ["PIXELS", "CaptureDataManager", "CaptureDataManagerConfig", "CaptureDataset", "pixel_batch"]
+
+PIXELS = "neilfpp_pixels"
+"""Key of a dataset's metadata under which the model finds the `PixelDataset`."""
+
+# Not under the name `mask`: nerfstudio draws no pixel outside of that, and L_vol needs those as well.
+FACTS = {"object_mask": "mask", "mask_known": "mask_known", "image_gradient": "image_gradient"}
+
+
+class CaptureDataset(InputDataset):
+    """Images as the files hold them: linear radiance without an upper bound, or display values in [0, 1].
+
+    Raises:
+        UserError: the views differ in size, or are to be scaled.
+    """
+
+    exclude_batch_keys_from_device: ClassVar = [*InputDataset.exclude_batch_keys_from_device, *FACTS]
+
+    def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
+        super().__init__(dataparser_outputs, scale_factor)
+        capture = capture_of(dataparser_outputs)
+        if scale_factor != 1.0:
+            raise UserError("camera_res_scale_factor is not 1", "scale the capture instead")
+        if len({(int(w), int(h)) for w, h in zip(self.cameras.width, self.cameras.height, strict=True)}) > 1:
+            raise UserError(f"{capture.root}: views of several sizes", "use `neilfpp train`, or bring them to one size")
+        views = {view.image: view for view in capture.views}
+        self.pixels = PixelDataset(capture, [views[image] for image in dataparser_outputs.image_filenames])
+        self.metadata[PIXELS] = self.pixels
+
+    def get_image_float32(self, image_idx: int) -> Float[Tensor, "H W 3"]:
+        """The image as its file holds it."""
+        return self._image(image_idx, self.pixels.view(image_idx).color)
+
+    def get_metadata(self, data: dict[str, Any]) -> dict[str, Tensor]:
+        """What the losses ask of each pixel, (H, W, 1)."""
+        pixels = self.pixels.view(data["image_idx"])
+        return {key: self._image(data["image_idx"], getattr(pixels, name)) for key, name in FACTS.items()}
+
+    def _image(self, i: int, values: Tensor) -> Float[Tensor, "H W C"]:
+        camera = self.pixels.views[i].camera
+        return values.reshape(camera.height, camera.width, -1)
+
+
+def pixel_batch(origins: Tensor, directions: Tensor, batch: dict[str, Any]) -> PixelBatch:
+    """Nerfstudio's rays and its batch of pixels as ours; both in the scene frame."""
+    facts = {name: batch[key].to(origins.device)[:, 0] for key, name in FACTS.items()}
+    color, view = batch["image"].to(origins.device), batch["indices"][:, 0].to(origins.device)
+    return PixelBatch(origins=origins, directions=directions, color=color, view=view, **facts)
+
+
+@dataclass
+class CaptureDataManagerConfig(VanillaDataManagerConfig):
+    """Nerfstudio's data manager with float images."""
+
+    _target: type = field(default_factory=lambda: CaptureDataManager)
+
+
+class CaptureDataManager(VanillaDataManager[CaptureDataset]):
+    """Nerfstudio's data manager with float images."""

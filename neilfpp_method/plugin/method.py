@@ -1,0 +1,52 @@
+"""The methods `neilfpp` and `neilfpp-mesh` of `ns-train`."""
+
+from __future__ import annotations
+
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from neilfpp_method.config import NeilfConfig
+from neilfpp_method.plugin.datamanager import CaptureDataManagerConfig
+from neilfpp_method.plugin.dataparser import CaptureParserConfig
+from neilfpp_method.plugin.model import FieldAdamConfig, NeilfMethodConfig
+from neilfpp_method.presets import fixed_geometry, preset
+from neilfpp_method.schedule import GEOMETRY, MATERIAL, stage_steps
+
+__all__ = ["neilfpp", "neilfpp_mesh"]
+
+
+def trainer(name: str, settings: NeilfConfig) -> TrainerConfig:
+    """Nerfstudio's trainer with the numbers of the settings."""
+    loop = settings.train
+    return TrainerConfig(
+        method_name=name,
+        max_num_iterations=sum(stage_steps(loop).values()),
+        steps_per_save=loop.checkpoint_every,
+        steps_per_eval_image=loop.checkpoint_every,
+        pipeline=VanillaPipelineConfig(
+            datamanager=CaptureDataManagerConfig(
+                dataparser=CaptureParserConfig(),
+                train_num_rays_per_batch=loop.rays,
+                eval_num_rays_per_batch=loop.rays,
+            ),
+            model=NeilfMethodConfig(neilf=settings, eval_num_rays_per_chunk=loop.eval_chunk),
+        ),
+        # The rates are those of `pipeline.model.neilf.optimizer`, set at each step.
+        optimizers={
+            field: {"optimizer": FieldAdamConfig(name=field), "scheduler": None} for field in sorted(GEOMETRY | MATERIAL)
+        },
+        viewer=ViewerConfig(num_rays_per_chunk=loop.eval_chunk),
+        vis="viewer",
+    )
+
+
+neilfpp = MethodSpecification(
+    trainer("neilfpp", preset("fast")),
+    "NeILF++: geometry, material and incident light by inter-reflectable light fields.",
+)
+neilfpp_mesh = MethodSpecification(
+    trainer("neilfpp-mesh", fixed_geometry(preset("fast"))),
+    "NeILF++ on a given mesh: material and incident light.",
+)

@@ -1,0 +1,235 @@
+"""`NeilfModel` as a nerfstudio model: its losses, stages and rates are those of the standalone loop, called from here."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Optional
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.engine.optimizers import OptimizerConfig, Optimizers
+from nerfstudio.engine.trainer import Trainer
+from nerfstudio.models.base_model import Model, ModelConfig
+from nerfstudio.utils import colormaps
+from torch import Tensor, nn
+
+from neilfpp_method.config import NeilfConfig
+from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.errors import UserError
+from neilfpp_method.evaluate import metrics
+from neilfpp_method.hosts.nerfstudio import OWN_LOSSES, NerfstudioHost
+from neilfpp_method.model import Maps, NeilfModel
+from neilfpp_method.plugin.datamanager import PIXELS, pixel_batch
+from neilfpp_method.plugin.foreign import build_foreign
+from neilfpp_method.presets import preset
+from neilfpp_method.schedule import Stage, active_losses, stage_at, stage_steps, weigh
+from neilfpp_method.shading.color import apply_response, tone_map
+from neilfpp_method.shading.sampling import sample_directions
+from neilfpp_method.structures import RayBatch
+from neilfpp_method.train.build import build_model, scene_facts
+from neilfpp_method.train.loop import _set_rates, seed_step
+
+__all__ = ["FieldAdamConfig", "NeilfMethod", "NeilfMethodConfig"]
+
+
+@dataclass
+class FieldAdamConfig(OptimizerConfig):
+    """The optimiser of one field; at each step its rate is set as the standalone loop sets it."""
+
+    name: str = ""
+    """The field."""
+
+    def setup(self, params: list[nn.Parameter]) -> torch.optim.Optimizer:
+        """Adam, as in `train.loop.make_optimizer`."""
+        return torch.optim.Adam([{"params": params, "name": self.name}], lr=self.lr, betas=(0.9, 0.99), eps=1e-15)
+
+
+@dataclass
+class NeilfMethodConfig(ModelConfig):
+    """NeILF++ on a host."""
+
+    _target: type = field(default_factory=lambda: NeilfMethod)
+    enable_collider: bool = False
+    """Unused: hosts bound their rays themselves."""
+    host: Optional[str] = None  # noqa: UP045  (tyro reads it at run time)
+    """A nerfstudio method that renders rays as the host (neus, nerfacto, …); none: the host of `neilf`. It trains at its
+    own rate and with its own regularisers."""
+    neilf: NeilfConfig = field(default_factory=lambda: preset("fast"))
+    """The settings of the method. Of `train` only the seed and the steps of the stages count here."""
+
+
+class NeilfMethod(Model):
+    """The model, its outputs by name, and the three stages through nerfstudio's callbacks.
+
+    `rgb` and `rgb_volume` are in the response of the capture, as its pixels are: linear where it is HDR.
+    """
+
+    config: NeilfMethodConfig
+    neilf: NeilfModel
+
+    def populate_modules(self) -> None:
+        """Build the model for the capture that the data manager has read."""
+        super().populate_modules()
+        pixels: PixelDataset | None = self.kwargs["metadata"].get(PIXELS)
+        if pixels is None:
+            raise UserError("the data manager is not ours", "leave --pipeline.datamanager as `ns-train neilfpp` sets it")
+        settings = self.config.neilf
+        facts = scene_facts(pixels.capture, pixels, settings)
+        seed_step(settings.train.seed, step=-1)
+        self.rates = settings.optimizer
+        if self.config.host is None:
+            self.neilf = build_model(pixels.capture, facts, settings)
+        else:
+            arguments = {"scene_box": self.scene_box, "num_train_data": self.num_train_data, **self.kwargs}
+            foreign = build_foreign(self.config.host, arguments)
+            self.rates = dataclasses.replace(settings.optimizer, geometry=foreign.rate)
+            host = NerfstudioHost(
+                foreign.model, response=facts.response, radiance_scale=facts.radiance_scale, own_losses=True
+            )
+            self.neilf = NeilfModel(host, settings, facts)
+        self.step = 0
+        self.set_up_for: Stage | None = None
+
+    @property
+    def stage(self) -> Stage:
+        """The stage of the step in progress."""
+        return stage_at(self.step, self.config.neilf.train).stage
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Parameters by field."""
+        return {name: parameters for name, parameters in self.neilf.parameter_groups().items() if parameters}
+
+    # ------------------------------------------------------------------------------------------------------------- stages
+
+    def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+        """Ours, and those of a host that comes from nerfstudio.
+
+        Raises:
+            UserError: training on several devices; the losses are computed where nerfstudio's wrapper does not look.
+        """
+        trainer, optimizers = training_callback_attributes.trainer, training_callback_attributes.optimizers
+        if trainer.world_size > 1:
+            raise UserError("several devices under nerfstudio", "use `neilfpp train --devices N`, or one device")
+        host = self.neilf.host
+        theirs = (
+            host.model.get_training_callbacks(training_callback_attributes) if isinstance(host, NerfstudioHost) else []
+        )
+        before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
+        after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+        return [
+            *theirs,
+            TrainingCallback(before, self._begin_step, args=[optimizers]),
+            TrainingCallback(after, self._end_after_last, args=[trainer]),
+        ]
+
+    def _begin_step(self, optimizers: Optimizers, step: int) -> None:
+        settings = self.config.neilf.train
+        self.step = step
+        position = stage_at(step, settings)
+        if self.set_up_for is not position.stage:
+            self.neilf.freeze_for(position.stage)
+            self.set_up_for = position.stage
+        for optimizer in optimizers.optimizers.values():
+            _set_rates(optimizer, self.rates, position.stage, position.step / position.length)
+        seed_step(settings.seed, step)
+
+    def _end_after_last(self, trainer: Trainer, step: int) -> None:
+        """Nerfstudio counts iterations from where it resumes; the stages end where they end."""
+        if step + 1 >= sum(stage_steps(self.config.neilf.train).values()):
+            trainer.stop_training = True
+
+    def update_to_step(self, step: int) -> None:
+        """The step of a checkpoint that has been loaded."""
+        self.step = step
+
+    # ------------------------------------------------------------------------------------------------------------- losses
+
+    def get_loss_dict(
+        self, outputs: dict[str, Tensor], batch: dict[str, Any], metrics_dict: dict[str, Tensor] | None = None
+    ) -> dict[str, Tensor]:
+        """The weighted losses of the stage; in evaluation the mean absolute difference from the image."""
+        if not self.training:
+            return {"rgb": (outputs["rgb"] - batch["image"].to(self.device)).abs().mean()}
+        pixels = pixel_batch(outputs["origins"], outputs["directions"], batch)
+        terms = self.neilf.losses(pixels, self.stage)
+        weights = {**active_losses(self.stage, self.config.neilf, self.neilf.stages), OWN_LOSSES: 1.0}
+        if metrics_dict is not None:
+            # Known only now, and logged after this: the terms before their weights.
+            metrics_dict |= weigh(terms, weights).terms
+        return {name: weigh({name: term}, weights).loss for name, term in terms.items()}
+
+    # ------------------------------------------------------------------------------------------------------------ outputs
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
+        """In evaluation every map; in training the rays themselves: what must be rendered, the losses decide."""
+        rays = RayBatch(ray_bundle.origins, ray_bundle.directions)
+        if self.training:
+            return {"origins": rays.origins, "directions": rays.directions}
+        # Before the stage that moves it, the material is what it starts as, and says nothing of the scene.
+        maps = self.neilf.maps(rays, with_material=self._has_material())
+        response = self.neilf.facts.response
+        return {
+            "rgb": apply_response(maps.rgb, response),
+            "rgb_volume": apply_response(maps.rgb_volume, response),
+            "base_color": maps.base_color,
+            "roughness": maps.roughness,
+            "metallic": maps.metallic,
+            "incident_light": self._incident_light(rays, maps),
+            "normal": maps.normal,
+            "depth": maps.depth,
+            "accumulation": maps.opacity,
+        }
+
+    def _has_material(self) -> bool:
+        return self.neilf.stages[self.stage].moves_material
+
+    @torch.no_grad()
+    def _incident_light(self, rays: RayBatch, maps: Maps) -> Float[Tensor, "N 3"]:
+        """Irradiance over π where a ray meets the surface: the mean incident radiance, weighted by the cosine."""
+        light = torch.zeros_like(maps.rgb)
+        rows = torch.nonzero(maps.roughness[:, 0])[:, 0]  # what is no hit, or has no material yet, holds zeros
+        if not len(rows):
+            return light
+        normal, wo = maps.normal[rows], -rays.directions[rows]
+        position = rays.origins[rows] + maps.depth[rows] * rays.directions[rows]
+        count = self.config.neilf.shading.train_samples
+        # The density of a cosine sampler cancels the cosine: what is left is a plain mean.
+        drawn = sample_directions("cosine", normal, wo, maps.roughness[rows], count, self.neilf.lobe, stochastic=False)
+        light[rows] = self.neilf.incident_light(position, drawn.wi).mean(dim=1)
+        return light
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Any]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """PSNR and SSIM of display values over the object, as `neilfpp eval` has them, and all maps as pictures."""
+        truth, rgb, volume = (self._display(image.to(self.device)) for image in _images(batch, outputs))
+        mask = batch["object_mask"][..., 0].cpu().numpy() > 0.5
+        arrays = {"": rgb, "volume_": volume}
+        figures = {
+            f"{name}{kind}": measure(image.cpu().numpy(), truth.cpu().numpy(), mask)
+            for name, image in arrays.items()
+            for kind, measure in {"psnr": metrics.psnr, "ssim": metrics.ssim}.items()
+        }
+        accumulation = outputs["accumulation"]
+        pictures = {
+            "img": torch.cat([truth, rgb], dim=1),
+            "rgb_volume": volume,
+            "normal": 0.5 * (outputs["normal"] + 1.0) * accumulation,
+            "depth": colormaps.apply_depth_colormap(outputs["depth"], accumulation),
+            "accumulation": accumulation.expand(-1, -1, 3),
+        }
+        if self._has_material():
+            pictures |= {name: tone_map(outputs[name]) for name in ("base_color", "incident_light")}
+            pictures |= {name: outputs[name].expand(-1, -1, 3) for name in ("roughness", "metallic")}
+        return figures, pictures
+
+    def _display(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+        return tone_map(image) if self.neilf.facts.response == "linear" else image.clamp(0.0, 1.0)
+
+
+def _images(batch: Mapping[str, Any], outputs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    return batch["image"], outputs["rgb"], outputs["rgb_volume"]

@@ -1,0 +1,117 @@
+"""The presets: the published settings, and one for a laptop."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+
+from neilfpp_method.config import (
+    BackgroundConfig,
+    BrdfConfig,
+    HashGridConfig,
+    IncidentLightConfig,
+    InterReflectionConfig,
+    LossConfig,
+    NeilfConfig,
+    OptimizerConfig,
+    OutgoingRadianceConfig,
+    SdfConfig,
+    ShadingConfig,
+    TrainConfig,
+    VolumeConfig,
+)
+from neilfpp_method.errors import UserError
+
+__all__ = ["PRESETS", "fixed_geometry", "preset"]
+
+
+def paper_mlp() -> NeilfConfig:
+    """The paper's MLP setting: 80k steps, 24 h on a V100."""
+    return NeilfConfig()
+
+
+def paper_ngp() -> NeilfConfig:
+    """The paper's hash-grid setting: 30k steps, 4 h on a V100; it asks for a point cloud in SDF init."""
+    return NeilfConfig(
+        preset="paper-ngp",
+        sdf=SdfConfig(encoding="hash", layers=2, width=64, skip=None, feature_width=15),
+        radiance=OutgoingRadianceConfig(encoding="hash", layers=4, width=64, direction_encoding="spherical_harmonics"),
+        brdf=BrdfConfig(encoding="hash", activation="relu", layers=2, width=64, skip=None),
+        light=IncidentLightConfig(activation="relu", direction_encoding="spherical_harmonics", direction_degree=5),
+        loss=LossConfig(
+            point_cloud=0.1, position_gradient=0.0, normal_gradient=0.1, hessian_method="finite_difference"
+        ),
+        optimizer=OptimizerConfig(geometry=1e-2, radiance=1e-2, brdf=1e-2, light=1e-3, background=1e-3, beta=1e-3),
+        train=TrainConfig(sdf_steps=15_000, material_steps=7_500, joint_steps=7_500),
+    )
+
+
+def fast() -> NeilfConfig:
+    """Minutes on the two cores of a laptop: the same method with small hash grids and few rays."""
+    grid = HashGridConfig(levels=8, log2_entries=16, base_resolution=16, max_resolution=256)
+    return NeilfConfig(
+        preset="fast",
+        sdf=SdfConfig(encoding="hash", grid=grid, layers=1, width=64, skip=None, feature_width=15),
+        radiance=OutgoingRadianceConfig(layers=2, width=64, direction_encoding="spherical_harmonics"),
+        brdf=BrdfConfig(encoding="hash", grid=grid, activation="relu", layers=2, width=64, skip=None),
+        light=IncidentLightConfig(layers=4, width=64, direction_encoding="spherical_harmonics", direction_degree=5),
+        background=BackgroundConfig(layers=4, width=64, samples=16),
+        volume=VolumeConfig(radius=1.75, beta_init=0.03, initial_samples=64, rounds=2, samples=32),
+        shading=ShadingConfig(sampler="mis", train_samples=32, eval_samples=128),
+        inter_reflection=InterReflectionConfig(rays_per_point=0.25),
+        loss=LossConfig(
+            unit="median",
+            hessian=2e-3,
+            hessian_joint=1e-3,
+            surface=1e-2,
+            surface_joint=1e-3,
+            mask=0.1,
+            smoothness=5e-3,
+            lambertian=0.0,
+            position_gradient=0.0,
+            normal_gradient=0.1,
+            hessian_method="finite_difference",
+        ),
+        optimizer=OptimizerConfig(geometry=2e-2, radiance=5e-3, brdf=5e-3, light=2e-3, background=5e-3, beta=5e-3),
+        train=TrainConfig(sdf_steps=2_000, material_steps=1_000, joint_steps=300, rays=512),
+    )
+
+
+PRESETS: Mapping[str, Callable[[], NeilfConfig]] = {"fast": fast, "paper-mlp": paper_mlp, "paper-ngp": paper_ngp}
+
+
+def preset(name: str) -> NeilfConfig:
+    """The settings of a preset by name.
+
+    Raises:
+        UserError: no preset has this name.
+    """
+    if name not in PRESETS:
+        raise UserError(f"unknown preset '{name}'", f"choose one of {', '.join(PRESETS)}")
+    return PRESETS[name]()
+
+
+def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
+    """A preset for geometry that is given as a mesh: one stage in which R, B and L move together.
+
+    R has no feature of G that knows the place, so it encodes positions as G would; 8×128 is the paper's surface light
+    field. A surface without thickness needs no distance to leave it, and what leaves it is known well enough to learn
+    from L_ref (METHOD §2, §4).
+    """
+    replace, train = dataclasses.replace, config.train
+    return replace(
+        config,
+        preset=f"{config.preset}-mesh",
+        host="mesh",
+        radiance=replace(
+            config.radiance,
+            encoding=config.sdf.encoding,
+            frequencies=config.sdf.frequencies,
+            grid=config.sdf.grid,
+            layers=8,
+            width=128,
+        ),
+        inter_reflection=replace(config.inter_reflection, radiance_gradient=0.7, offset=2e-3),
+        loss=replace(config.loss, lambertian=5e-3),
+        train=replace(train, sdf_steps=0, material_steps=train.material_steps + train.joint_steps, joint_steps=0),
+    )

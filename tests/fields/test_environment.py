@@ -1,0 +1,87 @@
+"""The environment map: look-ups, densities and sampling against closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from neilfpp_method.fields.environment import EnvironmentLight
+
+
+def directions(count: int) -> torch.Tensor:
+    return normalize(torch.randn(1, count, 3), dim=-1)
+
+
+def test_it_starts_at_one_radiance_everywhere():
+    light = EnvironmentLight(8, 0.25)
+    torch.testing.assert_close(light.radiance(torch.zeros(1, 3), directions(50)), torch.full((1, 50, 3), 0.25))
+
+
+def test_texel_centres_show_their_texel():
+    light = EnvironmentLight(9, 1.0)
+    with torch.no_grad():
+        light.log_radiance.normal_()
+    for row, column in ((4, 0), (4, 17), (2, 5), (7, 11)):
+        theta, phi = math.pi * row / 8, 2 * math.pi * (column + 0.5) / 18
+        wi = torch.tensor([[[math.sin(phi) * math.sin(theta), math.cos(phi) * math.sin(theta), math.cos(theta)]]])
+        expected = light.log_radiance[:, row, column].exp()
+        torch.testing.assert_close(light.radiance(torch.zeros(1, 3), wi)[0, 0], expected, rtol=1e-4, atol=0.0)
+
+
+def test_the_map_closes_around_the_azimuth():
+    light = EnvironmentLight(9, 1.0)
+    with torch.no_grad():
+        light.log_radiance.normal_()
+    phi = torch.tensor([1e-5, 2 * math.pi - 1e-5])
+    wi = torch.stack((phi.sin(), phi.cos(), torch.zeros(2)), -1)[None]
+    radiance = light.radiance(torch.zeros(1, 3), wi)[0]
+    torch.testing.assert_close(radiance[0], radiance[1], rtol=1e-3, atol=0.0)
+
+
+def test_the_density_integrates_to_one_and_follows_the_light():
+    light = EnvironmentLight(16, 0.1)
+    with torch.no_grad():
+        light.log_radiance[:, 5, 9] = math.log(500.0)
+    # Midpoints of equal solid angle: z uniform, azimuth uniform.
+    z = 1 - (torch.arange(400) + 0.5) / 200
+    phi = 2 * math.pi * (torch.arange(800) + 0.5) / 800
+    sine = (1 - z**2).sqrt()
+    grid = torch.stack(
+        ((sine[:, None] * phi.sin()).flatten(), (sine[:, None] * phi.cos()).flatten(), z.repeat_interleave(800)), -1
+    )[None]
+    pdf = light.pdf(grid)
+    assert (pdf.mean() * 4 * math.pi).item() == pytest.approx(1.0, abs=0.03)  # the quadrature cuts through texels
+    brightest = light.radiance(torch.zeros(1, 3), grid).mean(-1).argmax()
+    assert pdf[0, brightest] > 100 * pdf.median()
+
+
+@pytest.mark.parametrize("bright", [0.0, 5.0])
+def test_samples_follow_the_density(bright):
+    """The mean of f/pdf is the integral of f over the sphere: 4π for 1, 4π/3 for each squared coordinate, 0 for z."""
+    light = EnvironmentLight(12, 1.0)
+    with torch.no_grad():
+        light.log_radiance[:, 3:5, 7:10] = bright
+    torch.manual_seed(0)
+    drawn = light.sample(torch.zeros(5000, 3), 64, stochastic=True)
+    weight = 1 / drawn.pdf[..., None]
+    assert weight.mean().item() == pytest.approx(4 * math.pi, rel=0.01)
+    squares = (drawn.wi.square() * weight).mean((0, 1))
+    assert squares.tolist() == pytest.approx([4 * math.pi / 3] * 3, rel=0.02)
+    assert (drawn.wi * weight).mean((0, 1)).tolist() == pytest.approx([0.0] * 3, abs=0.1)
+    # More samples where there is more light, in the proportion that the density says.
+    theta, phi = math.pi * 3.5 / 11, 2 * math.pi * 8.5 / 24
+    centre = torch.tensor([math.sin(phi) * math.sin(theta), math.cos(phi) * math.sin(theta), math.cos(theta)])
+    near = drawn.wi @ centre > math.cos(0.1)
+    solid_angle = 2 * math.pi * (1 - math.cos(0.1))
+    expected = light.pdf(centre[None, None]).item() * solid_angle
+    assert near.float().mean().item() == pytest.approx(expected, rel=0.15)
+
+
+def test_the_gradient_reaches_the_texels_that_are_seen():
+    light = EnvironmentLight(8, 1.0)
+    light.radiance(torch.zeros(1, 3), torch.tensor([[[0.0, 0.0, 1.0]]])).sum().backward()
+    assert light.log_radiance.grad[:, 0].abs().sum() > 0
+    assert light.log_radiance.grad[:, 2:].abs().sum() == 0

@@ -1,0 +1,167 @@
+"""The house has one direction of flow: no import, read from the sources, runs against it."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+PACKAGE = "neilfpp_method"
+ROOT = Path(__file__).parent.parent / PACKAGE
+SOURCES = {
+    ".".join((PACKAGE, *path.relative_to(ROOT).with_suffix("").parts)).removesuffix(".__init__"): path
+    for path in sorted(ROOT.rglob("*.py"))
+}
+
+# A room may import what stands to its left, and itself; rooms of one step know nothing of one another. Lower is right.
+LAYERS: tuple[tuple[str, ...], ...] = (
+    ("errors", "structures"),
+    ("config",),
+    ("shading", "volume", "kernels", "schedule", "presets"),
+    ("fields", "data", "losses"),
+    ("hosts.base",),
+    ("hosts", "inter_reflection"),
+    ("model",),
+    ("attach", "train"),
+    ("export",),
+    ("evaluate",),
+    ("demo", "plugin"),
+    ("cli",),
+)
+# Rooms that keep out of more than their layer says. Data is read without a network in sight, settings included.
+ONLY = {"data": {"errors", "structures", "shading.color"}, "structures": set(), "errors": set()}
+MOST_LINES = 400
+
+
+def room(module: str) -> str:
+    """The longest name in `LAYERS` that a module belongs to; none: the empty string."""
+    name = module.removeprefix(f"{PACKAGE}.")
+    rooms = [r for layer in LAYERS for r in layer if f"{name}.".startswith(f"{r}.")]
+    return max(rooms, key=len, default="")
+
+
+def layer(name: str) -> int:
+    return next(i for i, rooms in enumerate(LAYERS) if name in rooms)
+
+
+def imports(tree: ast.AST, module: str = "") -> Iterator[str]:
+    """Every module that a source imports, wherever in it; of the package only modules, not the names in them."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module}: a relative import hides where it leads"
+            for alias in node.names:
+                full = f"{node.module}.{alias.name}"
+                yield full if full in SOURCES else node.module or ""
+
+
+def backward(module: str, imported: str) -> bool:
+    """Whether an import runs against the order."""
+    here, there = room(module), room(imported)
+    if here == there:
+        return False
+    allowed = ONLY.get(here)
+    if allowed is not None and imported.removeprefix(f"{PACKAGE}.") not in allowed:
+        return True
+    return layer(there) >= layer(here)
+
+
+def calls(tree: ast.AST) -> Iterator[tuple[str, ast.Call]]:
+    """Every call by its dotted name."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            yield ast.unparse(node.func), node
+
+
+@pytest.fixture(params=SOURCES)
+def source(request) -> tuple[str, ast.AST]:
+    return request.param, ast.parse(SOURCES[request.param].read_text())
+
+
+def test_every_module_has_its_place(source):
+    module, _ = source
+    assert module == PACKAGE or room(module), f"{module} stands in no layer"
+
+
+def test_no_arrow_runs_backwards(source):
+    module, tree = source
+    if module == PACKAGE:
+        assert not [name for name in imports(tree) if name.startswith(PACKAGE)]  # its names load when asked for
+        return
+    wrong = [name for name in imports(tree, module) if name.startswith(f"{PACKAGE}.") and backward(module, name)]
+    assert not wrong, f"{module} may not import {wrong}"
+
+
+def test_no_two_modules_need_each_other():
+    graph = {
+        module: {name for name in imports(ast.parse(path.read_text())) if name in SOURCES and name != module}
+        for module, path in SOURCES.items()
+    }
+    # A room's own __init__ may gather the room, and what imports a module has its __init__ run first anyway.
+    for module in graph:
+        graph[module] -= {f"{PACKAGE}.{room(module)}", PACKAGE}
+    TopologicalSorter(graph).prepare()  # raises CycleError
+
+
+def test_only_the_plugin_knows_nerfstudio(source):
+    module, tree = source
+    if not module.startswith((f"{PACKAGE}.plugin", f"{PACKAGE}.hosts.nerfstudio")):
+        assert not [name for name in imports(tree) if name.split(".")[0] == "nerfstudio"]
+
+
+def test_devices_follow_the_inputs(source):
+    _, tree = source
+    assert not [name for name, _ in calls(tree) if name.endswith(".cuda")]
+
+
+def test_nothing_unpickles_what_it_did_not_write(source):
+    _, tree = source
+    for name, call in calls(tree):
+        assert name not in ("pickle.load", "pickle.loads")
+        if name in ("torch.load", "load") or name.endswith("torch.load"):
+            safe = {keyword.arg: ast.unparse(keyword.value) for keyword in call.keywords}.get("weights_only")
+            assert safe == "True", "torch.load runs what a file says unless weights_only=True"
+
+
+def test_modules_are_short(source):
+    module, _ = source
+    assert len(SOURCES[module].read_text().splitlines()) <= MOST_LINES
+
+
+# --------------------------------------------------------------------------------------------- the tests above can fail
+
+
+@pytest.mark.parametrize(
+    ("module", "imported", "wrong"),
+    [
+        ("shading.brdf", "fields.brdf", True),
+        ("fields.brdf", "shading.brdf", False),
+        ("shading.brdf", "shading.frame", False),
+        ("volume.density", "shading.frame", True),
+        ("hosts.base", "schedule", False),
+        ("hosts.base", "hosts.volsdf", True),
+        ("fields.sdf", "data.mesh", True),
+        ("hosts.volsdf", "hosts.base", False),
+        ("losses", "hosts.base", True),
+        ("inter_reflection", "hosts.volsdf", True),
+        ("data.pixels", "shading.color", False),
+        ("data.pixels", "shading.brdf", True),
+        ("data.pixels", "config", True),
+        ("train.loop", "attach", True),
+        ("export.mesh", "evaluate.metrics", True),
+        ("evaluate.protocols", "export.mesh", False),
+        ("structures", "errors", True),
+        ("model", "cli", True),
+    ],
+)
+def test_the_order_is_the_order(module, imported, wrong):
+    assert backward(f"{PACKAGE}.{module}", f"{PACKAGE}.{imported}") == wrong
+
+
+def test_imports_are_found_wherever_they_stand():
+    text = "import a.b\nfrom neilfpp_method import losses\ndef f():\n  from neilfpp_method.data.images import write_png"
+    assert list(imports(ast.parse(text))) == ["a.b", f"{PACKAGE}.losses", f"{PACKAGE}.data.images"]

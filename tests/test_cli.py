@@ -1,0 +1,332 @@
+"""The command line from end to end: what it says, where it stops, and what it leaves behind."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from neilfpp_method.cli import COMMANDS, main
+from neilfpp_method.data.images import read_image, write_exr, write_png
+from neilfpp_method.evaluate import protocols
+from neilfpp_method.presets import PRESETS
+from tests.data.make_capture import CENTRE, RADIUS, make_capture
+from tests.train.small_runs import small_config
+
+
+@pytest.fixture(autouse=True)
+def _tiny_preset(monkeypatch):
+    monkeypatch.setitem(PRESETS, "tiny", small_config)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_capture(tmp_path_factory.mktemp("capture") / "sphere", masks=True)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory, capture: Path) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "sphere"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "tiny", small_config)
+        assert train("--data", capture, "--out", out) == 0
+    return out
+
+
+def train(*options: object) -> int:
+    return main(["train", "--preset", "tiny", "--device", "cpu", *map(str, options)])
+
+
+def tree(folder: Path) -> dict[Path, bytes | None]:
+    """Everything in a folder."""
+    return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+
+
+# --------------------------------------------------------------------------------------------------------- the good way
+
+
+def test_train_says_what_it_does_and_leaves_a_run(trained):
+    for name in ("config.json", "capture.json", "scene.json", "environment.json", "timing.json"):
+        assert json.loads((trained / name).read_text())
+    stages = ("sdf_init", "material_init", "joint")
+    assert {path.name for path in (trained / "checkpoints").iterdir()} == {f"{s}.pt" for s in ("last", *stages)}
+    assert {path.name for path in (trained / "previews").iterdir()} == {f"{s}.png" for s in stages}
+    assert list(json.loads((trained / "timing.json").read_text())) == list(stages)
+    assert list((trained / "tensorboard").iterdir())
+
+
+def test_eval_writes_flat_finite_figures(trained, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(protocols, "SURFACE_POINTS", 1000)
+    monkeypatch.setattr(protocols, "MESH_RESOLUTION", 32)
+    assert main(["eval", str(trained), "--device", "cpu"]) == 0
+    said = capfd.readouterr()
+    assert said.err == ""
+    figures = json.loads((trained / "metrics.json").read_text())
+    material = {"base_color_psnr", "base_color_psnr_gamma", "base_color_psnr_scaled", "roughness_psnr", "metallic_psnr"}
+    wanted = {"volume_psnr", "pbr_psnr", "normal_mae_deg"} | material | {f"{name}_frame" for name in material}
+    assert wanted <= figures.keys()
+    for name, value in figures.items():
+        assert isinstance(value, float), name
+        assert math.isfinite(value), name
+        assert f"{name} " in said.out
+    out = tmp_path / "of_a_stage.json"
+    assert main(["eval", str(trained), "--device", "cpu", "--checkpoint", "material_init", "--out", str(out)]) == 0
+    assert wanted <= json.loads(out.read_text()).keys()
+
+
+def test_render_writes_every_map(trained, tmp_path, capfd):
+    assert main(["render", str(trained), "--device", "cpu"]) == 0
+    assert capfd.readouterr().err == ""
+    out = trained / "renders"
+    assert (out / "000.exr").is_file()
+    for name in ("rgb", "rgb_volume", "base_color", "roughness", "metallic", "normal", "depth", "diffuse", "specular"):
+        assert read_image(out / name / "000.png").pixels.shape[:2] == (18, 24)
+    assert main(["render", str(trained), "--device", "cpu", "--views", "all", "--out", str(tmp_path / "all")]) == 0
+    assert len(list((tmp_path / "all").glob("*.exr"))) == 6
+
+
+def test_export_writes_the_surface_where_it_was_captured(trained, tmp_path, capfd):
+    out = tmp_path / "sphere.ply"
+    assert main(["export", str(trained), "--device", "cpu", "--resolution", "32", "--out", str(out)]) == 0
+    assert capfd.readouterr().err == ""
+    mesh = trimesh.load(out)
+    assert mesh.is_watertight
+    assert np.linalg.norm(mesh.centroid - CENTRE) < 0.25 * RADIUS
+    assert mesh.visual.vertex_colors.shape == (len(mesh.vertices), 4)
+
+
+def test_a_run_without_a_name_is_named_after_its_capture(capture, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    steps = [f"--config.train.{stage}-steps=1" for stage in ("sdf", "material", "joint")]
+    assert main(["train", "--data", str(capture), "--device", "cpu", "--preset=tiny", *steps]) == 0
+    assert (tmp_path / "runs" / "sphere-fast" / "config.json").is_file()
+
+
+# ----------------------------------------------------------------------------------------------------------------- help
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"]])
+def test_help_names_the_commands(arguments, capsys):
+    assert main(arguments) == 0
+    said = capsys.readouterr().out
+    for name, command in COMMANDS.items():
+        assert f"  {name} " in said
+        assert command.summary in said
+    assert "examples:" in said
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_a_command_shows_examples(name, capsys):
+    assert main([name, "--help"]) == 0
+    said = capsys.readouterr()
+    assert said.err == ""
+    assert "Examples:" in said.out
+    for example in COMMANDS[name].examples:
+        assert example.split("  ")[0] in said.out
+        assert example.startswith(f"neilfpp {name}")
+
+
+def test_the_examples_parse(monkeypatch):
+    """Each example of the help is a command that the parser takes."""
+    for name, command in COMMANDS.items():
+        for example in command.examples:
+            seen = []
+            monkeypatch.setitem(COMMANDS, name, command.__class__(command.options, seen.append, command.examples))
+            assert main(example.split("  ")[0].split()[1:]) == 0
+            assert isinstance(seen[0], command.options)
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("neilfpp 0.")
+
+
+# ------------------------------------------------------------------------------------------------------------ bad input
+
+
+def refused(capfd, arguments: list[object], *words: object, leaves: Path) -> None:
+    """The command ends with 2 and one line that has these words and a remedy, and changes nothing in a folder."""
+    before = tree(leaves)
+    capfd.readouterr()
+    assert main([str(argument) for argument in arguments]) == 2
+    said = capfd.readouterr().err
+    assert said.count("\n") == 1
+    assert said.startswith("error: ")
+    assert len(said.split("; ")) >= 2
+    assert said.split("; ")[-1].strip()
+    for word in words:
+        assert str(word) in said
+    assert tree(leaves) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["paint"], ("unknown command 'paint'", "train", "eval")),
+        (["train", "--preset", "slow"], ("unknown preset 'slow'", "fast", "paper-ngp")),
+        (["train", "--preset=slow"], ("unknown preset 'slow'",)),
+        (["train", "--preset"], ("--preset", "neilfpp train --help")),
+        (["train", "--data", "x", "--colour", "red"], ("--colour", "neilfpp train --help")),
+        (["train", "--data", "x", "--config.train.rayss", "3"], ("--config.train.rayss", "neilfpp train --help")),
+        (["train", "--data", "x", "--config.train.rays", "few"], ("--config.train.rays", "'few'")),
+        (["train", "--response", "hdr"], ("--response", "linear", "srgb")),
+        (["train", "--test-every", "often"], ("--test-every", "'often'")),
+        (["train"], ("--data",)),
+        (["train", "--resume"], ("--resume needs the run's folder", "--out")),
+        (["eval"], ("The run's folder", "neilfpp eval --help")),
+        (["eval", "a", "b"], ("b", "neilfpp eval --help")),
+        (["export", "a", "--checkpoint", "first"], ("--checkpoint", "sdf_init")),
+        (["render", "a", "--views", "best"], ("--views", "test")),
+    ],
+)
+def test_a_command_line_that_makes_no_sense(tmp_path, monkeypatch, capfd, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    refused(capfd, arguments, *words, leaves=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--config.train.rays", "0"], ("--config.train.rays is 0",)),
+        (["--config.train.checkpoint-every", "0"], ("--config.train.checkpoint-every is 0",)),
+        (["--config.train.log-every", "-1"], ("--config.train.log-every is -1",)),
+        (["--config.train.joint-steps", "-1"], ("no steps",)),
+        (["--config.loss.volume", "0"], ("--config.loss.volume",)),
+        (["--config.loss.physical", "0"], ("--config.loss.physical",)),
+        (["--devices", "0"], ("--devices",)),
+        (["--device", "cuda:99"], ("no device 'cuda:99' here", "cpu")),
+        (["--device", "abacus"], ("no device 'abacus' here", "cpu")),
+        (["--device", "meta"], ("no device 'meta' here", "cpu")),
+        (["--test-every", "1"], ("all 6 views are held out",)),
+    ],
+)
+def test_settings_that_cannot_be(tmp_path, monkeypatch, capture, capfd, options, words):
+    monkeypatch.chdir(tmp_path)
+    command = ["train", "--data", capture, "--preset", "tiny", "--device", "cpu", *options]
+    refused(capfd, command, *words, leaves=tmp_path)
+
+
+def edit_scene(change: Callable[[dict, dict], object]) -> Callable[[Path], None]:
+    """Change the cameras and the file names of a scene file."""
+
+    def apply(root: Path) -> None:
+        path = root / "inputs" / "sfm_scene.json"
+        scene = json.loads(path.read_text())
+        change(scene["camera_track_map"]["images"], scene["image_path"]["file_paths"])
+        path.write_text(json.dumps(scene))
+
+    return apply
+
+
+def paint(value: float) -> Callable[[Path], None]:
+    """Put one pixel of a value into an image."""
+
+    def apply(root: Path) -> None:
+        path = root / "inputs" / "images" / "002.exr"
+        pixels = read_image(path).pixels.copy()
+        pixels[3, 4, 1] = value
+        write_exr(path, {"RGB": pixels})
+
+    return apply
+
+
+def truncate(name: str) -> Callable[[Path], None]:
+    def apply(root: Path) -> None:
+        path = root / "inputs" / name
+        path.write_bytes(path.read_bytes()[:-40])
+
+    return apply
+
+
+BROKEN = {
+    "missing folder": (shutil.rmtree, "no such folder"),
+    "not a capture": (lambda root: (root / "inputs" / "sfm_scene.json").unlink(), "inputs/sfm_scene.json"),
+    "no images": (edit_scene(lambda cameras, files: (cameras.clear(), files.clear())), "sfm_scene.json: no images"),
+    "image without camera": (edit_scene(lambda cameras, _: cameras.pop("3")), "paths.3: an image without a camera"),
+    "camera without image": (edit_scene(lambda _, files: files.pop("3")), "images.3: a camera without an image"),
+    "image is not there": (lambda root: (root / "inputs" / "images" / "003.exr").unlink(), "003.exr"),
+    "another size": (edit_scene(lambda cameras, _: cameras["3"].update(size=[48, 36])), "003.exr: 24×18 pixels"),
+    "NaN": (paint(np.nan), "002.exr: 1 pixels are NaN"),
+    "infinite": (paint(np.inf), "002.exr: 1 pixels are NaN, infinite"),
+    "negative": (paint(-0.25), "002.exr: 1 pixels are NaN, infinite or negative"),
+    "unreadable image": (truncate("images/004.exr"), "004.exr: cannot be read"),
+    "unreadable scene": (truncate("sfm_scene.json"), "sfm_scene.json: not valid JSON"),
+    "empty mask": (
+        lambda root: write_png(root / "inputs" / "masks" / "001.png", np.zeros((18, 24), np.uint8)),
+        "masks/001.png: the mask shows no object",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_capture_that_cannot_be_used(tmp_path, capfd, capture, case):
+    spoil, complaint = BROKEN[case]
+    root = tmp_path / "spoilt"
+    shutil.copytree(capture, root)
+    spoil(root)
+    command = ["train", "--data", root, "--out", tmp_path / "runs" / "new", "--preset", "tiny", "--device", "cpu"]
+    refused(capfd, command, root, complaint, leaves=tmp_path)
+
+
+def test_a_point_cloud_that_the_settings_need(tmp_path, capfd, capture):
+    root = tmp_path / "without"
+    shutil.copytree(capture, root)
+    (root / "inputs" / "model" / "oriented_pcd.ply").unlink()
+    command = ["train", "--data", root, "--out", tmp_path / "run", "--preset", "tiny", "--device", "cpu"]
+    refused(capfd, [*command, "--config.loss.point-cloud", "0.1"], root, "oriented_pcd.ply", leaves=tmp_path)
+
+
+def test_a_folder_that_is_taken(tmp_path, capfd, capture):
+    out = tmp_path / "photos"
+    out.mkdir()
+    (out / "cat.png").write_bytes(b"meow")
+    command = ["train", "--data", capture, "--out", out, "--preset", "tiny", "--device", "cpu"]
+    refused(capfd, command, out, "exists already", "--out", "--resume", leaves=tmp_path)
+
+
+@pytest.mark.parametrize("name", ["train", "eval", "render", "export"])
+def test_a_run_of_another_version(tmp_path, capfd, trained, name):
+    run = tmp_path / "run"
+    shutil.copytree(trained, run)
+    settings = json.loads((run / "config.json").read_text())
+    (run / "config.json").write_text(json.dumps({**settings, "format": 99}))
+    command = [name, "--out", run, "--resume"] if name == "train" else [name, run, "--out", tmp_path / "out"]
+    refused(capfd, [*command, "--device", "cpu"], run / "config.json", "format 99", leaves=tmp_path)
+
+
+@pytest.mark.parametrize("name", ["eval", "render", "export"])
+def test_a_folder_that_is_no_run(tmp_path, capfd, trained, name):
+    refused(capfd, [name, tmp_path, "--device", "cpu"], tmp_path, "no run here", leaves=tmp_path)
+    run = tmp_path / "run"
+    shutil.copytree(trained, run)
+    for file, complaint in (("last.pt", "not a readable checkpoint"), ("joint.pt", "no checkpoint")):
+        path = run / "checkpoints" / file
+        path.write_bytes(b"weights") if file == "last.pt" else path.unlink()
+        command = [name, run, "--device", "cpu", "--checkpoint", path.stem]
+        refused(capfd, command, path, complaint, leaves=tmp_path)
+
+
+@pytest.mark.parametrize("name", ["eval", "render", "export"])
+def test_a_run_whose_capture_has_moved(tmp_path, capfd, trained, name):
+    run = tmp_path / "run"
+    shutil.copytree(trained, run)
+    source = json.loads((run / "capture.json").read_text())
+    (run / "capture.json").write_text(json.dumps({**source, "root": str(tmp_path / "away")}))
+    refused(capfd, [name, run, "--device", "cpu"], tmp_path / "away", "no such folder", leaves=tmp_path)
+
+
+def test_a_real_process_says_one_line_and_no_more(tmp_path):
+    """No warning of a library before it, no traceback after it."""
+    command = [sys.executable, "-m", "neilfpp_method.cli", "train", "--data", str(tmp_path / "nowhere")]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert process.returncode == 2
+    assert process.stdout == ""
+    assert process.stderr == f"error: {tmp_path / 'nowhere'}: no such folder; give the folder of a capture\n"

@@ -1,0 +1,66 @@
+"""Trainings of milliseconds a step, for tests of the loop."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import torch
+from lightning_fabric import Fabric
+from rich.console import Console
+
+from neilfpp_method.config import NeilfConfig
+from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.train.build import build_model, scene_facts
+from neilfpp_method.train.loop import Training, seed_step
+from neilfpp_method.train.progress import Reporter
+from tests.scenes import tiny_config
+
+
+def small_config(**train) -> NeilfConfig:
+    """The tiny settings, in which most rays that meet something are shaded; four steps a stage but for `train`."""
+    config = tiny_config()
+    return dataclasses.replace(
+        config,
+        shading=dataclasses.replace(config.shading, hit_share=0.2),
+        train=dataclasses.replace(config.train, **train),
+    )
+
+
+class Listener(Reporter):
+    """A reporter that shows nothing and remembers what it was told."""
+
+    def __init__(self) -> None:
+        super().__init__(Console(quiet=True), None, None)
+        self.said: list[str] = []
+        self.losses: list[float] = []
+
+    def step(self, loss: float, psnr: float) -> None:
+        self.losses.append(loss)
+
+    def say(self, text: str) -> None:
+        self.said.append(text)
+
+
+def small_training(root: Path, out: Path, config: NeilfConfig) -> Training:
+    """A training of a capture that is ready to begin."""
+    capture = load_capture(root)
+    pixels = PixelDataset(capture, capture.train_views)
+    seed_step(config.train.seed, step=-1)
+    model = build_model(capture, scene_facts(capture, pixels, config), config)
+    fabric = Fabric(accelerator="cpu", devices=1)
+    return Training(out, config, model, pixels, fabric, Listener(), lambda: False, lambda model, stage: None, "")
+
+
+def differences(one: object, other: object, where: str = "") -> list[str]:
+    """The places where two nests of dictionaries, lists and tensors are not the same bit for bit."""
+    if isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor):
+        same = one.dtype == other.dtype and torch.equal(one, other)
+    elif isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
+        return [place for key in one for place in differences(one[key], other[key], f"{where}.{key}")]
+    elif isinstance(one, list | tuple) and isinstance(other, list | tuple) and len(one) == len(other):
+        return [place for i in range(len(one)) for place in differences(one[i], other[i], f"{where}.{i}")]
+    else:
+        same = one == other
+    return [] if same else [where]

@@ -1,0 +1,220 @@
+"""The run folder: whole files or none, nothing executed that a file says, and one line for what does not fit."""
+
+from __future__ import annotations
+
+import json
+import platform
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+import torch
+
+from neilfpp_method.errors import UserError
+from neilfpp_method.model import SceneFacts
+from neilfpp_method.train.run import (
+    FORMAT,
+    CaptureSource,
+    check_free,
+    create_run,
+    load_checkpoint,
+    load_run,
+    read_description,
+    save_checkpoint,
+)
+from tests.scenes import tiny_config
+
+FACTS = SceneFacts("linear", 0.25, 3.0, "constant", (0.5, 0.25, 0.125))
+
+
+def learner() -> tuple[torch.nn.Module, torch.optim.Optimizer]:
+    """A model and its optimiser after one step."""
+    model = torch.nn.Linear(3, 2)
+    optimizer = torch.optim.Adam(model.parameters())
+    model(torch.ones(1, 3)).sum().backward()
+    optimizer.step()
+    return model, optimizer
+
+
+def refused(path: Path, complaint: str) -> None:
+    with pytest.raises(UserError, match=complaint) as caught:
+        load_checkpoint(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert caught.value.remedy
+
+
+# ---------------------------------------------------------------------------------------------------------- checkpoints
+
+
+def test_a_checkpoint_holds_what_was_saved(tmp_path):
+    model, optimizer = learner()
+    save_checkpoint(tmp_path / "checkpoints" / "last.pt", model, optimizer, 7)
+    saved = load_checkpoint(tmp_path / "checkpoints" / "last.pt")
+    assert saved["step"] == 7
+    torch.testing.assert_close(saved["model"], model.state_dict(), rtol=0, atol=0)
+    other_model, other = learner()
+    other_model.load_state_dict(saved["model"])
+    other.load_state_dict(saved["optimizer"])
+    torch.testing.assert_close(other.state_dict(), optimizer.state_dict(), rtol=0, atol=0)
+
+
+def test_a_crash_while_writing_leaves_the_old_checkpoint(tmp_path, monkeypatch):
+    path = tmp_path / "last.pt"
+    save_checkpoint(path, *learner(), 7)
+    before = path.read_bytes()
+
+    def half_a_save(contents: object, file: Path) -> None:
+        Path(file).write_bytes(before[: len(before) // 2])
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(torch, "save", half_a_save)
+    with pytest.raises(OSError, match="No space left"):
+        save_checkpoint(path, *learner(), 8)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+class Bomb:
+    """Unpickling it makes a file."""
+
+    def __init__(self, crater: Path) -> None:
+        self.crater = crater
+
+    def __reduce__(self):
+        return Path.touch, (self.crater,)
+
+
+def test_a_checkpoint_that_wants_to_run_code_is_refused_and_does_not(tmp_path):
+    path, crater = tmp_path / "last.pt", tmp_path / "crater"
+    torch.save({"format": FORMAT, "step": 1, "model": Bomb(crater), "optimizer": {}}, path)
+    refused(path, "not a readable checkpoint")
+    assert not crater.exists()
+    torch.load(path, weights_only=False)
+    assert crater.exists()  # the bomb was live
+
+
+def test_a_truncated_checkpoint(tmp_path):
+    path = tmp_path / "last.pt"
+    save_checkpoint(path, *learner(), 7)
+    whole = path.read_bytes()
+    for length in (0, 1, 10, 100, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:length])
+        refused(path, "not a readable checkpoint")
+
+
+def test_a_damaged_checkpoint_is_read_or_refused(tmp_path):
+    path = tmp_path / "last.pt"
+    save_checkpoint(path, *learner(), 7)
+    whole = path.read_bytes()
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(200):
+        damaged = bytearray(whole)
+        for place in torch.randint(len(whole), (20,), generator=generator).tolist():
+            damaged[place] = int(torch.randint(256, (), generator=generator))
+        path.write_bytes(damaged)
+        try:
+            load_checkpoint(path)
+        except UserError:
+            continue
+
+
+def test_a_missing_checkpoint(tmp_path):
+    refused(tmp_path / "last.pt", "no checkpoint")
+    (tmp_path / "joint.pt").mkdir()
+    refused(tmp_path / "joint.pt", "no checkpoint")
+
+
+@pytest.mark.parametrize(
+    "contents",
+    [
+        {"format": FORMAT + 1, "step": 1, "model": {}, "optimizer": {}},
+        {"step": 1, "model": {}, "optimizer": {}},
+        {"format": FORMAT, "step": 1},
+        {"weight": torch.zeros(3)},
+        [FORMAT],
+        torch.zeros(3),
+    ],
+)
+def test_a_checkpoint_of_another_version(tmp_path, contents):
+    torch.save(contents, tmp_path / "last.pt")
+    refused(tmp_path / "last.pt", "a checkpoint of another version")
+
+
+# --------------------------------------------------------------------------------------------------------- descriptions
+
+
+def described(path: Path) -> Path:
+    create_run(path, tiny_config(), CaptureSource("/captures/sphere", 4, "linear"), FACTS)
+    return path
+
+
+def test_a_description_comes_back(tmp_path):
+    run = read_description(described(tmp_path / "run"))
+    assert run.config == tiny_config()
+    assert run.source == CaptureSource("/captures/sphere", 4, "linear")
+    assert run.facts == FACTS
+
+
+def test_a_run_does_not_move_into_somebodys_folder(tmp_path):
+    (tmp_path / "empty").mkdir()
+    check_free(tmp_path / "empty")
+    check_free(tmp_path / "missing")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("Abstract")
+    (tmp_path / "file").write_text("")
+    for name in ("full", "file"):
+        with pytest.raises(UserError, match=f"{name}: exists already; choose another --out"):
+            described(tmp_path / name)
+    assert [path.name for path in (tmp_path / "full").iterdir()] == ["thesis.tex"]
+
+
+def change(path: Path, **values) -> None:
+    contents = json.loads(path.read_text()) | values
+    path.write_text(json.dumps(contents))
+
+
+@pytest.mark.parametrize(
+    ("file", "values", "complaint"),
+    [
+        ("config.json", {"format": FORMAT + 1}, f"written in run format {FORMAT + 1}, this version reads {FORMAT}"),
+        ("config.json", {"format": None}, "written in run format None"),
+        ("config.json", {"config": {"telepathy": True}}, r"config\.json: config: unknown setting 'telepathy'"),
+        ("config.json", {"config": {"sdf": {"encoding": "hush"}}}, r"config\.sdf\.encoding: 'hush' is not a choice"),
+        ("config.json", {"config": None}, "not a complete description"),
+        ("config.json", {"config": {"sdf": 3}}, "not a complete description"),
+        ("capture.json", {"drive": "B:"}, r"capture\.json: unknown setting 'drive'"),
+        ("scene.json", {"moon": 1}, r"scene\.json: unknown setting 'moon'"),
+    ],
+)
+def test_a_description_of_another_version(tmp_path, file, values, complaint):
+    change(described(tmp_path / "run") / file, **values)
+    with pytest.raises(UserError, match=complaint):
+        read_description(tmp_path / "run")
+
+
+@pytest.mark.parametrize("file", ["config.json", "capture.json", "scene.json"])
+@pytest.mark.parametrize("text", [None, b"", b"{", b"[]", b"{}", b"\xff"])
+def test_a_damaged_description(tmp_path, file, text):
+    path = described(tmp_path / "run") / file
+    path.unlink() if text is None else path.write_bytes(text)
+    with pytest.raises(UserError, match=file) as caught:
+        read_description(tmp_path / "run")
+    assert caught.value.remedy
+
+
+def test_a_folder_that_is_no_run(tmp_path):
+    with pytest.raises(UserError, match="no run here"):
+        load_run(tmp_path)
+
+
+def test_the_environment_is_written_down(tmp_path):
+    written = json.loads((described(tmp_path / "run") / "environment.json").read_text())
+    assert written["packages"]["torch"] == metadata.version("torch")
+    assert written["packages"]["numpy"] == metadata.version("numpy")
+    assert written["python"] == platform.python_version()
+    assert written["cores"] >= 1
+    assert written["threads"] == torch.get_num_threads()
+    assert written["processor"]
+    assert len(written["gpus"]) == torch.cuda.device_count()
+    assert written["command"]

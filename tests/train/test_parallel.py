@@ -1,0 +1,123 @@
+"""Two processes train one model: each on rays of its own, both with the mean of the two gradients."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+import torch
+
+from neilfpp_method.cli import main
+from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.train.loop import seed_step
+from tests.data.make_capture import make_capture
+from tests.train.small_runs import differences, small_config, small_training
+
+REPOSITORY = Path(__file__).parents[2]
+STEPS = ["--config.train.sdf-steps", "2", "--config.train.material-steps", "2", "--config.train.joint-steps", "2"]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_capture(tmp_path_factory.mktemp("capture") / "sphere")
+
+
+@contextmanager
+def started(capture: Path, out: Path, *options: str, record: Path | None = None) -> Iterator[subprocess.Popen]:
+    """A training in two processes; none is left when the block ends, however it ends."""
+    command = [sys.executable, "-m", "tests.tiny_command", "train", "--data", str(capture), "--out", str(out)]
+    command += ["--preset", "tiny", "--device", "cpu", "--devices", "2", *options]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"} | ({"TINY_RECORD": str(record)} if record else {})
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen(command, env=environment, cwd=REPOSITORY, start_new_session=True, **pipes)
+    try:
+        yield process
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+def recorded(folder: Path, name: str) -> dict[str, torch.Tensor]:
+    """What a process wrote down; the second may end a moment after the first."""
+    path, deadline = folder / f"{name}.pt", time.monotonic() + 20.0
+    while time.monotonic() < deadline:
+        try:
+            return torch.load(path, weights_only=True)
+        except (OSError, RuntimeError, EOFError):
+            time.sleep(0.05)
+    raise AssertionError(f"{path} was not written")
+
+
+def test_two_processes_end_with_one_model(tmp_path, capture):
+    """Two steps of each stage."""
+    out = tmp_path / "run"
+    with started(capture, out, *STEPS, record=tmp_path) as process:
+        said, complaint = process.communicate(timeout=120)
+    assert process.returncode == 0, complaint
+    assert said.count("run folder") == 1
+
+    first, second = (recorded(tmp_path, f"parameters_{rank}") for rank in (0, 1))
+    assert differences(first, second) == []
+    saved = torch.load(out / "checkpoints" / "last.pt", weights_only=True)
+    assert saved["step"] == 6
+    assert differences({name: saved["model"][name] for name in first}, first) == []
+
+    # The first step, computed here for both processes one after the other.
+    config = small_config(sdf_steps=2, material_steps=2, joint_steps=2)
+    model_of = small_training(capture, tmp_path / "here", config)
+    gradients = [local_gradients(model_of, rank) for rank in (0, 1)]
+    seen = [recorded(tmp_path, f"gradients_{rank}") for rank in (0, 1)]
+    assert differences(*seen) == []
+    assert seen[0].keys() == gradients[0].keys()
+    for name, gradient in seen[0].items():
+        torch.testing.assert_close(gradient, (gradients[0][name] + gradients[1][name]) / 2.0, rtol=1e-4, atol=1e-7)
+    largest = max(seen[0], key=lambda name: seen[0][name].norm())
+    assert (gradients[0][largest] - gradients[1][largest]).norm() > 0.1 * seen[0][largest].norm()  # other rays
+
+
+def local_gradients(training, rank: int) -> dict[str, torch.Tensor]:
+    """The gradient of step 0 on the rays of one process."""
+    model, stage = training.model.train(), Stage.SDF_INIT
+    model.freeze_for(stage)
+    seed_step(training.config.train.seed, 0, rank)
+    terms = model.losses(training.pixels.sample(training.config.train.rays), stage)
+    weigh(terms, active_losses(stage, training.config)).loss.backward()
+    return {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
+
+
+def test_a_stop_stops_both_processes_after_the_same_step(tmp_path, capture):
+    """The signal reaches the first process alone."""
+    out = tmp_path / "run"
+    with started(capture, out, "--config.train.sdf-steps", "100000") as process:
+        while not (out / "checkpoints" / "last.pt").exists():
+            assert process.poll() is None
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        _, complaint = process.communicate(timeout=30)  # until both have closed their end
+    assert process.returncode == 130
+    assert complaint.count("stopped after step") == 1
+    assert complaint.endswith(f"continue with: neilfpp train --out {out} --resume --device cpu --devices 2\n")
+
+
+def test_bad_input_is_told_once(tmp_path, capture):
+    with started(capture, capture) as process:
+        _, complaint = process.communicate(timeout=30)
+    assert process.returncode == 2
+    assert complaint == f"error: {capture}: exists already; choose another --out, or continue it with --resume\n"
+
+
+def test_the_second_process_leaves_words_and_status_to_the_first(monkeypatch, capfd):
+    """A child that ends with a status of its own has its parent killed."""
+    assert main(["eval", "nowhere"]) == 2
+    assert "no run here" in capfd.readouterr().err
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    assert main(["eval", "nowhere"]) == 0
+    assert capfd.readouterr().err == ""

@@ -1,0 +1,238 @@
+"""A run that is stopped and continued is the run that was never stopped, bit for bit."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+
+from neilfpp_method.cli import main
+from neilfpp_method.config import NeilfConfig
+from neilfpp_method.errors import Stopped, UserError
+from neilfpp_method.train import loop
+from neilfpp_method.train.command import run_training
+from neilfpp_method.train.run import read_description
+from tests.data.make_capture import make_capture
+from tests.train.small_runs import differences, small_config
+
+# Four steps in each of three stages: 0–3, 4–7, 8–11.
+STEPS = 12
+
+
+def run(data: Path | None, out: Path, config: NeilfConfig | None = None, resume: bool = False, **options) -> str:
+    """Train or continue, and return what the person is told."""
+    console = Console()
+    options = {"test_every": None, "response": "auto", "device": "cpu", "devices": 1, **options}
+    with console.capture() as said:
+        run_training(data=data, out=out, config=config, resume=resume, console=console, **options)
+    return said.get()
+
+
+def interrupt_at(patch: pytest.MonkeyPatch, *steps: int) -> None:
+    """Press Ctrl-C while these steps are computed."""
+
+    def seed_step(seed: int, step: int, rank: int = 0) -> None:
+        if step in steps:
+            signal.raise_signal(signal.SIGINT)
+        original(seed, step, rank)
+
+    original = loop.seed_step
+    patch.setattr(loop, "seed_step", seed_step)
+
+
+def state(out: Path, name: str = "last") -> dict:
+    return torch.load(out / "checkpoints" / f"{name}.pt", weights_only=True)
+
+
+def files(folder: Path) -> dict[Path, tuple[int, bytes]]:
+    """Everything in a folder, with its time and contents."""
+    return {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_capture(tmp_path_factory.mktemp("capture") / "sphere")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory, capture: Path) -> Path:
+    """A run that nobody stopped."""
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    run(capture, out, small_config())
+    return out
+
+
+@pytest.mark.parametrize(
+    ("asked", "stops"),
+    [(0, 1), (1, 2), (2, 3), (4, 5), (6, 7), (8, 9), (10, 11), (3, 5), (7, 9)],
+    ids=lambda value: str(value),
+)
+def test_a_stop_in_any_stage_changes_nothing(tmp_path, capture, whole, monkeypatch, asked, stops):
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, asked)
+        with pytest.raises(Stopped, match=f"stopped after step {stops}; continue with: neilfpp train"):
+            run(capture, out, small_config())
+    assert state(out)["step"] == stops
+    run(None, out, resume=True)
+    assert state(out)["step"] == STEPS
+    for name in ("last", "sdf_init", "material_init", "joint"):
+        assert differences(state(out, name), state(whole, name)) == []
+    for stage in ("sdf_init", "material_init", "joint"):
+        preview = Path("previews") / f"{stage}.png"
+        assert (out / preview).read_bytes() == (whole / preview).read_bytes()
+
+
+def test_the_comparison_sees_a_changed_bit(whole):
+    changed = state(whole)
+    moments = changed["optimizer"]["state"]
+    assert {"exp_avg", "exp_avg_sq", "step"} <= moments[0].keys()
+    entry = moments[0]["exp_avg_sq"].view(-1)[-1:]
+    entry.copy_(entry.nextafter(torch.ones(1)))
+    assert differences(state(whole), changed) == [".optimizer.state.0.exp_avg_sq"]
+
+
+def test_many_stops_change_nothing(tmp_path, capture, whole, monkeypatch):
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 1, 5, 6, 9)
+        for resume in (False, True, True, True):
+            with pytest.raises(Stopped):
+                run(None if resume else capture, out, None if resume else small_config(), resume=resume)
+    run(None, out, resume=True)
+    assert differences(state(out), state(whole)) == []
+
+
+def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint(tmp_path, capture, whole, monkeypatch):
+    """Nothing is saved at the moment of death; the checkpoint of every third step is there."""
+
+    def die(seed: int, step: int, rank: int = 0) -> None:
+        if step == 7:
+            raise MemoryError
+        original(seed, step, rank)
+
+    original, out = loop.seed_step, tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "seed_step", die)
+        with pytest.raises(MemoryError):
+            run(capture, out, small_config())
+    assert state(out)["step"] == 6
+    run(None, out, resume=True)
+    assert differences(state(out), state(whole)) == []
+
+
+def test_a_stop_in_the_last_step_has_nothing_left_to_stop(tmp_path, capture, whole, monkeypatch):
+    interrupt_at(monkeypatch, STEPS - 1)
+    run(capture, tmp_path / "run", small_config())
+    assert differences(state(tmp_path / "run"), state(whole)) == []
+
+
+def test_time_adds_up_over_stops(tmp_path, capture, monkeypatch):
+    """On a clock that ticks when it is read, a stage takes one second a step, stopped or not."""
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(loop.time, "perf_counter", ticking())
+        interrupt_at(patch, 1, 5)
+        with pytest.raises(Stopped):
+            run(capture, out, small_config())
+        assert json.loads((out / "timing.json").read_text()) == {"sdf_init": 2.0}
+        with pytest.raises(Stopped):
+            run(None, out, resume=True)
+        assert json.loads((out / "timing.json").read_text()) == {"sdf_init": 4.0, "material_init": 2.0}
+        run(None, out, resume=True)
+    assert json.loads((out / "timing.json").read_text()) == {"sdf_init": 4.0, "material_init": 4.0, "joint": 4.0}
+
+
+def ticking() -> Callable[[], float]:
+    count = itertools.count()
+    return lambda: float(next(count))
+
+
+# ---------------------------------------------------------------------------------------------------- what resume takes
+
+
+def test_a_finished_run_is_left_as_it_is(whole):
+    before = files(whole)
+    said = run(None, whole, resume=True)
+    assert said == f"run folder {whole}: finished already, nothing to continue\n"
+    assert files(whole) == before
+
+
+def test_a_run_keeps_its_settings(tmp_path, capture, whole, monkeypatch):
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 5)
+        with pytest.raises(Stopped):
+            run(capture, out, small_config())
+    before = files(out)
+    other = make_capture(tmp_path / "other")
+    for given in (
+        {"data": None, "config": small_config(rays=49)},
+        {"data": other},
+        {"data": None, "test_every": 3},
+        {"data": None, "response": "srgb"},
+    ):
+        with pytest.raises(UserError, match="a run keeps its capture and its settings"):
+            run(out=out, resume=True, **given)
+    assert files(out) == before
+    run(capture, out, small_config(), resume=True)  # the same command again, with --resume, is as good
+    assert read_description(out) == read_description(whole)
+    assert differences(state(out), state(whole)) == []
+
+
+def test_a_run_that_stopped_before_its_first_checkpoint_starts_again(tmp_path, capture, whole, monkeypatch):
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr("neilfpp_method.train.command.train", lambda training: None)
+        run(capture, out, small_config())
+    assert not (out / "checkpoints").exists()
+    run(None, out, resume=True)
+    assert differences(state(out), state(whole)) == []
+
+
+def test_weights_that_do_not_fit_the_settings(tmp_path, capture, monkeypatch):
+    out = tmp_path / "run"
+    interrupt_at(monkeypatch, 1)
+    with pytest.raises(Stopped):
+        run(capture, out, small_config())
+    settings = json.loads((out / "config.json").read_text())
+    settings["config"]["brdf"]["width"] += 1
+    (out / "config.json").write_text(json.dumps(settings))
+    with pytest.raises(UserError, match=r"does not fit the settings in config\.json"):
+        run(None, out, resume=True)
+
+
+# -------------------------------------------------------------------------------------------------------- a real Ctrl-C
+
+
+def test_ctrl_c_in_a_real_terminal_session(tmp_path, capture):
+    """The process says in one line how to go on, ends with 130, and that line, typed as it is, goes on."""
+    out, rays = tmp_path / "a folder with spaces", 512
+    command = [sys.executable, "-m", "tests.tiny_command", "train", "--data", str(capture), "--out", str(out)]
+    command += ["--preset", "tiny", "--config.train.rays", str(rays), "--device", "cpu"]
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen(command, cwd=Path(__file__).parents[2], **pipes)
+    while not (out / "checkpoints" / "last.pt").exists():
+        assert process.poll() is None
+        time.sleep(0.005)
+    process.send_signal(signal.SIGINT)
+    _, complaint = process.communicate(timeout=60)
+    assert process.returncode == 130
+    stopped = state(out)["step"]
+    assert 3 <= stopped < STEPS
+    told = f"stopped after step {stopped}; continue with: neilfpp train --out '{out}' --resume --device cpu\n"
+    assert complaint == told
+
+    assert main(shlex.split(complaint.split("continue with: neilfpp ")[1])) == 0
+    run(capture, tmp_path / "unstopped", small_config(rays=rays))
+    assert differences(state(out), state(tmp_path / "unstopped")) == []

@@ -1,0 +1,186 @@
+"""`ns-train neilfpp` through all three stages, and every command that follows it, on a reduced table top."""
+
+from __future__ import annotations
+
+import dataclasses
+import gzip
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes
+from nerfstudio.scripts.eval import ComputePSNR
+from nerfstudio.scripts.render import DatasetRender
+from nerfstudio.utils.eval_utils import eval_setup
+
+from neilfpp_method.data.capture import load_capture
+from neilfpp_method.errors import UserError
+from neilfpp_method.model import Maps
+from neilfpp_method.presets import fixed_geometry
+from neilfpp_method.schedule import STAGES, Stage
+from neilfpp_method.structures import RayBatch
+from neilfpp_method.train.loop import train
+from tests.data.make_capture import make_capture
+from tests.train.small_runs import differences, small_training
+from tests_nerfstudio.runs import (
+    TEST,
+    checkpoint,
+    ns_train,
+    parameters,
+    reduced_tabletop,
+    small_settings,
+    trainer_config,
+    with_steps,
+)
+
+# Which part of the model each field of the loss table is.
+FIELDS = {
+    "geometry": "host.sdf_field.",
+    "beta": "host.density.",
+    "radiance": "host.radiance_field.",
+    "background": "host.background.",
+    "brdf": "brdf.",
+    "light": "light.",
+}
+SETTINGS = small_settings()
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return reduced_tabletop(tmp_path_factory.mktemp("tabletop"))
+
+
+@pytest.fixture(scope="module")
+def run(data: Path, tmp_path_factory) -> Path:
+    return ns_train(trainer_config(data, tmp_path_factory.mktemp("run"), SETTINGS))
+
+
+def train_for(data: Path, out: Path, iterations: int) -> Path:
+    config = trainer_config(data, out, SETTINGS)
+    config.max_num_iterations = iterations
+    return ns_train(config)
+
+
+# ------------------------------------------------------------------------------------------------------------- training
+
+
+def test_each_stage_moves_its_fields_and_no_others(data: Path, tmp_path: Path) -> None:
+    ends = [parameters(train_for(data, tmp_path / str(n), n)) for n in (1, 4, 8, 12)]
+    # The first is one step into SDF init; the others are the ends of the stages.
+    for stage, before, after in zip(Stage, ends, ends[1:], strict=False):
+        for field, prefix in FIELDS.items():
+            changed = any(
+                not torch.equal(before[key], after[key]) for key in before if key.startswith(prefix) and before[key].numel()
+            )
+            there = any(key.startswith(prefix) for key in before)
+            assert changed == (there and field in STAGES[stage].moves), (stage, field)
+
+
+def test_a_run_that_is_resumed_ends_as_one_that_was_not(data: Path, run: Path, tmp_path: Path) -> None:
+    first = train_for(data, tmp_path / "first", 6)
+    config = trainer_config(data, tmp_path / "second", SETTINGS)
+    config.load_dir = first / "nerfstudio_models"
+    # Nerfstudio would run as many iterations again; the stages end where they end.
+    second = ns_train(config)
+    assert differences(checkpoint(run)["pipeline"], checkpoint(second)["pipeline"]) == []
+    assert differences(checkpoint(run)["optimizers"], checkpoint(second)["optimizers"]) == []
+
+
+def test_the_same_scene_seed_and_steps_give_the_same_quality_in_both_loops(data: Path, tmp_path: Path) -> None:
+    settings = with_steps(SETTINGS, sdf_steps=160, material_steps=80, joint_steps=20)
+    inside = ns_train(trainer_config(data, tmp_path / "inside", settings))
+    ns = evaluated(inside, tmp_path)
+    standalone = small_training(data, tmp_path / "standalone", settings)
+    train(standalone)
+    # The same measure for both: nerfstudio's model with the weights of the standalone loop.
+    _, pipeline, _, _ = eval_setup(inside / "config.yml")
+    pipeline.model.neilf.load_state_dict(standalone.model.state_dict())
+    own = pipeline.get_average_eval_image_metrics()
+    print(f"psnr {ns['psnr']:.2f} / {own['psnr']:.2f}, volume {ns['volume_psnr']:.2f} / {own['volume_psnr']:.2f}")
+    for name in ("psnr", "volume_psnr"):
+        assert own[name] > 15.0, "something was learnt, or there is nothing to compare"
+        assert ns[name] == pytest.approx(own[name], abs=0.5), name
+
+
+def test_on_a_given_mesh_material_and_light_alone_are_trained(tmp_path: Path) -> None:
+    tiny = fixed_geometry(SETTINGS)
+    settings = dataclasses.replace(tiny, radiance=dataclasses.replace(tiny.radiance, layers=1, width=16))
+    settings = with_steps(settings, sdf_steps=0, material_steps=2, joint_steps=0)
+    run = ns_train(trainer_config(make_capture(tmp_path / "capture"), tmp_path / "run", settings, method="neilfpp-mesh"))
+    moved = {key.split(".")[0] for key in parameters(run)}
+    assert {"brdf", "light", "host"} <= moved
+    assert set(checkpoint(run)["optimizers"]) == {"radiance", "brdf", "light"}
+    assert checkpoint(run)["step"] == 1
+
+
+def test_several_devices_are_refused(data: Path, tmp_path: Path) -> None:
+    config = trainer_config(data, tmp_path, SETTINGS)
+    config.pipeline.datamanager.data = data
+    model = config.pipeline.setup(device="cpu").model
+    with pytest.raises(UserError, match="one device"):
+        model.get_training_callbacks(TrainingCallbackAttributes(None, None, None, SimpleNamespace(world_size=2)))
+
+
+# ---------------------------------------------------------------------------------------------------- the commands after
+
+
+def evaluated(run: Path, out: Path) -> dict[str, float]:
+    ComputePSNR(load_config=run / "config.yml", output_path=out / "eval.json", render_output_path=out / "eval").main()
+    return json.loads((out / "eval.json").read_text())["results"]
+
+
+def test_ns_eval_measures_the_test_views_and_writes_all_maps(run: Path, tmp_path: Path) -> None:
+    figures = evaluated(run, tmp_path)
+    assert {"psnr", "ssim", "volume_psnr", "volume_ssim"} <= set(figures)
+    assert np.isfinite(list(figures.values())).all()
+    maps = {path.stem.removeprefix("eval_").rsplit("_", 1)[0] for path in (tmp_path / "eval").iterdir()}
+    assert {"img", "base_color", "roughness", "metallic", "incident_light", "normal", "depth"} <= maps
+
+
+def test_ns_render_writes_material_maps_as_raw_floats(run: Path, tmp_path: Path) -> None:
+    names = ["raw-roughness", "raw-base_color", "raw-incident_light", "raw-rgb", "raw-normal", "base_color"]
+    DatasetRender(load_config=run / "config.yml", output_path=tmp_path, rendered_output_names=names).main()
+    _, pipeline, _, _ = eval_setup(run / "config.yml")
+    for i, (camera, _) in enumerate(pipeline.datamanager.fixed_indices_eval_dataloader):
+        expected = pipeline.model.get_outputs_for_camera(camera)
+        for name in names[:5]:
+            with gzip.open(tmp_path / "test" / name / f"{TEST[i]:03d}.npy.gz") as file:
+                values = np.load(file)
+            assert values.dtype == np.float32
+            np.testing.assert_array_equal(values, expected[name.removeprefix("raw-")].numpy())
+        hit = expected["roughness"][..., 0] > 0.0
+        assert hit.any()
+        assert (expected["base_color"][hit] > 0.0).all()
+        assert (expected["incident_light"][hit] > 0.0).all()
+        assert not expected["incident_light"][~hit].any()
+    assert (tmp_path / "test" / "base_color").is_dir()
+
+
+def test_before_there_is_a_material_none_is_shown(data: Path, tmp_path: Path) -> None:
+    run = train_for(data, tmp_path, 3)
+    _, pipeline, _, _ = eval_setup(run / "config.yml")
+    camera, _ = pipeline.datamanager.next_eval_image(0)
+    outputs = pipeline.model.get_outputs_for_camera(camera)
+    assert torch.equal(outputs["rgb"], outputs["rgb_volume"])
+    for name in ("base_color", "roughness", "incident_light"):
+        assert not outputs[name].any()
+
+
+def test_light_on_a_wall_is_its_irradiance_over_pi(run: Path, monkeypatch) -> None:
+    _, pipeline, _, _ = eval_setup(run / "config.yml")
+    model = pipeline.model
+    monkeypatch.setattr(model.neilf, "incident_light", lambda x, wi: wi[..., 2:].clamp_min(0.0).expand(-1, -1, 3))
+    up = torch.tensor([[0.0, 0.0, 1.0]])
+    one, three = torch.ones(1, 1), torch.ones(1, 3)
+    maps = Maps(three, three, three, three, three, one, one, up, one, one)
+    light = model._incident_light(RayBatch(2.0 * up, -up), maps)
+    # ∫ cos θ · cos θ dω over the hemisphere is 2π/3; a lattice of 8 directions comes near.
+    torch.testing.assert_close(light, torch.full((1, 3), 2.0 / 3.0), atol=0.05, rtol=0)
+
+
+def test_the_capture_of_the_run_is_the_one_given(data: Path, run: Path) -> None:
+    _, pipeline, _, _ = eval_setup(run / "config.yml")
+    assert pipeline.datamanager.train_dataset.pixels.capture.root == load_capture(data).root
