@@ -2,28 +2,39 @@
 
     python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results
 
-For each capture: the preset trained from scratch, with and without L_ref (the paper's Table 2), each measured after the
-material stage ("Sep.") and after the joint stage (Table 3), beside baselines that need no method. The two runs share
-the stage SDF init, which L_ref does not enter; every step depends on seed and number alone, so sharing changes nothing.
+For each capture: the preset trained from scratch, with and without L_ref (the paper's Table 2), and with distant light and
+hard inter-reflection in place of the free field; each measured after the material stage ("Sep.") and after the joint stage
+(Table 3), beside baselines that need no method. The runs share the stage SDF init, which none of this enters; every step
+depends on seed and number alone, so sharing changes nothing.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 from rich.console import Console
+from torch import Tensor
 
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.evaluate.protocols import evaluate
 from neilfpp_method.evaluate.report import write_report
 from neilfpp_method.presets import preset
+from neilfpp_method.train.build import build_model
 from neilfpp_method.train.command import run_training
-from neilfpp_method.train.run import load_run, read_json, write_json
+from neilfpp_method.train.loop import make_optimizer, seed_step
+from neilfpp_method.train.run import (
+    create_run,
+    load_checkpoint,
+    load_run,
+    read_description,
+    read_json,
+    save_checkpoint,
+    write_json,
+)
 
 COLUMNS = {
     "volume_psnr": "R",
@@ -55,36 +66,57 @@ class Options:
     """Where to train."""
 
 
-def without_inter_reflection(config: NeilfConfig) -> NeilfConfig:
-    """The same settings with L_ref off."""
+def variants(config: NeilfConfig) -> dict[str, NeilfConfig]:
+    """What is compared; the first is the preset as it is."""
     off = dataclasses.replace(config.inter_reflection, mode="off")
-    return dataclasses.replace(config, inter_reflection=off)
+    hard = dataclasses.replace(config.inter_reflection, mode="hard")
+    distant = dataclasses.replace(config.light, kind="distant")
+    # A texel of a map is moved by what it says alone, not through a network: it takes larger steps.
+    optimizer = dataclasses.replace(config.optimizer, light=2e-2)
+    return {
+        "with L_ref": config,
+        "without L_ref": dataclasses.replace(config, inter_reflection=off),
+        "distant light, hard": dataclasses.replace(config, inter_reflection=hard, light=distant, optimizer=optimizer),
+    }
 
 
 def train(capture: Path, out: Path, config: NeilfConfig, device: str, start_from: Path | None = None) -> None:
     """A run from scratch, or from the end of another run's SDF init. A run that is there is continued."""
-    resume = out.exists()
-    if start_from is not None and not resume:
-        shutil.copytree(start_from, out, ignore=shutil.ignore_patterns("tensorboard", "*.html", "*.png", "*.ply"))
-        checkpoints = out / "checkpoints"
-        shutil.copyfile(checkpoints / "sdf_init.pt", checkpoints / "last.pt")
-        for stage in STAGES:
-            (checkpoints / f"{stage}.pt").unlink(missing_ok=True)
-        stored = read_json(out / "config.json")
-        write_json(out / "config.json", {**stored, "config": dataclasses.asdict(config)})
-        write_json(out / "timing.json", {"sdf_init": read_json(out / "timing.json")["sdf_init"]})
-        resume = True
+    if start_from is not None and not out.exists():
+        branch(start_from, out, config)
     run_training(
         data=capture,
         out=out,
         config=config,
-        resume=resume,
+        resume=out.exists(),
         test_every=None,
         response="auto",
         device=device,
         devices=1,
         console=Console(),
     )
+
+
+def branch(trunk: Path, out: Path, config: NeilfConfig) -> None:
+    """A run that stands at the end of SDF init, with the host of the trunk and a material and a light that have not moved."""
+    described = read_description(trunk)
+    saved = load_checkpoint(trunk / "checkpoints" / "sdf_init.pt")
+    seed_step(config.train.seed, step=-1)
+    model = build_model(described.source.load(), described.facts, config)
+    own = model.state_dict()
+    shared = {key: value for key, value in saved["model"].items() if key.startswith("host.") and is_like(value, own[key])}
+    model.load_state_dict(own | shared)
+    optimizer = make_optimizer(model, config.optimizer)
+    # So far only the host has moved: its moments are all that the optimiser knows, and its parameters come first.
+    optimizer.load_state_dict(optimizer.state_dict() | {"state": saved["optimizer"]["state"]})
+    create_run(out, config, described.source, described.facts)
+    save_checkpoint(out / "checkpoints" / "last.pt", model, optimizer, saved["step"])
+    write_json(out / "timing.json", {"sdf_init": read_json(trunk / "timing.json")["sdf_init"]})
+
+
+def is_like(value: object, other: object) -> bool:
+    """Whether both are tensors of one shape."""
+    return isinstance(value, Tensor) and isinstance(other, Tensor) and value.shape == other.shape
 
 
 def measure(out: Path) -> dict[str, dict[str, float]]:
@@ -118,25 +150,23 @@ def main(options: Options) -> None:
     config = preset(options.preset)
     sections = []
     for capture in options.captures:
+        rows: dict[str, dict[str, float]] = {}
+        times = []
         base = options.out / capture.name
-        bare = options.out / f"{capture.name}-without-ref"
-        train(capture, base, config, options.device)
-        train(capture, bare, without_inter_reflection(config), options.device, start_from=base)
-        with_ref, without = measure(base), measure(bare)
-        final = with_ref["joint"]
-        baseline = {key: final[f"baseline_{key}"] for key in COLUMNS if f"baseline_{key}" in final}
-        rows = {"naive baseline": baseline}
-        rows |= {f"{name}, without L_ref": figures for name, figures in without.items()}
-        rows |= {f"{name}, with L_ref": figures for name, figures in with_ref.items()}
-        seconds = {name: read_json(path / "timing.json") for name, path in (("with", base), ("without", bare))}
-        write_report(load_run(base), base, final, seconds["with"])
-        times = "; ".join(
-            f"{name} L_ref " + ", ".join(f"{stage} {value:.0f} s" for stage, value in stages.items())
-            for name, stages in seconds.items()
-        )
+        for name, settings in variants(config).items():
+            run = base if settings is config else options.out / f"{capture.name}-{name.replace(', ', '-').replace(' ', '-')}"
+            train(capture, run, settings, options.device, start_from=None if run == base else base)
+            figures = measure(run)
+            if not rows:
+                final = figures["joint"]
+                rows["naive baseline"] = {k: final[f"baseline_{k}"] for k in COLUMNS if f"baseline_{k}" in final}
+            rows |= {f"{stage}, {name}": values for stage, values in figures.items()}
+            seconds = read_json(run / "timing.json")
+            write_report(load_run(run), run, figures["joint"], seconds)
+            times.append(f"{name}: " + ", ".join(f"{stage} {value:.0f} s" for stage, value in seconds.items()))
         hardware = read_json(base / "environment.json")
-        machine = f"{hardware['processor']}, {hardware['threads']} threads; GPUs: {', '.join(hardware['gpus']) or 'none'}"
-        sections.append(f"### {capture.name}\n\n{table(rows)}\n\nTraining time: {times}. {machine}.\n")
+        machine = f"{hardware['processor']}, {hardware['threads']} threads, GPU {', '.join(hardware['gpus']) or 'none'}"
+        sections.append(f"### {capture.name}\n\n{table(rows)}\n\nTraining time: {'; '.join(times)}. {machine}.\n")
         options.out.mkdir(parents=True, exist_ok=True)
         (options.out / "tables.md").write_text("\n".join(sections))
     Console().print("\n".join(sections), markup=False, highlight=False)

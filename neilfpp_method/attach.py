@@ -1,14 +1,17 @@
 """`attach_neilf`: material and light on top of somebody else's geometry and radiance, in somebody else's loop.
 
+Three lines, the last one in every step:
+
     neilf = attach_neilf(host)
     optimizer.add_param_group({"params": neilf.parameters()})
-    loss = loss + neilf.losses(batch, step).loss      # in every step
+    loss = loss + neilf.losses(batch, step).loss
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -133,13 +136,11 @@ class AttachedNeilf(nn.Module):
         samples = settings.train_samples if self.training else settings.eval_samples
         shading = self.model.shade(position, hits.normal[rows], wo[rows], self.materials(position), samples)
         nothing = torch.zeros_like(wo)
-        return Shading(
-            *(nothing.index_put((rows,), part) for part in (shading.color, shading.diffuse, shading.specular))
-        )
+        return Shading(*(nothing.index_put((rows,), part) for part in (shading.color, shading.diffuse, shading.specular)))
 
 
 def attach_neilf(
-    host: Host | RenderFunction | nn.Module,
+    host: Any,
     config: NeilfConfig | None = None,
     *,
     response: str = "linear",
@@ -160,7 +161,7 @@ def attach_neilf(
         UserError: the host is none of the three.
     """
     adapted = _adapt(host, response)
-    borrowed = adapted is not host or not isinstance(host, HasParameterGroups)
+    borrowed = not isinstance(host, HasParameterGroups)
     facts = SceneFacts(response, median_radiance, radiance_scale or RADIANCE_SCALE[response], background="constant")
     attached = AttachedNeilf(NeilfModel(adapted, config or preset("fast"), facts, borrowed=borrowed))
     if attached.missing:

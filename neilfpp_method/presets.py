@@ -56,13 +56,14 @@ def fast() -> NeilfConfig:
         brdf=BrdfConfig(encoding="hash", grid=grid, activation="relu", layers=2, width=64, skip=None),
         light=IncidentLightConfig(layers=4, width=64, direction_encoding="spherical_harmonics", direction_degree=5),
         background=BackgroundConfig(layers=4, width=64, samples=16),
-        volume=VolumeConfig(radius=1.75, beta_init=0.03, initial_samples=64, rounds=2, samples=32),
+        volume=VolumeConfig(radius=1.75, beta_init=0.05, initial_samples=64, rounds=2, samples=32),
         shading=ShadingConfig(sampler="mis", train_samples=32, eval_samples=128),
         inter_reflection=InterReflectionConfig(rays_per_point=0.25),
         loss=LossConfig(
             unit="median",
-            hessian=2e-3,
-            hessian_joint=1e-3,
+            eikonal=0.05,
+            hessian=2e-4,
+            hessian_joint=5e-4,
             surface=1e-2,
             surface_joint=1e-3,
             mask=0.1,
@@ -72,8 +73,8 @@ def fast() -> NeilfConfig:
             normal_gradient=0.1,
             hessian_method="finite_difference",
         ),
-        optimizer=OptimizerConfig(geometry=2e-2, radiance=5e-3, brdf=5e-3, light=2e-3, background=5e-3, beta=5e-3),
-        train=TrainConfig(sdf_steps=2_000, material_steps=1_000, joint_steps=300, rays=512),
+        optimizer=OptimizerConfig(geometry=2e-2, radiance=5e-3, brdf=5e-3, light=2e-3, background=5e-3, beta=1e-3),
+        train=TrainConfig(sdf_steps=2_000, material_steps=800, joint_steps=200, rays=512),
     )
 
 
@@ -112,6 +113,6 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
             width=128,
         ),
         inter_reflection=replace(config.inter_reflection, radiance_gradient=0.7, offset=2e-3),
-        loss=replace(config.loss, lambertian=5e-3),
+        loss=replace(config.loss, lambertian=10.0 * config.loss.lambertian),
         train=replace(train, sdf_steps=0, material_steps=train.material_steps + train.joint_steps, joint_steps=0),
     )

@@ -16,6 +16,7 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.errors import UserError
 from neilfpp_method.plugin.datamanager import CaptureDataManagerConfig, CaptureDataset, pixel_batch
 from neilfpp_method.plugin.dataparser import CaptureParserConfig, capture_of
+from neilfpp_method.train.loop import seed_step
 from tests.data.make_capture import CENTRE, SCALE, make_capture
 
 VIEWS, WIDTH, HEIGHT = 6, 24, 18
@@ -67,6 +68,20 @@ def test_each_drawn_pixel_brings_its_color_and_its_facts(root: Path) -> None:
         torch.testing.assert_close(mine.directions, view.directions, atol=1e-5, rtol=0)
     assert drawn.color.max() > 1.0, "radiance above 1 is kept"
     assert 0.0 < drawn.mask.mean() < 1.0, "pixels off the object are drawn too"
+
+
+def test_a_step_learns_from_the_pixels_of_the_same_step_of_the_standalone_loop(root: Path) -> None:
+    manager = CaptureDataManagerConfig(dataparser=CaptureParserConfig(data=root), train_num_rays_per_batch=64).setup()
+    whole = PixelDataset(load_capture(root), load_capture(root).train_views)
+    for step in (0, 1):
+        seed_step(7, step)
+        rays, batch = manager.next_train(step)
+        seed_step(7, step)
+        expected = whole.sample(64)
+        drawn = pixel_batch(rays.origins, rays.directions, batch)
+        assert torch.equal(drawn.color, expected.color)
+        assert torch.equal(drawn.view, expected.view)
+        torch.testing.assert_close(drawn.directions, expected.directions, atol=1e-5, rtol=0)
 
 
 def test_another_dataparser_serves_as_well(root: Path) -> None:

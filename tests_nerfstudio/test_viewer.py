@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import io
 import socket
-import threading
+import subprocess
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
 import numpy as np
-from nerfstudio.scripts.viewer.run_viewer import RunViewer, ViewerConfigWithoutNumRays
 from PIL import Image
 from viser._messages import ViewerCameraMessage
 from websockets.sync.client import connect
@@ -25,13 +27,25 @@ def free_port() -> int:
         return one.getsockname()[1]
 
 
+@contextmanager
+def ns_viewer(config: Path, port: int) -> Iterator[None]:
+    """The command in a process of its own: it never ends by itself."""
+    code = "import tests_nerfstudio.conftest; from nerfstudio.scripts.viewer.run_viewer import entrypoint; entrypoint()"
+    options = ["--load-config", str(config), "--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", str(port)]
+    process = subprocess.Popen([sys.executable, "-W", "ignore", "-c", code, *options], stdout=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
 def test_a_frame_arrives(tmp_path: Path) -> None:
     run = ns_train(trainer_config(make_capture(tmp_path / "capture", background=0.2), tmp_path / "run", small_settings()))
     port = free_port()
-    viewer = ViewerConfigWithoutNumRays(websocket_host="127.0.0.1", websocket_port=port)
-    threading.Thread(target=RunViewer(run / "config.yml", viewer).main, daemon=True).start()
     camera = ViewerCameraMessage((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -30.0), 0.8, 1.0, (0.0, 0.0, 0.0), (0.0, -1.0, 0.0))
-    frame = first_frame(port, msgspec.msgpack.encode(camera.as_serializable_dict()))
+    with ns_viewer(run / "config.yml", port):
+        frame = first_frame(port, msgspec.msgpack.encode(camera.as_serializable_dict()))
     picture = np.asarray(Image.open(io.BytesIO(frame)).convert("RGB"))
     assert min(picture.shape[:2]) > 1
     assert picture.max() > 0, "the background alone is brighter than black"

@@ -37,9 +37,7 @@ class Meeting:
     weights: Float[Tensor, "N 3"]
 
 
-def meet(
-    origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"], triangles: Float[Tensor, "N 3 3"]
-) -> Meeting:
+def meet(origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"], triangles: Float[Tensor, "N 3 3"]) -> Meeting:
     """Each ray with the plane of its own triangle (Möller & Trumbore 1997); not finite for a ray along it."""
     corner, first, second = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     across = torch.linalg.cross(directions, second)
@@ -55,32 +53,38 @@ def meet(
 
 
 @dataclass(frozen=True)
+class Boxes:
+    """The lower and the upper corners of K boxes along the axes."""
+
+    low: Float[Tensor, "K 3"]
+    high: Float[Tensor, "K 3"]
+
+
+@dataclass(frozen=True)
 class BoxTree:
     """Triangles along a space-filling curve, and boxes around every 8, 64, 512, … neighbours on it, the root first.
 
     Node i of a level holds the nodes 8 i … 8 i + 7 of the next one, and of the last level the triangles. Levels are
-    filled up with empty boxes, and the triangles with ones that are not finite.
+    filled up to eights with boxes that are inside out, and the triangles with ones that are not finite.
     """
 
     triangles: Float[Tensor, "P 3 3"]
     numbers: Int[Tensor, " P"]
-    levels: tuple[tuple[Float[Tensor, "K 3"], Float[Tensor, "K 3"]], ...]
+    levels: tuple[Boxes, ...]
 
 
 def build_tree(triangles: Float[Tensor, "F 3 3"]) -> BoxTree:
     """Sort triangles by the Morton code of their centres, and box them in eights of eights."""
     order = torch.argsort(_morton(triangles.mean(dim=1)), stable=True)
-    padded = _fill_up(triangles[order], float("nan"))
+    padded = _fill_up(triangles[order], torch.nan)
     numbers = _fill_up(order, -1)
     room = SLACK * triangles.abs().max()
-    low = _fill_up(triangles[order].amin(dim=1) - room, float("inf"))
-    high = _fill_up(triangles[order].amax(dim=1) + room, float("-inf"))
-    levels = []
-    while len(low) > 1:
-        low, high = low.reshape(-1, BRANCHES, 3).amin(dim=1), high.reshape(-1, BRANCHES, 3).amax(dim=1)
-        if len(low) > 1:
-            low, high = _fill_up(low, float("inf")), _fill_up(high, float("-inf"))
-        levels.insert(0, (low, high))
+    low, high = triangles[order].amin(dim=1) - room, triangles[order].amax(dim=1) + room
+    levels: list[Boxes] = []
+    while not levels or len(low) > 1:
+        low = _fill_up(low, torch.inf).reshape(-1, BRANCHES, 3).amin(dim=1)
+        high = _fill_up(high, -torch.inf).reshape(-1, BRANCHES, 3).amax(dim=1)
+        levels.insert(0, Boxes(_fill_up(low, torch.inf), _fill_up(high, -torch.inf)))
     return BoxTree(padded, numbers, tuple(levels))
 
 
@@ -101,8 +105,8 @@ def _descend(tree: BoxTree, origins: Float[Tensor, "N 3"], directions: Float[Ten
     rays = torch.arange(count, device=device)
     nodes = torch.zeros_like(rays)
     children = torch.arange(BRANCHES, device=device)
-    for low, high in tree.levels:
-        kept = torch.nonzero(_meets_box(origins[rays], inverse[rays], low[nodes], high[nodes]))[:, 0]
+    for boxes in tree.levels:
+        kept = torch.nonzero(_meets_box(origins[rays], inverse[rays], boxes.low[nodes], boxes.high[nodes]))[:, 0]
         rays = rays[kept].repeat_interleave(BRANCHES)
         nodes = (BRANCHES * nodes[kept][:, None] + children).reshape(-1)
     meeting = meet(origins[rays], directions[rays], tree.triangles[nodes])
@@ -120,14 +124,14 @@ def _meets_box(
     low: Float[Tensor, "K 3"],
     high: Float[Tensor, "K 3"],
 ) -> Bool[Tensor, " K"]:
-    """Whether rays pass through boxes. The ray's direction chooses the sides, so an inverted box is never met."""
+    """Whether rays pass through boxes. The direction chooses the sides, so that a box that is inside out is never met."""
     forward = inverse > 0.0
     enter = ((torch.where(forward, low, high) - origins) * inverse).amax(-1)
     leave = ((torch.where(forward, high, low) - origins) * inverse).amin(-1)
     return (enter <= leave) & (leave >= 0.0)
 
 
-def _fill_up(rows: Tensor, value: float) -> Tensor:
+def _fill_up(rows: Tensor, value: float | int) -> Tensor:
     """The rows, and as many of a constant value as a multiple of 8 needs."""
     missing = -len(rows) % BRANCHES
     return torch.cat([rows, rows.new_full((missing, *rows.shape[1:]), value)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,12 +30,12 @@ class OutputCheck:
         self.hit_share = hit_share
         self.normals_known = False
 
-    def __call__(self, rays: RayBatch, hits: SurfaceHits, color_moves: bool) -> None:
+    def __call__(self, rays: RayBatch, hits: Any, color_moves: bool) -> None:
         """Look at what `rays` brought.
 
         Args:
             rays: what the host was asked.
-            hits: what it answered.
+            hits: what it answered: `SurfaceHits`, if all is well.
             color_moves: a loss on the colour is about to send a gradient into the host.
 
         Raises:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import torch
 from jaxtyping import Float
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
 from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
@@ -66,11 +68,33 @@ def pixel_batch(origins: Tensor, directions: Tensor, batch: dict[str, Any]) -> P
     return PixelBatch(origins=origins, directions=directions, color=color, view=view, **facts)
 
 
+class CapturePixelSampler(PixelSampler):
+    """Draws what `PixelDataset.sample` would: one number a ray, that counts all pixels view after view, row by row.
+
+    A step then learns from the same pixels as the same step of the standalone loop, with masks or without.
+    """
+
+    def collate_image_dataset_batch(
+        self, batch: dict[str, Any], num_rays_per_batch: int, keep_full_image: bool = False
+    ) -> dict[str, Tensor]:
+        """Pixels of a batch of images, and their `indices`: view, row, column."""
+        del keep_full_image  # no model of ours looks at whole images in training
+        count, height, width, _ = batch["image"].shape
+        number = torch.randint(count * height * width, (num_rays_per_batch,))
+        row, column = number // width % height, number % width
+        # Nerfstudio has shuffled the images when it loaded them.
+        place = batch["image_idx"].cpu().argsort()[number // (height * width)]
+        drawn = {key: values[place, row, column] for key, values in batch.items() if key != "image_idx"}
+        return drawn | {"indices": torch.stack([batch["image_idx"].cpu()[place], row, column], dim=-1)}
+
+
 @dataclass
 class CaptureDataManagerConfig(VanillaDataManagerConfig):
     """Nerfstudio's data manager with float images."""
 
     _target: type = field(default_factory=lambda: CaptureDataManager)
+    pixel_sampler: PixelSamplerConfig = field(default_factory=lambda: PixelSamplerConfig(_target=CapturePixelSampler))
+    """Who draws the pixels of a step."""
 
 
 class CaptureDataManager(VanillaDataManager[CaptureDataset]):

@@ -13,15 +13,18 @@ import trimesh
 from torch.nn.functional import normalize
 
 from neilfpp_method.cli import main
-from neilfpp_method.config import PRESETS, NeilfConfig, fixed_geometry
+from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.mesh import Mesh
+from neilfpp_method.evaluate.report import write_report
 from neilfpp_method.hosts import mesh_tracing
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.hosts.mesh_tracing import build_tree, embree_tracer, tree_tracer
 from neilfpp_method.inter_reflection import trace_light
 from neilfpp_method.model import NeilfModel, SceneFacts
+from neilfpp_method.presets import PRESETS, fixed_geometry
 from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.structures import RayBatch
+from neilfpp_method.train.run import load_run
 from tests.data.make_capture import CENTRE, make_capture
 from tests.scenes import sphere_batch, tiny_config
 from tests.train.small_runs import small_config
@@ -95,14 +98,40 @@ def test_hits_on_a_box_are_exact(tracer):
 
 
 def test_a_miss_shows_the_background_and_has_no_normal(tracer):
-    hits = mesh_host(SPHERE).render(rays_at(50, 0.1).__class__(*(3.0 * torch.eye(3), torch.eye(3))))
+    hits = mesh_host(SPHERE).render(RayBatch(3.0 * torch.eye(3), torch.eye(3)))
     torch.testing.assert_close(hits.color, torch.tensor([[0.25, 0.5, 0.75]]).expand(3, 3))
     assert not hits.normal.any()
     assert not hits.concentration.any()
 
 
-def test_the_inside_of_a_face_stops_a_ray_but_is_no_surface_point():
+def test_an_open_scene_lies_behind_the_mesh():
+    torch.manual_seed(0)
+    host = MeshHost(mesh_of(SPHERE), mesh_config(), 3.0, background="inverted_sphere")
+    rays = rays_at(100, 0.9)
+    hits = host.render(rays)
+    beyond = host.background(rays.origins, rays.directions)
+    missed = hits.opacity == 0.0
+    assert 0 < missed.sum() < 100
+    torch.testing.assert_close(hits.color[missed], beyond[missed])
+    assert (hits.color[~missed] != beyond[~missed]).all()
+    assert set(host.parameter_groups()) == {"radiance", "background"}
+
+
+@pytest.mark.parametrize("smooth", [True, False])
+def test_no_normal_points_away_from_the_viewer(smooth):
+    mesh = dataclasses.replace(mesh_config().mesh, smooth_normals=smooth)
+    rays = rays_at(2000, 0.8)
+    hits = mesh_host(trimesh.creation.icosphere(subdivisions=1, radius=0.7), mesh=mesh).render(rays)
+    seen = hits.concentration > 0
+    assert ((hits.normal * rays.directions).sum(-1)[seen] < 0.0).all()
+    torch.testing.assert_close(hits.normal[seen].norm(dim=-1), torch.ones(int(seen.sum())))
+    distinct = hits.normal[seen].mul(1e4).round().unique(dim=0)
+    assert (len(distinct) > 80) == smooth  # 80 triangles
+
+
+def test_the_inside_of_a_face_stops_a_ray_but_is_no_surface_point(tracer):
     hits = mesh_host(SPHERE).render(RayBatch(torch.zeros(3, 3), torch.eye(3)))
+    torch.testing.assert_close(hits.position, 0.7 * torch.eye(3), atol=1e-3, rtol=0.0)  # ahead, not behind
     assert (hits.opacity == 1.0).all()
     assert not hits.is_hit(0.8).any()
 
@@ -134,6 +163,13 @@ def test_a_tree_holds_every_triangle(faces):
     down = torch.tensor([[0.0, 0.0, -1.0]]).expand(faces, 3)
     assert torch.equal(tracer(origins, down), torch.arange(faces))
     assert (tracer(origins, -down) == -1).all()  # away from them
+
+
+def test_a_ray_between_two_triangles_meets_the_one_ahead():
+    corners = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    tracer = tree_tracer(build_tree(torch.stack([corners, corners + torch.tensor([0.0, 0.0, 1.0])])))
+    up = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    assert tracer(torch.tensor([[0.2, 0.2, 0.4]]).expand(2, 3), up).tolist() == [1, 0]
 
 
 # --------------------------------------------------------------------------------------------------------- light between
@@ -185,8 +221,9 @@ def test_rays_leave_a_surface_at_every_angle_without_meeting_it():
 
 
 def test_r_material_and_light_move_together_and_the_mesh_does_not():
+    assert mesh_config().inter_reflection.radiance_gradient == 0.7  # METHOD §2, for fixed geometry
     host = mesh_host(SPHERE)
-    model = NeilfModel(host, mesh_config(), FACTS)
+    model = NeilfModel(host, mesh_config(loss=dataclasses.replace(mesh_config().loss, lambertian=1e-3)), FACTS)
     assert set(model.parameter_groups()) == {"radiance", "brdf", "light"}
     terms = model.losses(sphere_batch(), Stage.MATERIAL_INIT)
     weights = active_losses(Stage.MATERIAL_INIT, model.config, model.stages)
@@ -209,6 +246,7 @@ def test_a_mesh_run_from_the_command_line(tmp_path: Path, monkeypatch, capsys):
     assert metrics["normal_mae_deg"] < 2.0  # the mesh is a sphere of triangles
     assert {"base_color_psnr", "volume_psnr", "pbr_psnr"} <= set(metrics)
     assert "chamfer" not in metrics
+    assert write_report(load_run(out), tmp_path / "report", metrics, {"material_init": 1.0}).is_file()
     assert main(["render", str(out), "--device", "cpu"]) == 0
     assert list((out / "renders").glob("*.exr"))
     assert main(["export", str(out), "--device", "cpu"]) == 2

@@ -1,0 +1,107 @@
+"""The contract suite: hosts that keep the contract pass, and each way to break it has a line of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from neilfpp_method.attach import CallableHost
+from neilfpp_method.hosts.testing import CHECKS, check_host
+from neilfpp_method.structures import RayBatch
+from tests.hosts.balls import Ball, BallHost, ball_rays
+from tests.hosts.test_mesh import SPHERE, mesh_host
+from tests.scenes import sphere_model
+
+
+def test_the_reference_host_keeps_the_contract():
+    report = check_host(sphere_model().host, ball_rays())
+    assert report.host == "VolSdfHost"
+    assert report.hits > 100
+    assert report.trains_geometry
+    assert len(report.checks) == len(CHECKS) + 1
+
+
+def test_a_mesh_keeps_the_contract_and_need_not_move():
+    report = check_host(mesh_host(SPHERE), ball_rays(spread=0.8))
+    assert 0 < report.hits < report.rays
+    assert not report.trains_geometry
+
+
+def test_a_function_keeps_the_contract():
+    ball = Ball()
+    report = check_host(CallableHost(ball), ball_rays(), list(ball.parameters()))
+    assert report.host == "Ball"
+    assert report.hits == 200
+
+
+def sideways(rays: RayBatch) -> torch.Tensor:
+    return 0.1 * torch.linalg.cross(rays.directions, rays.directions.roll(1, dims=-1))
+
+
+def missed(outputs: dict) -> torch.Tensor:
+    return outputs["opacity"][:, None] == 0.0
+
+
+def recomputed(rays: RayBatch, outputs: dict) -> dict:
+    """What a host does that takes its normal by autograd and forgets to detach it."""
+    with torch.enable_grad():
+        return {"normal": outputs["normal"] * torch.ones((), requires_grad=True)}
+
+
+def crash_on_nothing(rays: RayBatch, outputs: dict) -> dict:
+    return {"color": outputs["color"] / rays.origins.norm(dim=-1).max()}
+
+
+def shift_origins(rays: RayBatch, outputs: dict) -> dict:
+    rays.origins.add_(0.1)
+    return {}
+
+
+BROKEN = [
+    (lambda r, o: {"color": o["color"][:, :2]}, r"its color has the shape \(200, 2\); return \(200, 3\)"),
+    (lambda r, o: {"opacity": None}, r"its opacity is a NoneType"),
+    (lambda r, o: {"opacity": o["opacity"] > 0}, r"its opacity is a torch.bool"),
+    (lambda r, o: {"normal": o["normal"].double()}, r"its normal is torch.float64, the rays are torch.float32"),
+    (lambda r, o: {"concentration": 0.1 * o["concentration"]}, r"200 rays hit nothing"),
+    (lambda r, o: {"opacity": 2.0 * o["opacity"]}, r"its opacity leaves \[0, 1\]"),
+    (lambda r, o: {"normal": 0.5 * o["normal"]}, r"its normal is no unit vector: that of a hit has the length 0.5"),
+    (lambda r, o: {"normal": o["normal"] / 0.0 * 0.0}, r"its normal is not finite for 200 of 200 rays"),
+    (lambda r, o: {"normal": -o["normal"]}, r"100% of its normals point away from the viewer"),
+    (lambda r, o: {"position": o["position"] + sideways(r)}, r"hits do not lie on their ray"),
+    (lambda r, o: {"position": 2.0 * r.origins - o["position"]}, r"hits lie behind the origin"),
+    (lambda r, o: {"color": o["color"] - 9.0}, r"its colour is negative"),
+    (lambda r, o: {"color": o["color"] / 0.0}, r"its colour is not finite"),
+    (lambda r, o: {"color": (o["color"] / o["color"].median()).clamp_max(1.0)}, r"50% of its colours are exactly 1"),
+    (lambda r, o: {"position": torch.where(missed(o), torch.nan, o["position"])}, r"its position is not finite where"),
+    (lambda r, o: {"concentration": torch.ones_like(o["opacity"])}, r"hits something with rays that lead away"),
+    (crash_on_nothing, r"cannot render a batch without rays"),
+    (lambda r, o: {"color": o["color"] * (1.0 + np.random.rand())}, r"renders differently after the same seed"),  # noqa: NPY002
+    (shift_origins, r"changes its input"),
+    (lambda r, o: {"color": o["color"].detach()}, r"no gradient leads from its colour to its parameters"),
+    (lambda r, o: {n: o[n].detach() for n in ("position", "normal")}, r"no gradient leads from its hits"),
+    (lambda r, o: {"color": (o["color"] - o["color"].detach()).sqrt()}, r"a gradient of its parameters is not finite"),
+    (recomputed, r"its normal carries a gradient under torch.no_grad"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "message"), BROKEN, ids=[message[:40] for _, message in BROKEN])
+def test_a_broken_host_is_told_how_it_is_broken(spoil, message):
+    with pytest.raises(AssertionError, match=f"^BallHost: {message}"):
+        check_host(BallHost(spoil), ball_rays())
+
+
+def test_a_host_that_keeps_gradients_of_its_own_is_told():
+    host = BallHost()
+
+    def render_and_step(rays: RayBatch, outputs: dict) -> dict:
+        host.radius.grad = torch.zeros(())
+        return {}
+
+    host.spoil = render_and_step
+    with pytest.raises(AssertionError, match="rendering changes requires_grad or grad"):
+        check_host(host, ball_rays())
+
+
+def test_the_unspoiled_host_keeps_the_contract():
+    assert check_host(BallHost(), ball_rays()).hits == 200
