@@ -1,11 +1,12 @@
 """What the method recovers on captures whose truth is known: the tables of docs/results.md.
 
     python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results
+    python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results-mesh --host mesh
 
 For each capture: the preset trained from scratch, with and without L_ref (the paper's Table 2), and with distant light and
 hard inter-reflection in place of the free field; each measured after the material stage ("Sep.") and after the joint stage
 (Table 3), beside baselines that need no method. The runs share the stage SDF init, which none of this enters; every step
-depends on seed and number alone, so sharing changes nothing.
+depends on seed and number alone, so sharing changes nothing. With the mesh host geometry is given, and there is one stage.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 from rich.console import Console
@@ -22,7 +24,8 @@ from torch import Tensor
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.evaluate.protocols import evaluate
 from neilfpp_method.evaluate.report import write_report
-from neilfpp_method.presets import preset
+from neilfpp_method.presets import fixed_geometry, preset
+from neilfpp_method.schedule import Stage, stage_steps
 from neilfpp_method.train.build import build_model
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.loop import make_optimizer, seed_step
@@ -62,6 +65,8 @@ class Options:
     """Where the runs and the tables go."""
     preset: str = "fast"
     """Which settings."""
+    host: Literal["volsdf", "mesh"] = "volsdf"
+    """Geometry to be found, or given as a mesh."""
     device: str = "auto"
     """Where to train."""
 
@@ -119,10 +124,13 @@ def is_like(value: object, other: object) -> bool:
     return isinstance(value, Tensor) and isinstance(other, Tensor) and value.shape == other.shape
 
 
-def measure(out: Path) -> dict[str, dict[str, float]]:
+def measure(out: Path, config: NeilfConfig) -> dict[str, dict[str, float]]:
     """The figures of a run after each of its stages with a material."""
     figures = {}
+    steps = stage_steps(config.train)
     for stage, name in STAGES.items():
+        if not steps[Stage(stage)]:
+            continue
         path = out / f"metrics-{stage}.json"
         if not path.exists():
             write_json(path, evaluate(load_run(out, checkpoint=stage)))
@@ -148,6 +156,7 @@ def _cell(column: str, value: float | None) -> str:
 def main(options: Options) -> None:
     """Train, measure, and write `tables.md`."""
     config = preset(options.preset)
+    config = fixed_geometry(config) if options.host == "mesh" else config
     sections = []
     for capture in options.captures:
         rows: dict[str, dict[str, float]] = {}
@@ -155,14 +164,15 @@ def main(options: Options) -> None:
         base = options.out / capture.name
         for name, settings in variants(config).items():
             run = base if settings is config else options.out / f"{capture.name}-{name.replace(', ', '-').replace(' ', '-')}"
-            train(capture, run, settings, options.device, start_from=None if run == base else base)
-            figures = measure(run)
+            shares_trunk = run != base and config.train.sdf_steps > 0
+            train(capture, run, settings, options.device, start_from=base if shares_trunk else None)
+            figures = measure(run, config)
+            final = list(figures.values())[-1]
             if not rows:
-                final = figures["joint"]
                 rows["naive baseline"] = {k: final[f"baseline_{k}"] for k in COLUMNS if f"baseline_{k}" in final}
             rows |= {f"{stage}, {name}": values for stage, values in figures.items()}
             seconds = read_json(run / "timing.json")
-            write_report(load_run(run), run, figures["joint"], seconds)
+            write_report(load_run(run), run, final, seconds)
             times.append(f"{name}: " + ", ".join(f"{stage} {value:.0f} s" for stage, value in seconds.items()))
         hardware = read_json(base / "environment.json")
         machine = f"{hardware['processor']}, {hardware['threads']} threads, GPU {', '.join(hardware['gpus']) or 'none'}"

@@ -153,7 +153,7 @@ def run_eval(options: Eval) -> None:
     out = options.out or options.run / "metrics.json"
     with _bar("evaluating") as advance:
         metrics = evaluate(run, advance)
-    write_metrics(out, metrics)
+    write_metrics(out, run, metrics)
     console = Console()
     for name, value in metrics.items():
         console.print(f"{name:36} {value:8.3f}", highlight=False)

@@ -206,7 +206,7 @@ class InterReflectionConfig:
     """L_ref: what arrives from another surface is what that surface sends (METHOD §2)."""
 
     mode: Literal["off", "soft", "hard"] = "soft"
-    """soft: the paper's loss. hard: a direction that meets the scene brings what R says there; only the others ask the light."""
+    """soft: the paper's loss. hard: a direction that meets the scene brings R from there; only the others ask the light."""
     grid_resolution: int = 96
     """Vertices along an edge of the grid that hard inter-reflection traces in a distance field."""
     rays_per_point: float = 1.0

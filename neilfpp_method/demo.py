@@ -11,6 +11,7 @@ from rich.console import Console
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.evaluate.protocols import evaluate, write_metrics
 from neilfpp_method.evaluate.report import write_report
+from neilfpp_method.evaluate.views import render_test_views
 from neilfpp_method.presets import preset
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.run import load_run, read_json
@@ -58,9 +59,10 @@ def run_demo(out: Path, *, short: bool, resume: bool, device: str, console: Cons
     )
     run = load_run(out)
     console.print("measuring on the test views …")
-    metrics = evaluate(run)
-    write_metrics(out / "metrics.json", metrics)
+    rendered = render_test_views(run)
+    metrics = evaluate(run, rendered=rendered)
+    write_metrics(out / "metrics.json", run, metrics)
     console.print("drawing the report …")
-    report = write_report(run, out, metrics, read_json(out / "timing.json"))
+    report = write_report(run, out, metrics, read_json(out / "timing.json"), rendered)
     console.print(f"done: open {report}", highlight=False)
     return report

@@ -17,7 +17,6 @@ the run has an estimate of it. Alignments are never silent: each has a key of it
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -28,7 +27,6 @@ import trimesh
 from jaxtyping import Bool, Float
 
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.images import replacing
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.data.truth import LightField, Truth
 from neilfpp_method.evaluate import metrics
@@ -44,7 +42,7 @@ from neilfpp_method.evaluate.views import (
 )
 from neilfpp_method.export.mesh import HasSdf, extract_mesh
 from neilfpp_method.shading.color import tone_map
-from neilfpp_method.train.run import Run
+from neilfpp_method.train.run import Run, write_json
 
 __all__ = ["evaluate", "protocol", "write_metrics"]
 
@@ -102,11 +100,10 @@ def protocol(run: Run) -> dict[str, str]:
     }
 
 
-def write_metrics(path: Path, figures: Mapping[str, float], protocol: Mapping[str, str] | None = None) -> None:
-    """Write the figures as a JSON object, in one step; how to read them goes beside them under the key `protocol`."""
-    contents = dict(figures) if protocol is None else {**figures, "protocol": dict(protocol)}
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(contents, indent=2, allow_nan=False) + "\n")
+def write_metrics(path: Path, run: Run, figures: Mapping[str, float]) -> None:
+    """Write the figures as a flat JSON object, and how to read them beside it, as `<stem>-protocol.json`."""
+    write_json(path, figures)
+    write_json(path.with_name(f"{path.stem}-protocol.json"), protocol(run))
 
 
 # -------------------------------------------------------------------------------------------- images, material, normals

@@ -5,7 +5,7 @@ Both show the same: views of the run beside the truth where it is at hand, and t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from neilfpp_method.data.images import replacing, write_png
 from neilfpp_method.evaluate.page import Figure, report_page
 from neilfpp_method.evaluate.panels import albedo_scale, light_sections, view_sections
 from neilfpp_method.evaluate.pictures import contact_sheet
-from neilfpp_method.evaluate.views import has_material, known_test_views, render_test_views
+from neilfpp_method.evaluate.views import RenderedView, has_material, known_test_views, render_view
 from neilfpp_method.schedule import stage_steps
 from neilfpp_method.train.run import Run, read_json
 
@@ -34,7 +34,13 @@ LIGHT_CAPTION = (
 )
 
 
-def write_report(run: Run, out_dir: Path, metrics: Mapping[str, float], timing: Mapping[str, float]) -> Path:
+def write_report(
+    run: Run,
+    out_dir: Path,
+    metrics: Mapping[str, float],
+    timing: Mapping[str, float],
+    rendered: Sequence[RenderedView] = (),
+) -> Path:
     """Write `report.html` and `contact_sheet.png`.
 
     Args:
@@ -42,12 +48,14 @@ def write_report(run: Run, out_dir: Path, metrics: Mapping[str, float], timing: 
         out_dir: the folder to write.
         metrics: figures by name, as `protocols.evaluate` gives them.
         timing: seconds of each stage.
+        rendered: views that somebody has rendered already; the others are rendered here.
 
     Returns:
         The path of the report.
     """
     shown = _with_shown_views(run)
-    rendered = render_test_views(shown)
+    at_hand = {view.name: view for view in rendered}
+    rendered = [at_hand.get(view.name) or render_view(run, run.capture.views.index(view)) for view in shown.capture.test_views]
     known = known_test_views(shown, rendered).views
     scale = albedo_scale(rendered, known) if has_material(run) else None
     views = view_sections(shown, rendered, known, scale)

@@ -31,7 +31,7 @@ from neilfpp_method.shading.color import apply_response, tone_map
 from neilfpp_method.shading.sampling import sample_directions
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.train.build import build_model, scene_facts
-from neilfpp_method.train.loop import _set_rates, seed_step
+from neilfpp_method.train.loop import seed_step, set_rates
 
 __all__ = ["FieldAdamConfig", "NeilfMethod", "NeilfMethodConfig"]
 
@@ -134,7 +134,7 @@ class NeilfMethod(Model):
             self.neilf.freeze_for(position.stage)
             self.set_up_for = position.stage
         for optimizer in optimizers.optimizers.values():
-            _set_rates(optimizer, self.rates, position.stage, position.step / position.length)
+            set_rates(optimizer, self.rates, position.stage, position.step / position.length)
         seed_step(settings.seed, step)
 
     def _end_after_last(self, trainer: Trainer, step: int) -> None:

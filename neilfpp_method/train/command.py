@@ -150,6 +150,11 @@ def _check(config: NeilfConfig) -> None:
         if getattr(config.train, name) < 1:
             option = f"--config.train.{name.replace('_', '-')}"
             raise UserError(f"{option} is {getattr(config.train, name)}", "set it to 1 or more")
+    if config.light.kind == "distant" and config.inter_reflection.mode == "soft":
+        raise UserError(
+            "a distant light is the same at every point, so L_ref has nothing to teach it",
+            "set --config.inter-reflection.mode hard or off",
+        )
     steps = config.train
     for name, needed in {"volume": steps.sdf_steps, "physical": steps.material_steps + steps.joint_steps}.items():
         if needed and getattr(config.loss, name) <= 0.0:

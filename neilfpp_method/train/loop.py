@@ -21,7 +21,7 @@ from neilfpp_method.structures import LossTerms
 from neilfpp_method.train.progress import Reporter
 from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, save_checkpoint, write_json
 
-__all__ = ["Training", "make_optimizer", "seed_step", "train"]
+__all__ = ["Training", "make_optimizer", "seed_step", "set_rates", "train"]
 
 # So many steps in a row without a finite gradient are no accident.
 MOST_SKIPPED = 10
@@ -82,7 +82,7 @@ def _train_stage(
     before = run.seconds.get(stage.value, 0.0)
     for number in range(position.step, position.length):
         seed_step(settings.seed, step, run.fabric.global_rank)
-        _set_rates(optimizer, run.config.optimizer, stage, number / position.length)
+        set_rates(optimizer, run.config.optimizer, stage, number / position.length)
         batch = run.pixels.sample(settings.rays)
         terms = wrapped(batch, stage)
         stop = _update(run, model, optimizer, terms, weigh(terms, weights), step)
@@ -153,7 +153,8 @@ def make_optimizer(model: NeilfModel, config: OptimizerConfig) -> torch.optim.Op
     return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
 
 
-def _set_rates(optimizer: torch.optim.Optimizer, config: OptimizerConfig, stage: Stage, share: float) -> None:
+def set_rates(optimizer: torch.optim.Optimizer, config: OptimizerConfig, stage: Stage, share: float) -> None:
+    """The rate of each field when `share` of a stage is over."""
     factor = (config.joint if stage is Stage.JOINT else 1.0) * config.final**share
     for group in optimizer.param_groups:
         group["lr"] = getattr(config, group["name"]) * factor

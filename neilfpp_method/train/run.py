@@ -211,7 +211,7 @@ def load_weights(model: torch.nn.Module, saved: Mapping[str, Any], run: Path) ->
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
     """A JSON object, in one step."""
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=2) + "\n")
+        temporary.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -328,11 +328,13 @@ def test_the_light_field_of_a_capture_is_read_and_asked_in_chunks(captures, tmp_
 # ----------------------------------------------------------------------------------------------------------------- file
 
 
-def test_metrics_are_written_whole(tmp_path):
+def test_metrics_are_flat_and_their_protocol_lies_beside_them(captures, tmp_path):
+    run = make_run(load_capture(captures.hdr))
     path = tmp_path / "new" / "metrics.json"
-    write_metrics(path, {"volume_psnr": 30.5}, {"mask_source": "true depth"})
-    assert json.loads(path.read_text()) == {"volume_psnr": 30.5, "protocol": {"mask_source": "true depth"}}
+    write_metrics(path, run, {"volume_psnr": 30.5})
+    assert json.loads(path.read_text()) == {"volume_psnr": 30.5}
+    assert json.loads((path.parent / "metrics-protocol.json").read_text())["mask_source"] == "true depth"
     with pytest.raises(ValueError, match="JSON"):
-        write_metrics(path, {"volume_psnr": math.nan})
+        write_metrics(path, run, {"volume_psnr": math.nan})
     assert json.loads(path.read_text())["volume_psnr"] == 30.5  # the old file stands
-    assert [p.name for p in path.parent.iterdir()] == ["metrics.json"]
+    assert {p.name for p in path.parent.iterdir()} == {"metrics.json", "metrics-protocol.json"}
