@@ -40,5 +40,8 @@ test-nerfstudio: $(NERFSTUDIO)/.installed
 lint: $(VENV)/.installed
 	$(RUN)/ruff check .
 
+results: $(VENV)/.installed  ## make results CAPTURES="DIR DIR"
+	$(RUN)/python -m benchmarks.results $(CAPTURES)
+
 clean:
 	rm -rf $(VENV) $(NERFSTUDIO) build demo-run

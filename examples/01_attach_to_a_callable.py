@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 
 from neilfpp_method import attach_neilf, preset
 from neilfpp_method.attach import pixel_batch
+from neilfpp_method.presets import free_light
 
 
 class Ball(nn.Module):
@@ -42,7 +43,9 @@ host = Ball()
 optimizer = torch.optim.Adam(host.parameters(), lr=5e-3)
 steps = dataclasses.replace(preset("fast").train, sdf_steps=60, material_steps=80, joint_steps=20)
 
-neilf = attach_neilf(host, dataclasses.replace(preset("fast"), train=steps), median_radiance=0.2)  # 1
+settings = dataclasses.replace(free_light(preset("fast")), train=steps)
+
+neilf = attach_neilf(host, settings, median_radiance=0.2)  # 1
 optimizer.add_param_group({"params": neilf.parameters(), "lr": 2e-3})  # 2
 for step in range(160):
     origins, directions, color = photograph(256)

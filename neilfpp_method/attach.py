@@ -19,10 +19,10 @@ from torch import Tensor, nn
 
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.base import HasParameterGroups, Host
+from neilfpp_method.hosts.base import HasParameterGroups, Host, LightsItself
 from neilfpp_method.hosts.outputs import check_tensors, host_name
 from neilfpp_method.model import NeilfModel, SceneFacts
-from neilfpp_method.presets import preset
+from neilfpp_method.presets import free_light, preset
 from neilfpp_method.schedule import Stage, Total, active_losses, stage_at, weigh
 from neilfpp_method.structures import Material, PixelBatch, RayBatch, Shading, SurfaceHits
 
@@ -152,7 +152,8 @@ def attach_neilf(
     Args:
         host: an object with `render(rays) -> SurfaceHits`; a function (origins, directions) → (color, position,
             normal); or a nerfstudio model. In a frame where the object lies in the unit sphere.
-        config: the settings; none: the preset `fast`. For a host that is trained already, set `train.sdf_steps` to 0.
+        config: the settings; none: the preset `fast`, with the free light field on a host that cannot trace cheaply. For
+            a host that is trained already, set `train.sdf_steps` to 0.
         response: what the pixels are: "linear" (HDR) or "srgb" (LDR).
         median_radiance: median linear luminance of the object in the images; sets the light's first guess.
         radiance_scale: the range of the host's radiance; none: 3 for HDR, 1 for LDR.
@@ -163,7 +164,9 @@ def attach_neilf(
     adapted = _adapt(host, response)
     borrowed = not isinstance(host, HasParameterGroups)
     facts = SceneFacts(response, median_radiance, radiance_scale or RADIANCE_SCALE[response], background="constant")
-    attached = AttachedNeilf(NeilfModel(adapted, config or preset("fast"), facts, borrowed=borrowed))
+    if config is None:
+        config = preset("fast") if isinstance(adapted, LightsItself) else free_light(preset("fast"))
+    attached = AttachedNeilf(NeilfModel(adapted, config, facts, borrowed=borrowed))
     if attached.missing:
         lost = "; ".join(f"no {name}: {loss}" for name, loss in attached.missing.items())
         log.warning("NeILF++ attached to %s, which has %s", host_name(adapted), lost)

@@ -22,7 +22,7 @@ from neilfpp_method.config import (
 )
 from neilfpp_method.errors import UserError
 
-__all__ = ["PRESETS", "fixed_geometry", "preset"]
+__all__ = ["PRESETS", "fixed_geometry", "free_light", "preset"]
 
 
 def paper_mlp() -> NeilfConfig:
@@ -47,18 +47,21 @@ def paper_ngp() -> NeilfConfig:
 
 
 def fast() -> NeilfConfig:
-    """Minutes on the two cores of a laptop: the same method with small hash grids and few rays."""
+    """Minutes on the two cores of a laptop: the same method with small hash grids, few rays, and as much light as most
+    scenes need: an environment map and what the scene reflects. `free_light` has the paper's light field for it."""
     grid = HashGridConfig(levels=8, log2_entries=16, base_resolution=16, max_resolution=256)
     return NeilfConfig(
         preset="fast",
         sdf=SdfConfig(encoding="hash", grid=grid, layers=1, width=64, skip=None, feature_width=15),
         radiance=OutgoingRadianceConfig(layers=2, width=64, direction_encoding="spherical_harmonics"),
         brdf=BrdfConfig(encoding="hash", grid=grid, activation="relu", layers=2, width=64, skip=None),
-        light=IncidentLightConfig(layers=4, width=64, direction_encoding="spherical_harmonics", direction_degree=5),
+        light=IncidentLightConfig(
+            kind="distant", layers=4, width=64, direction_encoding="spherical_harmonics", direction_degree=5
+        ),
         background=BackgroundConfig(layers=4, width=64, samples=16),
         volume=VolumeConfig(radius=1.75, beta_init=0.05, initial_samples=64, rounds=2, samples=32),
         shading=ShadingConfig(sampler="mis", train_samples=32, eval_samples=128),
-        inter_reflection=InterReflectionConfig(rays_per_point=0.25),
+        inter_reflection=InterReflectionConfig(mode="hard", rays_per_point=0.25),
         loss=LossConfig(
             unit="median",
             eikonal=0.05,
@@ -67,13 +70,13 @@ def fast() -> NeilfConfig:
             surface=1e-2,
             surface_joint=1e-3,
             mask=0.1,
-            smoothness=5e-3,
+            smoothness=1.5e-3,
             lambertian=0.0,
             position_gradient=0.0,
             normal_gradient=0.1,
             hessian_method="finite_difference",
         ),
-        optimizer=OptimizerConfig(geometry=2e-2, radiance=5e-3, brdf=5e-3, light=2e-3, background=5e-3, beta=1e-3),
+        optimizer=OptimizerConfig(geometry=2e-2, radiance=5e-3, brdf=5e-3, light=3e-2, background=5e-3, beta=1e-3),
         train=TrainConfig(sdf_steps=2_000, material_steps=800, joint_steps=200, rays=512),
     )
 
@@ -90,6 +93,19 @@ def preset(name: str) -> NeilfConfig:
     if name not in PRESETS:
         raise UserError(f"unknown preset '{name}'", f"choose one of {', '.join(PRESETS)}")
     return PRESETS[name]()
+
+
+def free_light(config: NeilfConfig) -> NeilfConfig:
+    """`fast` with the paper's light: a field that is free at every point, tied to the scene by L_ref.
+
+    It asks nothing of the host but `render`. A network takes smaller steps than the texels of a map.
+    """
+    return dataclasses.replace(
+        config,
+        light=dataclasses.replace(config.light, kind="free"),
+        inter_reflection=dataclasses.replace(config.inter_reflection, mode="soft"),
+        optimizer=dataclasses.replace(config.optimizer, light=5e-3),
+    )
 
 
 def fixed_geometry(config: NeilfConfig) -> NeilfConfig:

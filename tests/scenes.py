@@ -10,13 +10,13 @@ from torch.nn.functional import normalize
 from neilfpp_method.config import HashGridConfig, NeilfConfig, TrainConfig
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel, SceneFacts
-from neilfpp_method.presets import preset
+from neilfpp_method.presets import free_light, preset
 from neilfpp_method.structures import PixelBatch
 
 
 def tiny_config(**changes) -> NeilfConfig:
     """The preset `fast`, cut down to milliseconds a step."""
-    config = preset("fast")
+    config = free_light(preset("fast"))
     grid = HashGridConfig(levels=3, log2_entries=10, base_resolution=8, max_resolution=32)
     small = dataclasses.replace(
         config,

@@ -15,6 +15,7 @@ from nerfstudio.engine.optimizers import OptimizerConfig, Optimizers
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.models.base_model import Model, ModelConfig
 from nerfstudio.utils import colormaps
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from neilfpp_method.config import NeilfConfig
@@ -25,7 +26,7 @@ from neilfpp_method.hosts.nerfstudio import OWN_LOSSES, NerfstudioHost
 from neilfpp_method.model import Maps, NeilfModel
 from neilfpp_method.plugin.datamanager import PIXELS, pixel_batch
 from neilfpp_method.plugin.foreign import build_foreign
-from neilfpp_method.presets import preset
+from neilfpp_method.presets import free_light, preset
 from neilfpp_method.schedule import Stage, active_losses, stage_at, stage_steps, weigh
 from neilfpp_method.shading.color import apply_response, tone_map
 from neilfpp_method.shading.sampling import sample_directions
@@ -78,6 +79,9 @@ class NeilfMethod(Model):
         if pixels is None:
             raise UserError("the data manager is not ours", "leave --pipeline.datamanager as `ns-train neilfpp` sets it")
         settings = self.config.neilf
+        if self.config.host is not None and settings.inter_reflection.mode == "hard":
+            CONSOLE.log(f"{self.config.host} traces no rays cheaply: the free light field and L_ref take the place of hard tracing")
+            settings = free_light(settings)
         facts = scene_facts(pixels.capture, pixels, settings)
         seed_step(settings.train.seed, step=-1)
         self.rates = settings.optimizer
