@@ -41,13 +41,12 @@ def photograph(count: int):
 torch.manual_seed(0)
 host = Ball()
 optimizer = torch.optim.Adam(host.parameters(), lr=5e-3)
-steps = dataclasses.replace(preset("fast").train, sdf_steps=60, material_steps=80, joint_steps=20)
-
-settings = dataclasses.replace(free_light(preset("fast")), train=steps)
+settings = free_light(preset("fast"))
+settings = dataclasses.replace(settings, train=dataclasses.replace(settings.train, sdf_steps=60, joint_steps=20))
 
 neilf = attach_neilf(host, settings, median_radiance=0.2)  # 1
 optimizer.add_param_group({"params": neilf.parameters(), "lr": 2e-3})  # 2
-for step in range(160):
+for step in range(160):  # 60 of the host alone, 100 with material and light
     origins, directions, color = photograph(256)
     own = (host(origins, directions)[0] - color).abs().mean()
     total = neilf.losses(pixel_batch(origins, directions, color), step)

@@ -80,7 +80,7 @@ class NeilfMethod(Model):
             raise UserError("the data manager is not ours", "leave --pipeline.datamanager as `ns-train neilfpp` sets it")
         settings = self.config.neilf
         if self.config.host is not None and settings.inter_reflection.mode == "hard":
-            CONSOLE.log(f"{self.config.host} traces no rays cheaply: the free light field and L_ref take the place of hard tracing")
+            CONSOLE.log(f"{self.config.host} traces no rays cheaply: a free light field and L_ref replace hard tracing")
             settings = free_light(settings)
         facts = scene_facts(pixels.capture, pixels, settings)
         seed_step(settings.train.seed, step=-1)
