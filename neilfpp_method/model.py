@@ -52,7 +52,8 @@ class SceneFacts:
 
 @dataclass(frozen=True)
 class Maps:
-    """Everything that a ray shows; one row a ray. Colours are linear; rows that are no hit hold zeros but in `rgb`."""
+    """Everything that a ray shows; one row a ray. Colours are linear. A ray that passes every surface by has the host's colour
+    in `rgb`, and zeros for the material."""
 
     rgb: Float[Tensor, "N 3"]
     rgb_volume: Float[Tensor, "N 3"]
@@ -257,7 +258,8 @@ class NeilfModel(nn.Module):
         size = len(rays)
         surfaces = torch.zeros(size, 11, dtype=hits.color.dtype, device=hits.color.device)
         rgb = hits.color.clone()
-        rows = torch.nonzero(hits.is_hit(self.config.shading.hit_share))[:, 0]
+        # A picture has no holes: where a pixel sees two surfaces, too blurred to learn from, it shows what lies between them.
+        rows = torch.nonzero(hits.opacity > 0.5)[:, 0]
         if with_material and len(rows):
             position, normal, wo = hits.position[rows], hits.normal[rows], -rays.directions[rows]
             material = self.brdf(position)
