@@ -19,6 +19,7 @@ from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.demo import demo_scene
 from neilfpp_method.hosts.nerfstudio import NerfstudioHost
+from neilfpp_method.presets import free_light
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 STEPS = int(sys.argv[1]) if len(sys.argv) > 1 else 2000
@@ -41,7 +42,7 @@ for _ in range(STEPS):
 print(f"NeuS: loss {loss.item():.4f}")
 
 # The add-on: three lines, and the same kind of step. The host is trained already, so its stage has no steps.
-config = preset("fast")
+config = free_light(preset("fast"))
 config = dataclasses.replace(config, train=dataclasses.replace(config.train, sdf_steps=0, material_steps=STEPS))
 neilf = attach_neilf(neus, config, response="linear", median_radiance=pixels.median_radiance()).to(DEVICE)
 optimizer = torch.optim.Adam(neilf.parameters(), 1e-3)

@@ -21,6 +21,9 @@ __all__ = ["TracedLight", "scene_light", "trace_light"]
 # Four scales up it is 1 % along the normal and 5 % at 80°.
 HEIGHT_IN_WIDTHS = 4.0
 
+# Rays that a host without cheap tracing renders at once: what bounds the memory.
+MOST_RENDERED = 2048
+
 
 @dataclass(frozen=True)
 class TracedLight:
@@ -76,11 +79,13 @@ def scene_light(
     x = x.detach()
     if isinstance(host, LightsItself):
         return host.scene_light(x, wi)
-    start = x[:, None] + config.offset * wi
-    hits = host.render(RayBatch(start.reshape(-1, 3), wi.reshape(-1, 3)))
-    hit = hits.is_hit(hit_share)
-    radiance = torch.where(hit[:, None], hits.color, 0.0)
-    return SceneLight(hit.view(wi.shape[:2]), radiance.view(wi.shape))
+    start = (x[:, None] + config.offset * wi).reshape(-1, 3)
+    hit, radiance = [], []
+    for rays in zip(start.split(MOST_RENDERED), wi.reshape(-1, 3).split(MOST_RENDERED), strict=True):
+        hits = host.render(RayBatch(*rays))
+        hit.append(hits.is_hit(hit_share))
+        radiance.append(torch.where(hit[-1][:, None], hits.color, 0.0))
+    return SceneLight(torch.cat(hit).view(wi.shape[:2]), torch.cat(radiance).view(wi.shape))
 
 
 def _random_rows(points: int, per_point: float, device: torch.device) -> Tensor:
