@@ -35,7 +35,7 @@ $(NERFSTUDIO)/.installed: pyproject.toml $(NERFSTUDIO_PINS)
 	touch $@
 
 test-nerfstudio: $(NERFSTUDIO)/.installed
-	$(NERFSTUDIO)/bin/python -m pytest tests_nerfstudio
+	$(NERFSTUDIO)/bin/python -m pytest tests_nerfstudio -m "not slow"
 
 lint: $(VENV)/.installed
 	$(RUN)/ruff check .
