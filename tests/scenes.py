@@ -28,6 +28,7 @@ def tiny_config(**changes) -> NeilfConfig:
         volume=dataclasses.replace(config.volume, initial_samples=24, rounds=1, samples=16, beta_init=0.02),
         shading=dataclasses.replace(config.shading, train_samples=8, eval_samples=8),
         inter_reflection=dataclasses.replace(config.inter_reflection, rays_per_point=0.5),
+        loss=dataclasses.replace(config.loss, lambertian=5e-4),  # every loss of the table counts
         train=TrainConfig(sdf_steps=4, material_steps=4, joint_steps=4, rays=48, checkpoint_every=3, log_every=2),
     )
     return dataclasses.replace(small, **changes)

@@ -54,8 +54,11 @@ def repaint(root: Path, look: Look) -> Path:
     return root
 
 
-def trains(root: Path, out: Path) -> None:
-    """Train a hundred steps a stage, and shade nearly every ray that the object might stop."""
+def trains(root: Path, out: Path, may_rest: frozenset[str] = frozenset()) -> None:
+    """Train a hundred steps a stage, and shade nearly every ray that the object might stop.
+
+    Every field must move, but those that `may_rest`.
+    """
     config = small_config(sdf_steps=100, material_steps=100, joint_steps=100, checkpoint_every=1000, rays=16)
     config = dataclasses.replace(config, shading=dataclasses.replace(config.shading, hit_share=0.01))
     training = small_training(root, out, config)
@@ -66,7 +69,8 @@ def trains(root: Path, out: Path) -> None:
     assert len(training.reporter.losses) == 300
     for field, parameters in groups.items():
         assert all(p.isfinite().all() for p in parameters), field
-        assert not all(map(torch.equal, before[field], parameters)), f"{field} did not train"
+        moved = not all(map(torch.equal, before[field], parameters))
+        assert moved or field in may_rest, f"{field} did not train"
 
 
 def environment(direction: np.ndarray) -> np.ndarray:
@@ -111,4 +115,5 @@ def test_an_overexposed_capture(tmp_path):
 def test_a_scene_without_an_object(tmp_path):
     root = make_capture(tmp_path / "empty", background=0.3)
     repaint(root, lambda n, d: np.full_like(n, 0.3))
-    trains(root, tmp_path / "run")
+    # Once nothing is left to hit, there is nothing to shade.
+    trains(root, tmp_path / "run", may_rest=frozenset({"brdf", "light"}))
