@@ -17,11 +17,12 @@ demo: $(VENV)/.installed
 demo-short: $(VENV)/.installed
 	$(RUN)/neilfpp demo --short --out build/demo-short
 
+# The tensors of the tests are small: a second thread costs more than it brings, many times more on a busy machine.
 test: $(VENV)/.installed
-	$(RUN)/python -m pytest -m "not slow"
+	OMP_NUM_THREADS=1 $(RUN)/python -m pytest -m "not slow"
 
 test-slow: $(VENV)/.installed
-	$(RUN)/python -m pytest -m slow
+	OMP_NUM_THREADS=1 $(RUN)/python -m pytest -m slow
 
 # Nerfstudio pins another OpenCV, so it has an environment of its own.
 NERFSTUDIO := .venv-nerfstudio
@@ -35,7 +36,7 @@ $(NERFSTUDIO)/.installed: pyproject.toml $(NERFSTUDIO_PINS)
 	touch $@
 
 test-nerfstudio: $(NERFSTUDIO)/.installed
-	$(NERFSTUDIO)/bin/python -m pytest tests_nerfstudio -m "not slow"
+	OMP_NUM_THREADS=1 $(NERFSTUDIO)/bin/python -m pytest tests_nerfstudio -m "not slow"
 
 lint: $(VENV)/.installed
 	$(RUN)/ruff check .
