@@ -33,6 +33,8 @@ class HashGridConfig:
     """Cells along an edge of the scene's cube at the coarsest level."""
     max_resolution: int = 4096
     """Cells along an edge at the finest level."""
+    backend: Literal["auto", "reference", "cpu", "triton"] = "auto"
+    """Who computes it. auto: the fastest that runs on the device. reference: plain torch. cpu: compiled by Numba. triton: CUDA."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,26 @@ class BrdfConfig:
 
 
 @dataclass(frozen=True)
+class LightFitConfig:
+    """How an environment map is solved for (`light_fit`)."""
+
+    points: int = 1024
+    """Surface points that the map is fitted to; memory and time grow with points · texels."""
+    every: int = 100
+    """Steps between two fits."""
+    steps: int = 100
+    """Steps of a fit."""
+    rate: float = 0.1
+    """Rate of log radiance at the start of a fit."""
+    smoothness: float = 0.03
+    """Weight of the total variation of log radiance, per texel, against the relative error."""
+    floor: float = 0.1
+    """Errors are relative to the pixel and this share of a typical one."""
+    outlier: float = 0.1
+    """Relative errors beyond this count by their size rather than by their square."""
+
+
+@dataclass(frozen=True)
 class IncidentLightConfig:
     """L: position, direction → linear RGB that arrives (METHOD §5): sharp in direction, smooth in position."""
 
@@ -107,6 +129,13 @@ class IncidentLightConfig:
     """free: the paper's field, its own light at every point. distant: an environment map, with inter-reflection hard or off."""
     environment_height: int = 32
     """Rows of the environment map; it has twice as many columns."""
+    fit: LightFitConfig = field(default_factory=LightFitConfig)
+    """How the map is found."""
+    network: Literal["mlp", "factorised"] = "mlp"
+    """What a free field is. mlp: the paper's network. factorised: per colour the exponential of a dot product of a vector of the
+    position with one of the direction; pairs of a point and a direction then cost next to nothing."""
+    rank: int = 32
+    """Length of the vectors of a factorised field; its map of directions has `environment_height` rows."""
     activation: Literal["sine", "relu"] = "sine"
     """Hidden units; sine is SIREN's, with ω = 30."""
     direction_encoding: Literal["frequency", "spherical_harmonics"] = "frequency"
@@ -165,6 +194,8 @@ class VolumeConfig:
     """Its smallest value."""
     sampler: Literal["error_bounded", "uniform"] = "error_bounded"
     """Algorithm 1 of VolSDF, or stratified samples alone."""
+    skip_empty: bool = False
+    """In training, rays skip what a coarse grid of the SDF shows to be empty. Evaluation takes whole rays."""
     initial_samples: int = 128
     """SDF queries per ray of the first round; also those added in each refinement."""
     rounds: int = 5

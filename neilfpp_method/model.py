@@ -21,6 +21,7 @@ from neilfpp_method.fields.incident_light import IncidentLightField
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised
 from neilfpp_method.hosts.outputs import OutputCheck
 from neilfpp_method.inter_reflection import scene_light, trace_light
+from neilfpp_method.light_fit import Observed, SurfaceMemory, fit_environment, transport
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, active_losses
 from neilfpp_method.shading.brdf import LOBES
 from neilfpp_method.shading.color import apply_response
@@ -114,7 +115,9 @@ class NeilfModel(nn.Module):
         self.light: IncidentLightField | EnvironmentLight
         if config.light.kind == "distant":
             self.light = EnvironmentLight(config.light.environment_height, first_radiance)
+            self.memory = SurfaceMemory(config.light.fit)
         else:
+            self.memory = None
             self.light = IncidentLightField(config.light, base, first_radiance)
 
     # -------------------------------------------------------------------------------------------------------- one step
@@ -145,7 +148,11 @@ class NeilfModel(nn.Module):
         # 3. The BRDF field says what the surface is made of.
         material = self._material_and_priors(position, pixels.image_gradient, names, terms)
 
-        # 4. The incident light field says what arrives. 5. The rendering equation says what leaves.
+        # 4. The light says what arrives; an environment map is solved for from what has been seen, now and then.
+        if self.memory is not None and self.training:
+            self._keep_fitting(Observed(position, normal, -pixels.directions, pixels.color).detach())
+
+        # 5. The rendering equation says what leaves.
         shading = self.shade(position, normal, -pixels.directions, material, self.config.shading.train_samples)
         terms["physical"] = losses.photometric(shading.color, pixels.color, self.facts.response, self.units.physical)
 
@@ -196,6 +203,20 @@ class NeilfModel(nn.Module):
         hit = torch.nonzero(traced.hit)[:, 0]
         incident = self.light.radiance(traced.position[hit], traced.wi[hit][:, None])[:, 0]
         return losses.inter_reflection(incident, traced.radiance[hit], self.units.incident)
+
+    def _keep_fitting(self, seen: Observed) -> None:
+        """Remember some of what was seen, and when it is time solve for the map that explains what is remembered."""
+        self.memory.remember(seen)
+        if not self.memory.due:
+            return
+        seen, config = self.memory.recall(), self.config
+        with torch.no_grad():
+            material = self.brdf(seen.position)
+        lobe = self.lobe if config.shading.specular else None
+        hit_share = config.shading.hit_share
+        carried = transport(self.host, seen, material.roughness, self.light, lobe, config.inter_reflection, hit_share)
+        unit, response = self.units.physical, self.facts.response
+        fit_environment(self.light, carried, material, seen.pixel, response, unit, config.light.fit)
 
     # ------------------------------------------------------------------------------------------------------- the parts
 

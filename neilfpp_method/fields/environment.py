@@ -7,6 +7,7 @@ The map is in latitude and longitude about +z: row j is at the angle θ = π j/(
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
@@ -16,14 +17,24 @@ from torch.nn import functional
 from neilfpp_method.shading.color import luminance
 from neilfpp_method.structures import IncidentSamples
 
-__all__ = ["EnvironmentLight"]
+__all__ = ["EnvironmentLight", "TexelDirections"]
 
 UNIFORM_SHARE = 0.1
 """Share of the samples that is spread evenly over the sphere, so that no direction is left out of the density."""
 
 
+@dataclass(frozen=True)
+class TexelDirections:
+    """One direction within each of T texels, for each of N points, and the texels' solid angles."""
+
+    wi: Float[Tensor, "N T 3"]
+    solid_angle: Float[Tensor, " T"]
+
+
 class EnvironmentLight(nn.Module):
     """A grid of log radiance; radiance between the texels is the exponential of the bilinear interpolation.
+
+    The map is no parameter: what surfaces send is linear in it, so `light_fit` solves for it.
 
     Args:
         height: rows of the map; it has twice as many columns.
@@ -32,7 +43,7 @@ class EnvironmentLight(nn.Module):
 
     def __init__(self, height: int, initial_radiance: float) -> None:
         super().__init__()
-        self.log_radiance = nn.Parameter(torch.full((3, height, 2 * height), math.log(initial_radiance)))
+        self.register_buffer("log_radiance", torch.full((3, height, 2 * height), math.log(initial_radiance)))
         edges = (torch.arange(height + 1) - 0.5).clamp(0, height - 1) * math.pi / (height - 1)
         self.register_buffer("cos_edges", edges.cos(), persistent=False)
 
@@ -53,13 +64,16 @@ class EnvironmentLight(nn.Module):
         strata = torch.arange(count, device=like.device, dtype=like.dtype)
         within = torch.rand(3, *shape, device=like.device, dtype=like.dtype) if stochastic else like.new_full((3, *shape), 0.5)
         cell = torch.searchsorted(self._texel_shares().cumsum(0), (strata + within[0]) / count)
-        width = self.log_radiance.shape[2]
-        row, column = self._in_map(cell)
-        cos_theta = torch.lerp(self.cos_edges[row], self.cos_edges[row + 1], within[1])
-        phi = 2 * math.pi * (column + within[2]) / width
-        sin_theta = ((1 - cos_theta) * (1 + cos_theta)).clamp_min(0).sqrt()
-        wi = torch.stack((phi.sin() * sin_theta, phi.cos() * sin_theta, cos_theta), -1)
+        wi = self._within(cell, within[1], within[2])
         return IncidentSamples(wi, self.pdf(wi))
+
+    @torch.no_grad()
+    def texel_directions(self, like: Float[Tensor, "N 3"]) -> TexelDirections:
+        """A random direction within every texel, row by row, for each row of `like`: the sphere in T strata."""
+        _, height, width = self.log_radiance.shape
+        cell = torch.arange(height * width, device=like.device).expand(len(like), -1)
+        within = torch.rand(2, *cell.shape, device=like.device, dtype=like.dtype)
+        return TexelDirections(self._within(cell, within[0], within[1]), self._texel_solid_angles())
 
     @torch.no_grad()
     def pdf(self, wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S"]:
@@ -76,10 +90,17 @@ class EnvironmentLight(nn.Module):
         turn = torch.atan2(x, y) / (2 * math.pi)
         return (turn - turn.floor()) * width - 0.5, torch.acos(z.clamp(-1, 1)) / math.pi * (height - 1)
 
-    def _in_map(self, cell: Int[Tensor, "N S"]) -> tuple[Int[Tensor, "N S"], Int[Tensor, "N S"]]:
+    def _within(
+        self, cell: Int[Tensor, "N S"], down: Float[Tensor, "N S"], across: Float[Tensor, "N S"]
+    ) -> Float[Tensor, "N S 3"]:
+        """Directions in texels, by number, at shares of their height and width; even shares spread evenly over the texel."""
         _, height, width = self.log_radiance.shape
         cell = cell.clamp_max(height * width - 1)
-        return cell // width, cell % width
+        row, column = cell // width, cell % width
+        cos_theta = torch.lerp(self.cos_edges[row], self.cos_edges[row + 1], down)
+        phi = 2 * math.pi * (column + across) / width
+        sin_theta = ((1 - cos_theta) * (1 + cos_theta)).clamp_min(0).sqrt()
+        return torch.stack((phi.sin() * sin_theta, phi.cos() * sin_theta, cos_theta), -1)
 
     def _texel_solid_angles(self) -> Float[Tensor, " T"]:
         width = self.log_radiance.shape[2]

@@ -16,12 +16,14 @@ from neilfpp_method.fields.outgoing_radiance import OutgoingRadianceField
 from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_tracer, meet, tree_tracer
 from neilfpp_method.schedule import FIXED_GEOMETRY
 from neilfpp_method.shading.frame import safe_normalize
-from neilfpp_method.structures import RayBatch, SurfaceHits
+from neilfpp_method.structures import RayBatch, SceneLight, SurfaceHits
 
 __all__ = ["MeshHost"]
 
 TINY = 1e-18
 """Length under which a sum of edge products has no direction: triangles may be small."""
+RADIANCE_AT_ONCE = 2**16
+"""Points at which R is asked together where light is traced: bounds the memory."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,7 @@ class MeshHost(nn.Module):
         self.register_buffer("triangles", triangles, persistent=False)
         self.register_buffer("outward", outward, persistent=False)
         self.register_buffer("corner_normals", smooth.expand(-1, 3, -1), persistent=False)
+        self.offset = config.inter_reflection.offset
         self._tracers: dict[torch.device, FirstHits] = {}
 
     # ------------------------------------------------------------------------------------------------ the host contract
@@ -87,6 +90,20 @@ class MeshHost(nn.Module):
             opacity=zeros.index_fill(0, met.rows, 1.0),
             concentration=zeros.index_put((met.rows,), met.outside.to(zeros.dtype)),
         )
+
+    @torch.no_grad()
+    def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
+        """R where directions meet the mesh again; its inside stops them and is dark."""
+        directions = wi.reshape(-1, 3)
+        origins = (x[:, None] + self.offset * wi).reshape(-1, 3)
+        met = self.cross(RayBatch(origins, directions))
+        radiance, hit = torch.zeros_like(directions), torch.zeros_like(directions[:, 0], dtype=torch.bool)
+        hit[met.rows] = True
+        seen = torch.nonzero(met.outside)[:, 0]
+        for part in seen.split(RADIANCE_AT_ONCE):
+            rows, position = met.rows[part], met.position[part]
+            radiance[rows] = self.radiance_field(position, -directions[rows], met.normal[part], position[:, :0])
+        return SceneLight(hit.view(wi.shape[:2]), radiance.view(wi.shape))
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
         """R, and the background where it is a field."""

@@ -1,0 +1,166 @@
+"""Solving for the environment map, against closed forms, the Monte-Carlo estimator and maps that are known."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from neilfpp_method.config import InterReflectionConfig, LightFitConfig
+from neilfpp_method.fields.environment import EnvironmentLight
+from neilfpp_method.light_fit import Observed, SurfaceMemory, fit_environment, total_variation, transport
+from neilfpp_method.shading.brdf import GGX
+from neilfpp_method.shading.rendering_equation import shade
+from neilfpp_method.shading.sampling import sample_directions
+from neilfpp_method.structures import Material, RayBatch, SurfaceHits
+
+OFF = InterReflectionConfig(mode="off")
+HARD = InterReflectionConfig(mode="hard", offset=1e-4)
+
+
+class HalfRoom:
+    """A host: below the origin a wall of radius 2 that sends out radiance 0.7; above it nothing."""
+
+    def render(self, rays: RayBatch) -> SurfaceHits:
+        along = (rays.origins * rays.directions).sum(-1)
+        depth = (along**2 + 4.0 - rays.origins.square().sum(-1)).sqrt() - along
+        position = rays.origins + depth[:, None] * rays.directions
+        met = (rays.directions[:, 2] < 0).float()
+        return SurfaceHits(torch.full_like(position, 0.7), position, -position / 2.0, met, met)
+
+
+def points(count: int, seed: int = 0) -> Observed:
+    """Points near the origin with all normals, each seen from within 60° of its normal."""
+    generator = torch.Generator().manual_seed(seed)
+    normal = normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    wo = normalize(normal + 0.8 * normalize(torch.randn(count, 3, generator=generator), dim=-1), dim=-1)
+    return Observed(0.1 * normal, normal, wo, torch.zeros(count, 3))
+
+
+def material(count: int, seed: int = 1) -> Material:
+    generator = torch.Generator().manual_seed(seed)
+    base_color = 0.2 + 0.6 * torch.rand(count, 3, generator=generator)
+    roughness = 0.3 + 0.5 * torch.rand(count, 1, generator=generator)
+    metallic = torch.rand(count, 1, generator=generator).round()
+    return Material(base_color, roughness, metallic)
+
+
+def test_a_lambertian_surface_in_a_white_furnace_shows_its_base_colour():
+    torch.manual_seed(0)
+    seen, of = points(16), material(16)
+    carried = transport(HalfRoom(), seen, of.roughness, EnvironmentLight(48, 1.0), None, OFF, 0.8)
+    white = torch.ones(carried.texels.shape[-1], 3)
+    torch.testing.assert_close(carried.outgoing(of, white), of.base_color, rtol=0.01, atol=0.0)
+
+
+def test_transport_agrees_with_the_estimator_under_a_map_and_a_wall():
+    torch.manual_seed(0)
+    seen, of = points(24), material(24)
+    environment = EnvironmentLight(48, 1.0)
+    rows = torch.linspace(0, math.pi, 48)[:, None].expand(48, 96)
+    environment.log_radiance.copy_(torch.stack((rows.cos(), 0.5 * rows.sin(), -rows.cos())))
+    several = [transport(HalfRoom(), seen, of.roughness, environment, GGX, HARD, 0.8) for _ in range(4)]
+    # The texels are read where the map holds them; between texels it varies little here.
+    radiance = environment.log_radiance.exp().flatten(1).t()
+    carried = sum(one.outgoing(of, radiance) for one in several) / len(several)
+
+    drawn = sample_directions("mis", seen.normal, seen.wo, of.roughness, 16_384, GGX, stochastic=True)
+    arriving = environment.radiance(seen.position, drawn.wi)
+    arriving = torch.where(drawn.wi[..., 2:] < 0, 0.7, arriving)
+    expected = shade(of, seen.normal, seen.wo, drawn, arriving, GGX).color
+    torch.testing.assert_close(carried, expected, rtol=0.06, atol=0.02)
+
+
+def lamp(height: int) -> EnvironmentLight:
+    """A dim sky with one lamp of 40 at row 8, column 20 of a map of 24 rows, and its neighbours at 5."""
+    environment = EnvironmentLight(height, 0.3)
+    environment.log_radiance[:, 7:10, 19:22] = math.log(5.0)
+    environment.log_radiance[:, 8, 20] = math.log(40.0)
+    return environment
+
+
+@pytest.mark.parametrize("tint", [1.0, 0.6])
+def test_a_lamp_is_found_where_it_is_and_as_bright_beside_the_sky_as_it_is(tint):
+    """All the same where the base colour is wrong by one factor, which light and base colour share."""
+    torch.manual_seed(0)
+    seen, of = points(600), material(600)
+    true = lamp(24)
+    radiance = true.log_radiance.exp().flatten(1).t()
+    image = transport(HalfRoom(), seen, of.roughness, true, GGX, OFF, 0.8).outgoing(of, radiance)
+
+    found = EnvironmentLight(24, 1.0)
+    carried = transport(HalfRoom(), seen, of.roughness, found, GGX, OFF, 0.8)
+    guess = Material(of.base_color * tint, of.roughness, of.metallic)
+    config = LightFitConfig(steps=200)
+    fit_environment(found, carried, guess, image, "linear", image.median().item(), config)
+
+    green = found.log_radiance[1]
+    row, column = divmod(int(green.argmax()), 48)
+    assert abs(row - 8) <= 1
+    assert abs(column - 20) <= 1
+    # The power around the lamp, over which one texel may share with the next, in units of the sky far from it.
+    sky = green[:, 30:].median()
+    power = (green[6:11, 18:23] - sky).exp().sum().item()
+    assert power == pytest.approx((true.log_radiance[1, 6:11, 18:23].exp() / 0.3).sum().item(), rel=0.25)
+    assert (green[:, 30:] - sky).abs().mean() < 0.3
+
+
+def test_where_no_point_looks_the_map_takes_after_its_surroundings():
+    torch.manual_seed(0)
+    seen = points(300)
+    up = normalize(seen.normal * torch.tensor([0.2, 0.2, 0.0]) + torch.tensor([0.0, 0.0, 1.0]), dim=-1)
+    seen = Observed(seen.position, up, up, seen.pixel)
+    of = Material(torch.full((300, 3), 0.5), torch.full((300, 1), 0.9), torch.zeros(300, 1))
+    true = EnvironmentLight(16, 2.0)
+    image = transport(HalfRoom(), seen, of.roughness, true, GGX, OFF, 0.8).outgoing(of, torch.full((512, 3), 2.0))
+    found = EnvironmentLight(16, 0.5)
+    carried = transport(HalfRoom(), seen, of.roughness, found, GGX, OFF, 0.8)
+    fit_environment(found, carried, of, image, "linear", 1.0, LightFitConfig(steps=300))
+    assert found.log_radiance[:, -2:].exp().mean().item() == pytest.approx(2.0, rel=0.35)
+
+
+def test_total_variation_counts_every_step_once_and_closes_the_map():
+    """One column of 1 in a map of 0: it steps up and down in each of its four rows, of 32 texels."""
+    values = torch.zeros(1, 4, 8)
+    values[0, :, 7] = 1.0
+    assert total_variation(values).item() == pytest.approx(2 * 4 / 32, abs=0.02)  # the rounding near 0 adds 0.01 a step
+
+
+def test_a_map_without_a_finite_answer_stays_as_it_was():
+    seen, of = points(8), material(8)
+    environment = EnvironmentLight(8, 0.5)
+    before = environment.log_radiance.clone()
+    carried = transport(HalfRoom(), seen, of.roughness, environment, GGX, OFF, 0.8)
+    broken = torch.full((8, 3), math.inf)
+    fit_environment(environment, carried, of, broken, "linear", 1.0, LightFitConfig(steps=3))
+    assert torch.equal(environment.log_radiance, before)
+
+
+def test_memory_is_due_at_once_then_every_so_often_and_keeps_the_newest():
+    memory = SurfaceMemory(LightFitConfig(points=20, every=4))
+    assert not memory.due
+    memory.remember(points(50))
+    assert memory.due
+    assert len(memory.recall()) == 20
+    for step in range(4):
+        assert not memory.due, step
+        memory.remember(points(50, seed=step + 2))
+    assert memory.due
+    kept = memory.recall()
+    for step in range(4):  # five points of each of the four steps
+        newest = points(50, seed=step + 2).normal[:5]
+        assert all((kept.normal == normal).all(-1).any() for normal in newest)
+
+
+def test_memory_survives_a_checkpoint():
+    config = LightFitConfig(points=20, every=4)
+    memory, again = SurfaceMemory(config), SurfaceMemory(config)
+    memory.remember(points(12))
+    memory.recall()
+    memory.remember(points(12, seed=5))
+    again.load_state_dict(memory.state_dict())
+    assert (again.filled, again.next, again.age) == (memory.filled, memory.next, memory.age)
+    for one, other in zip(vars(memory.recall()).values(), vars(again.recall()).values(), strict=True):
+        assert torch.equal(one, other)
