@@ -18,6 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.errors import EarlyEnd, Stopped, UserError
+from neilfpp_method.prepare.options import Prepare
 from neilfpp_method.presets import fixed_geometry, preset
 
 __all__ = ["main"]
@@ -27,6 +28,22 @@ Device = Annotated[str, tyro.conf.arg(metavar="cpu|cuda|cuda:N|auto")]
 
 
 # -------------------------------------------------------------------------------------------------------------- options
+
+
+@dataclass
+class Inspect:
+    """Say what is in a capture and what is wrong with it."""
+
+    data: tyro.conf.Positional[Path]
+    """The capture's folder."""
+    out: Path | None = None
+    """Where inspect.json and inspect.png go; none: they are not written."""
+    format: str | None = None
+    """The capture's format; none: told from what is in the folder."""
+    response: Literal["auto", "linear", "srgb"] = "auto"
+    """What the pixels are: linear radiance (HDR) or sRGB (LDR); auto: told from the files."""
+    strict: bool = False
+    """End with status 1 where there is a problem."""
 
 
 @dataclass
@@ -45,6 +62,8 @@ class Train:
     """The mesh of --host mesh, in the capture's world frame; none: the capture's inputs/model/mesh.ply."""
     resume: bool = False
     """Continue the run in --out from its last checkpoint, exactly as if it had never stopped."""
+    format: str | None = None
+    """The capture's format (see docs/captures.md); none: told from what is in the folder."""
     test_every: int | None = None
     """Hold out every k-th view for testing; none: the capture's split.json, or every 8th."""
     response: Literal["auto", "linear", "srgb"] = "auto"
@@ -122,6 +141,18 @@ class Demo:
 # ------------------------------------------------------------------------------------------------------------- commands
 
 
+def run_inspect(options: Inspect) -> None:
+    from neilfpp_method.inspection.command import run_inspection
+
+    run_inspection(options.data, options.out, options.format, options.response, options.strict, Console())
+
+
+def run_prepare(options: Prepare) -> None:
+    from neilfpp_method.prepare.command import run_prepare as prepare
+
+    prepare(options, Console())
+
+
 def run_train(options: Train) -> None:
     from neilfpp_method.train.command import run_training
 
@@ -138,6 +169,7 @@ def run_train(options: Train) -> None:
         resume=options.resume,
         test_every=options.test_every,
         response=options.response,
+        format=options.format,
         device=options.device,
         devices=options.devices,
         console=Console(),
@@ -220,6 +252,20 @@ class Command:
 
 COMMANDS = {
     "demo": Command(Demo, run_demo, ["neilfpp demo", "neilfpp demo --short --out trial"]),
+    "inspect": Command(
+        Inspect,
+        run_inspect,
+        ["neilfpp inspect captures/teapot", "neilfpp inspect captures/teapot --out teapot-inspection --strict"],
+    ),
+    "prepare": Command(
+        Prepare,
+        run_prepare,
+        [
+            "neilfpp prepare photos/teapot --out captures/teapot",
+            "neilfpp prepare photos/teapot --out captures/teapot --dense --also nerfstudio neilf",
+            "neilfpp prepare scans/colmap-project --out captures/teapot   (keeps the poses)",
+        ],
+    ),
     "train": Command(
         Train,
         run_train,

@@ -6,14 +6,10 @@ effect that is switched off asks no network and traces no ray.
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeVar, get_args, get_type_hints
+from typing import Literal
 
-from neilfpp_method.errors import UserError
-
-__all__ = ["NeilfConfig", "from_dict", "to_dict"]
+__all__ = ["NeilfConfig"]
 
 
 # ---------------------------------------------------------------------------------------------------------------- fields
@@ -87,6 +83,8 @@ class BrdfConfig:
 
     encoding: Literal["frequency", "hash"] = "frequency"
     """How positions are encoded."""
+    initial_base_color: float = 0.5
+    """What the base colour starts as. Light and base colour share a scale that images hardly tell, so it stays near this."""
     frequencies: int = 6
     """Octaves of the frequency encoding."""
     grid: HashGridConfig = field(default_factory=HashGridConfig)
@@ -103,10 +101,10 @@ class BrdfConfig:
 
 @dataclass(frozen=True)
 class LightFitConfig:
-    """How an environment map is solved for (`light_fit`)."""
+    """How an environment map, and lamps before it, are solved for (`lighting`)."""
 
     points: int = 1024
-    """Surface points that the map is fitted to; memory and time grow with points · texels."""
+    """Surface points that the light is fitted to; memory and time grow with points · texels."""
     every: int = 100
     """Steps between two fits."""
     steps: int = 100
@@ -115,6 +113,14 @@ class LightFitConfig:
     """Rate of log radiance at the start of a fit."""
     smoothness: float = 0.03
     """Weight of the total variation of log radiance, per texel, against the relative error."""
+    sparsity: float = 0.02
+    """Weight of the light that near lamps bring, in units of a typical pixel, against the relative error."""
+    candidates: int = 192
+    """Places for lamps that one fit tries."""
+    lamps: int = 8
+    """Most lamps."""
+    lamp_radius: float = 0.06
+    """Of every lamp, scene units."""
     floor: float = 0.1
     """Errors are relative to the pixel and this share of a typical one."""
     outlier: float = 0.1
@@ -125,15 +131,17 @@ class LightFitConfig:
 class IncidentLightConfig:
     """L: position, direction → linear RGB that arrives (METHOD §5): sharp in direction, smooth in position."""
 
-    kind: Literal["free", "distant"] = "free"
-    """free: the paper's field, its own light at every point. distant: an environment map, with inter-reflection hard or off."""
+    kind: Literal["free", "distant", "distant_near", "auto"] = "free"
+    """free: the paper's field, its own light at every point. distant: an environment map. distant_near: a map, and lamps
+    close to the scene. auto: a map, and lamps where points that were kept back from the fit ask for them. All but free go
+    with inter-reflection hard or off."""
     environment_height: int = 32
     """Rows of the environment map; it has twice as many columns."""
     fit: LightFitConfig = field(default_factory=LightFitConfig)
     """How the map is found."""
     network: Literal["mlp", "factorised"] = "mlp"
-    """What a free field is. mlp: the paper's network. factorised: per colour the exponential of a dot product of a vector of the
-    position with one of the direction; pairs of a point and a direction then cost next to nothing."""
+    """What a free field is. mlp: the paper's network. factorised: per colour the exponential of a dot product of a vector of
+    the position with one of the direction; pairs of a point and a direction then cost next to nothing."""
     rank: int = 32
     """Length of the vectors of a factorised field; its map of directions has `environment_height` rows."""
     activation: Literal["sine", "relu"] = "sine"
@@ -221,9 +229,10 @@ class ShadingConfig:
     """Distribution and masking of the specular lobe."""
     specular: bool = True
     """Off: a Lambertian surface; roughness and metallic are not asked for."""
-    sampler: Literal["fibonacci", "cosine", "lobe", "mis"] = "fibonacci"
+    sampler: Literal["fibonacci", "cosine", "lobe", "mis", "shared"] = "fibonacci"
     """Who draws the incident directions: the paper's lattice, a cosine, the specular lobe, or cosine, lobe and (where it can
-    be sampled) light together by the balance heuristic."""
+    be sampled) light together by the balance heuristic. shared: one lattice of the sphere for all points of a step, so
+    that a free field asks its part for directions once."""
     train_samples: int = 128
     """Incident directions per point in training."""
     eval_samples: int = 256
@@ -341,51 +350,3 @@ class NeilfConfig:
     loss: LossConfig = field(default_factory=LossConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
-
-
-# ---------------------------------------------------------------------------------------------------------- to and from JSON
-
-
-def to_dict(config: Any) -> dict[str, Any]:
-    """The settings as plain JSON values."""
-    return dataclasses.asdict(config)
-
-
-Config = TypeVar("Config")
-
-
-def from_dict(kind: type[Config], values: Mapping[str, Any], where: str = "config") -> Config:
-    """Settings from JSON values, the inverse of `to_dict`.
-
-    Raises:
-        UserError: a key is unknown or a value has the wrong type; names the setting.
-    """
-    hints = get_type_hints(kind)
-    unknown = set(values) - set(hints)
-    if unknown:
-        raise UserError(f"{where}: unknown setting '{sorted(unknown)[0]}'", "was it written by another version?")
-    arguments = {}
-    for name, value in values.items():
-        if dataclasses.is_dataclass(hints[name]):
-            value = from_dict(hints[name], value, f"{where}.{name}")
-        elif isinstance(value, list):
-            value = tuple(value)
-        else:
-            _check(value, hints[name], f"{where}.{name}")
-        arguments[name] = value
-    return kind(**arguments)
-
-
-def _check(value: Any, hint: Any, where: str) -> None:
-    """That a JSON value is one of the choices, or of one of the plain types, that a hint names."""
-    choices = get_args(hint)
-    if choices and all(isinstance(choice, str) for choice in choices):
-        if value not in choices:
-            raise UserError(f"{where}: '{value}' is not a choice", f"choose one of {', '.join(choices)}")
-        return
-    plain = [kind for kind in choices or (hint,) if isinstance(kind, type)]
-    # JSON has one kind of number, and bool is an int to Python but to nobody else.
-    fits = any(isinstance(value, (int, float) if kind is float else kind) for kind in plain)
-    if plain and (not fits or (isinstance(value, bool) and bool not in plain)):
-        names = " or ".join("nothing" if kind is type(None) else kind.__name__ for kind in plain)
-        raise UserError(f"{where}: {value!r} where {names} belongs", "correct the file, or train again")

@@ -80,12 +80,14 @@ def scene_light(
     if isinstance(host, LightsItself):
         return host.scene_light(x, wi)
     start = (x[:, None] + config.offset * wi).reshape(-1, 3)
-    hit, radiance = [], []
-    for rays in zip(start.split(MOST_RENDERED), wi.reshape(-1, 3).split(MOST_RENDERED), strict=True):
-        hits = host.render(RayBatch(*rays))
-        hit.append(hits.is_hit(hit_share))
-        radiance.append(torch.where(hit[-1][:, None], hits.color, 0.0))
-    return SceneLight(torch.cat(hit).view(wi.shape[:2]), torch.cat(radiance).view(wi.shape))
+    radiance, distance = [], []
+    for origins, directions in zip(start.split(MOST_RENDERED), wi.reshape(-1, 3).split(MOST_RENDERED), strict=True):
+        hits = host.render(RayBatch(origins, directions))
+        hit = hits.is_hit(hit_share)
+        distance.append(torch.where(hit, (hits.position - origins).norm(dim=-1), torch.inf))
+        radiance.append(torch.where(hit[:, None], hits.color, 0.0))
+    distance = torch.cat(distance).view(wi.shape[:2])
+    return SceneLight(distance.isfinite(), torch.cat(radiance).view(wi.shape), distance)
 
 
 def _random_rows(points: int, per_point: float, device: torch.device) -> Tensor:

@@ -17,17 +17,30 @@ from neilfpp_method import losses
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
+from neilfpp_method.fields.factorised_light import FactorisedLightField
+from neilfpp_method.fields.free_light import make_incident_light
 from neilfpp_method.fields.incident_light import IncidentLightField
+from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised
 from neilfpp_method.hosts.outputs import OutputCheck
 from neilfpp_method.inter_reflection import scene_light, trace_light
-from neilfpp_method.light_fit import Observed, SurfaceMemory, fit_environment, transport
+from neilfpp_method.lighting.memory import Observed, SurfaceMemory
+from neilfpp_method.lighting.solve import solve_light
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, active_losses
 from neilfpp_method.shading.brdf import LOBES
 from neilfpp_method.shading.color import apply_response
+from neilfpp_method.shading.frame import dot
 from neilfpp_method.shading.rendering_equation import shade
-from neilfpp_method.shading.sampling import pdf_mis, sample_directions
-from neilfpp_method.structures import IncidentSamples, LossTerm, Material, PixelBatch, RayBatch, Shading, SurfaceHits
+from neilfpp_method.shading.sampling import Technique, sample_directions
+from neilfpp_method.structures import (
+    LossTerm,
+    Material,
+    PixelBatch,
+    RayBatch,
+    SceneLight,
+    Shading,
+    SurfaceHits,
+)
 
 __all__ = ["Maps", "NeilfModel", "RadianceUnits", "SceneFacts"]
 
@@ -112,13 +125,16 @@ class NeilfModel(nn.Module):
         self.brdf = BrdfField(config.brdf, config.volume.radius)
         base = config.light.base or (10.0 if facts.response == "linear" else math.e)
         first_radiance = facts.median_radiance / self._first_albedo()
-        self.light: IncidentLightField | EnvironmentLight
-        if config.light.kind == "distant":
+        self.light: IncidentLightField | FactorisedLightField | EnvironmentLight
+        self.lamps: Lamps | None = None
+        self.memory: SurfaceMemory | None = None
+        if config.light.kind != "free":
+            fit = config.light.fit
             self.light = EnvironmentLight(config.light.environment_height, first_radiance)
-            self.memory = SurfaceMemory(config.light.fit)
+            self.lamps = None if config.light.kind == "distant" else Lamps(fit.lamps, fit.lamp_radius)
+            self.memory = SurfaceMemory(fit.points, fit.every)
         else:
-            self.memory = None
-            self.light = IncidentLightField(config.light, base, first_radiance)
+            self.light = make_incident_light(config.light, base, first_radiance)
 
     # -------------------------------------------------------------------------------------------------------- one step
 
@@ -205,18 +221,19 @@ class NeilfModel(nn.Module):
         return losses.inter_reflection(incident, traced.radiance[hit], self.units.incident)
 
     def _keep_fitting(self, seen: Observed) -> None:
-        """Remember some of what was seen, and when it is time solve for the map that explains what is remembered."""
+        """Remember some of what was seen, and when it is time solve for the light that explains what is remembered."""
         self.memory.remember(seen)
         if not self.memory.due:
             return
-        seen, config = self.memory.recall(), self.config
+        seen = self.memory.recall()
         with torch.no_grad():
             material = self.brdf(seen.position)
-        lobe = self.lobe if config.shading.specular else None
-        hit_share = config.shading.hit_share
-        carried = transport(self.host, seen, material.roughness, self.light, lobe, config.inter_reflection, hit_share)
-        unit, response = self.units.physical, self.facts.response
-        fit_environment(self.light, carried, material, seen.pixel, response, unit, config.light.fit)
+        lobe = self.lobe if self.config.shading.specular else None
+        scene = None if self.config.inter_reflection.mode == "off" else self._scene_light
+        response, unit = self.facts.response, self.units.physical
+        self.evidence = solve_light(
+            self.light, self.lamps, seen, material, lobe, scene, response, unit, self.config.light
+        )
 
     # ------------------------------------------------------------------------------------------------------- the parts
 
@@ -227,11 +244,20 @@ class NeilfModel(nn.Module):
     def incident_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
         """Linear radiance that arrives at x from wi: from the light, or in hard inter-reflection from the scene before it."""
         if self.config.inter_reflection.mode != "hard":
-            return self.light.radiance(x, wi)
-        scene = scene_light(self.host, x, wi, self.config.inter_reflection, self.config.shading.hit_share)
+            radiance, nearest = self.light.radiance(x, wi), torch.full_like(wi[..., 0], math.inf)
+        else:
+            scene = self._scene_light(x, wi)
+            radiance, nearest = self._before_light(scene, x, wi), scene.distance
+        return radiance if self.lamps is None else radiance + self.lamps.seen(x, wi, nearest)
+
+    def _before_light(self, scene: SceneLight, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
+        """What the scene sends, and where it is not in the way the light."""
         point, direction = torch.nonzero(~scene.hit, as_tuple=True)
         light = self.light.radiance(x[point], wi[point, direction][:, None])[:, 0]
         return scene.radiance.index_put((point, direction), light)
+
+    def _scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
+        return scene_light(self.host, x, wi, self.config.inter_reflection, self.config.shading.hit_share)
 
     def shade(
         self,
@@ -247,27 +273,31 @@ class NeilfModel(nn.Module):
         without_lobe = {"mis": "cosine", "lobe": "cosine"}
         sampler = settings.sampler if settings.specular else without_lobe.get(settings.sampler, settings.sampler)
         about, roughness = normal.detach(), material.roughness.detach()
-        drawn = self._sample(sampler, about, wo, roughness, samples)
-        incident = self.incident_light(position, drawn.wi)
-        return shade(material, normal, wo, drawn, incident, self.lobe, settings.specular)
+        drawn = sample_directions(sampler, about, wo, roughness, samples, self.lobe, self.training, self._sky(about))
+        if self.config.inter_reflection.mode == "hard":
+            wi = drawn.wi.expand(len(position), -1, -1)
+            incident = self._before_light(self._scene_light(position, wi), position, wi)
+        elif len(drawn.wi) < len(position) and not isinstance(self.light, EnvironmentLight):
+            incident = self.light.radiance(position, drawn.wi, dot(drawn.wi, about) > 0)
+        else:
+            incident = self.light.radiance(position, drawn.wi)
+        shading = shade(material, normal, wo, drawn, incident, self.lobe, settings.specular)
+        if self.lamps is None or not self.lamps.lit:
+            return shading
+        # Lamps are small and few: each is asked by itself, and no direction that another sampler draws meets one.
+        rays = self.lamps.rays_from(position)
+        radiance = self.lamps.radiance().expand_as(rays.wi)
+        if self.config.inter_reflection.mode == "hard":
+            radiance = radiance * (self._scene_light(position, rays.wi).distance >= rays.distance)[..., None]
+        lit = shade(material, normal, wo, rays.samples(), radiance, self.lobe, settings.specular)
+        return Shading(shading.color + lit.color, shading.diffuse + lit.diffuse, shading.specular + lit.specular)
 
-    def _sample(
-        self,
-        sampler: str,
-        normal: Float[Tensor, "N 3"],
-        wo: Float[Tensor, "N 3"],
-        roughness: Float[Tensor, "N 1"],
-        count: int,
-    ) -> IncidentSamples:
-        """Directions by the sampler of the settings; "mis" also asks a light that can be sampled, for a third of them."""
-        if sampler != "mis" or not isinstance(self.light, EnvironmentLight):
-            return sample_directions(sampler, normal, wo, roughness, count, self.lobe, self.training)
-        bright = self.light.sample(normal, count // 3, self.training)
-        others = sample_directions(sampler, normal, wo, roughness, count - count // 3, self.lobe, self.training)
-        wi = torch.cat((bright.wi, others.wi), 1)
-        share = (count // 3) / count
-        pdf = share * self.light.pdf(wi) + (1 - share) * pdf_mis(wi, normal, wo, roughness, self.lobe)
-        return IncidentSamples(wi, pdf)
+    def _sky(self, normal: Float[Tensor, "N 3"]) -> Technique | None:
+        """The map, as one that draws directions; none for a light that cannot be sampled."""
+        light = self.light
+        if not isinstance(light, EnvironmentLight):
+            return None
+        return Technique(lambda count, stochastic: light.sample(normal, count, stochastic).wi, light.pdf)
 
     @torch.no_grad()
     def maps(self, rays: RayBatch, with_material: bool = True) -> Maps:
@@ -311,10 +341,10 @@ class NeilfModel(nn.Module):
                 parameter.grad = None
 
     def _first_albedo(self) -> float:
-        """Directional albedo of the mid-grey material that B starts as, seen from the normal under uniform light."""
+        """Directional albedo of the material that B starts as, seen from the normal under uniform light."""
         half = torch.full((1, 1), 0.5)
         up = torch.tensor([[0.0, 0.0, 1.0]])
-        material = Material(half.expand(1, 3), half, half)
+        material = Material(torch.full((1, 3), self.config.brdf.initial_base_color), half, half)
         samples = sample_directions("fibonacci", up, up, half, 4096, self.lobe, stochastic=False)
         white = torch.ones_like(samples.wi)
         return shade(material, up, up, samples, white, self.lobe, self.config.shading.specular).color.mean().item()

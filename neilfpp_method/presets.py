@@ -54,9 +54,11 @@ def fast() -> NeilfConfig:
         preset="fast",
         sdf=SdfConfig(encoding="hash", grid=grid, layers=1, width=64, skip=None, feature_width=15),
         radiance=OutgoingRadianceConfig(layers=2, width=64, direction_encoding="spherical_harmonics"),
-        brdf=BrdfConfig(encoding="hash", grid=grid, activation="relu", layers=2, width=64, skip=None),
+        brdf=BrdfConfig(
+            encoding="hash", grid=grid, activation="relu", layers=2, width=64, skip=None, initial_base_color=0.3
+        ),
         light=IncidentLightConfig(
-            kind="distant", layers=4, width=64, direction_encoding="spherical_harmonics", direction_degree=5
+            kind="auto", layers=4, width=64, direction_encoding="spherical_harmonics", direction_degree=5
         ),
         background=BackgroundConfig(layers=4, width=64, samples=16),
         volume=VolumeConfig(radius=1.75, beta_init=0.05, initial_samples=64, rounds=2, samples=32),

@@ -63,7 +63,8 @@ class RayBatch(Indexable):
 class PixelBatch(Indexable):
     """Rays with what the images say about them.
 
-    `color` is what the file holds: linear radiance for an HDR capture, display values (sRGB) for an LDR one.
+    `color` is linear radiance for an HDR capture, on the scale that its views share, and display values (sRGB) for an LDR
+    one.
     `mask` is 1 on the object and 0 off it, as far as `mask_known` is 1: everywhere in a capture with masks, only where the
     image shows exactly its background in one without (there the other pixels have mask 1). `image_gradient` is the length
     of the gradient of the image's luminance at the pixel, per pixel.
@@ -126,7 +127,7 @@ class IncidentSamples(Indexable):
 
     `wi` points away from the surface. `pdf` is per steradian and is that of the whole set, so that the mean over S of
     f(wi)/pdf(wi) estimates the integral of f over the hemisphere, whatever the sampler. A direction below the horizon is
-    allowed; the shading gives it no weight.
+    allowed; the shading gives it no weight. Directions that all points share have N = 1.
     """
 
     wi: Float[Tensor, "N S 3"]
@@ -144,11 +145,12 @@ class Shading(Indexable):
 
 @dataclass(frozen=True)
 class SceneLight(Indexable):
-    """What the scene itself sends to N points from S directions: where a direction meets the scene, and the linear radiance
-    that arrives from there (zero where it meets nothing)."""
+    """What the scene itself sends to N points from S directions: where a direction meets the scene, how far away, and the
+    linear radiance that arrives from there. Where it meets nothing the distance is infinite and the radiance zero."""
 
     hit: Bool[Tensor, "N S"]
     radiance: Float[Tensor, "N S 3"]
+    distance: Float[Tensor, "N S"]
 
 
 class LossTerm(NamedTuple):

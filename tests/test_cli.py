@@ -206,6 +206,8 @@ def test_a_command_line_that_makes_no_sense(tmp_path, monkeypatch, capfd, argume
         (["--device", "abacus"], ("no device 'abacus' here", "cpu")),
         (["--device", "meta"], ("no device 'meta' here", "cpu")),
         (["--test-every", "1"], ("all 6 views are held out",)),
+        (["--format", "tape"], ("unknown capture format 'tape'", "sfm_scene", "colmap")),
+        (["--format", "colmap"], ("not a capture of the format colmap", "sparse/0")),
     ],
 )
 def test_settings_that_cannot_be(tmp_path, monkeypatch, capture, capfd, options, words):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import Counter
 
 import pytest
@@ -12,7 +13,7 @@ from neilfpp_method.hosts.base import LightsItself
 from neilfpp_method.inter_reflection import trace_light
 from neilfpp_method.model import NeilfModel, SceneFacts
 from neilfpp_method.schedule import Stage, active_losses, weigh
-from neilfpp_method.structures import RayBatch, SurfaceHits
+from neilfpp_method.structures import Material, RayBatch, SurfaceHits
 from neilfpp_method.train.loop import make_optimizer
 from tests.scenes import sphere_batch, sphere_model, tiny_config
 
@@ -267,3 +268,45 @@ def test_the_tracing_grid_is_renewed_as_the_geometry_moves_and_survives_a_checkp
     again.load_state_dict(model.state_dict())
     assert again.host.grid_age == 1
     assert torch.equal(again.host.distance_grid, model.host.distance_grid)
+
+
+@pytest.mark.parametrize("kind", ["free", "distant", "auto"])
+@pytest.mark.parametrize("sampler", ["fibonacci", "shared"])
+def test_every_light_goes_with_every_kind_of_sampling(kind, sampler):
+    """Under light of one radiance from everywhere, a surface shows the same by each."""
+    config = tiny_config()
+    off = dataclasses.replace(config.inter_reflection, mode="off")
+    config = dataclasses.replace(
+        config,
+        inter_reflection=off,
+        light=dataclasses.replace(config.light, kind=kind, environment_height=8),
+        shading=dataclasses.replace(config.shading, sampler=sampler),
+    )
+    model = sphere_model(config).eval()
+    position = torch.tensor([[0.0, 0.0, 0.6], [0.6, 0.0, 0.0]])
+    normal = position / 0.6
+    half = torch.full((2, 1), 0.5)
+    material = Material(torch.full((2, 3), config.brdf.initial_base_color), half, half)
+    shading = model.shade(position, normal, normal, material, 512)
+    torch.testing.assert_close(shading.color, torch.full((2, 3), model.facts.median_radiance), rtol=0.1, atol=0.0)
+
+
+def test_a_lamp_shines_where_nothing_stands_before_it():
+    config = tiny_config()
+    hard = dataclasses.replace(config.inter_reflection, mode="hard", offset=1e-4)
+    light = dataclasses.replace(config.light, kind="auto", environment_height=8)
+    config = dataclasses.replace(config, inter_reflection=hard, light=light)
+    model = NeilfModel(HalfRoom(), config, SceneFacts("linear", 0.2, 3.0, "constant")).eval()
+    x, up = torch.zeros(2, 3), torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    half = torch.full((2, 1), 0.5)
+    material = Material(half.expand(2, 3), half, half)
+    before = model.shade(x, up, up, material, 64)
+    # One lamp above, where there is nothing, and one below, beyond the wall at 2.
+    model.lamps.place(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -2.5]]), torch.ones(2, 3))
+    after = model.shade(x, up, up, material, 64)
+    gained = (after.diffuse - before.diffuse)[:, 0]
+    # Towards a lamp at distance 1, straight above: (1 − m) b/π · I/d².
+    assert gained[0].item() == pytest.approx(0.25 / math.pi, rel=0.02)
+    assert gained[1].item() == pytest.approx(0.0, abs=1e-6)
+    seen = model.incident_light(x[:1], torch.tensor([[[0.0, 0.0, 1.0]]]))[0, 0]
+    assert (seen > model.lamps.radiance()[0]).all()

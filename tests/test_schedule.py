@@ -7,7 +7,8 @@ import dataclasses
 import pytest
 import torch
 
-from neilfpp_method.config import TrainConfig, from_dict, to_dict
+from neilfpp_method.config import TrainConfig
+from neilfpp_method.config_json import from_dict, to_dict
 from neilfpp_method.errors import UserError
 from neilfpp_method.presets import PRESETS, preset
 from neilfpp_method.schedule import Stage, active_losses, stage_at, weigh

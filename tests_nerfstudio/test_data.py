@@ -4,19 +4,31 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.process_data.colmap_utils import colmap_to_json
 
 from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.capture_folder import write_capture
+from neilfpp_method.data.formats.write_transforms import write_transforms
+from neilfpp_method.data.images import write_png
+from neilfpp_method.data.lens import Lens
 from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.views import camera_rays, project
 from neilfpp_method.errors import UserError
 from neilfpp_method.plugin.datamanager import CaptureDataManagerConfig, CaptureDataset, pixel_batch
 from neilfpp_method.plugin.dataparser import CaptureParserConfig, capture_of
 from neilfpp_method.train.loop import seed_step
+from tests.data.formats.scenes import POINTS, material
+from tests.data.formats.test_colmap import colmap_camera, reconstruction
+from tests.data.formats.test_colmap import write as write_model
 from tests.data.make_capture import CENTRE, SCALE, make_capture
 
 VIEWS, WIDTH, HEIGHT = 6, 24, 18
@@ -84,6 +96,23 @@ def test_a_step_learns_from_the_pixels_of_the_same_step_of_the_standalone_loop(r
         torch.testing.assert_close(drawn.directions, expected.directions, atol=1e-5, rtol=0)
 
 
+def test_pixels_that_are_marked_as_invalid_are_not_drawn(tmp_path: Path) -> None:
+    capture = load_capture(make_capture(tmp_path, background=0.3))
+    valid = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    valid[:, :9] = 0
+    write_png(tmp_path / "valid.png", valid)
+    views = tuple(dataclasses.replace(view, valid=tmp_path / "valid.png") for view in capture.views)
+    write_capture(tmp_path, dataclasses.replace(capture, views=views), response="linear", test=capture.test)
+    manager = CaptureDataManagerConfig(dataparser=CaptureParserConfig(data=tmp_path), train_num_rays_per_batch=400).setup()
+    whole = PixelDataset(load_capture(tmp_path), load_capture(tmp_path).train_views)
+    for step in (0, 1):
+        seed_step(7, step)
+        rays, batch = manager.next_train(step)
+        seed_step(7, step)
+        assert torch.equal(pixel_batch(rays.origins, rays.directions, batch).color, whole.sample(400).color)
+        assert (batch["indices"][:, 2] >= 9).all()
+
+
 def test_another_dataparser_serves_as_well(root: Path) -> None:
     outputs = parsed(root)
     other = PixelDataset(capture := capture_of(as_another_dataparser(outputs)), capture.views)
@@ -94,12 +123,93 @@ def test_another_dataparser_serves_as_well(root: Path) -> None:
     assert torch.equal(other.view(2).color, ours.view(2).color)
 
 
-def test_cameras_that_are_no_pinholes_are_refused(root: Path) -> None:
+LENSES = {
+    "RADIAL": (-0.12, 0.03),
+    "OPENCV": (-0.12, 0.03, 0.002, -0.001),
+    "FULL_OPENCV": (-0.12, 0.03, 0.002, -0.001, 0.01, 0.0, 0.0, 0.0),
+    "OPENCV_FISHEYE": (0.03, -0.005, 0.002, -0.001),
+}
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_lenses_bend_rays_alike(tmp_path: Path, model: str) -> None:
+    plain = load_capture(make_capture(tmp_path))
+    lens = Lens(model, LENSES[model])
+    views = tuple(dataclasses.replace(v, camera=dataclasses.replace(v.camera, lens=lens)) for v in plain.views)
+    write_capture(tmp_path, dataclasses.replace(plain, views=views), response="linear")
+    capture, outputs = load_capture(tmp_path), parsed(tmp_path)
+    pixels = PixelDataset(capture, capture.train_views)
+    there = capture_of(as_another_dataparser(outputs))
+    back = PixelDataset(there, there.views)
+    for i in range(len(capture.train_views)):
+        theirs, ours = outputs.cameras.generate_rays(camera_indices=i).flatten(), pixels.view(i)
+        torch.testing.assert_close(theirs.directions, ours.directions, atol=1e-4, rtol=0)
+        torch.testing.assert_close(back.view(i).directions, ours.directions, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(("model", "words"), [("FOV", "no lens FOV"), ("THIN_PRISM_FISHEYE", "no lens THIN_PRISM")])
+def test_lenses_that_nerfstudio_has_not_are_refused(tmp_path: Path, model: str, words: str) -> None:
+    plain = load_capture(make_capture(tmp_path))
+    lens = Lens(model, (0.5,) if model == "FOV" else (0.01,) * 8)
+    views = tuple(dataclasses.replace(v, camera=dataclasses.replace(v.camera, lens=lens)) for v in plain.views)
+    write_capture(tmp_path, dataclasses.replace(plain, views=views), response="linear")
+    with pytest.raises(UserError, match=words):
+        parsed(tmp_path)
+
+
+def test_cameras_without_an_image_plane_are_refused(root: Path) -> None:
     outputs = as_another_dataparser(parsed(root))
     outputs.cameras = copy.deepcopy(outputs.cameras)
     outputs.cameras.distortion_params = torch.full((VIEWS - 1, 6), 0.1)
-    with pytest.raises(UserError, match="undistort"):
+    with pytest.raises(UserError, match=r"k4 .* undistort"):
         capture_of(outputs)
+    outputs.cameras.camera_type[:] = CameraType.EQUIRECTANGULAR.value
+    with pytest.raises(UserError, match="neither perspective nor fisheye"):
+        capture_of(outputs)
+
+
+def test_other_layouts_are_read_and_a_format_can_be_forced(tmp_path: Path) -> None:
+    capture = load_capture(make_capture(tmp_path / "in", masks=True))
+    root = write_transforms(capture, tmp_path / "out")
+    outputs = CaptureParserConfig(data=root, format="transforms").setup().get_dataparser_outputs("train")
+    torch.testing.assert_close(outputs.cameras.camera_to_worlds, parsed(tmp_path / "in").cameras.camera_to_worlds)
+    with pytest.raises(UserError, match="not a capture of the format colmap"):
+        CaptureParserConfig(data=root, format="colmap").setup().get_dataparser_outputs("train")
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
+def test_what_nerfstudio_makes_of_a_colmap_model_is_read(tmp_path: Path, model: str) -> None:
+    write_model(material(tmp_path), reconstruction(colmap_camera(model)))
+    colmap_to_json(tmp_path / "sparse" / "0", tmp_path)
+    first, theirs = load_capture(tmp_path, "colmap"), load_capture(tmp_path, "transforms")
+    applied = np.array(json.loads((tmp_path / "transforms.json").read_text())["applied_transform"])
+    assert not np.allclose(applied, np.eye(4)[:3])  # they turn the world
+    points = torch.from_numpy(POINTS)
+    turned = points @ torch.from_numpy(applied[:, :3]).T + torch.from_numpy(applied[:, 3])
+    assert [view.name for view in theirs.views] == [view.name for view in first.views]
+    for new, old in zip(theirs.views, first.views, strict=True):
+        torch.testing.assert_close(project(new.camera, turned).pixel, project(old.camera, points).pixel, atol=1e-4, rtol=0)
+    assert theirs.scene_from == "points"  # those of their sparse_pc.ply, in the turned frame
+    np.testing.assert_allclose(theirs.normalisation.centre, applied[:, :3] @ first.normalisation.centre, atol=0.1)
+
+
+def test_nerfstudio_reads_what_is_written_for_it(tmp_path: Path) -> None:
+    capture = load_capture(make_capture(tmp_path / "in", hdr=False, masks=True))
+    config = NerfstudioDataParserConfig(
+        data=write_transforms(capture, tmp_path / "out"),
+        orientation_method="none",
+        center_method="none",
+        auto_scale_poses=False,
+        downscale_factor=1,
+        load_3D_points=False,
+    )
+    for split, views in (("train", capture.train_views), ("test", capture.test_views)):
+        outputs = config.setup().get_dataparser_outputs(split)
+        assert [path.stem for path in outputs.image_filenames] == [view.name for view in views]
+        for i, view in enumerate(views):
+            theirs, ours = outputs.cameras.generate_rays(camera_indices=i).flatten(), camera_rays(view.camera)
+            torch.testing.assert_close(theirs.origins, ours.origins, atol=1e-5, rtol=0)
+            torch.testing.assert_close(theirs.directions, ours.directions, atol=1e-5, rtol=0)
 
 
 def test_views_are_not_rescaled_in_silence(root: Path) -> None:

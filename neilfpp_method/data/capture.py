@@ -11,14 +11,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Protocol
 
-from neilfpp_method.data import sfm_scene
+import numpy as np
+
+from neilfpp_method.data import capture_folder
+from neilfpp_method.data.formats import blender, colmap, dtu, sfm_scene, transforms
 from neilfpp_method.data.images import image_header
-from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, View, check_camera, inside
+from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, SceneSource, View, check_camera, inside, plain_name
 from neilfpp_method.errors import UserError
 
 __all__ = ["READERS", "Camera", "Capture", "Normalisation", "Reader", "View", "load_capture"]
 
 TEST_EVERY = 8
+FOUND: Mapping[SceneSource, str] = {
+    "box": "",
+    "points": ", told by the points",
+    "masks": ", told by the masks",
+    "cameras": ", guessed from the cameras alone: add masks, points or a scene box where it is wrong",
+}
 
 
 class Reader(Protocol):
@@ -33,7 +42,14 @@ class Reader(Protocol):
         """The capture's files; a `UserError` where they contradict the layout."""
 
 
-READERS: Mapping[str, Reader] = {"sfm_scene": sfm_scene}
+READERS: Mapping[str, Reader] = {
+    "neilfpp": capture_folder,
+    "sfm_scene": sfm_scene,
+    "dtu": dtu,
+    "transforms": transforms,
+    "blender": blender,
+    "colmap": colmap,
+}
 """In the order in which they are asked."""
 
 
@@ -42,7 +58,8 @@ class Capture:
     """A checked capture. Cameras are in the world frame; `normalisation` leads to the scene frame.
 
     `hdr`: pixels are linear radiance; otherwise they are display values (sRGB). `test` names the views that are held
-    out. `inputs` is the folder of masks, depth maps and other companions of the images.
+    out. `inputs` is the folder of masks, depth maps and other companions of the images. `scene_from` is what told the
+    normalisation.
     """
 
     root: Path
@@ -53,6 +70,7 @@ class Capture:
     hdr: bool
     test: frozenset[str]
     point_cloud: Path | None = None
+    scene_from: SceneSource = "box"
 
     @property
     def train_views(self) -> tuple[View, ...]:
@@ -77,7 +95,8 @@ class Capture:
                 f"{len(self.train_views)} to train on and {len(self.test_views)} to test on",
                 f"pixels: {'linear HDR' if self.hdr else 'display values (sRGB)'}; masks: {masks or 'none'}; "
                 f"point cloud: {self.point_cloud.name if self.point_cloud else 'none'}",
-                f"scene: centre ({x:.3g}, {y:.3g}, {z:.3g}), 1 scene unit = {self.normalisation.scale:.4g} world units",
+                f"scene: centre ({x:.3g}, {y:.3g}, {z:.3g}), 1 scene unit = {self.normalisation.scale:.4g} world units"
+                + FOUND[self.scene_from],
             ]
         )
 
@@ -95,8 +114,10 @@ def load_capture(
         root: the capture's folder.
         format: a name in `READERS`; none: the first reader that recognises the folder.
         test_every: hold out every k-th view, from the k-th on; 0 holds out none. Overrides `split.json`.
-        test: hold out these views, by name or by number; overrides both. Without any of the three, every 8th is.
-        response: whether pixels are linear radiance or display values; auto: floating-point files are linear.
+        test: hold out these views, by name or by number; overrides both. Without any of the three the capture's own
+            split counts, and without one every 8th view is held out.
+        response: whether pixels are linear radiance or display values; auto: as the capture says, and where it does
+            not, floating-point files are linear.
 
     Raises:
         UserError: the capture cannot be used; names the file and the remedy.
@@ -110,7 +131,8 @@ def load_capture(
     if not READERS[format].recognise(root):
         raise UserError(f"{root}: not a capture of the format {format}", f"it needs {READERS[format].LAYOUT}")
     files = READERS[format].read(root)
-    hdr = _check_views(files.views)
+    floating = _check_views(files.views)
+    hdr = floating if files.hdr is None else files.hdr
     return Capture(
         root=root,
         format=format,
@@ -118,8 +140,9 @@ def load_capture(
         views=files.views,
         normalisation=files.normalisation,
         hdr={"auto": hdr, "linear": True, "srgb": False}[response],
-        test=_test_views(root, files.views, test_every, test),
+        test=_test_views(root, files, test_every, test),
         point_cloud=files.point_cloud,
+        scene_from=files.scene_from,
     )
 
 
@@ -132,16 +155,20 @@ def _recognise(root: Path) -> str:
 
 
 def _check_views(views: tuple[View, ...]) -> bool:
-    """Cameras, sizes and kinds of all views; whether the files are HDR."""
+    """Names, cameras, sizes and kinds of all views; whether the files are HDR."""
     names: dict[str, View] = {}
     hdr: dict[bool, View] = {}
     for view in views:
         check_camera(view.camera, str(view.image))
+        if not plain_name(view.name):
+            raise UserError(f"{view.image}: '{view.name}' cannot name a file", "rename the view")
         if view.name in names:
             raise UserError(f"{view.image} and {names[view.name].image} have the same name", "rename one of them")
         names[view.name] = view
+        if not all(np.isfinite(f) and f > 0 for f in (view.exposure, *view.white_balance)):
+            raise UserError(f"{view.image}: exposure and white balance are not all positive", "correct the factors")
         size = (view.camera.width, view.camera.height)
-        headers = {path: image_header(path) for path in (view.image, view.mask) if path}
+        headers = {path: image_header(path) for path in (view.image, view.mask, view.valid) if path}
         hdr.setdefault(headers[view.image].hdr, view)
         for path, header in headers.items():
             if (header.width, header.height) != size:
@@ -157,14 +184,14 @@ def _check_views(views: tuple[View, ...]) -> bool:
 # ---------------------------------------------------------------------------------------------------------------- split
 
 
-def _test_views(
-    root: Path, views: tuple[View, ...], test_every: int | None, test: Collection[str | int] | None
-) -> frozenset[str]:
-    split = root / "split.json"
+def _test_views(root: Path, files: CaptureFiles, test_every: int | None, test: Collection[str | int] | None) -> frozenset[str]:
+    split, views = root / "split.json", files.views
     if test is not None:
         held_out = _named(views, test, "test")
     elif test_every is None and split.is_file():
         held_out = _named(views, _read_split(inside(root, split)), str(split))
+    elif test_every is None and files.test is not None:
+        held_out = _named(views, files.test, "the capture's own split")
     else:
         every = TEST_EVERY if test_every is None else test_every
         if every < 0:

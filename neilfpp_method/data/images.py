@@ -143,6 +143,14 @@ def _opencv_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
     return samples[..., [2, 1, 0, 3][: samples.shape[2]]]
 
 
+def _tiff_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
+    with tifffile.TiffFile(path) as file:
+        page = file.pages[0]
+        if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and page.samplesperpixel > 1:
+            return np.moveaxis(page.asarray(), 0, -1)  # OpenCV would take the planes for pixels, and says nothing
+    return _opencv_samples(path)
+
+
 def _jpeg_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
     # Not OpenCV: it fills what a cut-off file lacks with grey, and says nothing.
     with Image.open(path) as image:
@@ -160,7 +168,7 @@ class Format:
     samples: Callable[[Path], np.ndarray]
 
 
-TIFF = Format(_tiff_header, _opencv_samples)
+TIFF = Format(_tiff_header, _tiff_samples)
 JPEG = Format(_pillow_header, _jpeg_samples)
 FORMATS: Mapping[str, Format] = {
     ".exr": Format(_exr_header, _exr_samples),

@@ -4,31 +4,35 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int
 from torch import Tensor
 
 from neilfpp_method.data.capture import Capture
+from neilfpp_method.data.drawing import ValidPixels
 from neilfpp_method.data.images import ImageFile, read_image
-from neilfpp_method.data.views import View, pixel_rays
+from neilfpp_method.data.views import CameraRays, View
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.color import luminance, srgb_to_linear, tone_map
 from neilfpp_method.structures import PixelBatch
 
-__all__ = ["PixelDataset"]
+__all__ = ["PixelDataset", "pixel_colors"]
 
 BORDER_TOLERANCE = 0.02
 BORDER_SHARE = 0.5
 DARK = 1e-3
+REPAIR = "repair the images, or mark the pixels in a validity mask"
 
 
 class PixelDataset:
     """P pixels of the chosen views, view after view, row by row. `len` is P; `PixelBatch.view` counts in `views`.
 
-    Colours, masks and image gradients are stored, 17 bytes a pixel; rays are computed from the cameras when asked for.
+    Colours, masks, validity and image gradients are stored, 19 bytes a pixel; rays are computed from the cameras when
+    asked for. Colours of a linear capture are radiance on the scale that its views share: the exposure and the white
+    balance of each view are divided out.
 
     Args:
         capture: where the views come from.
@@ -37,8 +41,8 @@ class PixelDataset:
         on_view: called with the name of each view once it is loaded.
 
     Raises:
-        UserError: an image cannot be read, has changed its size, or holds NaN, infinite or negative pixels, or a mask
-            shows no object.
+        UserError: an image cannot be read, has changed its size, or holds NaN, infinite or negative pixels that are not
+            marked as invalid; a mask shows no object; no pixel is valid; or a view of display values has an exposure.
     """
 
     def __init__(
@@ -53,33 +57,41 @@ class PixelDataset:
         self.capture = capture
         self.views = tuple(views)
         loaded = _load(self.views, capture.hdr, on_view)
-        self._color, self._mask, self._mask_known, self._gradient = (tensor.to(device) for tensor in loaded)
+        self._color, self._mask, self._mask_known, self._gradient, valid = (tensor.to(device) for tensor in loaded)
+        if not valid.any():
+            raise UserError(f"{capture.root}: no pixel is valid", "check the validity masks: white is valid")
+        self._drawn = ValidPixels(valid)
+        self._valid = self._drawn.valid
         cameras = [capture.normalisation.camera(view.camera) for view in views]
         sizes = [camera.width * camera.height for camera in cameras]
         self._starts = tuple(itertools.accumulate(sizes, initial=0))
         if not self._mask_known.any():
             self._mask_from_background()
         self._first = torch.tensor(self._starts[:-1], device=device)
-        self._width = torch.tensor([camera.width for camera in cameras], device=device)
-        self._intrinsics = torch.tensor(np.stack([c.intrinsics for c in cameras]), dtype=torch.float32, device=device)
-        self._c2w = torch.tensor(np.stack([c.c2w for c in cameras]), dtype=torch.float32, device=device)
+        self._rays = CameraRays(cameras, device)
 
     def __len__(self) -> int:
         return self._color.shape[0]
 
     def sample(self, count: int) -> PixelBatch:
-        """`count` pixels drawn uniformly and independently from all views, by torch's global generator."""
-        return self._batch(torch.randint(len(self), (count,), device=self._color.device))
+        """`count` valid pixels drawn uniformly and independently from all views, by torch's global generator."""
+        return self._batch(self.draw(count))
+
+    def draw(self, count: int) -> Int[Tensor, " count"]:
+        """The numbers of the pixels that `sample` would return, from 0 to P − 1."""
+        return self._drawn.draw(count)
 
     def view(self, i: int) -> PixelBatch:
-        """All pixels of `views[i]`, row by row."""
-        span = self._starts[i], self._starts[i + 1]
-        return self._batch(torch.arange(*span, device=self._color.device))
+        """All pixels of `views[i]`, row by row; those that are not `valid` as well."""
+        return self._batch(torch.arange(self._starts[i], self._starts[i + 1], device=self._color.device))
+
+    def valid(self, i: int) -> Bool[Tensor, " N"]:
+        """Which pixels of `views[i]` count: all but those that its validity mask leaves out."""
+        return self._valid[self._starts[i] : self._starts[i + 1]]
 
     def _batch(self, index: Int[Tensor, " N"]) -> PixelBatch:
         view = torch.bucketize(index, self._first, right=True) - 1
-        local, width = index - self._first[view], self._width[view]
-        rays = pixel_rays(self._intrinsics[view], self._c2w[view], local % width, local // width)
+        rays = self._rays(view, index - self._first[view])
         return PixelBatch(
             origins=rays.origins,
             directions=rays.directions,
@@ -95,7 +107,9 @@ class PixelDataset:
 
         Rendered captures, and clipped backdrops, have such pixels; in front of a noisy backdrop hardly any pixel is exact.
         """
-        border = torch.cat([self._border(i) for i in range(len(self.views))])
+        border = self._border()
+        if not len(border):
+            return
         color = border.median(dim=0).values
         background = (self._color == color).all(dim=-1)
         if (border == color).all(dim=-1).float().mean() >= BORDER_SHARE and not background.all():
@@ -104,20 +118,20 @@ class PixelDataset:
     # ------------------------------------------------------------------------------------------------------- statistics
 
     def median_radiance(self) -> float:
-        """The median luminance, linear, of the object: of pixels within the mask that are not black.
+        """The median luminance, linear, of the object: of valid pixels within the mask that are not black.
 
         Raises:
             UserError: there is no such pixel.
         """
-        seen = luminance(self._linear(self._color[self._mask]))
+        seen = luminance(self._linear(self._color[self._mask & self._valid]))
         lit = seen[seen > DARK * seen.mean()]
         if not len(lit):
             raise UserError(f"{self.capture.root}: all pixels of the object are black", "check images and masks")
         return float(lit.median())
 
     def radiance_quantile(self, share: float) -> float:
-        """The linear value that `share` of the values of all object pixels and channels do not exceed."""
-        values = self._linear(self._color[self._mask]).flatten()
+        """The linear value that `share` of the values of all valid object pixels and channels do not exceed."""
+        values = self._linear(self._color[self._mask & self._valid]).flatten()
         return float(values.kthvalue(max(1, round(share * len(values)))).values)
 
     def border_color(self) -> Float[Tensor, " 3"] | None:
@@ -126,16 +140,23 @@ class PixelDataset:
         The border's median colour counts when half of the border shares it: differs from it by at most 2 % of the
         brighter of that colour and the object's median radiance.
         """
-        border = self._linear(torch.cat([self._border(i) for i in range(len(self.views))]))
+        border = self._linear(self._border())
+        if not len(border):
+            return None
         color = border.median(dim=0).values
         tolerance = BORDER_TOLERANCE * max(float(color.max()), self.median_radiance())
         share = ((border - color).abs().amax(dim=-1) <= tolerance).float().mean()
         return color if share >= BORDER_SHARE else None
 
-    def _border(self, i: int) -> Float[Tensor, "B 3"]:
-        camera = self.views[i].camera
-        image = self._color[self._starts[i] : self._starts[i + 1]].view(camera.height, camera.width, 3)
-        return torch.cat([image[0], image[-1], image[1:-1, 0], image[1:-1, -1]])
+    def _border(self) -> Float[Tensor, "B 3"]:
+        """The colours of the valid pixels on the borders of all images."""
+        parts = []
+        for view, (start, end) in zip(self.views, itertools.pairwise(self._starts), strict=True):
+            number = torch.arange(start, end, device=self._color.device)
+            image = number.view(view.camera.height, view.camera.width)
+            parts += [image[0], image[-1], image[1:-1, 0], image[1:-1, -1]]
+        border = torch.cat(parts)
+        return self._color[border[self._valid[border]]]
 
     def _linear(self, color: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         return color if self.capture.hdr else srgb_to_linear(color)
@@ -148,20 +169,28 @@ class LoadedPixels(NamedTuple):
     mask: Bool[Tensor, " P"]
     mask_known: Bool[Tensor, " P"]
     image_gradient: Float32[Tensor, " P"]
+    valid: Bool[Tensor, " P"]
 
 
 def _load(views: Sequence[View], hdr: bool, on_view: Callable[[str], None] | None) -> LoadedPixels:
     total = sum(view.camera.width * view.camera.height for view in views)
     mask, known = torch.ones(total, dtype=torch.bool), torch.zeros(total, dtype=torch.bool)
-    pixels = LoadedPixels(torch.empty(total, 3), mask, known, torch.empty(total))
+    valid = torch.ones(total, dtype=torch.bool)
+    pixels = LoadedPixels(torch.empty(total, 3), mask, known, torch.empty(total), valid)
     broken: list[tuple[View, int]] = []
     start = 0
     for view in views:
         image = _read(view)
-        color = torch.from_numpy(image.pixels).expand(-1, -1, 3)
-        if count := int((~(color.isfinite() & (color >= 0)).all(dim=-1)).sum()):
-            broken.append((view, count))
+        color = pixel_colors(view, image, hdr)
+        usable = (color.isfinite() & (color >= 0)).all(dim=-1)
         rows = slice(start, start := start + view.camera.width * view.camera.height)
+        if view.valid is not None:
+            marked = _mask_file(view.valid, view)
+            valid[rows] = marked.reshape(-1)
+            color = torch.where((usable | marked)[..., None], color, 0.0)
+            usable |= ~marked
+        if count := int((~usable).sum()):
+            broken.append((view, count))
         pixels.color[rows] = color.reshape(-1, 3)
         if (object_mask := _mask(view, image)) is not None:
             mask[rows], known[rows] = object_mask.reshape(-1), True
@@ -171,7 +200,7 @@ def _load(views: Sequence[View], hdr: bool, on_view: Callable[[str], None] | Non
     if broken:
         view, count = broken[0]
         others = f", and {len(broken) - 1} more images have such pixels" if len(broken) > 1 else ""
-        raise UserError(f"{view.image}: {count} pixels are NaN, infinite or negative{others}", "repair the images")
+        raise UserError(f"{view.image}: {count} pixels are NaN, infinite or negative{others}", REPAIR)
     return pixels
 
 
@@ -186,19 +215,42 @@ def _read(view: View) -> ImageFile:
     return image
 
 
+def pixel_colors(view: View, image: ImageFile, hdr: bool) -> Float32[Tensor, "H W 3"]:
+    """The pixels of a view; linear ones without its own exposure and white balance.
+
+    Raises:
+        UserError: display values with an exposure or a white balance.
+    """
+    color = torch.from_numpy(image.pixels).expand(-1, -1, 3)
+    factors = view.exposure * torch.tensor(view.white_balance)
+    if (factors == 1.0).all():
+        return color
+    if not hdr:
+        # What is clipped at display values stays so at any exposure: no render could be compared with the quotient.
+        raise UserError(
+            f"{view.image}: an exposure or white balance for display values (sRGB)",
+            "develop the images linearly, or expose them all alike and leave out the factors",
+        )
+    return color / factors
+
+
 def _mask(view: View, image: ImageFile) -> Bool[Tensor, "H W"] | None:
     """The object: where the mask file, or without one the image's alpha, is above one half; none without either."""
-    height, width = image.pixels.shape[:2]
     if view.mask is None and image.alpha is None:
         return None
     source = view.mask or view.image
-    values = image.alpha if view.mask is None else read_image(view.mask).pixels.max(axis=-1)
-    if values.shape != (height, width):
-        raise UserError(f"{source}: the mask has another size than {view.image}", "load the capture again")
-    mask = torch.from_numpy(values) > 0.5
+    mask = _mask_file(view.mask, view) if view.mask else torch.from_numpy(image.alpha) > 0.5
     if not mask.any():
         raise UserError(f"{source}: the mask shows no object", "remove the view, or make the object's pixels white")
     return mask
+
+
+def _mask_file(path: Path, view: View) -> Bool[Tensor, "H W"]:
+    """Where a mask of the view is above one half."""
+    values = read_image(path).pixels.max(axis=-1)
+    if values.shape != (view.camera.height, view.camera.width):
+        raise UserError(f"{path}: the mask has another size than {view.image}", "load the capture again")
+    return torch.from_numpy(values) > 0.5
 
 
 def _gradient(values: Float32[Tensor, "H W"]) -> Float32[Tensor, "H W"]:

@@ -10,11 +10,12 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
+from neilfpp_method.data.images import replacing
 from neilfpp_method.data.views import Normalisation
 from neilfpp_method.errors import UserError
 from neilfpp_method.structures import OrientedPoints
 
-__all__ = ["load_point_cloud", "read_oriented_ply"]
+__all__ = ["WorldPoints", "has_normals", "load_point_cloud", "read_oriented_ply", "read_positions", "write_oriented_ply"]
 
 OLD_NAMES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
 NEW_NAMES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
@@ -22,6 +23,8 @@ CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 TYPES = dict(zip(OLD_NAMES + NEW_NAMES, CODES + CODES, strict=True))
 BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": None}
 HEADER_LIMIT = 65_536
+POSITION = ("x", "y", "z")
+NORMAL = ("nx", "ny", "nz")
 
 
 @dataclass(frozen=True)
@@ -51,17 +54,8 @@ def read_oriented_ply(path: Path) -> WorldPoints:
         UserError: the file is missing, malformed or cut off, has no points or no normals, or holds a number that is not
             finite or a normal of no length.
     """
-    try:
-        vertices = _vertices(path.read_bytes())
-    except (OSError, ValueError, KeyError, IndexError) as error:
-        raise UserError(f"{path}: not a PLY file that can be read ({error})", "export the point cloud again") from error
-    for name in ("x", "y", "z", "nx", "ny", "nz"):
-        if name not in vertices.dtype.names:
-            raise UserError(f"{path}: the points have no {name}", "export them with positions and normals")
-    position, normal = (
-        np.stack([vertices[name].astype(np.float64) for name in names], axis=1)
-        for names in (("x", "y", "z"), ("nx", "ny", "nz"))
-    )
+    vertices = _read(path)
+    position, normal = _columns(path, vertices, POSITION), _columns(path, vertices, NORMAL)
     if not len(position):
         raise UserError(f"{path}: no points", "export the point cloud again")
     broken = ~(np.isfinite(position) & np.isfinite(normal)).all(axis=1) | (np.abs(normal).max(axis=1) < 1e-6)
@@ -71,6 +65,49 @@ def read_oriented_ply(path: Path) -> WorldPoints:
             "remove these points",
         )
     return WorldPoints(position, normal)
+
+
+def read_positions(path: Path) -> Float64[np.ndarray, "N 3"]:
+    """The positions of a PLY file's vertices, in the world frame, without those that are not finite.
+
+    Raises:
+        UserError: the file is missing, malformed or cut off.
+    """
+    position = _columns(path, _read(path), POSITION)
+    return position[np.isfinite(position).all(axis=1)]
+
+
+def has_normals(path: Path) -> bool:
+    """Whether the vertices of a PLY file have normals.
+
+    Raises:
+        UserError: as `read_positions`.
+    """
+    return set(NORMAL) <= set(_read(path).dtype.names)
+
+
+def write_oriented_ply(path: Path, points: WorldPoints) -> Path:
+    """Write points as binary PLY, in single precision; returns the path."""
+    properties = "".join(f"property float {name}\n" for name in POSITION + NORMAL)
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points.position)}\n{properties}end_header\n"
+    rows = np.concatenate([points.position, points.normal], axis=1).astype("<f4")
+    with replacing(path) as temporary:
+        temporary.write_bytes(head.encode("ascii") + rows.tobytes())
+    return path
+
+
+def _read(path: Path) -> np.ndarray:
+    try:
+        return _vertices(path.read_bytes())
+    except (OSError, ValueError, KeyError, IndexError) as error:
+        raise UserError(f"{path}: not a PLY file that can be read ({error})", "export the point cloud again") from error
+
+
+def _columns(path: Path, vertices: np.ndarray, names: tuple[str, str, str]) -> Float64[np.ndarray, "N 3"]:
+    for name in names:
+        if name not in vertices.dtype.names:
+            raise UserError(f"{path}: the points have no {name}", "export them with positions and normals")
+    return np.stack([vertices[name].astype(np.float64) for name in names], axis=1)
 
 
 def _vertices(data: bytes) -> np.ndarray:

@@ -1,41 +1,48 @@
 """What a capture is made of: cameras, views, and the map from the world to the scene frame.
 
-Cameras are pinholes with OpenCV axes (x right, y down, z forward) and pixel centres at +0.5: pixel (column, row) is
-seen through the image point (column + ½, row + ½).
+Cameras have OpenCV axes (x right, y down, z forward) and pixel centres at +0.5: pixel (column, row) is seen through the
+image point (column + ½, row + ½). They are pinholes, or have a `Lens` that bends straight lines.
 """
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
+from neilfpp_method.data.lens import Lens
 from neilfpp_method.errors import UserError
 from neilfpp_method.structures import RayBatch
 
 __all__ = [
     "Camera",
+    "CameraRays",
     "CaptureFiles",
     "Normalisation",
     "Projection",
+    "SceneSource",
     "View",
     "camera_rays",
     "check_camera",
     "inside",
-    "pixel_rays",
+    "plain_name",
     "project",
 ]
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole: focal lengths and principal point in pixels, size in pixels, and the pose, world (or scene) to camera.
+    """Focal lengths and principal point in pixels, size in pixels, and the pose, world (or scene) to camera.
 
-    Cameras are compared by identity: an array has no single truth value.
+    Without `lens` a pinhole; with it, focal lengths and principal point apply to the plane on which the lens shows the
+    scene. Cameras are compared by identity: an array has no single truth value.
     """
 
     fx: float
@@ -45,6 +52,7 @@ class Camera:
     width: int
     height: int
     w2c: Float64[np.ndarray, "4 4"]
+    lens: Lens | None = None
 
     @property
     def intrinsics(self) -> Float64[np.ndarray, " 4"]:
@@ -59,7 +67,7 @@ class Camera:
 
 
 def check_camera(camera: Camera, where: str) -> None:
-    """Refuse what is no pinhole with a rigid pose; `where` says to whom the camera belongs.
+    """Refuse what is no camera with a rigid pose; `where` says to whom the camera belongs.
 
     Raises:
         UserError: the camera is malformed.
@@ -73,17 +81,21 @@ def check_camera(camera: Camera, where: str) -> None:
         raise UserError(f"{where}: the image size is not positive", "give width and height in pixels")
     rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0
     if not rigid or not np.allclose(camera.w2c[3], [0, 0, 0, 1]):
-        raise UserError(
-            f"{where}: the extrinsic is no rotation and translation", "give world-to-camera, 4×4, row-major"
-        )
+        raise UserError(f"{where}: the extrinsic is no rotation and translation", "give world-to-camera, 4×4, row-major")
+    if camera.lens is not None:
+        camera.lens.check(where)
 
 
 @dataclass(frozen=True)
 class View:
     """One image with its camera in the world frame.
 
-    `name` is the image's stem, unique in the capture; `index` its number in the capture's own list, which counts views
-    that are left out as well.
+    `name` is unique in the capture and a plain file name, most often the image's stem; `index` its number in the
+    capture's own list, which counts views that are left out as well.
+
+    `mask` is white on the object. `valid` is white where a pixel can be used and black where it is saturated or
+    otherwise without meaning. Linear radiance = pixel / (`exposure` · `white_balance`), so that all images of a
+    capture share one scale.
     """
 
     name: str
@@ -91,6 +103,9 @@ class View:
     camera: Camera
     image: Path
     mask: Path | None = None
+    valid: Path | None = None
+    exposure: float = 1.0
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -115,17 +130,25 @@ class Normalisation:
         return replace(camera, w2c=w2c)
 
 
+SceneSource = Literal["box", "points", "masks", "cameras"]
+
+
 @dataclass(frozen=True)
 class CaptureFiles:
     """What a reader finds in a folder: the views in order, the scene frame, and where the rest lies.
 
-    `inputs` is the folder that listed paths start from: masks, depth maps and the like lie in it.
+    `inputs` is the folder that listed paths start from: masks, depth maps and the like lie in it. `test` names the views
+    that the capture itself holds out, and `hdr` says whether it declares its pixels linear; none: it does not say.
+    `scene_from` is what told the normalisation: a box that the capture has, or else what `scene_box` found.
     """
 
     inputs: Path
     views: tuple[View, ...]
     normalisation: Normalisation
     point_cloud: Path | None = None
+    test: frozenset[str] | None = None
+    hdr: bool | None = None
+    scene_from: SceneSource = "box"
 
 
 def inside(root: Path, path: Path) -> Path:
@@ -143,6 +166,11 @@ def inside(root: Path, path: Path) -> Path:
     raise UserError(f"{path}: not a path within the capture folder {root}", "copy the file into the folder")
 
 
+def plain_name(name: str) -> bool:
+    """Whether a name can be that of a file anywhere: no folder in it, not hidden, printable."""
+    return bool(name) and name.isprintable() and not name.startswith(".") and not set(name) & set("/\\:")
+
+
 # ----------------------------------------------------------------------------------------------------------- projection
 
 
@@ -155,28 +183,79 @@ class Projection:
 
 
 def project(camera: Camera, points: Float[Tensor, "N 3"]) -> Projection:
-    """Where the camera sees points: u = fx·x/z + cx, v = fy·y/z + cy. A depth ≤ 0 means the point is behind it."""
+    """Where the camera sees points: u = fx·x/z + cx, v = fy·y/z + cy, with x/z and y/z bent by a lens where there is one.
+
+    A depth ≤ 0 means the point is behind the camera. Differentiable without a lens.
+    """
     w2c = torch.as_tensor(camera.w2c, dtype=points.dtype, device=points.device)
     intrinsics = torch.as_tensor(camera.intrinsics, dtype=points.dtype, device=points.device)
     local = points @ w2c[:3, :3].T + w2c[:3, 3]
     depth = local[:, 2]
-    return Projection(local[:, :2] / depth[:, None] * intrinsics[:2] + intrinsics[2:], depth)
-
-
-def pixel_rays(
-    intrinsics: Float[Tensor, "N 4"], c2w: Float[Tensor, "N 3 4"], columns: Int[Tensor, " N"], rows: Int[Tensor, " N"]
-) -> RayBatch:
-    """Rays through the centres of pixels, each with its own camera; in the frame of `c2w`."""
-    pixels = torch.stack([columns, rows], dim=-1).to(intrinsics.dtype) + 0.5
-    plane = (pixels - intrinsics[:, 2:]) / intrinsics[:, :2]
-    local = torch.nn.functional.pad(plane, (0, 1), value=1.0)
-    directions = torch.einsum("nij,nj->ni", c2w[:, :, :3], torch.nn.functional.normalize(local, dim=-1))
-    return RayBatch(c2w[:, :, 3], directions)
+    plane = local[:, :2] / depth[:, None]
+    if camera.lens is not None:
+        plane = torch.as_tensor(camera.lens.bend(plane.detach().cpu().double().numpy())).to(plane)
+    return Projection(plane * intrinsics[:2] + intrinsics[2:], depth)
 
 
 def camera_rays(camera: Camera, dtype: torch.dtype = torch.float32) -> RayBatch:
     """Rays through all pixels, row by row: N = height · width, in the frame of the camera's pose."""
     pixel = torch.arange(camera.height * camera.width)
-    intrinsics = torch.as_tensor(camera.intrinsics, dtype=dtype).expand(len(pixel), 4)
-    c2w = torch.as_tensor(camera.c2w, dtype=dtype).expand(len(pixel), 3, 4)
-    return pixel_rays(intrinsics, c2w, pixel % camera.width, pixel // camera.width)
+    return CameraRays([camera], dtype=dtype)(torch.zeros_like(pixel), pixel)
+
+
+class CameraRays:
+    """Rays through the centres of pixels of many cameras, in the frame of their poses.
+
+    The rays of a pinhole are computed when asked for; those of a lens are looked up, as its equations have no closed
+    inverse: 8 bytes a pixel, shared by cameras that differ in their pose alone.
+
+    Raises:
+        UserError: a lens shows nothing at some of its pixels.
+    """
+
+    def __init__(
+        self, cameras: Sequence[Camera], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
+    ) -> None:
+        self._intrinsics = torch.tensor(np.stack([c.intrinsics for c in cameras]), dtype=dtype, device=device)
+        self._c2w = torch.tensor(np.stack([c.c2w for c in cameras]), dtype=dtype, device=device)
+        self._width = torch.tensor([camera.width for camera in cameras], device=device)
+        kinds = {_shape(camera): camera for camera in cameras if camera.lens is not None}
+        if kinds:
+            sizes = [camera.width * camera.height for camera in kinds.values()]
+            starts = dict(zip(kinds, itertools.accumulate(sizes, initial=0), strict=False))
+            self._lens_start = torch.tensor([starts.get(_shape(camera), -1) for camera in cameras], device=device)
+            planes = np.concatenate([_straight_plane(camera) for camera in kinds.values()])
+            self._lens_plane = torch.tensor(planes, dtype=dtype, device=device)
+        else:
+            self._lens_plane = None
+
+    def __call__(self, camera: Int[Tensor, " N"], pixel: Int[Tensor, " N"]) -> RayBatch:
+        """Rays of cameras, by number, through pixels, counted row by row."""
+        width, intrinsics, c2w = self._width[camera], self._intrinsics[camera], self._c2w[camera]
+        corner = torch.stack([pixel % width, pixel // width], dim=-1)
+        plane = (corner.to(intrinsics.dtype) + 0.5 - intrinsics[:, 2:]) / intrinsics[:, :2]
+        if self._lens_plane is not None:
+            start = self._lens_start[camera]
+            looked_up = self._lens_plane[torch.where(start < 0, 0, start + pixel)]
+            plane = torch.where((start < 0)[:, None], plane, looked_up)
+        local = torch.nn.functional.pad(plane, (0, 1), value=1.0)
+        directions = torch.einsum("nij,nj->ni", c2w[:, :, :3], torch.nn.functional.normalize(local, dim=-1))
+        return RayBatch(c2w[:, :, 3], directions)
+
+
+def _shape(camera: Camera) -> tuple[Lens | None, float, float, float, float, int, int]:
+    """All of a camera but its pose."""
+    return (camera.lens, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+
+
+def _straight_plane(camera: Camera) -> Float64[np.ndarray, "P 2"]:
+    """Where the rays through the pixels of a camera with a lens meet the plane at unit distance, row by row."""
+    rows, columns = np.mgrid[: camera.height, : camera.width].reshape(2, -1) + 0.5
+    bent = (np.stack([columns, rows], axis=1) - camera.intrinsics[2:]) / camera.intrinsics[:2]
+    plane = camera.lens.straighten(bent)
+    if blind := int(np.isnan(plane).any(axis=1).sum()):
+        raise UserError(
+            f"a camera of the lens {camera.lens.model} shows nothing at {blind} of its {len(plane)} pixels",
+            "crop or undistort the images, or calibrate the camera again",
+        )
+    return plane

@@ -17,7 +17,6 @@ from neilfpp_method.data.views import View, camera_rays, project
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import Maps
 from neilfpp_method.shading.color import srgb_to_linear
-from neilfpp_method.structures import PixelBatch
 from neilfpp_method.train.run import Run
 
 __all__ = [
@@ -116,17 +115,20 @@ def mask_source(capture: Capture) -> str:
     "true depth" where every view has it; else "capture masks" where there are any, or where pixels that show exactly the
     background stand for them; else "rendered opacity" above one half, which lets the estimate choose its pixels.
     """
-    return _mask_source(_known_depths(capture), _stored_pixels(capture))
+    return _mask_source(_known_depths(capture), PixelDataset(capture, capture.test_views))
 
 
 def known_test_views(run: Run, rendered: Sequence[RenderedView]) -> HeldOut:
-    """What is known of the test views; `rendered` are the same views, in order. Masks as `mask_source` says."""
+    """What is known of the test views; `rendered` are the same views, in order.
+
+    Masks are as `mask_source` says, without the pixels that the capture marks as invalid.
+    """
     capture, truth = run.capture, Truth(run.capture)
-    depths, stored = _known_depths(capture), _stored_pixels(capture)
+    depths, stored = _known_depths(capture), PixelDataset(capture, capture.test_views)
     source = _mask_source(depths, stored)
     masks = {
         "true depth": lambda i: depths[i] > 0,
-        "capture masks": lambda i: stored[i].mask > 0.5,
+        "capture masks": lambda i: stored.view(i).mask > 0.5,
         "rendered opacity": lambda i: torch.from_numpy(rendered[i].maps["opacity"] > 0.5),
     }[source]
     views = []
@@ -135,8 +137,8 @@ def known_test_views(run: Run, rendered: Sequence[RenderedView]) -> HeldOut:
         views.append(
             KnownView(
                 view=view,
-                image=_image(stored[i].color, view),
-                mask=_image(masks(i), view)[..., 0],
+                image=_image(stored.view(i).color, view),
+                mask=_image(masks(i).reshape(-1) & stored.valid(i), view)[..., 0],
                 depth=None if depths[i] is None else _image(depths[i], view)[..., 0],
                 normal=None if normal is None else _image(normal, view),
                 material=material and {f.name: _image(getattr(material, f.name), view) for f in fields(material)},
@@ -150,15 +152,11 @@ def _known_depths(capture: Capture) -> list[Float[Tensor, " P"] | None]:
     return [truth.depth(view) for view in capture.test_views]
 
 
-def _stored_pixels(capture: Capture) -> list[PixelBatch]:
-    pixels = PixelDataset(capture, capture.test_views)
-    return [pixels.view(i) for i in range(len(capture.test_views))]
-
-
-def _mask_source(depths: Sequence[Tensor | None], stored: Sequence[PixelBatch]) -> str:
+def _mask_source(depths: Sequence[Tensor | None], stored: PixelDataset) -> str:
     if all(depth is not None for depth in depths):
         return "true depth"
-    return "capture masks" if any((batch.mask < 1).any() for batch in stored) else "rendered opacity"
+    masked = any((stored.view(i).mask < 1).any() for i in range(len(depths)))
+    return "capture masks" if masked else "rendered opacity"
 
 
 def _image(values: Shaped[Tensor, "P ..."], view: View) -> Shaped[np.ndarray, "H W C"]:
@@ -197,7 +195,7 @@ def mean_observed_color(capture: Capture, points: Float[Tensor, "P 3"]) -> Float
         inside = (seen.depth > 0) & (seen.pixel >= 0).all(-1) & (seen.pixel < size).all(-1)
         column, row = torch.where(inside[:, None], seen.pixel, 0.0).long().unbind(-1)
         index = row * view.camera.width + column
-        visible = inside & ((truth.depth(view)[index] - seen.depth).abs() <= VISIBLE)
+        visible = inside & pixels.valid(i)[index] & ((truth.depth(view)[index] - seen.depth).abs() <= VISIBLE)
         color = pixels.view(i).color[index]
         total += visible[:, None] * (color if capture.hdr else srgb_to_linear(color))
         count += visible[:, None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -26,7 +27,7 @@ class BrdfSample:
 
 
 class BrdfField(nn.Module):
-    """Every parameter is ½ + ½ tanh of an output of the network, and starts close to ½."""
+    """Every parameter is ½ + ½ tanh of an output of the network, and starts close to ½, base colour to what is set."""
 
     def __init__(self, config: BrdfConfig, radius: float) -> None:
         super().__init__()
@@ -35,6 +36,8 @@ class BrdfField(nn.Module):
             self.encoding.width, 5, config.layers, config.width, config.activation, config.skip, output_scale=1e-2
         )
         nn.init.zeros_(self.mlp.layers[-1].bias)
+        with torch.no_grad():
+            self.mlp.layers[-1].bias[:3] = math.atanh(2 * config.initial_base_color - 1)
 
     def forward(self, x: Float[Tensor, "N 3"]) -> Material:
         return _material(torch.tanh(self.mlp(self.encoding(x))))

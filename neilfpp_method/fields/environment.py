@@ -1,7 +1,6 @@
 """L for light from far away: an environment map, the same at every point, which can be importance-sampled.
 
-The map is in latitude and longitude about +z: row j is at the angle θ = π j/(h − 1) from +z, column i at the azimuth
-φ = 2π (i + ½)/w, and the direction there is (sin φ sin θ, cos φ sin θ, cos θ).
+The map is laid out as `direction_map` says.
 """
 
 from __future__ import annotations
@@ -12,8 +11,8 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch.nn import functional
 
+from neilfpp_method.fields.direction_map import interpolate
 from neilfpp_method.shading.color import luminance
 from neilfpp_method.structures import IncidentSamples
 
@@ -47,15 +46,9 @@ class EnvironmentLight(nn.Module):
         edges = (torch.arange(height + 1) - 0.5).clamp(0, height - 1) * math.pi / (height - 1)
         self.register_buffer("cos_edges", edges.cos(), persistent=False)
 
-    def radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
+    def radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "#N S 3"]) -> Float[Tensor, "#N S 3"]:
         """Radiance > 0 from wi, whatever x; what stands between is not this model's."""
-        column, row = self._columns_and_rows(wi)
-        _, height, width = self.log_radiance.shape
-        # One column more on each side closes the map; the azimuth of a column is at its middle.
-        closed = torch.cat((self.log_radiance[..., -1:], self.log_radiance, self.log_radiance[..., :1]), -1)
-        at = torch.stack((2 * (column + 1) / (width + 1) - 1, 2 * row / (height - 1) - 1), -1)
-        values = functional.grid_sample(closed[None], at[None].to(closed.dtype), align_corners=True)
-        return values[0].permute(1, 2, 0).exp()
+        return interpolate(self.log_radiance, wi).exp()
 
     @torch.no_grad()
     def sample(self, like: Float[Tensor, "N 3"], count: int, stochastic: bool) -> IncidentSamples:

@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from neilfpp_method.config import IncidentLightConfig
 from neilfpp_method.fields.encodings import direction_encoding
 from neilfpp_method.fields.mlp import Mlp
 
-__all__ = ["IncidentLightField"]
+__all__ = ["IncidentLightField", "exponential"]
 
 LARGEST_EXPONENT = 20.0  # radiance stays within e^±20 of its start
 
@@ -44,9 +44,24 @@ class IncidentLightField(nn.Module):
         nn.init.uniform_(self.position_part.weight, -bound, bound)
         self.tail.activation.init_(self.tail.layers[0])
 
-    def radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
-        """Radiance > 0 that arrives at x from wi, which points away from x."""
-        return self.at_positions(x, self.of_directions(wi))
+    def radiance(
+        self,
+        x: Float[Tensor, "N 3"],
+        wi: Float[Tensor, "S 3"] | Float[Tensor, "#N S 3"],
+        asked: Bool[Tensor, "N S"] | None = None,
+    ) -> Float[Tensor, "N S 3"]:
+        """Radiance > 0 that arrives at x from wi, which points away from x.
+
+        Directions that all points share, (S, 3) or (1, S, 3), go through their part of the network once. Only the pairs of
+        a point and a direction that are `asked` go through the rest, where that is given; the others are 0.
+        """
+        directions = self.of_directions(wi if wi.ndim == 3 else wi[None])
+        if asked is None:
+            return self.at_positions(x, directions)
+        point, direction = torch.nonzero(asked, as_tuple=True)
+        shared = directions[0, direction] if len(directions) == 1 else directions[point, direction]
+        pairs = self._from_middle(shared + self.position_part(x)[point])
+        return pairs.new_zeros(*asked.shape, 3).index_put((point, direction), pairs)
 
     def of_directions(self, wi: Float[Tensor, "... 3"]) -> Float[Tensor, "... W"]:
         """The middle layer before its activation, as far as the direction decides it."""
@@ -54,12 +69,16 @@ class IncidentLightField(nn.Module):
 
     def at_positions(self, x: Float[Tensor, "N 3"], directions: Float[Tensor, "#N S W"]) -> Float[Tensor, "N S 3"]:
         """The rest of the network, from the middle layer on."""
-        middle = self.tail.activation.value(directions + self.position_part(x)[:, None])
-        exponent = self.log_base * self.tail(middle)
-        radiance = self.initial_radiance * torch.exp(_limited(exponent, LARGEST_EXPONENT))
-        return radiance.expand(*radiance.shape[:-1], 3)
+        return self._from_middle(directions + self.position_part(x)[:, None])
+
+    def _from_middle(self, middle: Float[Tensor, "*B W"]) -> Float[Tensor, "*B 3"]:
+        return exponential(self.log_base * self.tail(self.tail.activation.value(middle)), self.initial_radiance)
 
 
-def _limited(z: Float[Tensor, "N S C"], largest: float) -> Float[Tensor, "N S C"]:
-    """z clamped to ±largest, with derivative 1 everywhere: a value beyond the limit still feels the loss."""
-    return z.clamp(-largest, largest).detach() + (z - z.detach())
+def exponential(exponent: Float[Tensor, "*B C"], initial_radiance: float) -> Float[Tensor, "*B 3"]:
+    """initial_radiance · e^exponent, one channel for all three colours where there is one.
+
+    The exponent is clamped, with derivative 1 everywhere: a value beyond the limit still feels the loss.
+    """
+    limited = exponent.clamp(-LARGEST_EXPONENT, LARGEST_EXPONENT).detach() + (exponent - exponent.detach())
+    return (initial_radiance * limited.exp()).expand(*exponent.shape[:-1], 3)

@@ -97,13 +97,14 @@ class MeshHost(nn.Module):
         directions = wi.reshape(-1, 3)
         origins = (x[:, None] + self.offset * wi).reshape(-1, 3)
         met = self.cross(RayBatch(origins, directions))
-        radiance, hit = torch.zeros_like(directions), torch.zeros_like(directions[:, 0], dtype=torch.bool)
-        hit[met.rows] = True
+        radiance, distance = torch.zeros_like(directions), torch.full_like(directions[:, 0], torch.inf)
+        distance[met.rows] = (met.position - origins[met.rows]).norm(dim=-1)
         seen = torch.nonzero(met.outside)[:, 0]
         for part in seen.split(RADIANCE_AT_ONCE):
             rows, position = met.rows[part], met.position[part]
             radiance[rows] = self.radiance_field(position, -directions[rows], met.normal[part], position[:, :0])
-        return SceneLight(hit.view(wi.shape[:2]), radiance.view(wi.shape))
+        distance = distance.view(wi.shape[:2])
+        return SceneLight(distance.isfinite(), radiance.view(wi.shape), distance)
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
         """R, and the background where it is a field."""

@@ -20,6 +20,7 @@ from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayB
 from neilfpp_method.volume.compositing import Weights, composite, render_weights
 from neilfpp_method.volume.density import LaplaceDensity
 from neilfpp_method.volume.distance_grid import cell_size, sample_grid, trace_grid
+from neilfpp_method.volume.empty_space import EmptySpace
 from neilfpp_method.volume.intersect import sphere_interval
 from neilfpp_method.volume.samplers import error_bounded_samples, uniform_samples
 
@@ -72,6 +73,7 @@ class VolSdfHost(nn.Module):
         self.background = (
             InvertedSphere(config.background, radius, radiance_scale) if background == "inverted_sphere" else None
         )
+        self.empty_space = EmptySpace(radius) if config.volume.skip_empty else None
         self.register_buffer("background_color", torch.tensor(background_color))
         hard = config.inter_reflection.mode == "hard"
         resolution = config.inter_reflection.grid_resolution if hard else 0
@@ -88,8 +90,11 @@ class VolSdfHost(nn.Module):
     def render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
         """As `render`, with those of eikonal, hessian, surface, point_cloud and mask that `names` holds."""
         march = self._march(batch.rays)
-        if self.grid_age is not None and march.surface.distance.requires_grad:
-            self.grid_age += 1
+        if march.surface.distance.requires_grad:
+            if self.grid_age is not None:
+                self.grid_age += 1
+            if self.empty_space is not None:
+                self.empty_space.moved()
         return RegularisedHits(march.hits, self._regularisers(march, batch, names))
 
     def surface_width(self) -> Float[Tensor, ""]:
@@ -125,7 +130,8 @@ class VolSdfHost(nn.Module):
         radiance[rows] = self.radiance_field(
             points, -directions[rows], safe_normalize(surface.gradient), surface.feature
         )
-        return SceneLight(found.hit.view(wi.shape[:2]), radiance.view(wi.shape))
+        distance = torch.where(found.hit, found.distance, torch.inf)
+        return SceneLight(found.hit.view(wi.shape[:2]), radiance.view(wi.shape), distance.view(wi.shape[:2]))
 
     def get_extra_state(self) -> dict[str, int | None]:
         """The age of the distance grid, for checkpoints."""
@@ -171,6 +177,8 @@ class VolSdfHost(nn.Module):
 
     def _march(self, rays: RayBatch) -> March:
         interval = sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
+        if self.empty_space is not None and self.training:
+            interval = self.empty_space.narrow(self.sdf, rays, interval, self.surface_width())
         distances = self._sample(rays, interval.near, interval.far)
         points = rays.origins[:, None] + distances[..., None] * rays.directions[:, None]
         surface = self._surface(points.reshape(-1, 3))

@@ -29,6 +29,8 @@ class GridSpec:
     """Table rows, per level: every vertex of a dense level, a power of two for a hashed one."""
     features: int
     """Length of a table row."""
+    backend: str = "auto"
+    """Who computes it: `HashGridConfig.backend`."""
 
     @cached_property
     def offsets(self) -> tuple[int, ...]:
@@ -73,4 +75,4 @@ def grid_spec(config: HashGridConfig) -> GridSpec:
     growth = (finest / base) ** (1 / max(config.levels - 1, 1))
     resolutions = tuple(round(base * growth**level) for level in range(config.levels))
     entries = tuple(min((r + 1) ** 3, 2**config.log2_entries) for r in resolutions)
-    return GridSpec(resolutions, entries, config.features)
+    return GridSpec(resolutions, entries, config.features, config.backend)

@@ -6,25 +6,28 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
 from torch import Tensor
 
+from neilfpp_method.data.drawing import ValidPixels
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.errors import UserError
 from neilfpp_method.plugin.dataparser import capture_of
 from neilfpp_method.structures import PixelBatch
 
-__all__ = ["PIXELS", "CaptureDataManager", "CaptureDataManagerConfig", "CaptureDataset", "pixel_batch"]
+__all__ = ["PIXELS", "VALID", "CaptureDataManager", "CaptureDataManagerConfig", "CaptureDataset", "pixel_batch"]
 
 PIXELS = "neilfpp_pixels"
 """Key of a dataset's metadata under which the model finds the `PixelDataset`."""
 
 # Not under the name `mask`: nerfstudio draws no pixel outside of that, and L_vol needs those as well.
 FACTS = {"object_mask": "mask", "mask_known": "mask_known", "image_gradient": "image_gradient"}
+VALID = "valid"
+"""Key of a batch of pixels under which they say whether they count."""
 
 
 class CaptureDataset(InputDataset):
@@ -34,7 +37,7 @@ class CaptureDataset(InputDataset):
         UserError: the views differ in size, or are to be scaled.
     """
 
-    exclude_batch_keys_from_device: ClassVar = [*InputDataset.exclude_batch_keys_from_device, *FACTS]
+    exclude_batch_keys_from_device: ClassVar = [*InputDataset.exclude_batch_keys_from_device, *FACTS, VALID]
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
         super().__init__(dataparser_outputs, scale_factor)
@@ -52,11 +55,13 @@ class CaptureDataset(InputDataset):
         return self._image(image_idx, self.pixels.view(image_idx).color)
 
     def get_metadata(self, data: dict[str, Any]) -> dict[str, Tensor]:
-        """What the losses ask of each pixel, (H, W, 1)."""
-        pixels = self.pixels.view(data["image_idx"])
-        return {key: self._image(data["image_idx"], getattr(pixels, name)) for key, name in FACTS.items()}
+        """What the losses ask of each pixel, and which can be drawn, (H, W, 1)."""
+        i = data["image_idx"]
+        pixels = self.pixels.view(i)
+        facts = {key: self._image(i, getattr(pixels, name)) for key, name in FACTS.items()}
+        return facts | {VALID: self._image(i, self.pixels.valid(i))}
 
-    def _image(self, i: int, values: Tensor) -> Float[Tensor, "H W C"]:
+    def _image(self, i: int, values: Tensor) -> Shaped[Tensor, "H W C"]:
         camera = self.pixels.views[i].camera
         return values.reshape(camera.height, camera.width, -1)
 
@@ -69,22 +74,28 @@ def pixel_batch(origins: Tensor, directions: Tensor, batch: dict[str, Any]) -> P
 
 
 class CapturePixelSampler(PixelSampler):
-    """Draws what `PixelDataset.sample` would: one number a ray, that counts all pixels view after view, row by row.
+    """Draws what `PixelDataset.sample` would: one number a ray, that counts valid pixels view after view, row by row.
 
     A step then learns from the same pixels as the same step of the standalone loop, with masks or without.
     """
+
+    _valid: Tensor | None = None
+    _pixels: ValidPixels
 
     def collate_image_dataset_batch(
         self, batch: dict[str, Any], num_rays_per_batch: int, keep_full_image: bool = False
     ) -> dict[str, Tensor]:
         """Pixels of a batch of images, and their `indices`: view, row, column."""
         del keep_full_image  # no model of ours looks at whole images in training
-        count, height, width, _ = batch["image"].shape
-        number = torch.randint(count * height * width, (num_rays_per_batch,))
-        row, column = number // width % height, number % width
+        _, height, width, _ = batch["image"].shape
         # Nerfstudio has shuffled the images when it loaded them.
-        place = batch["image_idx"].cpu().argsort()[number // (height * width)]
-        drawn = {key: values[place, row, column] for key, values in batch.items() if key != "image_idx"}
+        order = batch["image_idx"].cpu().argsort()
+        if self._valid is not batch[VALID]:
+            self._valid, self._pixels = batch[VALID], ValidPixels(batch[VALID].cpu()[order].flatten())
+        number = self._pixels.draw(num_rays_per_batch)
+        row, column = number // width % height, number % width
+        place = order[number // (height * width)]
+        drawn = {key: values[place, row, column] for key, values in batch.items() if key not in ("image_idx", VALID)}
         return drawn | {"indices": torch.stack([batch["image_idx"].cpu()[place], row, column], dim=-1)}
 
 

@@ -19,6 +19,8 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from neilfpp_method.data.capture import Capture, load_capture
+from neilfpp_method.data.formats.nerfstudio_lens import FISHEYE, lens_from_nerfstudio, nerfstudio_coefficients
+from neilfpp_method.data.formats.transforms import FLIP
 from neilfpp_method.data.images import image_header
 from neilfpp_method.data.views import Camera, Normalisation, View, check_camera
 from neilfpp_method.errors import UserError
@@ -26,8 +28,8 @@ from neilfpp_method.errors import UserError
 __all__ = ["CaptureParser", "CaptureParserConfig", "capture_of", "neilfpp_data"]
 
 CAPTURE = "neilfpp_capture"
-# OpenCV's camera (x right, y down, z forward) and OpenGL's (x right, y up, z back).
-FLIP = np.array([1.0, -1.0, -1.0, 1.0])
+ORDER = ("k1", "k2", "k3", "k4", "p1", "p2")
+MODELS = {CameraType.PERSPECTIVE.value: "OPENCV", CameraType.FISHEYE.value: FISHEYE}
 
 
 @dataclass
@@ -37,10 +39,12 @@ class CaptureParserConfig(DataParserConfig):
     _target: type = field(default_factory=lambda: CaptureParser)
     data: Path = Path()
     """Folder of the capture."""
+    format: Optional[str] = None  # noqa: UP045  (tyro reads it at run time on every Python)
+    """The capture's format (see docs/captures.md); none: told from what is in the folder."""
     test_every: Optional[int] = None  # noqa: UP045  (tyro reads it at run time on every Python)
-    """Hold out every k-th view; none: as the capture's split.json says, else every 8th."""
+    """Hold out every k-th view; none: as the capture says, else every 8th."""
     response: Literal["auto", "linear", "srgb"] = "auto"
-    """Whether pixels are linear radiance or display values; auto: floating-point files are linear."""
+    """Whether pixels are linear radiance or display values; auto: as the capture says, else floating-point files are linear."""
 
 
 @dataclass
@@ -50,7 +54,8 @@ class CaptureParser(DataParser):
     config: CaptureParserConfig
 
     def _generate_dataparser_outputs(self, split: str = "train", **_) -> DataparserOutputs:
-        capture = load_capture(self.config.data, test_every=self.config.test_every, response=self.config.response)
+        chosen = self.config
+        capture = load_capture(chosen.data, chosen.format, chosen.test_every, response=chosen.response)
         # Nerfstudio cannot do without a view to evaluate; where none is held out it gets one from the training set.
         views = capture.train_views if split == "train" else capture.test_views or capture.train_views[:1]
         frame = capture.normalisation
@@ -66,27 +71,51 @@ class CaptureParser(DataParser):
         )
 
 
-def _cameras(pinholes: Sequence[Camera]) -> Cameras:
+def _cameras(cameras: Sequence[Camera]) -> Cameras:
     def column(name: str) -> torch.Tensor:
-        return torch.tensor([[getattr(pinhole, name)] for pinhole in pinholes])
+        return torch.tensor([[getattr(camera, name)] for camera in cameras])
 
-    poses = np.stack([pinhole.c2w * FLIP for pinhole in pinholes])
+    poses = np.stack([camera.c2w * FLIP for camera in cameras])
     intrinsics = {name: column(name).float() for name in ("fx", "fy", "cx", "cy")}
     sizes = {name: column(name) for name in ("width", "height")}
-    return Cameras(torch.from_numpy(poses).float(), **intrinsics, **sizes, camera_type=CameraType.PERSPECTIVE)
+    bent = any(camera.lens is not None for camera in cameras)
+    kinds = [CameraType.FISHEYE if _is_fisheye(camera) else CameraType.PERSPECTIVE for camera in cameras]
+    return Cameras(
+        torch.from_numpy(poses).float(),
+        **intrinsics,
+        **sizes,
+        distortion_params=torch.tensor([_distortion(camera) for camera in cameras]) if bent else None,
+        camera_type=torch.tensor([[kind.value] for kind in kinds]),
+    )
+
+
+def _is_fisheye(camera: Camera) -> bool:
+    return camera.lens is not None and camera.lens.model == FISHEYE
+
+
+def _distortion(camera: Camera) -> list[float]:
+    """A lens as nerfstudio's k1, k2, k3, k4, p1, p2.
+
+    Raises:
+        UserError: nerfstudio has no such lens.
+    """
+    known = nerfstudio_coefficients(camera)
+    if known is None:
+        raise UserError(f"nerfstudio has no lens {camera.lens.model}", "undistort the images, or use `neilfpp train`")
+    return [known.get(name, 0.0) for name in ORDER]
 
 
 def capture_of(outputs: DataparserOutputs) -> Capture:
     """The capture behind a dataparser's outputs: that of `neilfpp-data`, or one made of what another dataparser found.
 
     Raises:
-        UserError: the cameras are no pinholes.
+        UserError: a camera has no image plane: it is a panorama, or orthographic.
     """
     if CAPTURE in outputs.metadata:
         return outputs.metadata[CAPTURE]
     masks = outputs.mask_filenames or [None] * len(outputs.image_filenames)
     views = tuple(
-        View(f"{i:05d}", i, _pinhole(outputs.cameras, i), Path(image), mask and Path(mask))
+        View(f"{i:05d}", i, _camera(outputs.cameras, i), Path(image), mask and Path(mask))
         for i, (image, mask) in enumerate(zip(outputs.image_filenames, masks, strict=True))
     )
     kinds = {image_header(view.image).hdr for view in views}
@@ -96,16 +125,19 @@ def capture_of(outputs: DataparserOutputs) -> Capture:
     return Capture(folder, "nerfstudio", folder, views, Normalisation(1.0, (0.0, 0.0, 0.0)), kinds.pop(), frozenset())
 
 
-def _pinhole(cameras: Cameras, i: int) -> Camera:
-    bent = cameras.distortion_params is not None and bool(cameras.distortion_params[i].any())
-    if bent or int(cameras.camera_type[i]) != CameraType.PERSPECTIVE.value:
-        raise UserError(f"camera {i} is not a pinhole", "undistort the images")
+def _camera(cameras: Cameras, i: int) -> Camera:
+    kind = int(cameras.camera_type[i])
+    if kind not in MODELS:
+        raise UserError(f"camera {i} is neither perspective nor fisheye", "cut perspective images out of it")
+    bends = torch.zeros(6) if cameras.distortion_params is None else cameras.distortion_params[i]
+    distortion = dict(zip(ORDER, bends.double().tolist(), strict=True))
     c2w = np.eye(4)
     c2w[:3] = cameras.camera_to_worlds[i].double().numpy() * FLIP
     intrinsics = (float(getattr(cameras, name)[i]) for name in ("fx", "fy", "cx", "cy"))
-    pinhole = Camera(*intrinsics, int(cameras.width[i]), int(cameras.height[i]), np.linalg.inv(c2w))
-    check_camera(pinhole, f"camera {i}")
-    return pinhole
+    lens = lens_from_nerfstudio(MODELS[kind], distortion, f"camera {i}")
+    camera = Camera(*intrinsics, int(cameras.width[i]), int(cameras.height[i]), np.linalg.inv(c2w), lens)
+    check_camera(camera, f"camera {i}")
+    return camera
 
 
 neilfpp_data = DataParserSpecification(CaptureParserConfig(), "Captures that `neilfpp train` reads, HDR included.")

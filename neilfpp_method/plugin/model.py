@@ -24,7 +24,7 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.hosts.nerfstudio import OWN_LOSSES, NerfstudioHost
 from neilfpp_method.model import Maps, NeilfModel
-from neilfpp_method.plugin.datamanager import PIXELS, pixel_batch
+from neilfpp_method.plugin.datamanager import PIXELS, VALID, pixel_batch
 from neilfpp_method.plugin.foreign import build_foreign
 from neilfpp_method.presets import free_light, preset
 from neilfpp_method.schedule import Stage, active_losses, stage_at, stage_steps, weigh
@@ -211,7 +211,7 @@ class NeilfMethod(Model):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """PSNR and SSIM of display values over the object, as `neilfpp eval` has them, and all maps as pictures."""
         truth, rgb, volume = (self._display(image.to(self.device)) for image in _images(batch, outputs))
-        mask = batch["object_mask"][..., 0].cpu().numpy() > 0.5
+        mask = ((batch["object_mask"] > 0.5) & batch[VALID])[..., 0].cpu().numpy()
         arrays = {"": rgb, "volume_": volume}
         figures = {
             f"{name}{kind}": measure(image.cpu().numpy(), truth.cpu().numpy(), mask)

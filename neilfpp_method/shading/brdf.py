@@ -153,7 +153,7 @@ class Cosines:
     d: Float[Tensor, "N S"]
 
 
-def cosines(n: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Cosines:
+def cosines(n: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"], wi: Float[Tensor, "#N S 3"]) -> Cosines:
     """The cosines that the BRDF is a function of, for unit vectors.
 
     h is never formed: |wi + wo| = 2 wo·h and (wo·h)² = (1 + wi·wo)/2. For wi = −wo there is no h; the floor on (wo·h)²
@@ -199,7 +199,7 @@ def specular_terms(
     roughness: Float[Tensor, "N 1"],
     n: Float[Tensor, "N 3"],
     wo: Float[Tensor, "N 3"],
-    wi: Float[Tensor, "N S 3"],
+    wi: Float[Tensor, "#N S 3"],
     lobe: Lobe,
 ) -> SpecularTerms:
     """The scalars of the specular lobe; zero for wi at or below the horizon.
@@ -219,7 +219,7 @@ def evaluate(
     material: Material,
     n: Float[Tensor, "N 3"],
     wo: Float[Tensor, "N 3"],
-    wi: Float[Tensor, "N S 3"],
+    wi: Float[Tensor, "#N S 3"],
     lobe: Lobe,
     specular: bool = True,
 ) -> BrdfValue:

@@ -14,10 +14,11 @@ def at_least_float32(tensor: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]
     return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
 
 
-def dot(directions: Float[Tensor, "N S 3"], vector: Float[Tensor, "N 3"]) -> Float[Tensor, "N S"]:
+def dot(directions: Float[Tensor, "#N S 3"], vector: Float[Tensor, "N 3"]) -> Float[Tensor, "N S"]:
     """The inner product of each direction with the vector of its point, in at least float32.
 
-    Written out: it needs no (N, S, 3) product, and neither autocast nor TF32 may round it as they round a matmul.
+    Directions that all points share are (1, S, 3). Written out: it needs no (N, S, 3) product, and neither autocast nor
+    TF32 may round it as they round a matmul.
     """
     a, b = at_least_float32(directions), at_least_float32(vector).unsqueeze(1)
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]

@@ -23,7 +23,7 @@ def shade(
     n: Float[Tensor, "N 3"],
     wo: Float[Tensor, "N 3"],
     samples: IncidentSamples,
-    incident_radiance: Float[Tensor, "N S 3"],
+    incident_radiance: Float[Tensor, "#N S 3"],
     lobe: Lobe,
     specular: bool = True,
 ) -> Shading:
@@ -47,6 +47,6 @@ def shade(
     return Shading(diffuse + reflected, diffuse, reflected)
 
 
-def _integrate(weight: Float[Tensor, "N S"], radiance: Float[Tensor, "N S 3"]) -> Float[Tensor, "N 3"]:
+def _integrate(weight: Float[Tensor, "N S"], radiance: Float[Tensor, "#N S 3"]) -> Float[Tensor, "N 3"]:
     """Σ weight · radiance over the directions; as a matmul, autocast would do it in half precision."""
     return (weight.unsqueeze(-1) * radiance).sum(1)

@@ -1,9 +1,9 @@
 """Incident directions and the densities that drew them.
 
 Every sampler integrates the same integral: the mean over S of f(wi)/pdf(wi) estimates ∫ f dwi over the hemisphere about
-n. All map one lattice of the unit square to directions; they differ in the density. With `stochastic` each point's
-lattice is turned by a random azimuth and each sample moves uniformly within its stratum, so that the expectation is
-exact; without it the lattice lies at the midpoints, the same at every call.
+n. A `Technique` maps a lattice of the unit square to directions; techniques differ in the density, and `combine` joins
+several by the balance heuristic. With `stochastic` each point's lattice is turned at random and each sample moves evenly
+within its stratum, so that the expectation is exact; without it the lattice lies at the midpoints, the same at every call.
 
 Directions and densities are constants, without gradient. The estimator's gradient is then the mean of (∂f)/pdf, which
 estimates ∂∫f without bias: with f·cos zero at the horizon, the moving edge of the hemisphere adds nothing.
@@ -12,6 +12,7 @@ estimates ∂∫f without bias: with f·cos zero at the horizon, the moving edge
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -21,22 +22,41 @@ from torch import Tensor
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.brdf import Lobe, cosines
 from neilfpp_method.shading.frame import at_least_float32, dot, local_frame
+from neilfpp_method.shading.tabulated import DirectionTable
 from neilfpp_method.structures import IncidentSamples
 
 __all__ = [
+    "Technique",
+    "combine",
     "cosine",
     "fibonacci",
-    "mis",
     "pdf_cosine",
     "pdf_fibonacci",
-    "pdf_mis",
     "pdf_specular_lobe",
     "sample_directions",
+    "shared_sphere",
     "specular_lobe",
+    "tabulated",
 ]
 
 GOLDEN_TURN = (3 - math.sqrt(5)) / 2
 """The golden angle as a share of a full turn."""
+
+LOBE_SHARE, LIGHT_SHARE = 0.25, 0.5
+"""Shares of the directions of mis, where there is a light to sample; the cosine has the rest (docs/performance.md)."""
+
+
+@dataclass(frozen=True)
+class Technique:
+    """One way to draw directions at N points.
+
+    Attributes:
+        draw: `draw(count, stochastic)` gives (N, count, 3) unit directions.
+        pdf: the density (N, S) of any directions (N, S, 3), per steradian.
+    """
+
+    draw: Callable[[int, bool], Float[Tensor, "N S 3"]]
+    pdf: Callable[[Float[Tensor, "N S 3"]], Float[Tensor, "N S"]]
 
 
 @dataclass(frozen=True)
@@ -89,74 +109,84 @@ def pdf_specular_lobe(
     return lobe.pdf_h(cos.h.abs(), roughness) / (4 * cos.d)
 
 
-def pdf_mis(
-    wi: Float[Tensor, "N S 3"],
-    n: Float[Tensor, "N 3"],
-    wo: Float[Tensor, "N 3"],
-    roughness: Float[Tensor, "N 1"],
-    lobe: Lobe,
-    cosine_share: float = 0.5,
-) -> Float[Tensor, "N S"]:
-    """The mixture of `pdf_cosine` and `pdf_specular_lobe`."""
-    specular = pdf_specular_lobe(wi, n, wo, roughness, lobe)
-    return cosine_share * pdf_cosine(wi, n) + (1 - cosine_share) * specular
+# ----------------------------------------------------------------------------------------------------------- techniques
+
+
+def fibonacci(n: Float[Tensor, "N 3"]) -> Technique:
+    """The paper's lattice, with cells of equal solid angle and samples at their midpoints, n·wi = 1 − (k + ½)/S."""
+    return _hemisphere(n, lambda u: 1 - u, pdf_fibonacci)
+
+
+def cosine(n: Float[Tensor, "N 3"]) -> Technique:
+    """Directions in proportion to n·wi: no variance on a Lambertian surface under constant light."""
+    return _hemisphere(n, lambda u: (1 - u).sqrt(), pdf_cosine)
+
+
+def _hemisphere(
+    n: Float[Tensor, "N 3"], height: Callable[[Tensor], Tensor], pdf: Callable[[Tensor, Tensor], Tensor]
+) -> Technique:
+    """Directions about n whose cosine is `height` of a uniform number, at an even azimuth."""
+    n = at_least_float32(n)
+
+    def draw(count: int, stochastic: bool) -> Float[Tensor, "N S 3"]:
+        lattice = _lattice(n, count, stochastic)
+        return _about(n, height(lattice.u), lattice.v)
+
+    return Technique(draw, lambda wi: pdf(wi, n))
+
+
+def specular_lobe(n: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"], roughness: Float[Tensor, "N 1"], lobe: Lobe) -> Technique:
+    """Mirror directions of wo about half vectors that the lobe draws; some fall below the horizon."""
+    n, wo = at_least_float32(n), at_least_float32(wo)
+
+    def draw(count: int, stochastic: bool) -> Float[Tensor, "N S 3"]:
+        lattice = _lattice(n, count, stochastic)
+        h = _about(n, lobe.sample_cos_h(lattice.u, roughness), lattice.v)
+        return 2 * dot(h, wo).unsqueeze(-1) * h - wo.unsqueeze(1)
+
+    return Technique(draw, lambda wi: pdf_specular_lobe(wi, n, wo, roughness, lobe))
+
+
+def tabulated(table: DirectionTable, n: Float[Tensor, "N 3"]) -> Technique:
+    """Directions by a table, of each point or of all; some fall below the horizon of n."""
+    n = at_least_float32(n)
+
+    def draw(count: int, stochastic: bool) -> Float[Tensor, "N S 3"]:
+        lattice = _lattice(n, count, stochastic)
+        return table.draw(lattice.u, lattice.v)
+
+    return Technique(draw, table.pdf)
 
 
 # ------------------------------------------------------------------------------------------------------------- samplers
 
 
 @torch.no_grad()
-def fibonacci(n: Float[Tensor, "N 3"], count: int, stochastic: bool) -> IncidentSamples:
-    """The paper's lattice, with cells of equal solid angle and samples at their midpoints, n·wi = 1 − (k + ½)/S."""
-    n = at_least_float32(n)
-    lattice = _lattice(n, count, stochastic)
-    wi = _about(n, 1 - lattice.u, lattice.v)
-    return IncidentSamples(wi, pdf_fibonacci(wi, n))
+def combine(techniques: Sequence[tuple[Technique, int]], stochastic: bool) -> IncidentSamples:
+    """So many directions from each technique, joined by the balance heuristic (Veach 1997, §9.2).
+
+    The density is taken at the directions as they were rounded: then a lobe cancels exactly against that of the
+    integrand.
+    """
+    techniques = [(technique, count) for technique, count in techniques if count]
+    wi = torch.cat([technique.draw(count, stochastic) for technique, count in techniques], 1)
+    pdf = sum(technique.pdf(wi) * (count / wi.shape[1]) for technique, count in techniques)
+    return IncidentSamples(wi, pdf)
 
 
-@torch.no_grad()
-def cosine(n: Float[Tensor, "N 3"], count: int, stochastic: bool) -> IncidentSamples:
-    """Directions in proportion to n·wi: no variance on a Lambertian surface under constant light."""
-    n = at_least_float32(n)
-    lattice = _lattice(n, count, stochastic)
-    wi = _about(n, (1 - lattice.u).sqrt(), lattice.v)
-    return IncidentSamples(wi, pdf_cosine(wi, n))
+def shared_sphere(like: Float[Tensor, "N 3"], count: int, stochastic: bool) -> IncidentSamples:
+    """One lattice over the whole sphere for all points, (1, count, 3): what depends on direction alone is asked once.
 
-
-@torch.no_grad()
-def specular_lobe(
-    n: Float[Tensor, "N 3"],
-    wo: Float[Tensor, "N 3"],
-    roughness: Float[Tensor, "N 1"],
-    count: int,
-    lobe: Lobe,
-    stochastic: bool,
-) -> IncidentSamples:
-    """Mirror directions of wo about half vectors that the lobe draws; some fall below the horizon."""
-    n, wo = at_least_float32(n), at_least_float32(wo)
-    lattice = _lattice(n, count, stochastic)
-    h = _about(n, lobe.sample_cos_h(lattice.u, roughness), lattice.v)
-    wi = 2 * dot(h, wo).unsqueeze(-1) * h - wo.unsqueeze(1)
-    # The density is taken at wi as it was rounded: then D cancels exactly against the D of the integrand.
-    return IncidentSamples(wi, pdf_specular_lobe(wi, n, wo, roughness, lobe))
-
-
-@torch.no_grad()
-def mis(
-    n: Float[Tensor, "N 3"],
-    wo: Float[Tensor, "N 3"],
-    roughness: Float[Tensor, "N 1"],
-    count: int,
-    lobe: Lobe,
-    stochastic: bool,
-) -> IncidentSamples:
-    """Half from the cosine, half from the lobe, joined by the balance heuristic (Veach 1997, §9.2)."""
-    lobe_count = count // 2
-    cosine_count = count - lobe_count
-    broad = cosine(n, cosine_count, stochastic)
-    sharp = specular_lobe(n, wo, roughness, lobe_count, lobe, stochastic)
-    wi = torch.cat((broad.wi, sharp.wi), 1)
-    return IncidentSamples(wi, pdf_mis(wi, n, wo, roughness, lobe, cosine_count / count))
+    About half of it lies above the horizon of a point: `count` here is worth count/2 of `fibonacci`. With `stochastic` the
+    lattice is turned as a whole, evenly among all rotations. Its errors then agree between points, where those of lattices
+    of their own would not.
+    """
+    up = at_least_float32(like).new_tensor([[0.0, 0.0, 1.0]])
+    lattice = _lattice(up, count, stochastic)
+    wi = _about(up, 1 - 2 * lattice.u, lattice.v)
+    if stochastic:
+        wi = wi @ local_frame(_about(up, 1 - 2 * torch.rand_like(up[:, :1]), torch.rand_like(up[:, :1]))[:, 0])
+    return IncidentSamples(wi, torch.full_like(wi[..., 0], 1 / (4 * math.pi)))
 
 
 def sample_directions(
@@ -167,18 +197,29 @@ def sample_directions(
     count: int,
     lobe: Lobe,
     stochastic: bool,
+    light: Technique | None = None,
 ) -> IncidentSamples:
-    """`count` incident directions per point, in at least float32, by fibonacci, cosine, lobe or mis.
+    """`count` incident directions per point, in at least float32, by fibonacci, cosine, lobe, mis or shared.
+
+    mis is cosine and lobe by halves or, where there is a `light` that can be sampled, cosine, lobe and light together.
+    shared has `count` above the horizon of each point, of twice as many that all points share, (1, 2 · count, 3).
 
     Raises:
         UserError: there is no such sampler.
     """
+    if kind == "shared":
+        return shared_sphere(n, 2 * count, stochastic)
     if kind == "fibonacci":
-        return fibonacci(n, count, stochastic)
-    if kind == "cosine":
-        return cosine(n, count, stochastic)
-    if kind == "lobe":
-        return specular_lobe(n, wo, roughness, count, lobe, stochastic)
-    if kind == "mis":
-        return mis(n, wo, roughness, count, lobe, stochastic)
-    raise UserError(f"unknown sampler '{kind}'", "choose fibonacci, cosine, lobe or mis")
+        techniques = [(fibonacci(n), count)]
+    elif kind == "cosine":
+        techniques = [(cosine(n), count)]
+    elif kind == "lobe":
+        techniques = [(specular_lobe(n, wo, roughness, lobe), count)]
+    elif kind == "mis":
+        to_light = 0 if light is None else int(LIGHT_SHARE * count)
+        to_lobe = int(LOBE_SHARE * count) if to_light else count // 2
+        techniques = [(cosine(n), count - to_lobe - to_light), (specular_lobe(n, wo, roughness, lobe), to_lobe)]
+        techniques += [(light, to_light)] if light is not None else []
+    else:
+        raise UserError(f"unknown sampler '{kind}'", "choose fibonacci, cosine, lobe, mis or shared")
+    return combine(techniques, stochastic)

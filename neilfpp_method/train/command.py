@@ -48,12 +48,14 @@ def run_training(
     device: str,
     devices: int,
     console: Console,
+    format: str | None = None,
     command: str = "neilfpp train",
 ) -> Path:
     """Train a run to its end and return its folder. A run that is finished is left as it is.
 
     Args:
         config: the settings; none, with `resume`: those of the run.
+        format: the capture's format; none: told from what is in the folder.
         command: what a person types to get here, for the line that says how a stopped run continues.
 
     Raises:
@@ -67,7 +69,7 @@ def run_training(
         if out is None:
             raise UserError("--resume needs the run's folder", "give it with --out RUN")
         described = read_description(out)
-        _refuse_changes(out, described, data, config, test_every, response)
+        _refuse_changes(out, described, data, config, test_every, response, format)
         config, source = described.config, described.source
         if _is_finished(out, config):
             console.print(f"run folder {out}: finished already, nothing to continue", highlight=False, soft_wrap=True)
@@ -76,7 +78,7 @@ def run_training(
         if data is None or config is None:
             raise UserError("no capture given", "name its folder with --data DIR")
         _check(config)
-        source = CaptureSource(str(data.resolve()), test_every, response)
+        source = CaptureSource(str(data.resolve()), test_every, response, format)
         out = out or Path("runs") / f"{data.resolve().name}-{config.preset}"
         check_free(out)
     capture = source.load()
@@ -105,6 +107,7 @@ def _refuse_changes(
     config: NeilfConfig | None,
     test_every: int | None,
     response: str,
+    format: str | None,
 ) -> None:
     """That what is given beside --resume, where something is, is what the run was made of."""
     source = described.source
@@ -112,6 +115,7 @@ def _refuse_changes(
         source.root if data is None else str(data.resolve()),
         source.test_every if test_every is None else test_every,
         source.response if response == "auto" else response,
+        format or source.format,
     )
     if given != source or config not in (None, described.config):
         raise UserError(

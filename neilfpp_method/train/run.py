@@ -21,7 +21,8 @@ from typing import Any, TypeVar
 
 import torch
 
-from neilfpp_method.config import NeilfConfig, from_dict, to_dict
+from neilfpp_method.config import NeilfConfig
+from neilfpp_method.config_json import from_dict, to_dict
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.images import replacing
 from neilfpp_method.errors import UserError
@@ -64,9 +65,10 @@ class CaptureSource:
     root: str
     test_every: int | None = None
     response: str = "auto"
+    format: str | None = None
 
     def load(self) -> Capture:
-        return load_capture(Path(self.root), test_every=self.test_every, response=self.response)
+        return load_capture(Path(self.root), self.format, self.test_every, response=self.response)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import struct
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import cv2
 import numpy as np
 import OpenEXR
 import pytest
+import tifffile
 from PIL import Image
 
 from neilfpp_method.data.images import image_header, read_image, replacing, write_exr, write_png
@@ -85,6 +87,36 @@ def test_floating_point_files_are_hdr(tmp_path: Path, suffix: str) -> None:
     assert image.hdr
     assert image_header(tmp_path / f"f{suffix}").hdr
     assert np.allclose(image.pixels, RGB[..., ::-1], atol=0 if suffix == ".tif" else 4 / 128)
+
+
+@pytest.mark.parametrize("kind", ["NO", "ZIP", "PIZ", "RLE"])
+@pytest.mark.parametrize("layout", ["scanline", "tiled"])
+def test_exr_compressions_and_layouts(tmp_path: Path, kind: str, layout: str) -> None:
+    header = {"compression": getattr(OpenEXR, f"{kind}_COMPRESSION"), "type": getattr(OpenEXR, f"{layout}image")}
+    if layout == "tiled":
+        header["tiles"] = OpenEXR.TileDescription()
+    assert np.array_equal(read_image(openexr(tmp_path / "a.exr", {"RGB": RGB}, **header)).pixels, RGB)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64])
+@pytest.mark.parametrize("layout", [{}, {"tile": (16, 16)}, {"byteorder": ">"}, {"compression": "zlib"}, {"planarconfig": 2}])
+def test_tiff_of_another_writer(tmp_path: Path, dtype: type, layout: dict) -> None:
+    full = np.iinfo(dtype).max if np.issubdtype(dtype, np.integer) else 1
+    samples = (RGB if full == 1 else RGB / 4 * full).astype(dtype)
+    stored = samples.transpose(2, 0, 1) if "planarconfig" in layout else samples
+    tifffile.imwrite(tmp_path / "a.tif", stored, photometric="rgb", **layout)
+    image = read_image(tmp_path / "a.tif")
+    assert np.allclose(image.pixels, samples.astype(np.float64) / full, atol=1e-7)
+    assert image.hdr == (full == 1)
+
+
+def test_radiance_hdr_by_the_definition_of_rgbe(tmp_path: Path) -> None:
+    rgbe = np.random.default_rng(5).integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8)
+    rgbe[..., 3] = rgbe[..., 3] // 16 + 120
+    head = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y %d +X %d\n" % (HEIGHT, WIDTH)
+    (tmp_path / "a.hdr").write_bytes(head + rgbe.tobytes())
+    expected = rgbe[..., :3] * np.exp2(rgbe[..., 3:].astype(np.float64) - 136)
+    assert np.allclose(read_image(tmp_path / "a.hdr").pixels, expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("mode", ["L", "LA", "P", "1"])
@@ -165,6 +197,20 @@ def test_a_forged_size_is_refused_before_anything_is_allocated(tmp_path: Path) -
     (tmp_path / "a.png").write_bytes(data[:16] + struct.pack(">2I", 60_000, 60_000) + data[24:])
     with pytest.raises(UserError, match=r"a\.png"):
         read_image(tmp_path / "a.png")
+
+
+def test_a_header_of_100_000_columns_costs_no_memory(tmp_path: Path) -> None:
+    write_exr(tmp_path / "wide.exr", {"RGB": RGB})
+    data = bytearray((tmp_path / "wide.exr").read_bytes())
+    for window in (b"dataWindow", b"displayWindow"):
+        at = data.index(window + b"\0box2i\0") + len(window) + 7 + 4
+        data[at : at + 16] = struct.pack("<4i", 0, 0, 99_999, 99_999)
+    (tmp_path / "wide.exr").write_bytes(data)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for read in (image_header, read_image):
+        with pytest.raises(UserError, match="the header says 100000×100000"):
+            read(tmp_path / "wide.exr")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB; the pixels would be 120 GB
 
 
 def test_unknown_formats_are_refused(tmp_path: Path) -> None:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 from scipy import stats
 
-from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import write_exr
+from neilfpp_method.data.capture import Capture, load_capture
+from neilfpp_method.data.drawing import ValidPixels
+from neilfpp_method.data.images import write_exr, write_png
 from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.errors import UserError
 from tests.data.make_capture import RADIUS, SCALE, make_capture, radiance, srgb
 
 SPHERE = RADIUS / SCALE
@@ -76,9 +80,7 @@ def test_samples_are_uniform_and_follow_the_global_seed(tmp_path: Path) -> None:
     assert stats.chisquare(np.bincount(first.view, minlength=6)).pvalue > 1e-3
     local = torch.from_numpy(np.stack([view.camera.w2c[:3, :3] for view in pixels.views])).float()[first.view]
     plane = torch.einsum("nij,nj->ni", local, first.directions)
-    left = int(
-        (plane[:, 0] < -plane[:, 2] * 0.5 / 25.2).sum()
-    )  # the principal point lies half a pixel right of the middle
+    left = int((plane[:, 0] < -plane[:, 2] * 0.5 / 25.2).sum())  # the principal point lies half a pixel right of the middle
     assert stats.binomtest(left, 12_000, 0.5).pvalue > 1e-3
 
 
@@ -103,6 +105,117 @@ def test_image_gradient_of_a_ramp(tmp_path: Path) -> None:
     gradient = PixelDataset(capture, [capture.views[0]]).view(0).image_gradient.reshape(HEIGHT, WIDTH)
     assert np.allclose(gradient[1:-1, 1:-1], np.hypot(0.02, 0.01), atol=1e-5)
     assert np.allclose(gradient[1:-1, 0], np.hypot(0.01, 0.01), atol=1e-5)  # half a difference at the border
+
+
+# ------------------------------------------------------------------------------------- invalid pixels, exposure, balance
+
+
+def with_views(capture: Capture, **changes) -> Capture:
+    return replace(capture, views=tuple(replace(view, **changes) for view in capture.views))
+
+
+def marked(root: Path, columns: slice, **options) -> Capture:
+    """The capture with some columns of every view marked as invalid, and NaN in a corner of them."""
+    capture = load_capture(make_capture(root, **options))
+    valid = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    valid[:, columns] = 0
+    write_png(root / "valid.png", valid)
+    for view in capture.views:
+        color = OpenEXR.File(str(view.image)).channels()["RGB"].pixels
+        color[0, columns] = np.nan
+        color[1, columns] = -1
+        write_exr(view.image, {"RGB": color})
+    return with_views(capture, valid=root / "valid.png")
+
+
+@pytest.mark.parametrize("columns", [slice(0, 5), slice(3, 20)])
+def test_invalid_pixels_are_never_drawn_and_the_others_uniformly(tmp_path: Path, columns: slice) -> None:
+    capture = marked(tmp_path, columns)
+    pixels = PixelDataset(capture, capture.views)
+    number = pixels.draw(20_000)
+    column = number % WIDTH
+    dead = torch.zeros(WIDTH, dtype=torch.bool)
+    dead[columns] = True
+    assert not dead[column].any()
+    drawn = np.bincount(number.numpy(), minlength=len(pixels)).reshape(-1, WIDTH)[:, ~dead.numpy()]
+    assert stats.chisquare(drawn.reshape(6, -1).sum(1)).pvalue > 1e-3
+    assert stats.chisquare(drawn.sum(0)).pvalue > 1e-3
+    assert pixels.sample(500).color.isfinite().all()
+    assert torch.equal(pixels.valid(2).reshape(HEIGHT, WIDTH), ~dead.expand(HEIGHT, WIDTH))
+    assert (pixels.view(2).color.reshape(HEIGHT, WIDTH, 3)[:2, columns] == 0).all()
+
+
+def test_draws_do_not_change_where_all_pixels_are_valid(tmp_path: Path) -> None:
+    capture = load_capture(make_capture(tmp_path))
+    write_png(tmp_path / "valid.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    masked = with_views(capture, valid=tmp_path / "valid.png")
+    numbers = []
+    for known in (capture, masked):
+        torch.manual_seed(11)
+        numbers.append(PixelDataset(known, known.views).draw(100))
+    torch.manual_seed(11)
+    assert torch.equal(numbers[0], torch.randint(6 * WIDTH * HEIGHT, (100,)))
+    assert torch.equal(numbers[0], numbers[1])
+
+
+@pytest.mark.parametrize("count", [1, 255, 256, 257, 5000])
+def test_the_kth_valid_pixel_is_the_kth(count: int) -> None:
+    valid = torch.from_numpy(np.random.default_rng(count).random(count) < 0.3)
+    valid[-1] = True
+    among = ValidPixels(valid)
+    assert torch.equal(among.find(torch.arange(among.count)), valid.nonzero()[:, 0])
+    assert torch.equal(among.valid, valid)
+
+
+def test_statistics_leave_invalid_pixels_out(tmp_path: Path) -> None:
+    capture = marked(tmp_path / "a", slice(0, 12), background=0.25)
+    pixels = PixelDataset(capture, capture.views)
+    whole = dataset(tmp_path / "b", background=0.25)
+    right = torch.cat([whole.view(i).color.reshape(HEIGHT, WIDTH, 3)[:, 12:].reshape(-1, 3) for i in range(6)])
+    object_ = right[(right != 0.25).any(-1)]
+    assert pixels.median_radiance() == pytest.approx(float((object_ @ torch.tensor([0.2126, 0.7152, 0.0722])).median()))
+    assert pixels.radiance_quantile(1.0) == float(object_.max())
+    assert torch.equal(pixels.border_color(), torch.tensor([0.25, 0.25, 0.25]))
+
+
+def test_nothing_valid_is_refused(tmp_path: Path) -> None:
+    capture = marked(tmp_path, slice(0, WIDTH))
+    with pytest.raises(UserError, match="no pixel is valid"):
+        PixelDataset(capture, capture.views)
+
+
+def test_pixels_without_meaning_need_a_mark(tmp_path: Path) -> None:
+    capture = with_views(marked(tmp_path, slice(0, 2)), valid=None)
+    with pytest.raises(UserError, match=r"000\.exr: 4 pixels are NaN, infinite or negative.*validity mask"):
+        PixelDataset(capture, capture.views)
+
+
+def test_a_validity_mask_of_another_size_is_named(tmp_path: Path) -> None:
+    capture = with_views(load_capture(make_capture(tmp_path)), valid=tmp_path / "valid.png")
+    write_png(tmp_path / "valid.png", np.full((HEIGHT + 1, WIDTH), 255, np.uint8))
+    with pytest.raises(UserError, match=r"valid\.png: the mask has another size"):
+        PixelDataset(capture, capture.views)
+
+
+def test_exposure_and_white_balance_are_divided_out(tmp_path: Path) -> None:
+    capture = load_capture(make_capture(tmp_path))
+    truth = PixelDataset(capture, capture.views)
+    views = []
+    for i, view in enumerate(capture.views):
+        exposure, balance = 2.0 ** (i - 3), (1.0 + 0.1 * i, 1.0, 2.0 - 0.1 * i)
+        color = OpenEXR.File(str(view.image)).channels()["RGB"].pixels
+        write_exr(view.image, {"RGB": (color * exposure * np.array(balance)).astype(np.float32)})
+        views.append(replace(view, exposure=exposure, white_balance=balance))
+    pixels = PixelDataset(replace(capture, views=tuple(views)), views)
+    for i in range(6):
+        assert torch.allclose(pixels.view(i).color, truth.view(i).color, rtol=1e-6)
+        assert torch.allclose(pixels.view(i).image_gradient, truth.view(i).image_gradient, atol=1e-5)
+
+
+def test_display_values_have_no_exposure(tmp_path: Path) -> None:
+    capture = with_views(load_capture(make_capture(tmp_path, hdr=False)), exposure=2.0)
+    with pytest.raises(UserError, match=r"000\.png: an exposure or white balance for display values"):
+        PixelDataset(capture, capture.views)
 
 
 # ----------------------------------------------------------------------------------------------------------- statistics

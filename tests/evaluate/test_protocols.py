@@ -15,6 +15,7 @@ import torch
 from torch import nn
 
 from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.data.truth import LightField, Truth
 from neilfpp_method.errors import UserError
@@ -100,6 +101,25 @@ def _few_points(monkeypatch):
 
 
 # --------------------------------------------------------------------------------------------------- a perfect estimate
+
+
+def test_pixels_that_are_marked_as_invalid_do_not_count(captures, tmp_path):
+    capture = load_capture(shutil.copytree(captures.hdr, tmp_path / "hdr"))
+    valid = np.full((120, 160), 255, np.uint8)
+    valid[50:70, 60:100] = 0
+    write_png(tmp_path / "hdr" / "valid.png", valid)
+    for view in capture.test_views:
+        pixels = read_image(view.image).pixels
+        pixels[50:70, 60:100] = [np.nan, 9, 9]
+        write_exr(view.image, {"RGB": pixels})
+    views = tuple(dataclasses.replace(view, valid=tmp_path / "hdr" / "valid.png") for view in capture.views)
+    run = make_run(dataclasses.replace(capture, views=views))
+    figures = evaluate(run)
+    assert figures["volume_psnr_linear"] > 90
+    assert figures["normal_mae_deg"] < 0.1
+    known = known_test_views(run, render_test_views(run)).views[0]
+    colors = mean_observed_color(run.capture, surface_points(run.capture, known))
+    assert np.isfinite(colors).all()
 
 
 def test_a_perfect_estimate_scores_perfectly(captures):

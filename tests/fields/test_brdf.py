@@ -21,13 +21,14 @@ def positions(count: int = 8) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("name", ["paper-mlp", "paper-ngp", "fast"])
-def test_starts_at_mid_grey(name):
+def test_starts_at_the_middle_and_at_the_base_colour_that_is_set(name):
     torch.manual_seed(0)
     config = preset(name)
     material = BrdfField(config.brdf, config.volume.radius)(positions(200).float())
-    for values, width in ((material.base_color, 3), (material.roughness, 1), (material.metallic, 1)):
+    start = config.brdf.initial_base_color
+    for values, width, first in ((material.base_color, 3, start), (material.roughness, 1, 0.5), (material.metallic, 1, 0.5)):
         assert values.shape == (200, width)
-        assert (values - 0.5).abs().max() < 0.05
+        assert (values - first).abs().max() < 0.05
 
 
 @pytest.mark.parametrize("kind", SMALL)

@@ -8,7 +8,7 @@ import torch
 
 from neilfpp_method.shading.brdf import GGX, LOBES, SPHERICAL_GAUSSIAN, evaluate
 from neilfpp_method.shading.rendering_equation import shade
-from neilfpp_method.shading.sampling import fibonacci, sample_directions
+from neilfpp_method.shading.sampling import combine, fibonacci, sample_directions, shared_sphere
 from neilfpp_method.structures import IncidentSamples, Material
 from tests import oracles
 
@@ -55,7 +55,7 @@ def test_white_furnace_is_exact_at_every_count(count):
     """The midpoint rule integrates the cosine exactly: under unit light a Lambertian surface sends out its colour."""
     n = torch.nn.functional.normalize(torch.randn(10, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
     material = Material(rows(B, 10, torch.float32), torch.ones(10, 1), torch.full((10, 1), M))
-    samples = fibonacci(n, count, stochastic=False)
+    samples = combine([(fibonacci(n), count)], stochastic=False)
     for specular, expected in ((True, (1 - M) * material.base_color), (False, material.base_color)):
         shading = shade(material, n, n, samples, torch.ones_like(samples.wi), GGX, specular)
         assert (shading.diffuse - expected).abs().max() < 1e-6
@@ -155,10 +155,19 @@ def test_half_precision_is_summed_in_float32():
     """2048 equal terms: a bfloat16 sum would stall after 256 of them."""
     count = 2048
     n = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.bfloat16)
-    samples = fibonacci(n, count, stochastic=False)
+    samples = combine([(fibonacci(n), count)], stochastic=False)
     light = torch.ones(1, count, 3, dtype=torch.bfloat16)
     material = Material(n.new_ones(1, 3), n.new_ones(1, 1), n.new_zeros(1, 1))
     with torch.autocast("cpu", dtype=torch.bfloat16):
         shading = shade(material, n, n, samples, light, GGX, specular=False)
     assert shading.color.dtype == torch.float32
     assert shading.color.allclose(torch.ones(1, 3), atol=1e-5)
+
+
+def test_shared_directions_shade_as_their_copies_do():
+    material, n, wo, _, _ = random_scene()
+    samples = shared_sphere(n, 64, stochastic=False)
+    light = sky(samples.wi)[..., None].expand(-1, -1, 3)
+    copies = IncidentSamples(samples.wi.expand(5, -1, -1), samples.pdf.expand(5, -1))
+    shared = shade(material, n, wo, samples, light, GGX)
+    assert shared.color.allclose(shade(material, n, wo, copies, light.expand(5, -1, -1), GGX).color)

@@ -10,7 +10,8 @@ import torch
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading import sampling
 from neilfpp_method.shading.brdf import GGX, LOBES, SPHERICAL_GAUSSIAN
-from neilfpp_method.shading.sampling import sample_directions
+from neilfpp_method.shading.sampling import combine, fibonacci, sample_directions, shared_sphere, tabulated
+from neilfpp_method.shading.tabulated import DirectionTable
 from tests import oracles
 
 KINDS = ("fibonacci", "cosine", "lobe", "mis")
@@ -31,7 +32,7 @@ def density(kind, lobe, wi, n, wo, r):
         "fibonacci": lambda: sampling.pdf_fibonacci(wi, n),
         "cosine": lambda: sampling.pdf_cosine(wi, n),
         "lobe": lambda: sampling.pdf_specular_lobe(wi, n, wo, r, lobe),
-        "mis": lambda: sampling.pdf_mis(wi, n, wo, r, lobe),
+        "mis": lambda: 0.5 * sampling.pdf_cosine(wi, n) + 0.5 * sampling.pdf_specular_lobe(wi, n, wo, r, lobe),
     }[kind]()
 
 
@@ -74,7 +75,7 @@ def test_determinism(kind):
 
 def test_fibonacci_lies_at_cell_midpoints():
     n, _, _ = points((0.0, 0.0, 1.0), (0.0, 0.0, 1.0), 1)
-    wi = sampling.fibonacci(n, 4, stochastic=False).wi[0]
+    wi = combine([(fibonacci(n), 4)], stochastic=False).wi[0]
     assert wi[:, 2].allclose(torch.tensor([0.875, 0.625, 0.375, 0.125], dtype=torch.float64))
     azimuth = torch.atan2(wi[:, 1], wi[:, 0])
     golden = math.pi * (3 - math.sqrt(5))
@@ -86,7 +87,7 @@ def test_mis_holds_for_odd_counts(count):
     """The mean of (n·wi)/pdf estimates ∫ n·wi dwi = π; at one sample the mixture is the cosine alone."""
     torch.manual_seed(6)
     n, wo, r = points((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), 20_000)
-    samples = sampling.mis(n, wo, r, count, SPHERICAL_GAUSSIAN, stochastic=True)
+    samples = sample_directions("mis", n, wo, r, count, SPHERICAL_GAUSSIAN, stochastic=True)
     assert samples.pdf.shape == (20_000, count)
     estimate = (samples.wi[..., 2].clamp_min(0) / samples.pdf).mean().item()
     assert estimate == pytest.approx(math.pi, rel=5e-3)
@@ -100,5 +101,83 @@ def test_samples_carry_no_gradient():
 
 
 def test_an_unknown_sampler_is_refused():
-    with pytest.raises(UserError, match="choose fibonacci, cosine, lobe or mis"):
+    with pytest.raises(UserError, match="choose fibonacci, cosine, lobe, mis or shared"):
         sample_directions("uniform", *points((0, 0, 1.0), (0, 0, 1.0), 1), 4, GGX, False)
+
+
+# -------------------------------------------------------------------------------------------------- light that is known
+
+
+def light_of(n):
+    """Light from one side, known on a table so coarse that its edges are edges of the χ² cells."""
+    weights = torch.zeros(1, 2, 4, dtype=n.dtype)
+    weights[0, 0, 3] = 1
+    return tabulated(DirectionTable(weights), n)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 8, 9])
+def test_mis_with_light_estimates_the_same_integral(count):
+    torch.manual_seed(7)
+    n, wo, r = points((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), 20_000)
+    samples = sample_directions("mis", n, wo, r, count, GGX, stochastic=True, light=light_of(n))
+    assert samples.pdf.shape == (20_000, count)
+    estimate = (samples.wi[..., 2].clamp_min(0) / samples.pdf).mean().item()
+    assert estimate == pytest.approx(math.pi, rel=1e-2)
+
+
+def test_the_density_of_mis_with_light_is_that_of_its_directions():
+    torch.manual_seed(8)
+    n, wo, r = points(NORMALS["oblique"], (0.0, 0.0, 1.0), POINTS, 0.6)
+    light, one = light_of(n), (n[:1], wo[:1], r[:1])
+
+    def pdf(wi):  # 8 directions: 4 to the light, 2 to the lobe, 2 to the cosine
+        wi = torch.from_numpy(wi)[None]
+        parts = light.pdf(wi) / 2 + density("lobe", GGX, wi, *one) / 4 + density("cosine", GGX, wi, *one) / 4
+        return parts[0].numpy()
+
+    result = oracles.chi2_test(lambda: sample_directions("mis", n, wo, r, 8, GGX, True, light).wi.reshape(-1, 3).numpy(), pdf)
+    assert result.passed, result
+    assert result.total == pytest.approx(1, abs=1e-4)
+
+
+# ---------------------------------------------------------------------------------------------------- shared directions
+
+
+def test_shared_directions_are_spread_evenly():
+    torch.manual_seed(9)
+    like = torch.zeros(1, 3, dtype=torch.float64)
+
+    def draw():
+        return torch.cat([shared_sphere(like, 8, stochastic=True).wi[0] for _ in range(4_000)]).numpy()
+
+    result = oracles.chi2_test(draw, lambda wi: torch.full((len(wi),), 1 / (4 * math.pi)).numpy())
+    assert result.passed, result
+
+
+def test_shared_directions_count_those_above_the_horizon():
+    n, wo, r = points((0.6, 0.0, 0.8), (0.0, 0.0, 1.0), 5)
+    samples = sample_directions("shared", n, wo, r, 64, GGX, stochastic=False)
+    assert samples.wi.shape == (1, 128, 3)
+    assert ((samples.wi[0] @ n[0]) > 0).sum().item() == pytest.approx(64, abs=3)
+
+
+@pytest.mark.parametrize("stochastic", [False, True])
+def test_shared_directions_estimate_the_integral_of_each_point(stochastic):
+    """∫ max(n·wi, 0) dwi = π about any n, from one set of directions; 4 % at 512 on the sphere."""
+    torch.manual_seed(10)
+    n = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
+    samples = shared_sphere(n, 512, stochastic)
+    assert samples.wi.shape == (1, 512, 3)
+    estimate = ((samples.wi[0] @ n.T).clamp_min(0).T / samples.pdf).mean(1)
+    assert estimate.allclose(torch.full_like(estimate, math.pi), rtol=0.04)
+
+
+def test_one_rotation_turns_all_shared_directions():
+    """Angles between directions are those of the still lattice, up to the strata."""
+    torch.manual_seed(11)
+    like = torch.zeros(3, 3, dtype=torch.float64)
+    moved, again = (shared_sphere(like, 64, stochastic=True).wi[0] for _ in range(2))
+    assert moved.norm(dim=-1).allclose(torch.ones(64, dtype=torch.float64))
+    assert not moved.allclose(again)
+    nearest = (moved @ moved.T - 2 * torch.eye(64)).amax(1).clamp(-1, 1).acos()
+    assert nearest.min() > 0.05  # 64 independent directions come about as near as 0.03 in one of two draws

@@ -145,14 +145,14 @@ def test_a_checkpoint_of_another_version(tmp_path, contents):
 
 
 def described(path: Path) -> Path:
-    create_run(path, tiny_config(), CaptureSource("/captures/sphere", 4, "linear"), FACTS)
+    create_run(path, tiny_config(), CaptureSource("/captures/sphere", 4, "linear", "sfm_scene"), FACTS)
     return path
 
 
 def test_a_description_comes_back(tmp_path):
     run = read_description(described(tmp_path / "run"))
     assert run.config == tiny_config()
-    assert run.source == CaptureSource("/captures/sphere", 4, "linear")
+    assert run.source == CaptureSource("/captures/sphere", 4, "linear", "sfm_scene")
     assert run.facts == FACTS
 
 

@@ -8,50 +8,30 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from neilfpp_method.config import InterReflectionConfig, LightFitConfig
+from neilfpp_method.config import LightFitConfig
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.light_fit import Observed, SurfaceMemory, fit_environment, total_variation, transport
+from neilfpp_method.lighting.fit import Light, Target, fit_light, total_variation
+from neilfpp_method.lighting.memory import Observed
+from neilfpp_method.lighting.transport import Transport, from_texels
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.shading.rendering_equation import shade
 from neilfpp_method.shading.sampling import sample_directions
-from neilfpp_method.structures import Material, RayBatch, SurfaceHits
-
-OFF = InterReflectionConfig(mode="off")
-HARD = InterReflectionConfig(mode="hard", offset=1e-4)
+from neilfpp_method.structures import Material
+from tests.lighting.surfaces import half_room, material, points
 
 
-class HalfRoom:
-    """A host: below the origin a wall of radius 2 that sends out radiance 0.7; above it nothing."""
-
-    def render(self, rays: RayBatch) -> SurfaceHits:
-        along = (rays.origins * rays.directions).sum(-1)
-        depth = (along**2 + 4.0 - rays.origins.square().sum(-1)).sqrt() - along
-        position = rays.origins + depth[:, None] * rays.directions
-        met = (rays.directions[:, 2] < 0).float()
-        return SurfaceHits(torch.full_like(position, 0.7), position, -position / 2.0, met, met)
-
-
-def points(count: int, seed: int = 0) -> Observed:
-    """Points near the origin with all normals, each seen from within 60° of its normal."""
-    generator = torch.Generator().manual_seed(seed)
-    normal = normalize(torch.randn(count, 3, generator=generator), dim=-1)
-    wo = normalize(normal + 0.8 * normalize(torch.randn(count, 3, generator=generator), dim=-1), dim=-1)
-    return Observed(0.1 * normal, normal, wo, torch.zeros(count, 3))
-
-
-def material(count: int, seed: int = 1) -> Material:
-    generator = torch.Generator().manual_seed(seed)
-    base_color = 0.2 + 0.6 * torch.rand(count, 3, generator=generator)
-    roughness = 0.3 + 0.5 * torch.rand(count, 1, generator=generator)
-    metallic = torch.rand(count, 1, generator=generator).round()
-    return Material(base_color, roughness, metallic)
+def fit(environment: EnvironmentLight, carried: Transport, of: Material, image: torch.Tensor, unit: float, steps: int) -> None:
+    """Set a map by a fit without lamps."""
+    start = Light(environment.log_radiance, torch.zeros(0, 3))
+    found = fit_light(start, carried, Target(of, image), "linear", unit, LightFitConfig(steps=steps))
+    environment.log_radiance.copy_(found.log_radiance)
 
 
 def test_a_lambertian_surface_in_a_white_furnace_shows_its_base_colour():
     torch.manual_seed(0)
     seen, of = points(16), material(16)
-    carried = transport(HalfRoom(), seen, of.roughness, EnvironmentLight(48, 1.0), None, OFF, 0.8)
-    white = torch.ones(carried.texels.shape[-1], 3)
+    carried = from_texels(EnvironmentLight(48, 1.0), seen, of.roughness, None, None)
+    white = torch.ones(carried.sources.shape[-1], 3)
     torch.testing.assert_close(carried.outgoing(of, white), of.base_color, rtol=0.01, atol=0.0)
 
 
@@ -61,7 +41,7 @@ def test_transport_agrees_with_the_estimator_under_a_map_and_a_wall():
     environment = EnvironmentLight(48, 1.0)
     rows = torch.linspace(0, math.pi, 48)[:, None].expand(48, 96)
     environment.log_radiance.copy_(torch.stack((rows.cos(), 0.5 * rows.sin(), -rows.cos())))
-    several = [transport(HalfRoom(), seen, of.roughness, environment, GGX, HARD, 0.8) for _ in range(4)]
+    several = [from_texels(environment, seen, of.roughness, GGX, half_room) for _ in range(4)]
     # The texels are read where the map holds them; between texels it varies little here.
     radiance = environment.log_radiance.exp().flatten(1).t()
     carried = sum(one.outgoing(of, radiance) for one in several) / len(several)
@@ -88,13 +68,12 @@ def test_a_lamp_is_found_where_it_is_and_as_bright_beside_the_sky_as_it_is(tint)
     seen, of = points(600), material(600)
     true = lamp(24)
     radiance = true.log_radiance.exp().flatten(1).t()
-    image = transport(HalfRoom(), seen, of.roughness, true, GGX, OFF, 0.8).outgoing(of, radiance)
+    image = from_texels(true, seen, of.roughness, GGX, None).outgoing(of, radiance)
 
     found = EnvironmentLight(24, 1.0)
-    carried = transport(HalfRoom(), seen, of.roughness, found, GGX, OFF, 0.8)
+    carried = from_texels(found, seen, of.roughness, GGX, None)
     guess = Material(of.base_color * tint, of.roughness, of.metallic)
-    config = LightFitConfig(steps=200)
-    fit_environment(found, carried, guess, image, "linear", image.median().item(), config)
+    fit(found, carried, guess, image, image.median().item(), steps=200)
 
     green = found.log_radiance[1]
     row, column = divmod(int(green.argmax()), 48)
@@ -114,10 +93,10 @@ def test_where_no_point_looks_the_map_takes_after_its_surroundings():
     seen = Observed(seen.position, up, up, seen.pixel)
     of = Material(torch.full((300, 3), 0.5), torch.full((300, 1), 0.9), torch.zeros(300, 1))
     true = EnvironmentLight(16, 2.0)
-    image = transport(HalfRoom(), seen, of.roughness, true, GGX, OFF, 0.8).outgoing(of, torch.full((512, 3), 2.0))
+    image = from_texels(true, seen, of.roughness, GGX, None).outgoing(of, torch.full((512, 3), 2.0))
     found = EnvironmentLight(16, 0.5)
-    carried = transport(HalfRoom(), seen, of.roughness, found, GGX, OFF, 0.8)
-    fit_environment(found, carried, of, image, "linear", 1.0, LightFitConfig(steps=300))
+    carried = from_texels(found, seen, of.roughness, GGX, None)
+    fit(found, carried, of, image, 1.0, steps=300)
     assert found.log_radiance[:, -2:].exp().mean().item() == pytest.approx(2.0, rel=0.35)
 
 
@@ -132,35 +111,7 @@ def test_a_map_without_a_finite_answer_stays_as_it_was():
     seen, of = points(8), material(8)
     environment = EnvironmentLight(8, 0.5)
     before = environment.log_radiance.clone()
-    carried = transport(HalfRoom(), seen, of.roughness, environment, GGX, OFF, 0.8)
+    carried = from_texels(environment, seen, of.roughness, GGX, None)
     broken = torch.full((8, 3), math.inf)
-    fit_environment(environment, carried, of, broken, "linear", 1.0, LightFitConfig(steps=3))
+    fit(environment, carried, of, broken, 1.0, steps=3)
     assert torch.equal(environment.log_radiance, before)
-
-
-def test_memory_is_due_at_once_then_every_so_often_and_keeps_the_newest():
-    memory = SurfaceMemory(LightFitConfig(points=20, every=4))
-    assert not memory.due
-    memory.remember(points(50))
-    assert memory.due
-    assert len(memory.recall()) == 20
-    for step in range(4):
-        assert not memory.due, step
-        memory.remember(points(50, seed=step + 2))
-    assert memory.due
-    kept = memory.recall()
-    for step in range(4):  # five points of each of the four steps
-        newest = points(50, seed=step + 2).normal[:5]
-        assert all((kept.normal == normal).all(-1).any() for normal in newest)
-
-
-def test_memory_survives_a_checkpoint():
-    config = LightFitConfig(points=20, every=4)
-    memory, again = SurfaceMemory(config), SurfaceMemory(config)
-    memory.remember(points(12))
-    memory.recall()
-    memory.remember(points(12, seed=5))
-    again.load_state_dict(memory.state_dict())
-    assert (again.filled, again.next, again.age) == (memory.filled, memory.next, memory.age)
-    for one, other in zip(vars(memory.recall()).values(), vars(again.recall()).values(), strict=True):
-        assert torch.equal(one, other)

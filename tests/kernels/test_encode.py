@@ -1,8 +1,13 @@
-"""The hash grid, against a transcription that visits one vertex at a time."""
+"""Every backend of the hash grid, against a transcription that visits one vertex at a time.
+
+Triton's interpreter has to be chosen before Triton is imported: `test_triton.py` runs this file once more, with it.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
+import os
 
 import numpy as np
 import pytest
@@ -16,6 +21,17 @@ from neilfpp_method.kernels import encode, grid_spec
 # Resolutions 2, 4, 9: 27 and 125 vertices fit into 128 entries, 1000 do not.
 SMALL = grid_spec(HashGridConfig(levels=3, features=2, log2_entries=7, base_resolution=2, max_resolution=9))
 PRIMES = (1, 2654435761, 805459861)
+BACKENDS = ("triton",) if os.environ.get("TRITON_INTERPRET") == "1" else ("reference", "cpu")
+
+
+@pytest.fixture(params=BACKENDS)
+def backend(request) -> str:
+    return request.param
+
+
+@pytest.fixture
+def small(backend):
+    return dataclasses.replace(SMALL, backend=backend)
 
 
 def small_table(seed: int = 0) -> torch.Tensor:
@@ -55,59 +71,61 @@ def test_layout_of_the_levels():
     assert (paper.resolutions[0], paper.resolutions[-1], paper.width) == (16, 4096, 32)
 
 
-def test_features_agree_with_the_transcription():
+def test_features_agree_with_the_transcription(small):
     x = torch.cat((points(20), torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.5, 1.0, 0.0]], dtype=torch.float64)))
     expected = np.stack([one_by_one(p, small_table().numpy()) for p in x.numpy()])
     for jacobian in (False, True):
-        np.testing.assert_allclose(encode(x, small_table(), SMALL, jacobian).features.numpy(), expected, atol=1e-12)
+        np.testing.assert_allclose(encode(x, small_table(), small, jacobian).features.numpy(), expected, atol=1e-12)
 
 
-def test_jacobian_agrees_with_differences_of_the_transcription():
+def test_jacobian_agrees_with_differences_of_the_transcription(small):
     x, table, h = points(10), small_table().numpy(), 1e-6
     steps = h * np.eye(3)
     expected = np.stack(
-        [
-            np.stack([(one_by_one(p + s, table) - one_by_one(p - s, table)) / (2 * h) for s in steps], -1)
-            for p in x.numpy()
-        ]
+        [np.stack([(one_by_one(p + s, table) - one_by_one(p - s, table)) / (2 * h) for s in steps], -1) for p in x.numpy()]
     )
-    jacobian = encode(x, small_table(), SMALL, jacobian=True).jacobian
+    jacobian = encode(x, small_table(), small, jacobian=True).jacobian
     np.testing.assert_allclose(jacobian.numpy(), expected, atol=1e-7)
 
 
-def test_hash_of_a_fine_level_does_not_overflow():
+def test_hash_of_a_fine_level_does_not_overflow(backend):
     """Vertex numbers of 4096 times the primes leave int32; only their low bits count, and those must be right."""
-    spec = grid_spec(HashGridConfig(levels=1, features=1, log2_entries=10, base_resolution=4096, max_resolution=4096))
+    spec = grid_spec(
+        HashGridConfig(levels=1, features=1, log2_entries=10, base_resolution=4096, max_resolution=4096, backend=backend)
+    )
     table = torch.arange(1024, dtype=torch.float64)[:, None]
     vertices = torch.tensor([[4000, 3999, 3998], [17, 4096, 1]])
     expected = [(i ^ (j * PRIMES[1]) ^ (k * PRIMES[2])) % 1024 for i, j, k in vertices.tolist()]
     assert encode(vertices.double() / 4096, table, spec, jacobian=False).features[:, 0].tolist() == expected
 
 
-def test_derivatives_of_features_and_jacobian():
+def test_derivatives_of_features_and_jacobian(small):
     x, table = points(3).requires_grad_(), small_table().requires_grad_()
 
     def both(x, table):
-        encoded = encode(x, table, SMALL, jacobian=True)
+        encoded = encode(x, table, small, jacobian=True)
         return encoded.features, encoded.jacobian
 
-    assert gradcheck(both, (x, table))
-    assert gradgradcheck(lambda x, t: both(x, t)[0], (x[:1].detach().requires_grad_(), table))
+    if small.backend == "triton":  # hundreds of runs are too many for the interpreter
+        assert gradcheck(both, (x, table), fast_mode=True)
+    else:
+        assert gradcheck(both, (x, table))
+        assert gradgradcheck(lambda x, t: both(x, t)[0], (x[:1].detach().requires_grad_(), table))
 
 
-def test_a_point_outside_counts_as_the_nearest_point_of_the_cube():
+def test_a_point_outside_counts_as_the_nearest_point_of_the_cube(small):
     outside = torch.tensor([[1.4, 0.3, -0.2]], dtype=torch.float64)
     nearest = outside.clamp(0, 1)
-    got, at_face = (encode(x, small_table(), SMALL, jacobian=True) for x in (outside, nearest))
+    got, at_face = (encode(x, small_table(), small, jacobian=True) for x in (outside, nearest))
     torch.testing.assert_close(got.features, at_face.features)
     assert got.jacobian[..., [0, 2]].abs().max() == 0
     torch.testing.assert_close(got.jacobian[..., 1], at_face.jacobian[..., 1])
     assert at_face.jacobian.abs().amin() > 0
 
 
-def test_reruns_agree_to_the_last_bit():
-    spec = grid_spec(HashGridConfig(levels=8, log2_entries=12, max_resolution=128))
-    x = points(5000).float()
+def test_reruns_agree_to_the_last_bit(backend):
+    spec = grid_spec(HashGridConfig(levels=8, log2_entries=12, max_resolution=128, backend=backend))
+    x = points(100 if backend == "triton" else 5000).float()
 
     def gradient():
         table = torch.linspace(-1, 1, 2 * spec.entries).view(-1, 2).requires_grad_()
@@ -118,11 +136,11 @@ def test_reruns_agree_to_the_last_bit():
     assert torch.equal(gradient(), gradient())
 
 
-def test_float32_and_bfloat16_follow_float64():
+def test_float32_and_bfloat16_follow_float64(small):
     x, table = points(200), small_table()
-    exact = encode(x, table, SMALL, jacobian=True)
+    exact = encode(x, table, small, jacobian=True)
     for dtype, tolerance in ((torch.float32, 1e-4), (torch.bfloat16, 0.1)):
-        got = encode(x, table.to(dtype), SMALL, jacobian=True)
+        got = encode(x, table.to(dtype), small, jacobian=True)
         assert got.features.dtype == got.jacobian.dtype == dtype
         assert (got.features.double() - exact.features).abs().max() < tolerance
         assert (got.jacobian.double() - exact.jacobian).abs().max() < 9 * tolerance

@@ -7,19 +7,19 @@ camera_track_map.images.<i>.camera.extrinsic           world to camera, 4×4, ro
 image_path.file_paths.<i>                              relative to the folder `inputs`
 bbox.transform                                         4×4: full extents on the diagonal, centre in the last column
 inputs/masks/<stem>.*, inputs/model/oriented_pcd.ply   optional
+inputs/valid/<stem>.*                                  optional; the project's own writer adds it
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
+from neilfpp_method.data.formats.places import stored, stored_image
 from neilfpp_method.data.images import IMAGE_SUFFIXES
+from neilfpp_method.data.json_entry import Entry
 from neilfpp_method.data.point_cloud import read_oriented_ply
 from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, View, inside
 from neilfpp_method.errors import UserError
@@ -83,27 +83,15 @@ def _view(root: Path, inputs: Path, index: int, track: Entry, file: Entry) -> Vi
     cx, cy = intrinsic["ppt"].numbers((2,))
     w2c = extrinsic.numbers((16,), (4, 4)).reshape(4, 4)
     camera = Camera(float(fx), float(fy), float(cx), float(cy), int(width), int(height), w2c)
-    image = _stored(root, inputs / file.text())
-    if image is None:
-        raise UserError(f"{file.where}: there is no {inputs / file.text()}", "put the image there, or correct the path")
-    return View(image.stem, index, camera, image, _stored(root, inputs / "masks" / f"{image.stem}.png"))
-
-
-def _stored(root: Path, path: Path) -> Path | None:
-    """The file, or the one of its name with another suffix: published scenes list .png where the files are .exr."""
-    if inside(root, path).is_file():
-        return path
-    found = [inside(root, file) for suffix in IMAGE_SUFFIXES if (file := path.with_suffix(suffix)).is_file()]
-    if len(found) > 1:
-        names = " and ".join(file.name for file in found)
-        raise UserError(f"{path}: not there, and {names} could both be meant", "keep one of them")
-    return found[0] if found else None
+    image = stored_image(root, inputs / file.text(), file.where)
+    mask, valid = (stored(root, inputs / folder / f"{image.stem}.png") for folder in ("masks", "valid"))
+    return View(image.stem, index, camera, image, mask, valid)
 
 
 def _inputs_folder(root: Path, scene: Path, listed: str) -> Path:
     """The folder that listed paths start from, told by the first image: the scene file may lie in other places."""
     folders = (scene.parent, root / "inputs", root)
-    return next((folder for folder in folders if _stored(root, folder / listed) is not None), scene.parent)
+    return next((folder for folder in folders if stored(root, folder / listed) is not None), scene.parent)
 
 
 def _refuse_strays(views: tuple[View, ...], listed: set[str], scene: Path) -> None:
@@ -130,54 +118,3 @@ def _normalisation(scene: Entry, point_cloud: Path | None) -> Normalisation:
     if extents.min() < 0 or extents.max() == 0:
         raise UserError(f"{where}: the box is empty or inside out", "give the full extents on the diagonal")
     return Normalisation(float(extents.max() / 2), tuple(map(float, centre)))
-
-
-# ------------------------------------------------------------------------------------------ JSON that cannot be trusted
-
-
-class Entry:
-    """A value in a JSON file that knows where it is, so that every complaint can say so."""
-
-    def __init__(self, value: Any, where: str) -> None:
-        self.value = value
-        self.where = where
-
-    @staticmethod
-    def load(path: Path) -> Entry:
-        """The root of a file."""
-        try:
-            return Entry(json.loads(path.read_text("utf-8")), str(path))
-        except (ValueError, OSError, RecursionError) as error:
-            raise UserError(f"{path}: not valid JSON ({error})", "export the cameras again") from error
-
-    def name(self, key: str) -> str:
-        """The place of an entry below this one."""
-        return f"{self.where}: {key}" if ": " not in self.where else f"{self.where}.{key}"
-
-    def entries(self) -> Mapping[str, Any]:
-        """The entries of an object."""
-        if not isinstance(self.value, dict):
-            raise UserError(f"{self.where}: not a JSON object", "export the cameras again")
-        return self.value
-
-    def __getitem__(self, key: str) -> Entry:
-        if key not in self.entries():
-            raise UserError(f"{self.name(key)} is missing", "export the cameras again")
-        return Entry(self.value[key], self.name(key))
-
-    def text(self) -> str:
-        """A file name."""
-        if not isinstance(self.value, str) or not Path(self.value).name:
-            raise UserError(f"{self.where}: not a file name", "give a path relative to the capture")
-        return self.value
-
-    def numbers(self, *shapes: tuple[int, ...]) -> Float64[np.ndarray, " *shape"]:
-        """An array of finite numbers, of one of the shapes."""
-        try:
-            numbers = np.asarray(self.value, dtype=np.float64)
-        except (TypeError, ValueError, OverflowError):
-            numbers = np.full((0,), np.nan)
-        if numbers.shape not in shapes or not np.isfinite(numbers).all():
-            wanted = " or ".join(dict.fromkeys("×".join(map(str, shape)) or "1" for shape in shapes))
-            raise UserError(f"{self.where}: not {wanted} finite numbers", "export the cameras again")
-        return numbers

@@ -1,0 +1,117 @@
+"""Line charts on logarithmic axes as arrays, drawn with Pillow in the manner of the report's pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from neilfpp_method.data.images import write_png
+from neilfpp_method.evaluate.pictures import INK, PALE_INK, PAPER
+
+__all__ = ["Chart", "Line", "draw_charts"]
+
+WIDTH, HEIGHT = 420, 300
+LEFT, TOP, BOTTOM, GAP = 62, 34, 42, 18
+HEAD, LEGEND = 58, 26
+GRID = (222, 222, 218)
+COLORS = ((28, 30, 34), (214, 102, 34), (36, 118, 178), (52, 148, 84), (150, 76, 160), (190, 158, 40), (120, 124, 132))
+
+
+@dataclass(frozen=True)
+class Line:
+    """A series of points; all x and y are above 0."""
+
+    x: Sequence[float]
+    y: Sequence[float]
+
+
+@dataclass(frozen=True)
+class Chart:
+    """One panel: lines by name. Lines of one name have one colour in every panel."""
+
+    title: str
+    lines: Mapping[str, Line]
+
+
+def draw_charts(path: Path, title: str, x_name: str, y_name: str, charts: Sequence[Chart], columns: int) -> None:
+    """Write panels of one kind as a PNG, with common axes and one legend, so many side by side."""
+    names = list(dict.fromkeys(name for chart in charts for name in chart.lines))
+    lines = [line for chart in charts for line in chart.lines.values()]
+    x_range, y_range = _range([x for line in lines for x in line.x]), _range([y for line in lines for y in line.y])
+    rows = math.ceil(len(charts) / columns)
+    width = columns * (LEFT + WIDTH + GAP) + GAP
+    per_line = max(1, width // 250)
+    head = HEAD + LEGEND * math.ceil(len(names) / per_line)
+    sheet = Image.new("RGB", (width, head + rows * (TOP + HEIGHT + BOTTOM)), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    _write(draw, (GAP, 16), title, 22)
+    for number, name in enumerate(names):
+        x, y = GAP + number % per_line * 250, HEAD + number // per_line * LEGEND
+        draw.line([(x, y + 9), (x + 26, y + 9)], fill=_color(number), width=3)
+        _write(draw, (x + 34, y), name, 15)
+    for number, chart in enumerate(charts):
+        corner = (number % columns * (LEFT + WIDTH + GAP) + LEFT, head + number // columns * (TOP + HEIGHT + BOTTOM) + TOP)
+        _panel(draw, corner, chart, names, x_range, y_range, f"{y_name} over {x_name}")
+    write_png(path, np.asarray(sheet))
+
+
+def _range(values: Sequence[float]) -> tuple[float, float]:
+    low, high = math.log10(min(values)), math.log10(max(values))
+    margin = 0.04 * max(high - low, 0.1)
+    return low - margin, high + margin
+
+
+def _panel(
+    draw: ImageDraw.ImageDraw,
+    corner: tuple[int, int],
+    chart: Chart,
+    names: Sequence[str],
+    x_range: tuple[float, float],
+    y_range: tuple[float, float],
+    caption: str,
+) -> None:
+    left, top = corner
+
+    def place(x: float, y: float) -> tuple[float, float]:
+        across = (math.log10(x) - x_range[0]) / (x_range[1] - x_range[0])
+        up = (math.log10(y) - y_range[0]) / (y_range[1] - y_range[0])
+        return left + across * WIDTH, top + (1 - up) * HEIGHT
+
+    _write(draw, (left, top - 26), chart.title, 16)
+    for tick in _ticks(*x_range):
+        x, _ = place(tick, 10 ** y_range[0])
+        draw.line([(x, top), (x, top + HEIGHT)], fill=GRID)
+        _write(draw, (x - 8, top + HEIGHT + 4), f"{tick:g}", 12, PALE_INK)
+    for tick in _ticks(*y_range):
+        _, y = place(10 ** x_range[0], tick)
+        draw.line([(left, y), (left + WIDTH, y)], fill=GRID)
+        _write(draw, (left - 44, y - 8), f"{tick:g}", 12, PALE_INK)
+    _write(draw, (left, top + HEIGHT + 20), caption, 12, PALE_INK)
+    for name, line in chart.lines.items():
+        points = [place(x, y) for x, y in zip(line.x, line.y, strict=True)]
+        color = _color(names.index(name))
+        draw.line(points, fill=color, width=3, joint="curve")
+        for x, y in points:
+            draw.ellipse([(x - 3, y - 3), (x + 3, y + 3)], fill=color)
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """1, 2 and 5 times the powers of ten in a range of logarithms; where it is short, more of them."""
+    steps = (1, 2, 5) if high - low > 0.7 else (1, 1.5, 2, 2.5, 3, 4, 5, 7)
+    candidates = [step * 10.0**power for power in range(math.floor(low), math.ceil(high) + 1) for step in steps]
+    return [tick for tick in candidates if low <= math.log10(tick) <= high]
+
+
+def _color(number: int) -> tuple[int, int, int]:
+    return COLORS[number % len(COLORS)]
+
+
+def _write(
+    draw: ImageDraw.ImageDraw, corner: tuple[float, float], text: str, size: int, color: tuple[int, int, int] = INK
+) -> None:
+    draw.text(corner, text, font=ImageFont.load_default(size), fill=color)

@@ -1,0 +1,160 @@
+"""What the signed distance, its normal and their backward pass cost behind a hash grid, by three routes side by side.
+
+    python -m benchmarks.kernels [--points 32768] [--repeats 9] [--device cpu]
+
+- naive: straightforward torch; the normal is autograd's gradient of the distance, differentiated once more by the loss.
+- reference: the analytic Jacobian and the hand-written adjoint of the package, in torch.
+- fastest: the same with the compiled loops (CPU) or Triton's kernels (CUDA).
+
+All three compute one loss of one field, and their gradients are compared before anything is timed. Routes take turns, so
+that whatever else the machine does falls on all; medians and their ratios are printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import itertools
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neilfpp_method.config import HashGridConfig, SdfConfig
+from neilfpp_method.fields.sdf import SdfField
+from neilfpp_method.kernels import GridSpec, encode
+from neilfpp_method.presets import preset
+
+RADIUS = 1.75
+PRIMES = (1, 2654435761, 805459861)
+SAMPLES = 32  # points of one ray: neighbours in memory are neighbours in space, as in training
+
+
+def naive_encode(x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpec) -> Float[Tensor, "N F"]:
+    """A hash grid as one writes it down: eight weighted rows a level."""
+    features = []
+    for level, resolution in enumerate(spec.resolutions):
+        scaled = x01.clamp(0, 1) * resolution
+        cell = scaled.detach().long().clamp(0, resolution - 1)
+        fraction = scaled - cell
+        total = torch.zeros(len(x01), spec.features, device=x01.device)
+        for corner in itertools.product((0, 1), repeat=3):
+            offset = torch.tensor(corner, device=x01.device)
+            i, j, k = (cell + offset).unbind(1)
+            if spec.is_dense(level):
+                row = i + (resolution + 1) * (j + (resolution + 1) * k)
+            else:
+                row = ((i * PRIMES[0]) ^ (j * PRIMES[1]) ^ (k * PRIMES[2])) % spec.entries_per_level[level]
+            x, y, z = torch.where(offset.bool(), fraction, 1 - fraction).unbind(1)
+            total = total + (x * y * z)[:, None] * table[spec.offsets[level] + row]
+        features.append(total)
+    return torch.cat(features, 1)
+
+
+def naive_step(field: SdfField, x: Float[Tensor, "N 3"]) -> None:
+    """Distance, normal by autograd, and the gradient of a loss on both."""
+    grid = field.encoding
+    x = x.detach().requires_grad_()
+    features = naive_encode(x / (2 * RADIUS) + 0.5, grid.table, grid.spec)
+    distance = field.mlp(torch.cat((x, features), 1))[:, 0]
+    (gradient,) = torch.autograd.grad(distance.sum(), x, create_graph=True)
+    loss_on(distance, gradient).backward()
+
+
+def analytic_step(field: SdfField, x: Float[Tensor, "N 3"]) -> None:
+    """The same by the package."""
+    sample = field.with_gradient(x)
+    loss_on(sample.distance, sample.gradient).backward()
+
+
+def loss_on(distance: Float[Tensor, " N"], gradient: Float[Tensor, "N 3"]) -> Float[Tensor, ""]:
+    return (gradient.norm(dim=1) - 1).square().mean() + distance.square().mean()
+
+
+def encode_alone(field: SdfField, x: Float[Tensor, "N 3"]) -> None:
+    """The grid's share: features, Jacobian, and the gradient of the table."""
+    grid = field.encoding
+    encoded = encode(x / (2 * RADIUS) + 0.5, grid.table, grid.spec, jacobian=True)
+    torch.autograd.backward((encoded.features, encoded.jacobian), (encoded.features, encoded.jacobian))
+
+
+def with_backend(step: Callable[[SdfField, Tensor], None], backend: str) -> Callable[[SdfField, Tensor], None]:
+    """A step of which the grid is computed by a backend."""
+
+    def chosen(field: SdfField, x: Float[Tensor, "N 3"]) -> None:
+        field.encoding.spec = dataclasses.replace(field.encoding.spec, backend=backend)
+        step(field, x)
+
+    return chosen
+
+
+def measure(config: SdfConfig, points: int, repeats: int, device: torch.device) -> dict[str, float]:
+    """Median milliseconds of each route."""
+    torch.manual_seed(0)
+    field = SdfField(config, RADIUS).to(device)
+    torch.nn.init.normal_(field.encoding.table, std=1e-2)
+    start = torch.nn.functional.normalize(torch.randn(points // SAMPLES, 1, 3, device=device), dim=-1)
+    along = torch.linspace(0.1, 1.5, SAMPLES, device=device)[:, None]
+    x = (start * along + 0.1 * torch.rand(points // SAMPLES, 1, 3, device=device)).reshape(-1, 3)
+    routes: dict[str, Callable[[SdfField, Tensor], None]] = {
+        "naive": naive_step,
+        "reference": with_backend(analytic_step, "reference"),
+        "fastest": with_backend(analytic_step, "auto"),
+        "reference, grid alone": with_backend(encode_alone, "reference"),
+        "fastest, grid alone": with_backend(encode_alone, "auto"),
+    }
+    gradients = []
+    for name in ("naive", "reference", "fastest"):
+        field.zero_grad()
+        routes[name](field, x)
+        gradients.append(field.encoding.table.grad.clone())
+    for gradient in gradients[1:]:
+        torch.testing.assert_close(gradient, gradients[0], rtol=1e-2, atol=1e-4 * gradients[0].abs().max().item())
+    seconds: dict[str, list[float]] = {name: [] for name in routes}
+    for _, (name, route) in itertools.product(range(repeats), routes.items()):
+        field.zero_grad()
+        synchronize(device)
+        started = time.perf_counter()
+        route(field, x)
+        synchronize(device)
+        seconds[name].append(time.perf_counter() - started)
+    return {name: 1e3 * statistics.median(values) for name, values in seconds.items()}
+
+
+def synchronize(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def hardware(device: torch.device) -> str:
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    listed = Path("/proc/cpuinfo")
+    names = [line.split(":")[1].strip() for line in listed.open() if "model name" in line] if listed.exists() else []
+    return f"{names[0] if names else platform.processor()}, {torch.get_num_threads()} threads"
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--points", type=int, default=32_768)
+    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--device", default="cpu")
+    told = parser.parse_args()
+    device = torch.device(told.device)
+    paper = SdfConfig(encoding="hash", grid=HashGridConfig(), layers=2, width=64, skip=None, feature_width=15)
+    print(f"{hardware(device)}; {told.points} points, medians of {told.repeats}")
+    for title, config in {"16 levels × 2, 2^19": paper, "the grid of `fast`, 8 × 2, 2^16": preset("fast").sdf}.items():
+        medians = measure(config, told.points, told.repeats, device)
+        print(title)
+        for name, median in medians.items():
+            print(f"  {name:24} {median:9.1f} ms   {medians['naive'] / median:6.1f} times faster than naive")
+
+
+if __name__ == "__main__":
+    main()

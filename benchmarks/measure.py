@@ -1,0 +1,89 @@
+"""What a benchmark says, and how time and memory are measured."""
+
+from __future__ import annotations
+
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+__all__ = ["Measurement", "hardware", "in_yardsticks", "median_seconds", "yardstick"]
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A figure that is compared with the committed one.
+
+    Attributes:
+        name: what is measured, unique in the suite.
+        value: the figure.
+        unit: of the value; "×" for a ratio within one run, which other machines share.
+        better: which way is better.
+        tolerance: relative change for the worse that is not yet worse; none for a figure that no other machine shares, which
+            is shown and never fails.
+    """
+
+    name: str
+    value: float
+    unit: str
+    better: Literal["lower", "higher"]
+    tolerance: float | None = None
+
+    def worse_than(self, baseline: float) -> bool:
+        """Whether the value lies on the wrong side of a baseline, by more than the tolerance."""
+        if self.tolerance is None:
+            return False
+        if self.better == "lower":
+            return self.value > baseline * (1 + self.tolerance)
+        return self.value < baseline / (1 + self.tolerance)
+
+
+def median_seconds(*functions: Callable[[], object], repetitions: int = 7) -> list[float]:
+    """The median duration of each function, after one call that does not count.
+
+    They take turns, so that whatever else the machine does falls on all of them: their ratios are worth more than their
+    durations.
+    """
+    for function in functions:
+        function()
+    seconds: list[list[float]] = [[] for _ in functions]
+    for _ in range(repetitions):
+        for function, taken in zip(functions, seconds, strict=True):
+            started = time.perf_counter()
+            function()
+            taken.append(time.perf_counter() - started)
+    return [statistics.median(taken) for taken in seconds]
+
+
+def hardware() -> str:
+    """The machine in a line."""
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
+    return f"{_processor()}, {torch.get_num_threads()} thread(s), GPU {gpu}, torch {torch.__version__}"
+
+
+def _processor() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        names = [line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
+        if names:
+            return names[0]
+    return platform.processor() or platform.machine()
+
+
+def yardstick() -> None:
+    """Work that a machine does about as fast as ours: products of matrices and sines, some hundredths of a second."""
+    x = torch.ones(2048, 256)
+    weight = torch.full((256, 256), 1e-3)
+    for _ in range(16):
+        x = torch.sin(x @ weight)
+
+
+def in_yardsticks(function: Callable[[], object], repetitions: int) -> float:
+    """The duration of a function, in durations of `yardstick`: a figure that machines share better than seconds."""
+    taken, unit = median_seconds(function, yardstick, repetitions=repetitions)
+    return taken / unit

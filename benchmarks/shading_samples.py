@@ -1,0 +1,234 @@
+"""Error of the shading integral against the number of incident directions, on the true light of captures.
+
+    python -m benchmarks.shading_samples DATA/tabletop_env DATA/tabletop_mix --out docs
+
+At the points of the true light field, seen from some of its directions, the surface has its true colour and metallicity and
+one roughness after another. Every sampler estimates the same integral, of METHOD §1's BRDF and the true light interpolated
+between its 4096 directions; the reference is the same estimator with 9216 directions of all techniques together. The error is
+the root of the mean square over points, views, channels and repetitions, divided by that of the reference.
+
+What is known of the light when it is sampled, from little to much, each on a table of 256 cells times the cosine:
+  scene       one table for the scene, the mean over its points: what an environment map knows
+  neighbours  the mean over the four nearest other points: what a coarse cache of positions knows
+  learned     the factorised light field, fitted for 20 s to three of four points by relative squares: what training may know
+  point       the truth at the point itself: the best that a table can do
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import tyro
+from jaxtyping import Float
+from rich.console import Console
+from torch import Tensor
+
+from benchmarks.charts import Chart, Line, draw_charts
+from benchmarks.light_fields import KINDS, Field, fit, relative_error, split
+from benchmarks.measure import Measurement, hardware, in_yardsticks
+from benchmarks.true_light import TrueLight, read_light, true_light
+from neilfpp_method.data.truth import LightField
+from neilfpp_method.demo import demo_scene
+from neilfpp_method.fields.free_light import make_incident_light
+from neilfpp_method.shading.brdf import SPHERICAL_GAUSSIAN
+from neilfpp_method.shading.rendering_equation import shade
+from neilfpp_method.shading.sampling import Technique, combine, cosine, sample_directions, specular_lobe, tabulated
+from neilfpp_method.shading.tabulated import cell_directions, with_cosine
+from neilfpp_method.structures import IncidentSamples, Material
+
+__all__ = ["Scene", "error_curves", "measurements", "scene_of", "techniques"]
+
+COUNTS = (8, 16, 32, 64, 128, 256)
+ROUGHNESS = (0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0)
+VIEWS = 4
+REPETITIONS = 4
+CELLS = 16  # rows and columns of a table
+REFERENCE = 3072  # directions of each of three techniques
+UNKNOWN = 0.1  # share of a table's mean that a cell has at least, where the table belongs to other points
+LEARNING = 20.0  # seconds
+LOBE = SPHERICAL_GAUSSIAN
+
+
+@dataclass
+class Options:
+    """Measure the samplers on captures whose light is known."""
+
+    captures: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders of captures."""
+    out: Path = Path("runs/benchmarks")
+    """Where the figure and the table go."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """M pairs of a point and a view, with the light at each and what is known of it."""
+
+    normal: Float[Tensor, "M 3"]
+    wo: Float[Tensor, "M 3"]
+    material: Material
+    light: TrueLight
+    tables: Mapping[str, Float[Tensor, "M R C"]]
+
+    def shade(self, roughness: float, samples: IncidentSamples) -> Float[Tensor, "M 3"]:
+        """The estimate of the outgoing radiance of a surface with this roughness."""
+        even = torch.full_like(self.material.roughness, roughness)
+        material = Material(self.material.base_color, even, self.material.metallic)
+        return shade(material, self.normal, self.wo, samples, self.light.radiance(samples.wi), LOBE).color
+
+    def lobe(self, roughness: float) -> Technique:
+        even = torch.full_like(self.material.roughness, roughness)
+        return specular_lobe(self.normal, self.wo, even, LOBE)
+
+    def to_light(self, knowledge: str) -> Technique:
+        """Sampling of the light as far as it is known."""
+        return tabulated(with_cosine(self.tables[knowledge], self.normal), self.normal)
+
+
+Draw = Callable[[Scene, float, int], IncidentSamples]
+
+
+@torch.no_grad()
+def scene_of(field: LightField, learned: Field, views: int = VIEWS) -> Scene:
+    """The true light field of a capture, seen from the first of its directions, and a field that has learned from it."""
+    light = true_light(field.wi, field.incident)
+    rows = torch.arange(len(field.position)).repeat_interleave(views)
+    known = _tables(field, light) | {"learned": _learned_table(field, learned)}
+    tables = {name: table.expand(len(field.position), -1, -1)[rows] for name, table in known.items()}
+    return Scene(field.normal[rows], field.wo[:, :views].reshape(-1, 3), field.material[rows], light[rows], tables)
+
+
+def _tables(field: LightField, light: TrueLight) -> dict[str, Float[Tensor, "N R C"]]:
+    seen = light.directions().matmul(field.normal.T).permute(2, 0, 1) > 0
+    power = light.grid.mean(-1) * seen
+
+    def mean_over(points: Tensor) -> Tensor:
+        mean = power[points].sum(-3) / seen[points].sum(-3).clamp_min(1)
+        table = _coarse(mean.view(-1, *mean.shape[-2:]))
+        return table + UNKNOWN * table.mean((1, 2), keepdim=True)
+
+    apart = torch.cdist(field.position, field.position).fill_diagonal_(math.inf)
+    everywhere = torch.arange(len(field.position))[None]
+    return {
+        "scene": mean_over(everywhere),
+        "neighbours": mean_over(apart.topk(4, largest=False).indices),
+        "point": _coarse(power),
+    }
+
+
+def _learned_table(field: LightField, learned: Field) -> Float[Tensor, "N R C"]:
+    """What a field says of each cell, asked four times."""
+    wi = cell_directions(2 * CELLS, 2 * CELLS, field.position)
+    return _coarse(learned.radiance(field.position, wi.flatten(0, 1)).mean(-1).unflatten(1, wi.shape[:2]))
+
+
+def _coarse(power: Float[Tensor, "N H W"]) -> Float[Tensor, "N R C"]:
+    return torch.nn.functional.adaptive_avg_pool2d(power[:, None], CELLS)[:, 0]
+
+
+def techniques() -> dict[str, Draw]:
+    """The samplers that are compared, by name; the first is the paper's."""
+
+    def plain(kind: str) -> Draw:
+        return lambda scene, roughness, count: sample_directions(
+            kind, scene.normal, scene.wo, torch.full_like(scene.material.roughness, roughness), count, LOBE, stochastic=True
+        )
+
+    def with_light(knowledge: str) -> Draw:
+        return lambda scene, roughness, count: sample_directions(
+            "mis",
+            scene.normal,
+            scene.wo,
+            torch.full_like(scene.material.roughness, roughness),
+            count,
+            LOBE,
+            stochastic=True,
+            light=scene.to_light(knowledge),
+        )
+
+    known = {f"mis, light: {name}": with_light(name) for name in ("scene", "neighbours", "learned", "point")}
+    return {kind: plain(kind) for kind in ("fibonacci", "cosine", "lobe", "mis")} | known
+
+
+@torch.no_grad()
+def error_curves(
+    scene: Scene, roughness: float, draws: Mapping[str, Draw], counts: tuple[int, ...] = COUNTS
+) -> dict[str, Line]:
+    """Relative root mean square error over the number of directions, by sampler."""
+    parts = [cosine(scene.normal), scene.lobe(roughness), scene.to_light("point")]
+    samples = combine([(part, REFERENCE) for part in parts], stochastic=True)
+    truth = scene.shade(roughness, samples)
+    size = truth.square().mean().sqrt()
+    lines = {}
+    for name, draw in draws.items():
+        errors = []
+        for count in counts:
+            estimates = [scene.shade(roughness, draw(scene, roughness, count)) for _ in range(REPETITIONS)]
+            mean_square = torch.stack([(estimate - truth).square().mean() for estimate in estimates]).mean()
+            errors.append((mean_square.sqrt() / size).item())
+        lines[name] = Line(counts, errors)
+    return lines
+
+
+def measurements() -> Iterator[Measurement]:
+    """The error of 32 directions with the light known at the point over that of Fibonacci-128, and the time of the integral."""
+    torch.manual_seed(0)
+    unused = make_incident_light(KINDS["factorised"].config, 10.0, 1.0)
+    scene = scene_of(read_light(demo_scene()), unused)
+    draws = techniques()
+    paper, best = draws["fibonacci"], draws["mis, light: point"]
+    for roughness in (0.1, 0.35, 1.0):
+        few = error_curves(scene, roughness, {"": best}, counts=(32,))[""].y[0]
+        many = error_curves(scene, roughness, {"": paper}, counts=(128,))[""].y[0]
+        yield Measurement(f"shading/error of 32 over Fibonacci-128, roughness {roughness:g}", few / many, "×", "lower", 1.0)
+    for name, draw, count in (("Fibonacci-128", paper, 128), ("32 by mis with light", best, 32)):
+
+        def integrate(draw: Draw = draw, count: int = count) -> None:
+            scene.shade(0.35, draw(scene, 0.35, count))
+
+        taken = in_yardsticks(integrate, repetitions=21)  # milliseconds, which a busy machine stretches most
+        yield Measurement(f"shading/256 points, {name}", taken, "yardsticks", "lower", tolerance=1.0)
+
+
+def table(curves: Mapping[float, Mapping[str, Line]]) -> str:
+    """Markdown: by roughness, the error of Fibonacci-128, that of each sampler with 32 directions, and the least number of
+    directions with which the last sampler reaches the first."""
+    names = list(next(iter(curves.values())))
+    head = ["roughness", f"{names[0]}, 128", *(f"{name}, 32" for name in names[1:]), "least directions of the last"]
+    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    for roughness, by_name in curves.items():
+        goal = _at(by_name[names[0]], 128)
+        last = by_name[names[-1]]
+        least = next((str(count) for count, error in zip(last.x, last.y, strict=True) if error <= goal), "–")
+        cells = [f"{roughness:g}", f"{goal:.3f}", *(f"{_at(by_name[name], 32):.3f}" for name in names[1:]), least]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _at(line: Line, count: int) -> float:
+    return line.y[list(line.x).index(count)]
+
+
+def main(options: Options) -> None:
+    """Measure, print the tables, write them and the figure."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    torch.manual_seed(0)
+    sections, charts = [hardware()], []
+    for capture in options.captures:
+        field = read_light(capture)
+        scene = scene_of(field, fit(KINDS["factorised, shared"], split(field), (LEARNING,), relative_error).net)
+        curves = {roughness: error_curves(scene, roughness, techniques()) for roughness in ROUGHNESS}
+        sections.append(f"### {capture.name}\n\n{table(curves)}\n")
+        charts += [Chart(f"{capture.name}, roughness {r:g}", curves[r]) for r in (0.1, 0.35, 1.0)]
+    text = "\n\n".join(sections)
+    (options.out / "shading_samples.md").write_text(text + "\n")
+    title = "The shading integral: what a direction is worth"
+    draw_charts(options.out / "shading_samples.png", title, "incident directions", "relative RMSE", charts, columns=3)
+    Console().print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

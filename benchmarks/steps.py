@@ -1,0 +1,110 @@
+"""Whole training steps of every stage and preset, rendering for evaluation, and the memory that a step takes.
+
+The scene is the one in the package; the surface is the sphere that every geometry starts as, made sharp, so that the material
+stages have hits to shade. Numbers of rays are small; networks and samples per ray and per point are the presets' own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import multiprocessing
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import cache
+from pathlib import Path
+
+from benchmarks.measure import Measurement, in_yardsticks
+from neilfpp_method.config import NeilfConfig
+from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.demo import demo_scene
+from neilfpp_method.model import NeilfModel
+from neilfpp_method.presets import PRESETS, preset
+from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.train.build import build_model, scene_facts
+from neilfpp_method.train.loop import make_optimizer, seed_step
+
+__all__ = ["measurements", "step_of"]
+
+RAYS = 64
+EVALUATED = 256  # rays
+REPETITIONS = 3
+PROCESS = Path("/proc/self")
+SHARP = 3e-3  # β of a surface that counts as trained, scene units
+
+
+def config_of(name: str) -> NeilfConfig:
+    """A preset for the scene in the package, which has no point cloud, with a surface that can be shaded."""
+    config = preset(name)
+    return dataclasses.replace(
+        config,
+        loss=dataclasses.replace(config.loss, point_cloud=0.0),
+        volume=dataclasses.replace(config.volume, beta_init=SHARP),
+    )
+
+
+@cache
+def _pixels() -> PixelDataset:
+    capture = load_capture(demo_scene())
+    return PixelDataset(capture, capture.train_views)
+
+
+def model_of(name: str) -> NeilfModel:
+    """The untrained model of a preset."""
+    config, pixels = config_of(name), _pixels()
+    seed_step(config.train.seed, step=-1)
+    return build_model(pixels.capture, scene_facts(pixels.capture, pixels, config), config)
+
+
+def step_of(model: NeilfModel, stage: Stage, rays: int = RAYS) -> Callable[[], None]:
+    """A training step, as the loop takes it; always on the same pixels, that steps may be compared."""
+    config = model.config
+    weights = active_losses(stage, config, model.stages)
+    optimizer = make_optimizer(model, config.optimizer)
+    for group in optimizer.param_groups:
+        group["lr"] = 0.0  # the surface stays where it is, step by step
+    seed_step(0, 0)
+    batch = _pixels().sample(rays)
+
+    def step() -> None:
+        seed_step(0, 1)
+        model.freeze_for(stage)
+        total = weigh(model(batch, stage), weights)
+        optimizer.zero_grad(set_to_none=True)
+        total.loss.backward()
+        optimizer.step()
+
+    return step
+
+
+def peak_mebibytes(name: str) -> float:
+    """What a joint step of a model adds, at its peak, to the memory of the process. Linux alone tells."""
+    step = step_of(model_of(name), Stage.JOINT)
+    (PROCESS / "clear_refs").write_text("5")  # the peak so far is forgotten
+    before = _resident("VmRSS")
+    step()
+    return _resident("VmHWM") - before
+
+
+def _resident(name: str) -> float:
+    """A figure of this process's memory, MiB."""
+    lines = (PROCESS / "status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:")) / 1024
+
+
+def measurements() -> Iterator[Measurement]:
+    """Steps in yardsticks, pixels per yardstick, and memory."""
+    for name in PRESETS:
+        model = model_of(name)
+        for stage in Stage:
+            taken = in_yardsticks(step_of(model, stage), REPETITIONS)
+            yield Measurement(f"step/{name}/{stage.value}", taken, "yardsticks", "lower", tolerance=0.5)
+        model.eval()
+        rays = _pixels().sample(EVALUATED).rays
+        taken = in_yardsticks(lambda model=model, rays=rays: model.maps(rays), REPETITIONS)
+        yield Measurement(f"evaluation/{name}", EVALUATED / taken, "pixels a yardstick", "higher", tolerance=0.5)
+    spawn = multiprocessing.get_context("spawn")  # a process of its own: none of its memory has been used before
+    for name in PRESETS if (PROCESS / "clear_refs").exists() else ():
+        with ProcessPoolExecutor(1, mp_context=spawn) as fresh:
+            peak = fresh.submit(peak_mebibytes, name).result()
+        yield Measurement(f"memory/{name}/joint", peak, "MiB", "lower", tolerance=0.3)

@@ -1,0 +1,168 @@
+"""Folders of exposure brackets: which images belong together, and all of them merged into linear EXR."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float32
+
+from neilfpp_method.data.brackets import Bracket, Response, calibrate, linear_response, merge, srgb_response
+from neilfpp_method.data.images import IMAGE_SUFFIXES, read_image, write_exr, write_png
+from neilfpp_method.data.photo_exposure import exposures_of
+from neilfpp_method.data.raw import RAW_SUFFIXES, develop
+from neilfpp_method.data.views import inside
+from neilfpp_method.errors import UserError
+
+__all__ = ["find_brackets", "merge_folder"]
+
+GROUPS = "brackets.json"
+NUMBERED = re.compile(r"[_-]\d+$")
+CALIBRATED = 6
+"""Most brackets that a response is calibrated from."""
+
+
+def find_brackets(folder: Path, exposures: Path | None = None) -> Mapping[str, Mapping[Path, float]]:
+    """The brackets of a folder: by the name of the pose, its images with their exposures.
+
+    Images belong together when `brackets.json` says so ({"pose": ["a.jpg", "b.jpg"]}); when they lie in one sub-folder;
+    when their names are NAME_0, NAME_1, …; or when, in the order of their names, the same exposures return again and
+    again.
+
+    Args:
+        folder: where the images are.
+        exposures: a file of exposures, as `exposures_of` reads it; none: beside the images, or from EXIF.
+
+    Raises:
+        UserError: no brackets, an image without an exposure, or two images of a bracket with the same one.
+    """
+    listed = _listed_groups(folder)
+    images = [image for group in listed.values() for image in group]
+    if not images:
+        raise UserError(f"{folder}: no images", f"one of {', '.join((*IMAGE_SUFFIXES, *RAW_SUFFIXES))}")
+    known = exposures_of(folder, images, exposures)
+    by_name = images[0].parent == folder and not (folder / GROUPS).is_file()
+    guess = by_name and not all(_is_bracket(group, known) for group in listed.values())
+    groups = _returning_groups(images, known) if guess else listed
+    for name, group in groups.items():
+        if not _is_bracket(group, known):
+            raise UserError(
+                f"{folder}: the {len(group)} images of '{name}' are no bracket: their exposures do not all differ",
+                f"put each pose in a folder of its own, or list the poses in {GROUPS}",
+            )
+    return {name: {image: known[image] for image in group} for name, group in groups.items()}
+
+
+def _listed_groups(folder: Path) -> Mapping[str, Sequence[Path]]:
+    """Groups as files and folders name them; of images that only differ in a number, one group."""
+    path = folder / GROUPS
+    if path.is_file():
+        try:
+            named = {str(name): [folder / file for file in files] for name, files in json.loads(path.read_text()).items()}
+        except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+            raise UserError(f"{path}: no list of brackets ({error})", 'write {"pose": ["a.jpg", "b.jpg"]}') from error
+        for name in named:
+            if Path(name).name != name or name.startswith("."):
+                raise UserError(f"{path}: a pose cannot be called {name!r}", "give it the name of a file without suffix")
+        for image in (image for group in named.values() for image in group):
+            if not inside(folder, image).is_file():
+                raise UserError(f"{path}: there is no {image}", "correct the list")
+        return named
+    groups: dict[str, list[Path]] = defaultdict(list)
+    for image in _images(folder):
+        groups[NUMBERED.sub("", image.stem)].append(image)
+    folders = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    return groups or {path.name: images for path in folders if (images := _images(path))}
+
+
+def _images(folder: Path) -> list[Path]:
+    shown = {*IMAGE_SUFFIXES, *RAW_SUFFIXES}
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in shown and not p.name.startswith("."))
+
+
+def _returning_groups(images: Sequence[Path], exposures: Mapping[Path, float]) -> Mapping[str, Sequence[Path]]:
+    """Runs of the shortest period of the exposures; the whole sequence where there is none."""
+    period = next(
+        n
+        for n in range(1, len(images) + 1)
+        if len(images) % n == 0 and all(exposures[a] == exposures[b] for a, b in zip(images, images[n:], strict=False))
+    )
+    return {images[i].stem: images[i : i + period] for i in range(0, len(images), period)}
+
+
+def _is_bracket(images: Sequence[Path], exposures: Mapping[Path, float]) -> bool:
+    return 2 <= len(images) == len({exposures[image] for image in images})
+
+
+def merge_folder(
+    folder: Path,
+    images: Path,
+    valid: Path,
+    response: Literal["auto", "linear", "srgb"] = "auto",
+    exposures: Path | None = None,
+    on_merged: Callable[[str], None] | None = None,
+) -> tuple[str, ...]:
+    """Merge all brackets of a folder; returns the names of the poses, in order.
+
+    Writes linear float `images/NAME.exr`, all on one radiance scale, in which 1 is about the white of the middle
+    exposure, and `valid/NAME.png`, white where the radiance is known.
+
+    Args:
+        folder: the photographs, grouped as `find_brackets` says.
+        images: where the merged images go.
+        valid: where the validity masks go.
+        response: what the pixels are; auto: linear for camera RAW, else calibrated from the brackets themselves.
+        exposures: a file of exposures.
+        on_merged: called with the name of each pose once it is written.
+
+    Raises:
+        UserError: as `find_brackets`; an image cannot be read; the images of a pose differ in size; or the response
+            cannot be calibrated.
+    """
+    brackets = find_brackets(folder, exposures)
+    middle = float(np.median([exposure for bracket in brackets.values() for exposure in bracket.values()]))
+    decode = _response(brackets, response)
+    for name, bracket in brackets.items():
+        merged = merge(_read(bracket, middle), decode)
+        write_exr(images / f"{name}.exr", {"RGB": merged.radiance})
+        write_png(valid / f"{name}.png", np.where(merged.valid, 255, 0).astype(np.uint8))
+        if on_merged:
+            on_merged(name)
+    return tuple(brackets)
+
+
+def _response(brackets: Mapping[str, Mapping[Path, float]], response: str) -> Response:
+    raw = {image.suffix.lower() in RAW_SUFFIXES for bracket in brackets.values() for image in bracket}
+    if response != "auto" or raw == {True}:
+        return {"linear": linear_response, "srgb": srgb_response}["linear" if response == "auto" else response]
+    if len(raw) > 1:
+        raise UserError("camera RAW and other images in one folder", "keep one of the two")
+    alike = Counter(tuple(bracket.values()) for bracket in brackets.values()).most_common(1)[0][0]
+    usable = [bracket for bracket in brackets.values() if tuple(bracket.values()) == alike]
+    step = -(-len(usable) // CALIBRATED)
+    return calibrate([_read(bracket, 1.0) for bracket in usable[::step]])
+
+
+def _read(bracket: Mapping[Path, float], unit: float) -> Bracket:
+    """The pixels of a bracket, and its exposures in a unit."""
+    frames = {path: _frame(path) for path in bracket}
+    first = next(iter(frames))
+    for path, frame in frames.items():
+        if frame.shape != frames[first].shape:
+            raise UserError(f"{path}: another size than {first.name}", "do not crop or turn single images of a bracket")
+    return Bracket(tuple(frames.values()), tuple(exposure / unit for exposure in bracket.values()))
+
+
+def _frame(path: Path) -> Float32[np.ndarray, "H W 3"]:
+    if path.suffix.lower() in RAW_SUFFIXES:
+        developed = develop(path)
+        return np.where(developed.valid[..., None], developed.pixels, np.float32(1.0))
+    image = read_image(path)
+    if image.hdr:
+        raise UserError(f"{path}: holds linear radiance already", "use it as it is; merge photographs only")
+    return image.pixels if image.pixels.shape[2] == 3 else image.pixels.repeat(3, axis=2)

@@ -1,0 +1,180 @@
+"""The project's own capture folder: `capture.json`, and the images, masks and points that it names.
+
+docs/captures.md describes every entry, so that the folder can be read and written without this project.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+
+from neilfpp_method.data.json_entry import Entry, write_json
+from neilfpp_method.data.lens import Lens
+from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, View, inside
+from neilfpp_method.errors import UserError
+
+__all__ = ["FILE", "LAYOUT", "Writable", "read", "read_scene", "recognise", "write_capture"]
+
+LAYOUT = "a capture.json that names its format"
+FILE = "capture.json"
+FORMAT = "neilfpp-capture"
+VERSION = 1
+
+
+def recognise(root: Path) -> bool:
+    """Whether the folder has a `capture.json` of this format; a run's folder has one of another."""
+    path = root / FILE
+    return path.is_file() and FORMAT.encode() in path.read_bytes()
+
+
+def read(root: Path) -> CaptureFiles:
+    """The capture's files.
+
+    Raises:
+        UserError: `capture.json` is malformed, of a later version, or names a file that is missing or outside the folder.
+    """
+    entry = Entry.load(inside(root, root / FILE))
+    entry["format"].word(FORMAT)
+    if entry["version"].size() > VERSION:
+        raise UserError(f"{entry.where}: version {entry['version'].size()} of the format", f"version {VERSION} is read")
+    views = tuple(_view(root, i, view) for i, view in enumerate(entry["views"].items()))
+    if not views:
+        raise UserError(f"{entry.where}: no views", "add some")
+    test = entry.get("test")
+    return CaptureFiles(
+        inputs=root,
+        views=views,
+        normalisation=read_scene(entry["scene"]),
+        point_cloud=_file(root, entry, "point_cloud"),
+        test=None if test is None else frozenset(name.word() for name in test.items()),
+        hdr=entry["response"].word("linear", "srgb") == "linear",
+    )
+
+
+def read_scene(entry: Entry) -> Normalisation:
+    """The scene box of an entry with `centre` and `radius`.
+
+    Raises:
+        UserError: they are no numbers, or the radius is not positive.
+    """
+    x, y, z = map(float, entry["centre"].numbers((3,)))
+    radius = entry["radius"].number()
+    if radius <= 0:
+        raise UserError(f"{entry.name('radius')}: not positive", "give half the largest extent of the scene's box")
+    return Normalisation(radius, (x, y, z))
+
+
+def _view(root: Path, index: int, entry: Entry) -> View:
+    image = _file(root, entry, "image")
+    if image is None:
+        raise UserError(f"{entry.name('image')} is missing", "name the image's file")
+    exposure, balance = entry.get("exposure"), entry.get("white_balance")
+    red, green, blue = (1.0, 1.0, 1.0) if balance is None else map(float, balance.numbers((3,)))
+    return View(
+        name=entry["name"].word(),
+        index=index,
+        camera=_camera(entry["camera"]),
+        image=image,
+        mask=_file(root, entry, "mask"),
+        valid=_file(root, entry, "valid"),
+        exposure=1.0 if exposure is None else exposure.number(),
+        white_balance=(red, green, blue),
+    )
+
+
+def _camera(entry: Entry) -> Camera:
+    fx, fy, cx, cy = (entry[name].number() for name in ("fx", "fy", "cx", "cy"))
+    lens = entry.get("lens")
+    return Camera(
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        width=entry["width"].size(),
+        height=entry["height"].size(),
+        w2c=entry["w2c"].numbers((4, 4), (16,)).reshape(4, 4),
+        lens=lens and Lens(lens["model"].word(), tuple(map(float, lens["coefficients"].numbers()))),
+    )
+
+
+def _file(root: Path, entry: Entry, key: str) -> Path | None:
+    named = entry.get(key)
+    if named is None:
+        return None
+    path = inside(root, root / named.text())
+    if not path.is_file():
+        raise UserError(f"{named.where}: there is no {path}", "put the file there, or correct the path")
+    return path
+
+
+# -------------------------------------------------------------------------------------------------------------- writing
+
+
+@runtime_checkable
+class Writable(Protocol):
+    """What is written: a `CaptureFiles`, or a `Capture`."""
+
+    @property
+    def views(self) -> tuple[View, ...]: ...
+
+    @property
+    def normalisation(self) -> Normalisation: ...
+
+    @property
+    def point_cloud(self) -> Path | None: ...
+
+
+def write_capture(root: Path, files: Writable, *, response: Literal["linear", "srgb"], test: Collection[str] = ()) -> Path:
+    """Write `capture.json` into a folder whose images, masks and points are there already; returns its path.
+
+    Args:
+        root: the capture's folder.
+        files: views, scene box and point cloud; all paths lie in `root`.
+        response: what the pixels are.
+        test: the names of the views that are held out.
+
+    Raises:
+        UserError: a path leads out of `root`, or `test` names no view.
+    """
+    names = [view.name for view in files.views]
+    if strange := sorted(set(test) - set(names)):
+        raise UserError(f"{root}: there is no view {strange[0]!r} to hold out", "name views of the capture")
+    description = {
+        "format": FORMAT,
+        "version": VERSION,
+        "response": response,
+        "scene": {"centre": list(files.normalisation.centre), "radius": files.normalisation.scale},
+        "test": [name for name in names if name in test],
+        "point_cloud": _relative(root, files.point_cloud),
+        "views": [_described(root, view) for view in files.views],
+    }
+    write_json(root / FILE, description)
+    return root / FILE
+
+
+def _described(root: Path, view: View) -> dict[str, Any]:
+    camera, lens = view.camera, view.camera.lens
+    numbers = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
+    return {
+        "name": view.name,
+        "image": _relative(root, view.image),
+        "mask": _relative(root, view.mask),
+        "valid": _relative(root, view.valid),
+        "camera": {
+            **numbers,
+            "width": camera.width,
+            "height": camera.height,
+            "w2c": np.asarray(camera.w2c, np.float64).tolist(),
+            "lens": lens and {"model": lens.model, "coefficients": list(map(float, lens.coefficients))},
+        },
+        "exposure": float(view.exposure),
+        "white_balance": list(map(float, view.white_balance)),
+    }
+
+
+def _relative(root: Path, path: Path | None) -> str | None:
+    """The path as it stands in the file: from `root`, with forward slashes."""
+    return path and inside(root, path).resolve().relative_to(root.resolve()).as_posix()

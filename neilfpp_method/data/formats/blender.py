@@ -1,0 +1,53 @@
+"""Reader of Blender's transforms_train.json and transforms_test.json, as NeRF's synthetic scenes and Stanford-ORB have them.
+
+camera_angle_x                     radians, for all frames or in each
+frames[].file_path                 without suffix: .png with alpha, .exr, …
+frames[].transform_matrix          camera to world, 4×4, OpenGL axes
+<folder>_mask/<name>.png           optional: the masks of the images in <folder>; without them an alpha channel is the mask
+
+Views of the test file are held out. Validation views, and those of other scenes (transforms_novel.json), are left out.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from neilfpp_method.data.formats.places import stored, view_names
+from neilfpp_method.data.formats.transforms import Frame, read_frames
+from neilfpp_method.data.json_entry import Entry
+from neilfpp_method.data.scene_box import find_box
+from neilfpp_method.data.views import CaptureFiles, View, inside
+
+__all__ = ["LAYOUT", "read", "recognise"]
+
+LAYOUT = "transforms_train.json"
+TEST = "transforms_test.json"
+
+
+def recognise(root: Path) -> bool:
+    """Whether the folder has a transforms_train.json."""
+    return (root / LAYOUT).is_file()
+
+
+def read(root: Path) -> CaptureFiles:
+    """The capture's files: the training views, then the test views.
+
+    Raises:
+        UserError: a file is malformed, or names an image that is missing or outside the folder.
+    """
+    train = read_frames(root, Entry.load(inside(root, root / LAYOUT)))
+    held_out = (root / TEST).is_file()
+    test = read_frames(root, Entry.load(inside(root, root / TEST))) if held_out else ()
+    names = view_names([frame.listed for frame in (*train, *test)])
+    views = tuple(
+        View(name, i, frame.camera, frame.image, frame.mask or _mask(root, frame))
+        for i, (name, frame) in enumerate(zip(names, (*train, *test), strict=True))
+    )
+    box = find_box(views)
+    split = frozenset(names[len(train) :]) if held_out else None
+    return CaptureFiles(root, views, box.normalisation, test=split, scene_from=box.source)
+
+
+def _mask(root: Path, frame: Frame) -> Path | None:
+    folder = frame.image.parent
+    return stored(root, folder.with_name(f"{folder.name}_mask") / f"{frame.image.stem}.png")

@@ -1,0 +1,112 @@
+"""Reader of COLMAP models, text or binary, with rigs or from before them; any camera model but panoramas.
+
+sparse/0, sparse, …, or the folder itself     cameras, images, points3D (.bin or .txt)
+images/                                       the images, or beside the model; EXR files may stand for the listed ones
+masks/<image>.png, masks/<stem>.png           optional
+fused.ply, dense/fused.ply                    optional: COLMAP's dense points with normals
+
+The images are used as they are: a lens keeps its distortion, and its rays are bent instead of the image.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float64
+
+from neilfpp_method.data.formats.colmap_sizes import check_sizes
+from neilfpp_method.data.formats.places import stored, stored_image, view_names
+from neilfpp_method.data.lens import PANORAMAS, lens_of
+from neilfpp_method.data.scene_box import find_box
+from neilfpp_method.data.views import Camera, CaptureFiles, View, inside
+from neilfpp_method.errors import UserError
+
+__all__ = ["LAYOUT", "camera_of", "model_folder", "open_model", "read", "recognise"]
+
+LAYOUT = "a COLMAP model in sparse/0, sparse or the folder itself"
+MODELS = ("sparse/0", "sparse", ".", "colmap/sparse/0", "dense/sparse", "dense/0/sparse")
+IMAGE_FOLDERS = ("images", "dense/images", "dense/0/images", ".")
+POINT_CLOUDS = ("fused.ply", "dense/fused.ply", "dense/0/fused.ply")
+FILES = ("cameras", "images", "points3D")
+
+
+def recognise(root: Path) -> bool:
+    """Whether the folder has a complete model where COLMAP's tools put it."""
+    return model_folder(root) is not None
+
+
+def read(root: Path) -> CaptureFiles:
+    """The capture's files: one view for each registered image, in the order of their names.
+
+    Raises:
+        UserError: the model is malformed or empty, has a panorama, or an image is missing or outside the folder.
+    """
+    folder = model_folder(root)
+    if folder is None:
+        raise UserError(f"{root}: no COLMAP model", f"it needs {LAYOUT}")
+    for file in sorted(folder.iterdir()):
+        inside(root, file)
+    model = open_model(folder)
+    registered = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
+    if not registered:
+        raise UserError(f"{folder}: the model has no registered image", "reconstruct the cameras again")
+    first = registered[0].name
+    inputs = next((root / place for place in IMAGE_FOLDERS if stored(root, root / place / first)), None)
+    if inputs is None:
+        raise UserError(f"{root}: there is no images/{first}", "put the images of the model into the folder images")
+    views = []
+    for index, (image, name) in enumerate(zip(registered, view_names([i.name for i in registered]), strict=True)):
+        file = stored_image(root, inputs / image.name, f"{folder}: {image.name}")
+        w2c = np.concatenate([image.cam_from_world().matrix(), [[0.0, 0.0, 0.0, 1.0]]])
+        camera = camera_of(image.camera, w2c, f"{folder}: {image.name}")
+        views.append(View(name, index, camera, file, _mask(root, image.name)))
+    points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+    cloud = next((inside(root, root / place) for place in POINT_CLOUDS if (root / place).is_file()), None)
+    box = find_box(views, points[np.isfinite(points).all(axis=1)])
+    return CaptureFiles(inputs, tuple(views), box.normalisation, cloud, scene_from=box.source)
+
+
+def open_model(folder: Path) -> pycolmap.Reconstruction:
+    """A model as pycolmap reads it.
+
+    Raises:
+        UserError: it is malformed or cut off.
+    """
+    try:
+        check_sizes(folder)
+        return pycolmap.Reconstruction(folder)
+    except (ValueError, IndexError, RuntimeError, MemoryError, OSError) as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise UserError(f"{folder}: not a COLMAP model that can be read ({reason})", "export the model again") from error
+
+
+def camera_of(camera: pycolmap.Camera, w2c: Float64[np.ndarray, "4 4"], where: str) -> Camera:
+    """pycolmap's camera with a pose; a lens that bends nothing becomes a pinhole.
+
+    Raises:
+        UserError: a panorama, which has no image plane; names `where`.
+    """
+    if camera.model_name in PANORAMAS:
+        raise UserError(f"{where}: a camera of the model {camera.model_name}", "cut the panorama into perspective images")
+    params = np.asarray(camera.params, dtype=np.float64)
+    fx, fy = np.broadcast_to(params[list(camera.focal_length_idxs())], 2)
+    cx, cy = params[list(camera.principal_point_idxs())]
+    lens = lens_of(camera.model_name, params[list(camera.extra_params_idxs())].tolist())
+    return Camera(float(fx), float(fy), float(cx), float(cy), camera.width, camera.height, w2c, lens)
+
+
+def model_folder(root: Path) -> Path | None:
+    """Where the complete model lies; none: there is none."""
+    for place in MODELS:
+        folder = root / place
+        if any(all((folder / f"{name}{suffix}").is_file() for name in FILES) for suffix in (".bin", ".txt")):
+            return folder
+    return None
+
+
+def _mask(root: Path, image: str) -> Path | None:
+    """COLMAP's own name for a mask adds .png to the image's; others put it in place of the suffix."""
+    named = root / "masks" / f"{image}.png"
+    return named if inside(root, named).is_file() else stored(root, (root / "masks" / image).with_suffix(".png"))

@@ -1,0 +1,93 @@
+"""Copies of a capture's images, masks and points, for the writers of other layouts."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from neilfpp_method.data.images import read_image, replacing, write_exr, write_png
+from neilfpp_method.data.undistort import resample, straight_camera
+from neilfpp_method.data.views import Camera, View
+from neilfpp_method.errors import UserError
+from neilfpp_method.shading.color import linear_to_srgb, srgb_to_linear
+
+__all__ = ["copy_file", "copy_view", "writing"]
+
+
+@contextmanager
+def writing(out: Path) -> Iterator[None]:
+    """Make a folder to write into; what the system refuses becomes a `UserError`."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        raise UserError(f"{out}: cannot be written ({error.strerror or error})", "choose another folder") from error
+
+
+def copy_view(view: View, out: Path, hdr: bool, straight: bool) -> View:
+    """Copy a view's files to `out`/images, masks and valid, under the view's name; returns the view that they make.
+
+    The files are copied as they are where that says all. An exposure or white balance is divided out, as the layouts
+    know none: the image is then written as EXR. With `straight` a lens is undone: the image is resampled as linear
+    radiance and written as EXR, or as 16-bit PNG where it is not linear.
+
+    Raises:
+        UserError: an image cannot be read.
+    """
+    camera = straight_camera(view.camera) if straight else view.camera
+    factor = view.exposure * np.array(view.white_balance, np.float32)
+    as_it_is = camera is view.camera and bool((factor == 1.0).all())
+    if as_it_is:
+        image = copy_file(view.image, out / "images" / f"{view.name}{view.image.suffix.lower()}")
+    else:
+        image = _write_image(view, camera, factor, hdr, out / "images" / view.name)
+    return replace(
+        view,
+        camera=camera,
+        image=image,
+        mask=_copy_mask(view.mask, view.camera, camera, out / "masks" / f"{view.name}.png"),
+        valid=_copy_mask(view.valid, view.camera, camera, out / "valid" / f"{view.name}.png"),
+        exposure=1.0,
+        white_balance=(1.0, 1.0, 1.0),
+    )
+
+
+def copy_file(source: Path, target: Path) -> Path:
+    """Copy a file under another name, in one step; returns the target."""
+    with replacing(target) as temporary:
+        shutil.copyfile(source, temporary)
+    return target
+
+
+def _write_image(view: View, camera: Camera, factor: Float32[np.ndarray, " 3"], hdr: bool, target: Path) -> Path:
+    image = read_image(view.image)
+    linear = image.pixels if hdr else srgb_to_linear(torch.from_numpy(image.pixels)).numpy()
+    color = np.broadcast_to(linear, (*linear.shape[:2], 3)) / factor
+    layers = color if image.alpha is None else np.concatenate([color, image.alpha[..., None]], axis=-1)
+    layers = np.ascontiguousarray(layers, np.float32)
+    if camera is not view.camera:
+        layers = resample(layers, view.camera, camera)
+    if hdr:
+        write_exr(path := target.with_name(f"{target.name}.exr"), {"RGB" if layers.shape[2] == 3 else "RGBA": layers})
+        return path
+    layers[..., :3] = linear_to_srgb(torch.from_numpy(layers[..., :3])).numpy()
+    write_png(path := target.with_name(f"{target.name}.png"), np.rint(layers.clip(0, 1) * 65_535).astype(np.uint16))
+    return path
+
+
+def _copy_mask(mask: Path | None, camera: Camera, straight: Camera, target: Path) -> Path | None:
+    if mask is None:
+        return None
+    if camera is straight and mask.suffix.lower() == ".png":
+        return copy_file(mask, target)
+    values = read_image(mask).pixels.max(axis=-1, keepdims=True)
+    moved = values if camera is straight else resample(np.ascontiguousarray(values), camera, straight)
+    write_png(target, np.where(moved > 0.5, 255, 0).astype(np.uint8))
+    return target

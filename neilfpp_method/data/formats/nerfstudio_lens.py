@@ -1,0 +1,51 @@
+"""Lenses by nerfstudio's names k1, k2, k3, k4, p1, p2, and by COLMAP's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from neilfpp_method.data.lens import Lens, lens_of
+from neilfpp_method.data.views import Camera
+from neilfpp_method.errors import UserError
+
+__all__ = ["FISHEYE", "lens_from_nerfstudio", "nerfstudio_coefficients"]
+
+FISHEYE = "OPENCV_FISHEYE"
+# What COLMAP's models call their coefficients, in order; what follows has no name in nerfstudio.
+NAMES = {
+    "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"),
+    "OPENCV": ("k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3"),
+    FISHEYE: ("k1", "k2", "k3", "k4"),
+}
+
+
+def lens_from_nerfstudio(model: str, coefficients: Mapping[str, float], where: str) -> Lens | None:
+    """The lens of a camera model; none where it bends nothing.
+
+    Args:
+        model: `FISHEYE`, or any other name for a perspective camera.
+        coefficients: by name; those that are missing are 0.
+        where: whose lens it is.
+
+    Raises:
+        UserError: a perspective camera has a k4, which stands for r⁸ in nerfstudio and has no place in COLMAP's models.
+    """
+    known = {name: coefficients.get(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
+    if model != FISHEYE and known["k4"]:
+        raise UserError(f"{where}: k4 has a meaning for {FISHEYE} only", "undistort the images, or calibrate without it")
+    if model != FISHEYE:
+        model = "FULL_OPENCV" if known["k3"] else "OPENCV"
+    unnamed = (0.0,) * 3 if model == "FULL_OPENCV" else ()
+    return lens_of(model, (*(known[name] for name in NAMES[model]), *unnamed))
+
+
+def nerfstudio_coefficients(camera: Camera) -> Mapping[str, float] | None:
+    """The coefficients of a camera's lens by name: empty for a pinhole, none for a lens that nerfstudio has not."""
+    if camera.lens is None:
+        return {}
+    names, coefficients = NAMES.get(camera.lens.model), camera.lens.coefficients
+    if names is None or any(coefficients[len(names) :]):
+        return None
+    return dict(zip(names, coefficients, strict=False))

@@ -1,0 +1,49 @@
+"""Finding files: what several layouts need to get from listed names to files inside the capture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+from neilfpp_method.data.images import IMAGE_SUFFIXES
+from neilfpp_method.data.views import inside
+from neilfpp_method.errors import UserError
+
+__all__ = ["stored", "stored_image", "view_names"]
+
+
+def stored(root: Path, path: Path) -> Path | None:
+    """The file, or the one of its name with another image suffix: scenes list .png, or no suffix, where files are .exr.
+
+    Raises:
+        UserError: the path leads out of `root`, or two files could be meant.
+    """
+    if inside(root, path).is_file():
+        return path
+    base = path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
+    candidates = [base.with_name(base.name + suffix) for suffix in IMAGE_SUFFIXES]
+    found = [inside(root, file) for file in candidates if file.is_file()]
+    if len(found) > 1:
+        names = " and ".join(file.name for file in found)
+        raise UserError(f"{path}: not there, and {names} could both be meant", "keep one of them")
+    return found[0] if found else None
+
+
+def stored_image(root: Path, path: Path, where: str) -> Path:
+    """As `stored`, but the file has to be there; `where` says who lists it."""
+    image = stored(root, path)
+    if image is None:
+        raise UserError(f"{where}: there is no {path}", "put the image there, or correct the path")
+    return image
+
+
+def view_names(listed: Sequence[str]) -> tuple[str, ...]:
+    """Names for views: the stems of the listed files, or where two are the same, of all with their folders: "left-000"."""
+    paths = [PurePosixPath(name.replace("\\", "/")) for name in listed]
+    stems = tuple(path.stem for path in paths)
+    return stems if len(set(stems)) == len(stems) else tuple(_with_folders(path) for path in paths)
+
+
+def _with_folders(path: PurePosixPath) -> str:
+    folders = [part for part in path.parts[:-1] if part not in ("/", ".", "..", "images")]
+    return "-".join([*folders, path.stem])

@@ -1,0 +1,185 @@
+"""Reader of nerfstudio's transforms.json, and of what instant-ngp and others write under that name.
+
+camera_model                         OPENCV (also where missing), OPENCV_FISHEYE, or one of COLMAP's pinholes
+fl_x, fl_y, cx, cy, w, h, k1 … p2    for all frames, or in a frame for itself; camera_angle_x (radians) may stand for fl_x
+frames[].file_path, .mask_path       relative to the file; a mask is white on the object
+frames[].transform_matrix            camera to world, 4×4, OpenGL axes (x right, y up, z back)
+train_filenames, test_filenames, …   optional: the views held out are those that are not for training
+ply_file_path                        optional; used for its points, and where it has normals as oriented cloud
+scene, response, frames[].valid_path optional, as in capture.json: the project's own writer adds them
+
+The world frame is that of the file's poses, in which its point cloud lies too. `applied_transform`, which says how that
+frame came from an older one, stays applied.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from neilfpp_method.data.capture_folder import read_scene
+from neilfpp_method.data.formats.nerfstudio_lens import FISHEYE, lens_from_nerfstudio
+from neilfpp_method.data.formats.places import stored, stored_image, view_names
+from neilfpp_method.data.images import image_header
+from neilfpp_method.data.json_entry import Entry
+from neilfpp_method.data.point_cloud import has_normals, read_positions
+from neilfpp_method.data.scene_box import SceneBox, find_box
+from neilfpp_method.data.views import Camera, CaptureFiles, View, inside
+from neilfpp_method.errors import UserError
+
+__all__ = ["FLIP", "LAYOUT", "Frame", "read", "read_frames", "recognise"]
+
+LAYOUT = "transforms.json"
+FLIP = np.array([1.0, -1.0, -1.0, 1.0])
+"""OpenCV's axes (x right, y down, z forward) and OpenGL's (x right, y up, z back): one is the other times this."""
+MODELS = ("OPENCV", FISHEYE, "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+
+
+def recognise(root: Path) -> bool:
+    """Whether the folder has a transforms.json."""
+    return (root / LAYOUT).is_file()
+
+
+def read(root: Path) -> CaptureFiles:
+    """The capture's files, in the order of the frames.
+
+    Raises:
+        UserError: the file is malformed, or names an image or a mask that is missing or outside the folder.
+    """
+    entry = Entry.load(inside(root, root / LAYOUT))
+    frames = read_frames(root, entry)
+    names = view_names([frame.listed for frame in frames])
+    views = tuple(
+        View(name, i, frame.camera, frame.image, frame.mask, frame.valid)
+        for i, (name, frame) in enumerate(zip(names, frames, strict=True))
+    )
+    points = _points(root, entry)
+    box = _given_box(entry) or find_box(views, points.position)
+    response = entry.get("response")
+    return CaptureFiles(
+        inputs=root,
+        views=views,
+        normalisation=box.normalisation,
+        point_cloud=points.oriented,
+        test=_held_out(root, entry, views),
+        hdr=response and response.word("linear", "srgb") == "linear",
+        scene_from=box.source,
+    )
+
+
+@dataclass(frozen=True)
+class Points:
+    """Where the scene is, and the file of its points where these have normals."""
+
+    position: Float64[np.ndarray, "P 3"] | None
+    oriented: Path | None
+
+
+@dataclass(frozen=True)
+class Frame:
+    """An entry of `frames`: the path as listed, and what it leads to."""
+
+    listed: str
+    image: Path
+    mask: Path | None
+    valid: Path | None
+    camera: Camera
+
+
+def read_frames(root: Path, entry: Entry) -> tuple[Frame, ...]:
+    """The frames of a transforms file.
+
+    Raises:
+        UserError: as `read`.
+    """
+    frames = entry["frames"].items()
+    if not frames:
+        raise UserError(f"{entry.where}: no frames", "export the cameras again")
+    return tuple(_frame(root, entry, frame) for frame in frames)
+
+
+def _frame(root: Path, entry: Entry, frame: Entry) -> Frame:
+    listed = frame["file_path"]
+    image = _named(root, listed)
+    mask, valid = (_named(root, path) if (path := frame.get(name)) else None for name in ("mask_path", "valid_path"))
+    return Frame(listed.text(), image, mask, valid, _camera(entry, frame, image))
+
+
+def _named(root: Path, listed: Entry) -> Path:
+    return stored_image(root, root / listed.text(), listed.where)
+
+
+def _camera(entry: Entry, frame: Entry, image: Path) -> Camera:
+    """The camera of a frame; what the frame does not say, the file says for all."""
+
+    def number(name: str) -> float | None:
+        found = frame.get(name) or entry.get(name)
+        return found and found.number()
+
+    header = image_header(image)
+    width, height = (frame.get(name) or entry.get(name) for name in ("w", "h"))
+    width, height = width.size() if width else header.width, height.size() if height else header.height
+    fx = number("fl_x") or _focal(number("camera_angle_x"), width)
+    fy = number("fl_y") or _focal(number("camera_angle_y"), height) or fx
+    if fx is None or fy is None:
+        raise UserError(f"{frame.where}: no focal length", "add fl_x, in pixels, or camera_angle_x, in radians")
+    cx, cy = number("cx"), number("cy")
+    distortion = {name: value for name in ("k1", "k2", "k3", "k4", "p1", "p2") if (value := number(name)) is not None}
+    model = frame.get("camera_model") or entry.get("camera_model")
+    return Camera(
+        fx=fx,
+        fy=fy,
+        cx=width / 2 if cx is None else cx,
+        cy=height / 2 if cy is None else cy,
+        width=width,
+        height=height,
+        w2c=_pose(frame["transform_matrix"]),
+        lens=lens_from_nerfstudio(model.word(*MODELS) if model else "OPENCV", distortion, frame.where),
+    )
+
+
+def _focal(angle: float | None, size: int) -> float | None:
+    return None if angle is None or not 0 < angle < np.pi else size / (2 * np.tan(angle / 2))
+
+
+def _pose(entry: Entry) -> Float64[np.ndarray, "4 4"]:
+    """World to OpenCV camera, of camera to world with OpenGL axes; what is not rigid is refused."""
+    c2w = entry.numbers((4, 4), (3, 4))[:3]
+    rotation = c2w[:, :3] * FLIP[:3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
+        raise UserError(f"{entry.where}: not a rotation and a translation", "give camera-to-world, 4×4, row-major")
+    w2c = np.eye(4)
+    w2c[:3, :3], w2c[:3, 3] = rotation.T, -rotation.T @ c2w[:, 3]
+    return w2c
+
+
+def _held_out(root: Path, entry: Entry, views: Sequence[View]) -> frozenset[str] | None:
+    """The views that the file holds out: `test_filenames`, or else all that are in no list for training."""
+    lists = {split: entry.get(f"{split}_filenames") for split in ("train", "test")}
+    given = {split: {stored(root, root / name.text()) for name in names.items()} for split, names in lists.items() if names}
+    if not given:
+        return None
+    for split, files in given.items():
+        if not files <= {view.image for view in views}:
+            raise UserError(f"{entry.name(f'{split}_filenames')}: names a file that is no frame", "correct the list")
+    train, test = given.get("train"), given.get("test")
+    return frozenset(v.name for v in views if (v.image in test if test is not None else v.image not in (train or ())))
+
+
+def _given_box(entry: Entry) -> SceneBox | None:
+    scene = entry.get("scene")
+    return scene and SceneBox(read_scene(scene), "box")
+
+
+def _points(root: Path, entry: Entry) -> Points:
+    listed = entry.get("ply_file_path")
+    if listed is None:
+        return Points(None, None)
+    path = inside(root, root / listed.text())
+    if not path.is_file():
+        raise UserError(f"{listed.where}: there is no {path}", "put the file there, or remove the entry")
+    return Points(read_positions(path), path if has_normals(path) else None)

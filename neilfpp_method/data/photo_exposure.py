@@ -1,0 +1,90 @@
+"""How much light a photograph took in: from its EXIF entries, or from a file that a person wrote."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from pathlib import Path
+
+from PIL import Image
+
+from neilfpp_method.errors import UserError
+
+__all__ = ["exposures_of", "photo_exposure", "read_exposures"]
+
+EXIF_FOLDER, TIME, APERTURE, SENSITIVITY = 0x8769, 0x829A, 0x829D, 0x8827
+LISTS = ("exposures.json", "exposures.txt")
+WRITE_A_LIST = f"write {LISTS[1]} beside the images: a line 'NAME SECONDS' for each"
+
+
+def exposures_of(folder: Path, images: Sequence[Path], table: Path | None = None) -> Mapping[Path, float]:
+    """The exposure of each image; only quotients of exposures mean anything.
+
+    Args:
+        folder: where a file `exposures.json` or `exposures.txt` is looked for.
+        images: the files, under `folder`.
+        table: such a file elsewhere. With a file EXIF is not asked.
+
+    Raises:
+        UserError: the file is malformed, or an image has no exposure.
+    """
+    tables = [path for path in (folder / name for name in LISTS) if path.is_file()] if table is None else [table]
+    if tables:
+        listed = read_exposures(tables[0])
+        found = {image: listed.get(image.relative_to(folder).as_posix(), listed.get(image.name)) for image in images}
+        remedy = f"add it to {tables[0]}"
+    else:
+        found, remedy = {image: photo_exposure(image) for image in images}, WRITE_A_LIST
+    for image, exposure in found.items():
+        if exposure is None:
+            raise UserError(f"{image}: no exposure time", remedy)
+    return found
+
+
+def photo_exposure(path: Path) -> float | None:
+    """Exposure time, seconds, times ISO/100, over the f-number squared, from EXIF; none where no time is said.
+
+    An entry that is missing counts as 1: it is the same in all pictures of a lens or a camera that does not say it. An
+    ISO of 0 or an f-number of 0, which adapted lenses write, is such an entry.
+    """
+    try:
+        with Image.open(path) as image:
+            exif = image.getexif().get_ifd(EXIF_FOLDER)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # what Pillow does not open says nothing
+        return None
+    time, aperture, sensitivity = (_positive(exif.get(tag)) for tag in (TIME, APERTURE, SENSITIVITY))
+    if time is None:
+        return None
+    return time * (sensitivity or 100.0) / 100.0 / (aperture or 1.0) ** 2
+
+
+def _positive(entry: object) -> float | None:
+    try:
+        number = float(entry[0] if isinstance(entry, tuple) else entry)  # type: ignore[arg-type]
+    except (TypeError, ValueError, IndexError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
+
+
+def read_exposures(path: Path) -> Mapping[str, float]:
+    """Seconds by image name: a JSON object, or lines `NAME SECONDS`, seconds also as `1/60`; `#` starts a comment.
+
+    Raises:
+        UserError: the file is malformed, or an exposure is not a positive number.
+    """
+    try:
+        text = path.read_text("utf-8")
+        if path.suffix.lower() == ".json":
+            pairs = list(json.loads(text).items())
+        else:
+            lines = (line.split("#")[0].strip() for line in text.splitlines())
+            pairs = [line.rsplit(maxsplit=1) for line in lines if line]
+        listed = {name: float(Fraction(str(seconds))) for name, seconds in pairs}
+    except (OSError, ValueError, AttributeError, ZeroDivisionError, OverflowError, RecursionError) as error:
+        raise UserError(f"{path}: no list of exposures ({error})", "write lines 'NAME SECONDS', as 'a.jpg 1/60'") from error
+    for name, seconds in listed.items():
+        if not (math.isfinite(seconds) and seconds > 0):
+            raise UserError(f"{path}: the exposure of {name} is {seconds}", "give seconds above 0")
+    return listed

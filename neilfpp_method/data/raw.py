@@ -1,0 +1,84 @@
+"""Camera RAW developed into linear radiance by LibRaw; needs the extra `raw`.
+
+Nothing is decided by the single picture: no automatic brightness, no maximum told from the data, one white balance for all
+pictures of a camera. Two pictures of a scene then differ by their exposures alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt16
+
+from neilfpp_method.errors import UserError
+
+__all__ = ["RAW_SUFFIXES", "Developed", "develop"]
+
+RAW_SUFFIXES = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
+INTERPOLATION_REACH = 5
+"""Side of the square of sensor pixels, around each one, from which its missing colours are interpolated."""
+
+
+@dataclass(frozen=True)
+class Developed:
+    """A developed RAW file, in the orientation of the sensor.
+
+    `pixels` are linear, with the primaries of sRGB; 1 is the level at which the sensor saturates. `valid` is false where it
+    has. `white_balance` is what the camera would have multiplied red, green and blue of the sensor by, relative to green;
+    what was used instead is the daylight balance of the camera model.
+    """
+
+    pixels: Float32[np.ndarray, "H W 3"]
+    valid: Bool[np.ndarray, "H W"]
+    white_balance: tuple[float, float, float]
+
+
+def develop(path: Path) -> Developed:
+    """Develop a RAW file.
+
+    Raises:
+        UserError: rawpy is not installed, or it cannot read the file.
+    """
+    rawpy = _rawpy(path)
+    try:
+        with rawpy.imread(str(path)) as raw:
+            samples: UInt16[np.ndarray, "H W 3"] = raw.postprocess(
+                output_bps=16,
+                gamma=(1, 1),
+                no_auto_bright=True,
+                adjust_maximum_thr=0.0,
+                user_wb=list(raw.daylight_whitebalance),
+                output_color=rawpy.ColorSpace.sRGB,
+                highlight_mode=rawpy.HighlightMode.Clip,
+                user_flip=0,
+            )
+            saturated = _saturated(raw, samples.shape[:2])
+            red, green, blue = (float(factor) for factor in raw.camera_whitebalance[:3])
+    except UserError:
+        raise
+    except Exception as error:  # LibRaw's own exceptions do not share a base with rawpy's
+        raise UserError(f"{path}: cannot be developed ({error})", "convert it to DNG, or to linear EXR") from error
+    pixels = samples.astype(np.float32) / np.float32(65_535)
+    balance = (red / green, 1.0, blue / green) if min(red, green, blue) > 0 else (1.0, 1.0, 1.0)
+    return Developed(pixels, ~saturated, balance)
+
+
+def _rawpy(path: Path) -> ModuleType:
+    try:
+        import rawpy
+    except ImportError as error:
+        raise UserError(f"{path}: camera RAW needs rawpy", "pip install 'neilfpp-method[raw]'") from error
+    return rawpy
+
+
+def _saturated(raw, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    """Pixels whose colour comes, wholly or in part, from a sensor pixel at its white level."""
+    mosaic = raw.raw_image_visible
+    if mosaic.shape[:2] != size:
+        raise UserError(f"a sensor of {mosaic.shape[:2]} pixels in a picture of {size}", "develop it to linear EXR yourself")
+    full = (mosaic >= raw.white_level).reshape(*size, -1).any(axis=-1).astype(np.uint8)
+    return cv2.dilate(full, np.ones((INTERPOLATION_REACH, INTERPOLATION_REACH), np.uint8)) > 0

@@ -1,0 +1,163 @@
+"""Where the scene is, for captures that do not say it: told by points, by silhouettes, or else by the cameras alone.
+
+The scene frame has the object in the unit sphere; a box gives its centre and half of its largest extent (METHOD's
+normalisation). What is known best decides: points on the surface, then the masks, whose visual hull holds the object;
+the cameras know only what they look at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+
+from neilfpp_method.data.images import read_image
+from neilfpp_method.data.views import Normalisation, SceneSource, View, project
+from neilfpp_method.errors import UserError
+
+__all__ = ["SceneBox", "box_of_cameras", "box_of_points", "find_box"]
+
+OUTLIERS = 0.01
+MARGIN = 1.1
+FEWEST_POINTS = 20
+MOST_MASKS = 32
+AGREEMENT = 0.9
+CELLS = 32
+REFINEMENTS = 3
+
+
+@dataclass(frozen=True)
+class SceneBox:
+    """The scene frame and what told it."""
+
+    normalisation: Normalisation
+    source: SceneSource
+
+
+def find_box(views: Sequence[View], points: Float64[np.ndarray, "P 3"] | None = None) -> SceneBox:
+    """The scene box of a capture that has none.
+
+    Args:
+        views: the capture's views, with their masks or alpha channels where they have any.
+        points: points on the scene's surface, in the world frame; outliers are put up with. Where there are masks, only
+            points within them count.
+
+    Raises:
+        UserError: a mask cannot be read, or nothing tells where the scene is.
+    """
+    outlines = _outlines(views)
+    if points is not None and outlines:
+        points = points[_agreement(outlines, points) >= AGREEMENT]
+    if points is not None and len(points) >= FEWEST_POINTS:
+        return SceneBox(box_of_points(points), "points")
+    if outlines:
+        return SceneBox(_carve(outlines, box_of_cameras(views, fill=2.0)), "masks")
+    return SceneBox(box_of_cameras(views), "cameras")
+
+
+def box_of_points(points: Float64[np.ndarray, "P 3"]) -> Normalisation:
+    """The box that holds all but the outermost per cent of the points on every side, and a margin.
+
+    Raises:
+        UserError: the points lie in one place.
+    """
+    low, high = np.quantile(points, [OUTLIERS, 1 - OUTLIERS], axis=0)
+    return _box(low, high)
+
+
+def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalisation:
+    """A guess: what the cameras look at, as large as the circle that fits into their images, times `fill`.
+
+    The centre is the point nearest to all optical axes, by least squares.
+
+    Raises:
+        UserError: the axes do not come near one point in front of the cameras.
+    """
+    where = views[0].image.parent
+    poses = np.stack([view.camera.c2w for view in views])
+    eyes, axes = poses[:, :, 3], poses[:, :, 2]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    system = across.mean(axis=0)
+    if np.linalg.eigvalsh(system)[0] < 1e-4:
+        raise UserError(
+            f"{where}: the cameras look in one direction: they do not tell where the scene is", "add points or a scene box"
+        )
+    centre = np.linalg.solve(system, (across @ eyes[:, :, None]).mean(axis=0)[:, 0])
+    depth = np.einsum("ni,ni->n", centre - eyes, axes)
+    if np.median(depth) <= 0:
+        raise UserError(
+            f"{where}: the cameras look away from one another: they do not tell where the scene is", "add points or a scene box"
+        )
+    half = [min(c.width / c.fx, c.height / c.fy) / 2 for c in (view.camera for view in views)]
+    radius = float(np.median(depth * half)) * fill
+    return Normalisation(radius, (float(centre[0]), float(centre[1]), float(centre[2])))
+
+
+def _box(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> Normalisation:
+    scale = MARGIN * float((high - low).max()) / 2
+    if not scale > 0:
+        raise UserError("all points of the scene lie in one place", "add a scene box")
+    x, y, z = map(float, (low + high) / 2)
+    return Normalisation(scale, (x, y, z))
+
+
+# ---------------------------------------------------------------------------------------------------------- silhouettes
+
+
+@dataclass(frozen=True)
+class Outline:
+    """A view with its silhouette; where that does not touch the border, what lies out of the image is beside it, too."""
+
+    view: View
+    inside: Bool[np.ndarray, "H W"]
+
+    @property
+    def complete(self) -> bool:
+        mask = self.inside
+        return not (mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
+
+
+def _outlines(views: Sequence[View]) -> list[Outline]:
+    """The silhouettes of at most `MOST_MASKS` views, evenly chosen; none where the capture has none."""
+    step = -(-len(views) // MOST_MASKS)
+    outlines = []
+    for view in views[::step]:
+        image = read_image(view.mask or view.image)
+        values = image.alpha if view.mask is None else image.pixels.max(axis=-1)
+        if values is None:
+            return []
+        outlines.append(Outline(view, values > 0.5))
+    return outlines
+
+
+def _agreement(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, " P"]:
+    """The share of the views that can tell of a point, in whose silhouette it lies; 0 where fewer than half of them can."""
+    told, inside = np.zeros(len(points)), np.zeros(len(points))
+    for outline in outlines:
+        camera = outline.view.camera
+        image = project(camera, torch.from_numpy(points))
+        pixel, depth = np.nan_to_num(image.pixel.numpy(), nan=-1.0, posinf=-1.0, neginf=-1.0), image.depth.numpy()
+        size = np.array([camera.width, camera.height])
+        shown = (depth > 0) & (pixel >= 0).all(axis=1) & (pixel < size).all(axis=1)
+        column, row = np.where(shown[:, None], pixel, 0).astype(np.int64).T
+        told += shown | outline.complete
+        inside += shown & outline.inside[row, column]
+    return np.where(told >= len(outlines) / 2, inside / np.maximum(told, 1), 0.0)
+
+
+def _carve(outlines: Sequence[Outline], start: Normalisation) -> Normalisation:
+    """The box of the places that nearly all silhouettes hold, on grids that close in on it."""
+    centre, half = np.array(start.centre), np.full(3, start.scale)
+    low, high = centre - half, centre + half
+    for _ in range(REFINEMENTS):
+        axes = [np.linspace(a, b, CELLS) for a, b in zip(low, high, strict=True)]
+        cell = (high - low) / (CELLS - 1)
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        held = grid[_agreement(outlines, grid) >= AGREEMENT]
+        if not len(held):
+            raise UserError("the masks have no place in common", "check masks and cameras, or add a scene box")
+        low, high = held.min(axis=0) - cell, held.max(axis=0) + cell
+    return _box(low, high)

@@ -1,0 +1,29 @@
+"""Maps over the sphere of directions, in latitude and longitude about +z.
+
+Row j is at the angle θ = π j/(h − 1) from +z, column i at the azimuth φ = 2π (i + ½)/w, and the direction there is
+(sin φ sin θ, cos φ sin θ, cos θ): the layout of environment maps (docs/conventions.md).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+__all__ = ["interpolate"]
+
+
+def interpolate(values: Float[Tensor, "C H W"], wi: Float[Tensor, "M S 3"]) -> Float[Tensor, "M S C"]:
+    """The map at unit directions, bilinear between its texels and closed in azimuth."""
+    x, y, z = wi.unbind(-1)
+    _, height, width = values.shape
+    turn = torch.atan2(x, y) / (2 * math.pi)
+    column = (turn - turn.floor()) * width - 0.5
+    row = torch.acos(z.clamp(-1, 1)) / math.pi * (height - 1)
+    # One column more on each side closes the map; the azimuth of a column is at its middle.
+    closed = torch.cat((values[..., -1:], values, values[..., :1]), -1)
+    at = torch.stack((2 * (column + 1) / (width + 1) - 1, 2 * row / (height - 1) - 1), -1)
+    return functional.grid_sample(closed[None], at[None].to(closed.dtype), align_corners=True)[0].permute(1, 2, 0)

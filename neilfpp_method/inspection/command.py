@@ -1,0 +1,115 @@
+"""`neilfpp inspect`: the findings on the terminal, as JSON and as a picture."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.text import Text
+
+from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.images import replacing, write_png
+from neilfpp_method.errors import EarlyEnd
+from neilfpp_method.inspection.findings import Inspection, inspect_capture
+from neilfpp_method.inspection.picture import draw
+
+__all__ = ["run_inspection", "to_json"]
+
+STYLES = {"problem": "bold red", "warning": "yellow", "good": "bold green", "limited": "bold yellow", "poor": "bold red"}
+SHOWN = 6
+
+
+def run_inspection(
+    root: Path,
+    out: Path | None,
+    format: str | None,
+    response: Literal["auto", "linear", "srgb"],
+    strict: bool,
+    console: Console,
+) -> None:
+    """Inspect a capture and say what is in it.
+
+    Args:
+        root: the capture's folder.
+        out: where `inspect.json` and `inspect.png` go; none: they are not written.
+        format: the capture's format; none: found out.
+        response: what the pixels are; auto: told from the files.
+        strict: end with status 1 where there is a problem.
+        console: where the report goes.
+
+    Raises:
+        UserError: the folder holds no capture that can be loaded.
+        EarlyEnd: `strict`, and there is a problem.
+    """
+    capture = load_capture(root, format=format, response=response)
+    columns = (TextColumn("reading images"), BarColumn(), MofNCompleteColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("", total=len(capture.views))
+        inspection = inspect_capture(capture, lambda _: progress.advance(task))
+    _print(inspection, console)
+    if out is not None:
+        with replacing(out / "inspect.json") as temporary:
+            temporary.write_text(json.dumps(to_json(inspection), indent=2, allow_nan=False) + "\n", "utf-8")
+        write_png(out / "inspect.png", draw(inspection))
+        console.print(f"written to {out}", highlight=False)
+    problems = sum(finding.severity == "problem" for finding in inspection.findings)
+    if strict and problems:
+        raise EarlyEnd(f"{root}: {problems} problem{'s' * (problems != 1)}", "the remedies stand beside them")
+
+
+def to_json(inspection: Inspection) -> dict[str, Any]:
+    """The inspection as plain values."""
+    capture, where = inspection.capture, inspection.stand
+    figures = ("luminance", "stops", "sharpness", "clipped", "invalid", "broken", "pixels", "levels")
+    return {
+        "capture": {
+            "name": capture.root.resolve().name,
+            "format": capture.format,
+            "response": "linear" if capture.hdr else "srgb",
+            "views": len(capture.views),
+            "test_views": len(capture.test_views),
+            "masks": sum(view.mask is not None for view in capture.views),
+            "validity_masks": sum(view.valid is not None for view in capture.views),
+            "point_cloud": capture.point_cloud is not None,
+            "scene": {"centre": list(capture.normalisation.centre), "radius": capture.normalisation.scale},
+            "scene_from": capture.scene_from,
+            "coverage": where.coverage,
+            "degrees_between_views": where.gap,
+        },
+        "verdict": {"quality": inspection.verdict.quality, "text": inspection.verdict.text},
+        "findings": [
+            {"kind": f.kind, "severity": f.severity, "text": f.text, "remedy": f.remedy, "views": list(f.views)}
+            for f in inspection.findings
+        ],
+        "views": [
+            {
+                "name": view.name,
+                "image": view.image.resolve().relative_to(capture.root.resolve()).as_posix(),
+                "width": view.camera.width,
+                "height": view.camera.height,
+                "exposure": view.exposure,
+                "exposure_factor": factor,
+                **{name: getattr(measured, name) for name in figures},
+            }
+            for view, measured, factor in zip(capture.views, inspection.views, inspection.factors, strict=True)
+        ],
+    }
+
+
+def _print(inspection: Inspection, console: Console) -> None:
+    def say(*parts: str | tuple[str, str]) -> None:
+        console.print(Text.assemble(*parts), soft_wrap=True)
+
+    where, verdict = inspection.stand, inspection.verdict
+    say(inspection.capture.summary)
+    say(f"cameras: {where.gap:.0f}° from one to the next; {100 * where.coverage:.0f} % of all directions are covered")
+    say("radiance: ", (verdict.quality, STYLES[verdict.quality]), f"; {verdict.text}")
+    if not inspection.findings:
+        say(("nothing is wrong with it", STYLES["good"]))
+    for finding in inspection.findings:
+        rest = f" and {len(finding.views) - SHOWN} more" if len(finding.views) > SHOWN else ""
+        named = f" [{', '.join(finding.views[:SHOWN])}{rest}]" if finding.views else ""
+        say((finding.severity, STYLES[finding.severity]), f": {finding.text}{named}; {finding.remedy}")

@@ -1,0 +1,190 @@
+"""What is wrong with a capture: the figures held against limits, each finding with its remedy, and a verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from neilfpp_method.data.capture import Capture
+from neilfpp_method.data.point_cloud import load_point_cloud
+from neilfpp_method.errors import UserError
+from neilfpp_method.inspection.measure import ViewFigures, measure
+from neilfpp_method.inspection.relations import Stand, duplicates, exposure_factors, stand
+
+__all__ = ["Finding", "Inspection", "Verdict", "inspect_capture"]
+
+Severity = Literal["problem", "warning"]
+Quality = Literal["good", "limited", "poor"]
+
+JUMP = 1.5
+BLURRED = 0.4
+CLIPPED_VIEW, CLIPPED_A_BIT, CLIPPED_MUCH = 0.01, 0.001, 0.02
+INVALID_VIEW = 0.5
+FEWEST, FEW = 3, 16
+SPARSE_GAP = 25.0
+LEAST_COVERAGE = 0.25
+EDGE, STRAY_POINTS, SMALL_CLOUD = 1.05, 0.1, 0.2
+FEW_LEVELS = 256
+ENOUGH = 16
+"""Pixels a level, that their number means something."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that is wrong, and what to do about it.
+
+    A problem spoils or prevents a result, a warning worsens it. `views` are the names of the views concerned; none: it is
+    about the whole capture. `kind` is a short name that does not change between versions.
+    """
+
+    kind: str
+    severity: Severity
+    text: str
+    remedy: str
+    views: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether the radiance of a capture is good enough for the estimation of materials, and why."""
+
+    quality: Quality
+    text: str
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """All that was found; `views`, `factors` and the views of `stand` are in the capture's order."""
+
+    capture: Capture
+    views: tuple[ViewFigures, ...]
+    stand: Stand
+    factors: tuple[float, ...]
+    findings: tuple[Finding, ...]
+    verdict: Verdict
+
+
+def inspect_capture(capture: Capture, on_view: Callable[[str], None] = lambda name: None) -> Inspection:
+    """Look at every view of a capture.
+
+    Args:
+        capture: the capture.
+        on_view: called with the name of each view once it is measured.
+    """
+    views = []
+    for view in capture.views:
+        views.append(measure(view, capture.hdr))
+        on_view(view.name)
+    where = stand(capture)
+    factors = tuple(exposure_factors([view.luminance for view in views], where).tolist())
+    findings = (*_of_views(views, factors, capture), *_of_cameras(capture, where), *_of_scene(capture))
+    verdict = _verdict(capture, views, findings)
+    order = {"problem": 0, "warning": 1}
+    ranked = tuple(sorted(findings, key=lambda finding: order[finding.severity]))
+    return Inspection(capture, tuple(views), where, factors, ranked, verdict)
+
+
+def _of_views(views: Sequence[ViewFigures], factors: Sequence[float], capture: Capture) -> Iterator[Finding]:
+    if damaged := [view for view in views if view.unreadable]:
+        names = tuple(view.name for view in damaged)
+        yield Finding("unreadable", "problem", damaged[0].unreadable, "export these images again, or leave them out", names)
+    if broken := tuple(view.name for view in views if view.broken > 0):
+        most = max(view.broken for view in views)
+        text = f"pixels are NaN, infinite or negative, up to {100 * most:.2g} % of a view"
+        yield Finding("broken_pixels", "problem", text, "repair them, or mark them in a validity mask", broken)
+    if black := tuple(view.name for view in views if not view.unreadable and view.luminance <= 0):
+        yield Finding("black", "problem", "no pixel of the object is lit", "leave these views out, or correct the masks", black)
+    jumps = [(view.name, factor) for view, factor in zip(views, factors, strict=True) if max(factor, 1 / factor) > JUMP]
+    if jumps:
+        named = ", ".join(f"{name} ×{factor:.2g}" for name, factor in jumps[:4]) + ("…" if len(jumps) > 4 else "")
+        own, alike = "give these views their exposure in capture.json", "expose all images alike, or merge brackets"
+        text = f"brighter or darker than the views around them: {named}"
+        yield Finding("exposure_jump", "problem", text, own if capture.hdr else alike, tuple(name for name, _ in jumps))
+    sharp = np.median([view.sharpness for view in views if view.sharpness > 0] or [0.0])
+    if blurred := tuple(view.name for view in views if 0 < view.sharpness < BLURRED * sharp):
+        text = f"blurred: less than {100 * BLURRED:.0f} % of the usual fine detail"
+        yield Finding("blurred", "warning", text, "leave these views out, or take them again", blurred)
+    readable = [view for view in views if not view.unreadable]
+    if pairs := duplicates([view.small for view in readable]) if readable else ():
+        names = ", ".join(f"{readable[i].name} and {readable[j].name}" for i, j in pairs[:3]) + ("…" if len(pairs) > 3 else "")
+        again = tuple(dict.fromkeys(readable[j].name for _, j in pairs))
+        yield Finding("duplicate", "warning", f"the same picture twice: {names}", "keep one of each", again)
+    if clipped := [view for view in views if view.clipped > CLIPPED_VIEW]:
+        worst = max(clipped, key=lambda view: view.clipped)
+        text = f"highlights are clipped, up to {100 * worst.clipped:.2g} % of the object ({worst.name})"
+        remedy = "expose shorter, or merge brackets; mark what is clipped in a validity mask"
+        yield Finding("clipped", "warning", text, remedy, tuple(view.name for view in clipped))
+    if invalid := tuple(view.name for view in views if view.invalid > INVALID_VIEW):
+        text = "more than half of the pixels are marked as invalid"
+        yield Finding("mostly_invalid", "warning", text, "check the validity masks: white is valid", invalid)
+    large = [view.levels for view in readable if view.pixels > ENOUGH * FEW_LEVELS]
+    if capture.hdr and large and max(large) <= FEW_LEVELS:
+        text = f"linear files with {max(large)} levels a channel: 8-bit images in disguise"
+        yield Finding("few_levels", "problem", text, "develop the RAW files linearly, or merge brackets")
+
+
+def _of_cameras(capture: Capture, where: Stand) -> Iterator[Finding]:
+    names = np.array([view.name for view in capture.views])
+    if where.away.any():
+        text = "the cameras look away: the scene's centre is not in the picture"
+        remedy = "check the poses and the scene box, or leave these views out"
+        yield Finding("looking_away", "problem", text, remedy, tuple(names[where.away]))
+    if where.within.any():
+        text = "cameras within the unit sphere, which is to hold the object alone"
+        yield Finding("camera_inside", "warning", text, "make the scene box smaller", tuple(names[where.within]))
+    count = len(names)
+    if count < FEW:
+        severity: Severity = "problem" if count < FEWEST else "warning"
+        yield Finding("few_views", severity, f"{count} views", f"take {FEW} or more, better 50, from all around")
+    if count >= FEWEST and where.coverage < LEAST_COVERAGE:
+        text = f"the views cover {100 * where.coverage:.0f} % of the directions around the object"
+        yield Finding("coverage", "warning", text, "add views from other sides, and from other heights")
+    if count >= FEWEST and where.gap > SPARSE_GAP:
+        text = f"{where.gap:.0f}° from one view to the next"
+        yield Finding("sparse", "warning", text, f"add views between them, {SPARSE_GAP:.0f}° apart or less")
+
+
+def _of_scene(capture: Capture) -> Iterator[Finding]:
+    if capture.scene_from == "cameras":
+        text = "the scene's place and size are guessed from the cameras alone"
+        yield Finding("scale_guessed", "warning", text, "add a scene box, a point cloud or masks")
+    if capture.point_cloud is None:
+        return
+    try:
+        points = load_point_cloud(capture.point_cloud, capture.normalisation).position
+    except UserError as error:
+        yield Finding("point_cloud", "problem", error.problem, error.remedy)
+        return
+    reach = points.abs().amax(dim=-1).numpy()
+    outside = float((reach > EDGE).mean())
+    if outside > STRAY_POINTS:
+        text = f"{100 * outside:.0f} % of the point cloud lies outside the scene's box"
+        remedy = "make the scene box larger, or cut the cloud to the object"
+        yield Finding("scale", "problem" if outside > 0.5 else "warning", text, remedy)
+    elif np.quantile(reach, 0.95) < SMALL_CLOUD:
+        text = f"the object is small: 95 % of the point cloud lies within {100 * SMALL_CLOUD:.0f} % of the scene's box"
+        yield Finding("scale", "warning", text, "make the scene box smaller")
+
+
+def _verdict(capture: Capture, views: Sequence[ViewFigures], findings: Sequence[Finding]) -> Verdict:
+    readable = [view for view in views if not view.unreadable]
+    if not readable:
+        return Verdict("poor", "no image can be read")
+    kinds = {finding.kind for finding in findings}
+    clipped = float(np.mean([view.clipped for view in readable]))
+    stops = float(np.median([view.stops for view in readable]))
+    said = f"{stops:.1f} stops on the object, {100 * clipped:.2g} % of it clipped"
+    if not capture.hdr:
+        if clipped > CLIPPED_MUCH or "exposure_jump" in kinds:
+            return Verdict("poor", f"display values (sRGB), {said}: highlights are lost, gloss and light cannot be told")
+        return Verdict("limited", f"display values (sRGB), {said}: colours come out, gloss and light only roughly")
+    if "few_levels" in kinds or "exposure_jump" in kinds or clipped > CLIPPED_MUCH:
+        reasons = {"few_levels": "made from 8-bit images", "exposure_jump": "not on one scale"}
+        why = next((reason for kind, reason in reasons.items() if kind in kinds), "clipped where it is bright")
+        return Verdict("poor", f"linear, {said}, but {why}")
+    if clipped > CLIPPED_A_BIT:
+        return Verdict("limited", f"linear, {said}: mark what is clipped in a validity mask")
+    return Verdict("good", f"linear, {said}: good enough for the estimation of materials")

@@ -1,0 +1,153 @@
+"""Figures of one view, from its image alone. They judge nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32
+
+from neilfpp_method.data.images import ImageFile, read_image
+from neilfpp_method.data.pixels import pixel_colors
+from neilfpp_method.data.views import View
+from neilfpp_method.errors import UserError
+from neilfpp_method.shading.color import linear_to_srgb, luminance, srgb_to_linear
+
+__all__ = ["ViewFigures", "measure"]
+
+SMALL = 160
+"""Longest side, pixels, of the picture that is kept of a view."""
+SHARP = 1600
+"""Longest side, pixels, at which sharpness is measured: demosaicing blurs what is finer."""
+MIDDLE_GREY = 0.18
+BORDER_SHARE = 0.5
+DARK = 1e-3
+FULL = 254.5 / 255
+PLATEAU_WIDTH = 1e-4
+LEAST_PLATEAU = 16
+"""Fewest pixels at the very maximum of an image that are more than a coincidence."""
+SOME = 200_000
+"""Pixels of which the levels are counted."""
+
+
+@dataclass(frozen=True)
+class ViewFigures:
+    """What an image holds. Shares are of the object's pixels, where a mask, the alpha channel or an even background tells it.
+
+    Attributes:
+        name: the view's.
+        unreadable: why the pixels cannot be read, else empty; nothing else is known then.
+        luminance: the median linear luminance of the object, on the scale that all views share; 0 for a black image.
+        stops: between the 1st and the 99.9th percentile of that luminance, in powers of two.
+        sharpness: variance of the Laplacian over the variance of the picture, at one brightness for all views.
+        clipped: share at 255 (display values), or at a level at which an HDR image piles up, in any channel.
+        invalid: share of all pixels that the validity mask leaves out.
+        broken: share of all pixels that are NaN, infinite or negative and not marked as invalid.
+        pixels: number of the object's pixels that are valid.
+        levels: distinct values among up to 400 000 of the object's pixels, in the channel that has most of them.
+        small: linear radiance, at most 160 pixels a side.
+    """
+
+    name: str
+    unreadable: str = ""
+    luminance: float = 0.0
+    stops: float = 0.0
+    sharpness: float = 0.0
+    clipped: float = 0.0
+    invalid: float = 0.0
+    broken: float = 0.0
+    pixels: int = 0
+    levels: int = 0
+    small: Float32[np.ndarray, "h w 3"] = field(default_factory=lambda: np.zeros((1, 1, 3), np.float32), repr=False)
+
+
+def measure(view: View, hdr: bool) -> ViewFigures:
+    """The figures of a view; an image that cannot be read is a figure as well."""
+    try:
+        image = read_image(view.image)
+        color = pixel_colors(view, image, hdr).numpy()
+        valid = _mask(view, "valid", color.shape[:2])
+        mask = _mask(view, "mask", color.shape[:2]) if view.mask else image.alpha is not None and image.alpha > 0.5
+    except UserError as error:
+        return ViewFigures(view.name, unreadable=error.problem)
+    sound = (np.isfinite(color) & (color >= 0)).all(axis=-1)
+    usable = sound & valid
+    shown = usable & (_off_the_background(color, usable) if mask is False else mask)
+    color = np.where(sound[..., None], color, np.float32(0.0))
+    linear = color if hdr else srgb_to_linear(torch.from_numpy(color)).numpy()
+    light = luminance(torch.from_numpy(linear)).numpy()
+    lit = light[shown & (light > DARK * light[shown].mean())] if shown.any() else light[shown]
+    low, middle, high = np.percentile(lit, [1, 50, 99.9]) if lit.size else (1.0, 0.0, 1.0)
+    return ViewFigures(
+        name=view.name,
+        luminance=float(middle),
+        stops=float(np.log2(high / low)),
+        sharpness=_sharpness(light, shown, float(middle)),
+        clipped=_clipped(image, color, shown),
+        invalid=float(1.0 - valid.mean()),
+        broken=float((valid & ~sound).mean()),
+        pixels=int(shown.sum()),
+        levels=_levels(color[shown]),
+        small=_fitted(linear, SMALL),
+    )
+
+
+def _mask(view: View, kind: str, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    path = getattr(view, kind)
+    if path is None:
+        return np.ones(size, bool)
+    values = read_image(path).pixels.max(axis=-1)
+    if values.shape != size:
+        raise UserError(f"{path}: another size than {view.image}", "make the mask again")
+    return values > 0.5
+
+
+def _off_the_background(color: Float32[np.ndarray, "H W 3"], usable: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """All but the colour that most of the border shares."""
+    edge = np.zeros(usable.shape, bool)
+    edge[[0, -1]] = edge[:, [0, -1]] = True
+    border = color[edge & usable]
+    if not len(border):
+        return usable
+    common = np.median(border, axis=0)
+    even = (border == common).all(axis=-1).mean() >= BORDER_SHARE
+    return ~(color == common).all(axis=-1) if even else np.ones(usable.shape, bool)
+
+
+def _sharpness(light: Float32[np.ndarray, "H W"], shown: Bool[np.ndarray, "H W"], middle: float) -> float:
+    if middle <= 0:
+        return 0.0
+    grey = linear_to_srgb(torch.from_numpy(light * np.float32(MIDDLE_GREY / middle)).clamp(0, 1)).numpy()
+    grey, kept = _fitted(grey, SHARP), _fitted(shown.astype(np.float32), SHARP) > 0.5
+    if not kept.any():
+        return 0.0
+    spread = float(grey[kept].var())
+    return float(cv2.Laplacian(grey, cv2.CV_32F)[kept].var()) / spread if spread > 0 else 0.0
+
+
+def _clipped(image: ImageFile, color: Float32[np.ndarray, "H W 3"], shown: Bool[np.ndarray, "H W"]) -> float:
+    pixels = color[shown]
+    if not len(pixels):
+        return 0.0
+    if not image.hdr:
+        return float((image.pixels[shown] >= FULL).any(axis=-1).mean())
+    # A sensor that clips piles pixels up at one level; without clipping hardly two pixels share the maximum.
+    top = pixels >= pixels.max(axis=0) * (1 - PLATEAU_WIDTH)
+    piled = (top.sum(axis=0) >= LEAST_PLATEAU) & (pixels.max(axis=0) > pixels.min(axis=0))
+    return float((top & piled).any(axis=-1).mean())
+
+
+def _levels(pixels: Float32[np.ndarray, "N 3"]) -> int:
+    some = pixels[:: max(1, len(pixels) // SOME)]
+    return max(len(np.unique(channel)) for channel in some.T)
+
+
+def _fitted(values: Float32[np.ndarray, "H W *C"], side: int) -> Float32[np.ndarray, "h w *C"]:
+    height, width = values.shape[:2]
+    share = side / max(height, width)
+    if share >= 1:
+        return values
+    size = max(1, round(width * share)), max(1, round(height * share))
+    return cv2.resize(values, size, interpolation=cv2.INTER_AREA)

@@ -1,0 +1,108 @@
+"""The picture of an inspection: where the cameras stand, along two axes, and all views, flagged ones first."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from neilfpp_method.inspection.findings import Inspection
+from neilfpp_method.shading.color import tone_map
+
+__all__ = ["draw"]
+
+PAPER, INK, PALE_INK = (250, 250, 248), (28, 30, 34), (150, 154, 160)
+PROBLEM, WARNING, FINE = (200, 40, 40), (225, 150, 20), (70, 130, 180)
+CELL, LABEL, GAP, MARGIN = 160, 40, 12, 32
+COLUMNS = 7
+PLAN = 420
+MOST = 210
+"""Views that are shown at most: a picture of more is too long to look at."""
+KEY = 0.25
+"""What the median luminance of the capture is shown as, linear."""
+
+
+def draw(inspection: Inspection) -> UInt8[np.ndarray, "H W 3"]:
+    """The picture; views keep one exposure, so that jumps are seen."""
+    colors = _colors(inspection)
+    ranks = [{PROBLEM: 0, WARNING: 1, FINE: 2}[color] for color in colors]
+    order = sorted(range(len(ranks)), key=lambda i: ranks[i])[:MOST]
+    rows = -(-len(order) // COLUMNS)
+    width = 2 * MARGIN + COLUMNS * (CELL + GAP) - GAP
+    top = MARGIN + 70 + PLAN + 2 * GAP
+    sheet = Image.new("RGB", (width, top + rows * (CELL + LABEL + GAP) + MARGIN), PAPER)
+    pen = ImageDraw.Draw(sheet)
+    verdict, capture = inspection.verdict, inspection.capture
+    _write(pen, (MARGIN, MARGIN - 6), f"{capture.root.resolve().name}: {len(capture.views)} views", 26)
+    _write(pen, (MARGIN, MARGIN + 32), f"radiance {verdict.quality}: {verdict.text}", 16, PALE_INK)
+    for k, (axes, title) in enumerate([((0, 1), "along z (x, y)"), ((0, 2), "along y (x, z)")]):
+        plan = Image.fromarray(_plan(inspection, axes, colors, title))
+        sheet.paste(plan, (MARGIN + k * (PLAN + 2 * GAP), MARGIN + 70))
+    _list(pen, (MARGIN + 2 * (PLAN + 2 * GAP), MARGIN + 78), inspection)
+    for place, i in enumerate(order):
+        corner = (MARGIN + place % COLUMNS * (CELL + GAP), top + place // COLUMNS * (CELL + LABEL + GAP))
+        _cell(sheet, pen, corner, inspection, i, colors[i])
+    return np.asarray(sheet)
+
+
+def _colors(inspection: Inspection) -> list[tuple[int, int, int]]:
+    problems = {name for finding in inspection.findings if finding.severity == "problem" for name in finding.views}
+    warnings = {name for finding in inspection.findings for name in finding.views}
+    return [PROBLEM if v.name in problems else WARNING if v.name in warnings else FINE for v in inspection.views]
+
+
+def _plan(
+    inspection: Inspection, axes: tuple[int, int], colors: list[tuple[int, int, int]], title: str
+) -> UInt8[np.ndarray, "_ _ 3"]:
+    """Cameras as dots with their viewing directions, seen along an axis of the world; the circle is the unit sphere."""
+    plan = Image.new("RGB", (PLAN, PLAN), (255, 255, 255))
+    pen = ImageDraw.Draw(plan)
+    centres, forward = inspection.stand.centres[:, axes], inspection.stand.axes[:, axes]
+    reach = 1.15 * max(1.0, float(np.abs(centres).max()))
+
+    def place(points: Float64[np.ndarray, "*N 2"]) -> Float64[np.ndarray, "*N 2"]:
+        return PLAN / 2 * (1 + points / reach * np.array([1, -1]))
+
+    pen.ellipse([*place(np.array([-1.0, 1.0])), *place(np.array([1.0, -1.0]))], outline=PALE_INK)
+    for start, end, color in zip(place(centres), place(centres + 0.12 * reach * forward), colors, strict=True):
+        pen.line([*start, *end], fill=color, width=2)
+        pen.ellipse([*(start - 4), *(start + 4)], fill=color)
+    _write(pen, (10, 8), title, 14, PALE_INK)
+    return np.asarray(plan)
+
+
+def _list(pen: ImageDraw.ImageDraw, corner: tuple[int, int], inspection: Inspection) -> None:
+    for place, finding in enumerate(inspection.findings):
+        count = f": {len(finding.views)} view{'s' * (len(finding.views) != 1)}" if finding.views else ""
+        color = PROBLEM if finding.severity == "problem" else WARNING
+        _write(pen, (corner[0], corner[1] + 26 * place), finding.kind.replace("_", " ") + count, 16, color)
+    if not inspection.findings:
+        _write(pen, corner, "nothing is wrong with it", 16, FINE)
+
+
+def _cell(
+    sheet: Image.Image,
+    pen: ImageDraw.ImageDraw,
+    corner: tuple[int, int],
+    inspection: Inspection,
+    i: int,
+    color: tuple[int, int, int],
+) -> None:
+    view = inspection.views[i]
+    middle = float(np.median([v.luminance for v in inspection.views if v.luminance > 0] or [1.0]))
+    picture = Image.fromarray(_shown(view.small, KEY / middle))
+    picture.thumbnail((CELL, CELL))
+    sheet.paste(picture, (corner[0] + (CELL - picture.width) // 2, corner[1] + (CELL - picture.height) // 2))
+    pen.rectangle([corner[0] - 3, corner[1] - 3, corner[0] + CELL + 2, corner[1] + CELL + 2], outline=color, width=3)
+    kinds = [finding.kind.replace("_", " ") for finding in inspection.findings if view.name in finding.views]
+    _write(pen, (corner[0], corner[1] + CELL + 4), view.name[:22], 14)
+    _write(pen, (corner[0], corner[1] + CELL + 21), ", ".join(kinds)[:26], 12, color)
+
+
+def _shown(radiance: Float[np.ndarray, "h w 3"], exposure: float) -> UInt8[np.ndarray, "h w 3"]:
+    return (tone_map(torch.from_numpy(radiance * np.float32(exposure))).numpy() * 255 + 0.5).astype(np.uint8)
+
+
+def _write(pen: ImageDraw.ImageDraw, corner: tuple[int, int], text: str, size: int, color: tuple[int, int, int] = INK) -> None:
+    pen.text(corner, text, font=ImageFont.load_default(size), fill=color)

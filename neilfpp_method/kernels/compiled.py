@@ -1,0 +1,194 @@
+"""The loops of the CPU backend, compiled by Numba on first use and kept on disk from then on.
+
+They hold no lock of the interpreter, start no threads and add up in a fixed order. All compiled code stands in this one
+file, because what is kept on disk is renewed when its own file changes, and for no other.
+
+A grid comes in parts, one entry per level: `offsets` (first table row; and the end), `cells` along an edge, and `dense`.
+The vertices of a cell are numbered x + 2 y + 4 z, each coordinate 0 or 1. Arrays are dense, and all of one float type.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+
+import numpy as np
+from numba import njit
+
+__all__ = ["add_to_table", "interpolate", "pull_to_points"]
+
+BLOCK = 128  # points that take all levels in turn: what they write stays in the nearest cache
+Y_PRIME, Z_PRIME = np.uint32(2654435761), np.uint32(805459861)  # of the spatial hash
+ONE = np.uint32(1)
+
+
+def compiled(function: Callable) -> Callable:
+    """`function` as machine code. A product and a sum may fuse; nothing else may change the arithmetic."""
+    function = inspect.unwrap(function)  # a checker of types may have wrapped it
+    options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+    try:
+        return njit(cache=True, **options)(function)
+    except RuntimeError:  # no folder that could keep it may be written: each process compiles it anew
+        return njit(**options)(function)
+
+
+# ------------------------------------------------------------------------------------------------------------- one cell
+
+
+@compiled
+def _locate(points, n, axis, cells):
+    """Along one axis: the cell, the fraction of it, and d(position in cells) / d(coordinate), which is 0 off the cube."""
+    number = points.dtype.type
+    free = points[n, axis] * number(cells)
+    position = min(max(free, number(0)), number(cells))
+    start = min(np.floor(position), number(cells - 1))
+    # What is not a number takes the first cell, and makes all that is computed there not a number.
+    cell = np.uint32(start) if start > 0 else np.uint32(0)
+    return cell, position - start, number(cells if position == free else 0)
+
+
+@compiled
+def _vertices(i, j, k, cells, entries, dense):
+    """The rows of a cell's eight vertices in the table of its level."""
+    if dense:
+        step = np.uint32(cells) + ONE
+        a = i + step * (j + step * k)
+        b, c = a + step, a + step * step
+        d = c + step
+        return a, a + ONE, b, b + ONE, c, c + ONE, d, d + ONE
+    mask = np.uint32(entries) - ONE
+    y0, y1, z0, z1 = j * Y_PRIME, (j + ONE) * Y_PRIME, k * Z_PRIME, (k + ONE) * Z_PRIME
+    a, b, c, d = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
+    o = i + ONE
+    lower = (i ^ a) & mask, (o ^ a) & mask, (i ^ b) & mask, (o ^ b) & mask
+    upper = (i ^ c) & mask, (o ^ c) & mask, (i ^ d) & mask, (o ^ d) & mask
+    return lower + upper
+
+
+@compiled
+def _value_and_slopes(corners, x, y, z):
+    """Trilinear interpolation, and its derivative along each axis in units of the cell."""
+    c0, c1, c2, c3, c4, c5, c6, c7 = corners
+    z0, z1, z2, z3 = c4 - c0, c5 - c1, c6 - c2, c7 - c3
+    b0, b1, b2, b3 = c0 + z * z0, c1 + z * z1, c2 + z * z2, c3 + z * z3
+    y0, y1 = b2 - b0, b3 - b1
+    left, right = b0 + y * y0, b1 + y * y1
+    back, front = z0 + y * (z2 - z0), z1 + y * (z3 - z1)
+    return left + x * (right - left), right - left, y0 + x * (y1 - y0), back + x * (front - back)
+
+
+@compiled
+def _twists(corners, x, y, z):
+    """The mixed second derivatives xy, xz, yz in units of the cell; those along one axis are 0."""
+    c0, c1, c2, c3, c4, c5, c6, c7 = corners
+    low, high = c3 - c2 - c1 + c0, c7 - c6 - c5 + c4
+    near, far = c5 - c4 - c1 + c0, c7 - c6 - c3 + c2
+    left, right = c6 - c4 - c2 + c0, c7 - c5 - c3 + c1
+    return low + z * (high - low), near + y * (far - near), left + x * (right - left)
+
+
+@compiled
+def _corners(rows, vertices, f):
+    a, b, c, d, e, g, h, i = vertices
+    return rows[a, f], rows[b, f], rows[c, f], rows[d, f], rows[e, f], rows[g, f], rows[h, f], rows[i, f]
+
+
+# ------------------------------------------------------------------------------------------------------------ the loops
+
+
+@compiled
+def interpolate(points, table, offsets, cells, dense, features, jacobian, with_jacobian, start, stop):
+    """Write the features, and on demand the Jacobian, of the points from `start` to `stop`."""
+    for block in range(start, stop, BLOCK):
+        end = min(block + BLOCK, stop)
+        for level in range(len(cells)):
+            rows = table[offsets[level] : offsets[level + 1]]
+            if dense[level]:  # asked once here, not once per point
+                _interpolate_level(points, rows, level, cells[level], True, features, jacobian, with_jacobian, block, end)
+            else:
+                _interpolate_level(points, rows, level, cells[level], False, features, jacobian, with_jacobian, block, end)
+
+
+@compiled
+def _interpolate_level(points, rows, level, cells, dense, features, jacobian, with_jacobian, start, stop):
+    width = rows.shape[1]
+    for n in range(start, stop):
+        i, x, dx = _locate(points, n, 0, cells)
+        j, y, dy = _locate(points, n, 1, cells)
+        k, z, dz = _locate(points, n, 2, cells)
+        vertices = _vertices(i, j, k, cells, len(rows), dense)
+        for f in range(width):
+            value, along_x, along_y, along_z = _value_and_slopes(_corners(rows, vertices, f), x, y, z)
+            column = level * width + f
+            features[n, column] = value
+            if with_jacobian:
+                jacobian[n, column, 0] = along_x * dx
+                jacobian[n, column, 1] = along_y * dy
+                jacobian[n, column, 2] = along_z * dz
+
+
+@compiled
+def add_to_table(points, offsets, cells, dense, features, jacobian, with_jacobian, table, first, last):
+    """Add to the table what the gradients of features and Jacobian ask of it, for the levels from `first` to `last`."""
+    width = table.shape[1]
+    number = points.dtype.type
+    for level in range(first, last):
+        rows = table[offsets[level] : offsets[level + 1]]
+        for n in range(len(points)):
+            i, x, dx = _locate(points, n, 0, cells[level])
+            j, y, dy = _locate(points, n, 1, cells[level])
+            k, z, dz = _locate(points, n, 2, cells[level])
+            a, b, c, d, e, g, h, m = _vertices(i, j, k, cells[level], len(rows), dense[level])
+            rest_x, rest_y, rest_z = number(1) - x, number(1) - y, number(1) - z
+            for f in range(width):
+                column = level * width + f
+                value, along_x, along_y, along_z = features[n, column], number(0), number(0), number(0)
+                if with_jacobian:
+                    along_x, along_y = jacobian[n, column, 0] * dx, jacobian[n, column, 1] * dy
+                    along_z = jacobian[n, column, 2] * dz
+                # `_value_and_slopes` backwards: along x, then y, then z.
+                left, right = rest_x * value - along_x, x * value + along_x
+                b0, b1 = rest_y * left - rest_x * along_y, rest_y * right - x * along_y
+                b2, b3 = y * left + rest_x * along_y, y * right + x * along_y
+                back, front = rest_x * along_z, x * along_z
+                z0, z1, z2, z3 = rest_y * back, rest_y * front, y * back, y * front
+                rows[a, f] += rest_z * b0 - z0
+                rows[b, f] += rest_z * b1 - z1
+                rows[c, f] += rest_z * b2 - z2
+                rows[d, f] += rest_z * b3 - z3
+                rows[e, f] += z * b0 + z0
+                rows[g, f] += z * b1 + z1
+                rows[h, f] += z * b2 + z2
+                rows[m, f] += z * b3 + z3
+
+
+@compiled
+def pull_to_points(points, table, offsets, cells, dense, features, jacobian, with_jacobian, gradient, start, stop):
+    """Write what the gradients of features and Jacobian ask of the points from `start` to `stop`."""
+    width = table.shape[1]
+    number = points.dtype.type
+    for n in range(start, stop):
+        to_x, to_y, to_z = number(0), number(0), number(0)
+        for level in range(len(cells)):
+            rows = table[offsets[level] : offsets[level + 1]]
+            i, x, dx = _locate(points, n, 0, cells[level])
+            j, y, dy = _locate(points, n, 1, cells[level])
+            k, z, dz = _locate(points, n, 2, cells[level])
+            vertices = _vertices(i, j, k, cells[level], len(rows), dense[level])
+            for f in range(width):
+                corners = _corners(rows, vertices, f)
+                column = level * width + f
+                _, along_x, along_y, along_z = _value_and_slopes(corners, x, y, z)
+                value = features[n, column]
+                by_x, by_y, by_z = value * along_x, value * along_y, value * along_z
+                if with_jacobian:
+                    gx, gy = jacobian[n, column, 0] * dx, jacobian[n, column, 1] * dy
+                    gz = jacobian[n, column, 2] * dz
+                    xy, xz, yz = _twists(corners, x, y, z)
+                    by_x += gy * xy + gz * xz
+                    by_y += gx * xy + gz * yz
+                    by_z += gx * xz + gy * yz
+                to_x += by_x * dx
+                to_y += by_y * dy
+                to_z += by_z * dz
+        gradient[n, 0], gradient[n, 1], gradient[n, 2] = to_x, to_y, to_z

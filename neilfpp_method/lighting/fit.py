@@ -1,0 +1,153 @@
+"""Light is solved for, not descended to: a map and lamps under which remembered points look as the images show them.
+
+With the transport of these points at hand (`lighting.transport`), a hundred steps on the light cost less than as many steps
+of training. They find lamps that stochastic descent, through few and noisy samples of every texel, spreads into a haze that
+the base colour then makes up for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from neilfpp_method.config import LightFitConfig
+from neilfpp_method.lighting.transport import Transport
+from neilfpp_method.shading.color import apply_response
+from neilfpp_method.structures import Indexable, Material
+
+__all__ = ["Evidence", "Light", "Target", "compare", "fit_light", "total_variation"]
+
+SMOOTHED = 1e-2
+"""Differences of log radiance below this count by their square, so that the total variation has a gradient everywhere."""
+LEAST_RATE = 0.05
+"""The last step's rate over the first's."""
+LEAST_REACH = 0.05
+"""A lamp that brings less than this share of the mean, were all alike, is not sought: behind a wall anything fits."""
+FIRST_SHARE = 0.1
+"""Of the light that typical points receive, what all lamps that are not yet lit start with together."""
+
+
+@dataclass(frozen=True)
+class Light:
+    """A map, log radiance of its texels, and the intensity of lamps."""
+
+    log_radiance: Float[Tensor, "3 H W"]
+    intensity: Float[Tensor, "M 3"]
+
+
+@dataclass(frozen=True)
+class Target(Indexable):
+    """What points look like: their material, constants, and their pixels in the response of the capture."""
+
+    material: Material
+    pixel: Float[Tensor, "N 3"]
+
+    def __getitem__(self, rows: Tensor | slice) -> Target:
+        return Target(self.material[rows], self.pixel[rows])
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """How much lower the relative error of the second of two lights is at points that neither was fitted to, and the standard
+    error of that mean."""
+
+    gain: float
+    deviation: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether chance would bring it about less than once in forty times."""
+        return self.gain > 2 * self.deviation
+
+
+def fit_light(
+    start: Light, carried: Transport, target: Target, response: str, unit: float, config: LightFitConfig
+) -> Light:
+    """The light that explains the points best, the smoothest and with the fewest lamps where they do not say.
+
+    Minimises the relative error, robustly; the total variation of the map's log radiance, so that lamps in it may be sharp
+    and what no point sees takes after its surroundings; and the light that near lamps bring, which their squares as unknowns
+    make sparse. Base colour and light share a scale, so a factor per channel on the base colour is free during the fit: the
+    light need not make up for it.
+
+    Args:
+        start: where the search starts.
+        carried: from the texels of the map, row by row, and then from the lamps.
+        target: what the points look like.
+        response: of the capture, "linear" or "srgb".
+        unit: a pixel of typical brightness; errors are relative to the pixel and a share of this.
+        config: weights, rates and number of steps.
+
+    Returns:
+        `start` where the search leads to what is not finite.
+    """
+    texels = start.log_radiance[0].numel()
+    log_radiance = start.log_radiance.clone().requires_grad_()
+    # In units of what a lamp brings to a white surface in the mean over the points: its unknowns are then of one size.
+    brought = carried.sources[0, :, texels:].mean(0)[:, None] / unit
+    reaches = brought > LEAST_REACH * brought.mean()
+    first = FIRST_SHARE / max(1, len(brought))
+    root = (start.intensity * brought).clamp_min(first).sqrt().requires_grad_()
+    log_gain = torch.zeros(3, device=root.device, requires_grad=True)
+    groups = [{"params": [p], "rate": rate * config.rate} for p, rate in ((log_radiance, 1.0), (root, 0.2), (log_gain, 0.2))]
+    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
+    scale = target.pixel + config.floor * unit
+
+    def light() -> Light:
+        return Light(log_radiance, torch.where(reaches, root.square() / brought.clamp_min(1e-20), 0.0))
+
+    with torch.enable_grad():
+        for step in range(config.steps):
+            for group in optimizer.param_groups:
+                group["lr"] = group["rate"] * LEAST_RATE ** (step / config.steps)
+            error = (_shown(light(), carried, target.material, log_gain.exp(), response) - target.pixel) / scale
+            loss = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=config.outlier)
+            loss = loss + config.smoothness * total_variation(log_radiance)
+            loss = loss + config.sparsity * root.square().sum(0).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+    found = light()
+    found = Light(found.log_radiance.detach(), found.intensity.detach())
+    finite = found.log_radiance.isfinite().all() and found.intensity.isfinite().all()
+    return found if finite else start
+
+
+@torch.no_grad()
+def compare(
+    lights: tuple[Light, Light],
+    carried: tuple[Transport, Transport],
+    target: Target,
+    response: str,
+    unit: float,
+    config: LightFitConfig,
+) -> Evidence:
+    """Which of two lights explains the points better that neither was fitted to."""
+    scale = target.pixel + config.floor * unit
+    one, other = (
+        ((_shown(light, transport, target.material, 1.0, response) - target.pixel) / scale).abs().clamp_max(1).mean(-1)
+        for light, transport in zip(lights, carried, strict=True)
+    )
+    gain = one - other
+    return Evidence(gain.mean().item(), (gain.std(correction=0) / max(1, len(gain)) ** 0.5).item())
+
+
+def total_variation(values: Float[Tensor, "C H W"]) -> Float[Tensor, ""]:
+    """Σ |difference of neighbours| per texel, of a map that is closed in azimuth."""
+    across = torch.cat((values, values[..., :1]), -1).diff(dim=-1)
+    down = values.diff(dim=1)
+    size = values[0].numel()
+    return sum((step.square() + SMOOTHED**2).sqrt().sum() for step in (across, down)) / size
+
+
+def _shown(
+    light: Light, carried: Transport, material: Material, gain: Float[Tensor, " 3"] | float, response: str
+) -> Float[Tensor, "N 3"]:
+    """What the camera stores of the points, their base colour times `gain`."""
+    tinted = Material((material.base_color * gain).clamp(0, 1), material.roughness, material.metallic)
+    strength = torch.cat((light.log_radiance.exp().flatten(1).t(), light.intensity))
+    return apply_response(carried.outgoing(tinted, strength), response)

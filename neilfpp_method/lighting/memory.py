@@ -1,0 +1,72 @@
+"""What light is fitted to: surface points that training has seen, a share of every step's."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from neilfpp_method.structures import Indexable
+
+__all__ = ["Observed", "SurfaceMemory"]
+
+
+@dataclass(frozen=True)
+class Observed(Indexable):
+    """Surface points and what an image holds of each: `pixel` in the capture's response, `wo` towards the camera."""
+
+    position: Float[Tensor, "N 3"]
+    normal: Float[Tensor, "N 3"]
+    wo: Float[Tensor, "N 3"]
+    pixel: Float[Tensor, "N 3"]
+
+
+class SurfaceMemory(nn.Module):
+    """The newest points of all images, and when to fit to them next. It is part of a checkpoint.
+
+    Args:
+        capacity: how many points are kept.
+        every: steps between two fits.
+    """
+
+    def __init__(self, capacity: int, every: int) -> None:
+        super().__init__()
+        self.every = every
+        self.register_buffer("points", torch.zeros(capacity, 12))
+        self.filled = 0
+        self.next = 0
+        self.age: int | None = None
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time to fit: at the first step that saw anything, and `every` steps after each fit."""
+        return self.filled > 0 and (self.age is None or self.age >= self.every)
+
+    @torch.no_grad()
+    def remember(self, seen: Observed) -> None:
+        """Keep some rows, in the place of the oldest; of the first step all of them."""
+        capacity = len(self.points)
+        share = capacity if self.filled == 0 else math.ceil(capacity / self.every)
+        kept = torch.cat((seen.position, seen.normal, seen.wo, seen.pixel), -1)[:share].to(self.points.dtype)
+        slots = torch.arange(self.next, self.next + len(kept), device=kept.device) % capacity
+        self.points[slots] = kept
+        self.next = (self.next + len(kept)) % capacity
+        self.filled = min(self.filled + len(kept), capacity)
+        if self.age is not None:
+            self.age += 1
+
+    def recall(self) -> Observed:
+        """Everything that is remembered, for a fit that is done now."""
+        self.age = 0
+        return Observed(*self.points[: self.filled].split(3, -1))
+
+    def get_extra_state(self) -> dict[str, int | None]:
+        """Where the memory stands, for checkpoints."""
+        return {"filled": self.filled, "next": self.next, "age": self.age}
+
+    def set_extra_state(self, state: dict[str, int | None]) -> None:
+        """The inverse of `get_extra_state`."""
+        self.filled, self.next, self.age = state["filled"], state["next"], state["age"]

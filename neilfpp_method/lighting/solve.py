@@ -1,0 +1,79 @@
+"""The light of a scene from what was seen of it: the map, and lamps where the points that were kept back ask for them."""
+
+from __future__ import annotations
+
+import torch
+
+from neilfpp_method.config import IncidentLightConfig
+from neilfpp_method.fields.environment import EnvironmentLight
+from neilfpp_method.fields.lamps import Lamps
+from neilfpp_method.lighting.candidates import merge, propose
+from neilfpp_method.lighting.fit import Evidence, Light, Target, compare, fit_light
+from neilfpp_method.lighting.memory import Observed
+from neilfpp_method.lighting.transport import SceneTracer, from_lamps, from_texels
+from neilfpp_method.shading.brdf import Lobe
+from neilfpp_method.structures import Material
+
+__all__ = ["solve_light"]
+
+KEPT_BACK = 5
+"""One point in so many is not fitted to, and decides between two lights."""
+
+
+@torch.no_grad()
+def solve_light(
+    environment: EnvironmentLight,
+    lamps: Lamps | None,
+    seen: Observed,
+    material: Material,
+    lobe: Lobe | None,
+    scene: SceneTracer | None,
+    response: str,
+    unit: float,
+    config: IncidentLightConfig,
+) -> Evidence | None:
+    """Set the map, and the lamps where there may be any, to what explains the points.
+
+    Args:
+        environment, lamps: what is set; the search starts from what they are.
+        seen, material: surface points, and what they are made of.
+        lobe, scene: as of `from_texels`.
+        response, unit: as of `fit_light`.
+        config: with "auto" the lamps must earn their place: the fit is done with and without, and they stay where they
+            lower the error at points kept back from both by more than chance would.
+
+    Returns:
+        What spoke for lamps, or against them; none where the settings had decided.
+    """
+    texels = from_texels(environment, seen, material.roughness, lobe, scene)
+    target = Target(material, seen.pixel)
+    dark = environment.log_radiance.new_zeros(0, 3)
+    plain_start = Light(environment.log_radiance, dark)
+    if lamps is None:
+        environment.log_radiance.copy_(fit_light(plain_start, texels, target, response, unit, config.fit).log_radiance)
+        return None
+
+    places = propose(lamps, seen.position, config.fit.candidates)
+    near = from_lamps(places, lamps.radius, seen, material.roughness, lobe, scene)
+    both = texels.beside(near)
+    intensity = dark.new_zeros(len(places), 3)
+    intensity[: lamps.lit] = lamps.intensity[: lamps.lit]
+    start = Light(environment.log_radiance, intensity)
+    if config.kind != "auto":
+        found, evidence = fit_light(start, both, target, response, unit, config.fit), None
+    else:
+        kept_back = torch.zeros(len(seen), dtype=torch.bool, device=seen.position.device)
+        kept_back[torch.randperm(len(seen), device=kept_back.device)[: len(seen) // KEPT_BACK]] = True
+        fitted = ~kept_back
+        plain = fit_light(plain_start, texels[fitted], target[fitted], response, unit, config.fit)
+        found = fit_light(start, both[fitted], target[fitted], response, unit, config.fit)
+        carried = (texels[kept_back], both[kept_back])
+        evidence = compare((plain, found), carried, target[kept_back], response, unit, config.fit)
+        if not evidence.significant:
+            environment.log_radiance.copy_(plain.log_radiance)
+            lamps.place(dark, dark)
+            return evidence
+    environment.log_radiance.copy_(found.log_radiance)
+    lit = merge(places, found.intensity, near.sources[0].mean(0), len(lamps.position))
+    lamps.place(lit.position, lit.intensity)
+    return evidence

@@ -1,0 +1,140 @@
+"""How light travels to a surface and on to its viewer, as matrices: what a surface sends is linear in the light.
+
+With geometry and roughness fixed, a map of T texels of radiance E and M lamps of intensity I,
+
+    L_o = k_d (D E + D' I + d) + F0 (F E + F' I + f) + (G E + G' I + g),   k_d = (1 − m) b,   F0 = 0.04 (1 − m) + b m
+
+D, F, G hold cosine, visibility, solid angle, and the diffuse, the facing and the grazing part of the BRDF; d, f, g are what
+the scene's own surfaces add.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neilfpp_method.fields.environment import EnvironmentLight
+from neilfpp_method.fields.lamps import rays_towards
+from neilfpp_method.lighting.memory import Observed
+from neilfpp_method.shading.brdf import Lobe, diffuse_reflectance, normal_reflectance, specular_terms
+from neilfpp_method.shading.frame import dot
+from neilfpp_method.structures import Material, SceneLight
+
+__all__ = ["SceneTracer", "Transport", "from_lamps", "from_texels"]
+
+SceneTracer = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N S 3"]], SceneLight]
+"""What the scene sends to points from directions."""
+
+PAIRS_AT_ONCE = 2**18
+"""Pairs of a point and a direction that are traced together: what bounds the memory."""
+
+
+@dataclass(frozen=True)
+class Transport:
+    """How light leaves N points towards their viewers: the diffuse, the facing and the grazing part, in this order; K is 3,
+    or 1 for Lambertian surfaces.
+
+    `sources` is per unit of each of T sources, `scene` what the scene's own surfaces send through the points.
+    """
+
+    sources: Float[Tensor, "K N T"]
+    scene: Float[Tensor, "K N 3"]
+
+    def __getitem__(self, points: Tensor | slice) -> Transport:
+        """The same for some of the points."""
+        return Transport(self.sources[:, points], self.scene[:, points])
+
+    def beside(self, other: Transport) -> Transport:
+        """Both sets of sources."""
+        return Transport(torch.cat((self.sources, other.sources), -1), self.scene + other.scene)
+
+    def outgoing(self, material: Material, strength: Float[Tensor, "T 3"]) -> Float[Tensor, "N 3"]:
+        """L_o under sources of this strength; `material` brings the colours, its roughness is in the matrices."""
+        diffuse, *reflected = self.sources @ strength + self.scene
+        color = diffuse_reflectance(material, bool(reflected)) * diffuse
+        if reflected:
+            facing, grazing = reflected
+            color = color + normal_reflectance(material) * facing + grazing
+        return color
+
+
+@torch.no_grad()
+def from_texels(
+    environment: EnvironmentLight,
+    seen: Observed,
+    roughness: Float[Tensor, "N 1"],
+    lobe: Lobe | None,
+    scene: SceneTracer | None,
+) -> Transport:
+    """From the texels of a map, per unit of radiance; one direction per point and texel is traced.
+
+    Args:
+        environment: whose texels are meant; its radiance plays no part.
+        seen: surface points; unit normals and directions to the viewer.
+        roughness: at the points.
+        lobe: of the specular reflection; none for Lambertian surfaces.
+        scene: stands between the points and the map, and shines on them; none where inter-reflection is off.
+    """
+    texels = environment.log_radiance[0].numel()
+    sources, added = [], []
+    for part, rough in _chunks(seen, roughness, texels):
+        drawn = environment.texel_directions(part.position)
+        weight = dot(drawn.wi, part.normal).clamp_min(0) * drawn.solid_angle
+        # The map is even about every plane through its middle: half of its texels are above a horizon, up to grazing ones.
+        weight, above = weight.topk(texels // 2, dim=1)
+        wi = drawn.wi.gather(1, above[..., None].expand(-1, -1, 3))
+        kernel = _kernel(part, rough, wi, weight, lobe)
+        sent = kernel.new_zeros(*kernel.shape[:2], 3)
+        if scene is not None:
+            met = scene(part.position, wi)
+            sent = torch.einsum("kns,nsc->knc", kernel, met.radiance.to(kernel.dtype))
+            kernel = kernel * ~met.hit
+        sources.append(kernel.new_zeros(*kernel.shape[:2], texels).scatter_(2, above.expand(len(kernel), -1, -1), kernel))
+        added.append(sent)
+    return Transport(torch.cat(sources, 1), torch.cat(added, 1))
+
+
+@torch.no_grad()
+def from_lamps(
+    position: Float[Tensor, "M 3"],
+    radius: float,
+    seen: Observed,
+    roughness: Float[Tensor, "N 1"],
+    lobe: Lobe | None,
+    scene: SceneTracer | None,
+) -> Transport:
+    """From small lamps, per unit of intensity: the direction to their middle is traced. Arguments as of `from_texels`."""
+    sources = []
+    for part, rough in _chunks(seen, roughness, len(position)):
+        rays = rays_towards(part.position, position, radius)
+        weight = dot(rays.wi, part.normal).clamp_min(0) / rays.distance.square()
+        if scene is not None:
+            weight = weight * (scene(part.position, rays.wi).distance >= rays.distance)
+        sources.append(_kernel(part, rough, rays.wi, weight, lobe))
+    kernel = torch.cat(sources, 1)
+    return Transport(kernel, kernel.new_zeros(*kernel.shape[:2], 3))
+
+
+def _kernel(
+    seen: Observed,
+    roughness: Float[Tensor, "N 1"],
+    wi: Float[Tensor, "N S 3"],
+    weight: Float[Tensor, "N S"],
+    lobe: Lobe | None,
+) -> Float[Tensor, "K N S"]:
+    """The parts of the BRDF times a weight that holds cosine and solid angle."""
+    if lobe is None:
+        return weight[None] / math.pi
+    terms = specular_terms(roughness, seen.normal, seen.wo, wi, lobe)
+    return torch.stack((weight / math.pi, weight * terms.facing, weight * terms.grazing))
+
+
+def _chunks(seen: Observed, roughness: Float[Tensor, "N 1"], sources: int) -> list[tuple[Observed, Tensor]]:
+    rows = max(1, PAIRS_AT_ONCE // max(1, sources))
+    spans = [slice(start, start + rows) for start in range(0, len(seen), rows)]
+    return [(seen[span], roughness[span]) for span in spans]

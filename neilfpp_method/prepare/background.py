@@ -1,0 +1,53 @@
+"""Native calls that take minutes: they run beside the main thread, which shows their progress and can stop them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import TypeVar
+
+import cv2  # noqa: F401  before pycolmap: loaded after it, OpenCV writes PNG with the wrong zlib and aborts
+import pycolmap
+
+__all__ = ["in_background", "silent"]
+
+Result = TypeVar("Result")
+INTERVAL = 0.2
+
+
+def in_background(call: Callable[[pycolmap.CancellationToken], Result], look: Callable[[], None] = lambda: None) -> Result:
+    """What `call` returns or raises; `look` is called several times a second meanwhile, and once at the end.
+
+    Raises:
+        KeyboardInterrupt: a person asked to stop; the call has been told, and has ended.
+    """
+    token = pycolmap.CancellationToken()
+    outcome: list[Result] = []
+    failure: list[BaseException] = []
+    ended = threading.Event()  # Thread.join forgets its thread when Ctrl-C interrupts it (CPython 3.11)
+
+    def work() -> None:
+        try:
+            outcome.append(call(token))
+        except BaseException as error:
+            failure.append(error)
+        finally:
+            ended.set()
+
+    threading.Thread(target=work, daemon=True).start()
+    try:
+        while not ended.wait(INTERVAL):
+            look()
+        look()
+    except BaseException:
+        token.cancel()
+        ended.wait()
+        raise
+    if failure:
+        raise failure[0]
+    return outcome[0]
+
+
+def silent() -> None:
+    """COLMAP reports every image on the standard error; bars and a summary take its place."""
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL.value)

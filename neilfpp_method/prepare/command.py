@@ -1,0 +1,151 @@
+"""`neilfpp prepare`: from a folder of photographs to a capture.
+
+copies ──► matches ──► model ──► views ──► cloud ──► capture       each a step in CAPTURE/work, done once
+
+The capture's own files are laid out from the steps' results at the end, `capture.json` last: a folder without it is no
+capture yet.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields, replace
+from pathlib import Path
+
+from rich.console import Console
+
+from neilfpp_method.data.capture import READERS, Capture, load_capture
+from neilfpp_method.data.formats.colmap import model_folder, open_model
+from neilfpp_method.data.formats.copies import writing
+from neilfpp_method.errors import Stopped, UserError
+from neilfpp_method.prepare.background import silent
+from neilfpp_method.prepare.layout import WORK, Source, lay_out
+from neilfpp_method.prepare.mapping import map_scene, refuse_partial
+from neilfpp_method.prepare.matching import choose_pairing, extract_features, feature_counts, match_features
+from neilfpp_method.prepare.matching_copies import write_copies
+from neilfpp_method.prepare.options import Prepare
+from neilfpp_method.prepare.photos import Photos, survey, unreadable
+from neilfpp_method.prepare.posed import posed_by_capture, posed_by_model
+from neilfpp_method.prepare.progress import Bars, bars
+from neilfpp_method.prepare.sparse_cloud import sparse_points
+from neilfpp_method.prepare.steps import begin, stamp
+from neilfpp_method.prepare.summary import describe_cameras, placements, remarks_on
+
+__all__ = ["run_prepare"]
+
+
+def run_prepare(options: Prepare, console: Console) -> Path:
+    """Make a capture and return its folder. One that is finished, of the same images and options, is left as it is.
+
+    Raises:
+        UserError: bad input, or images that do not make a scene.
+        Stopped: a person asked for it; names the command that continues.
+    """
+    _check_place(options)
+    silent()
+    posed = any(reader.recognise(options.images) for reader in READERS.values())
+    capture = load_capture(options.images, response=options.response) if posed else None
+    photos = None if posed else _readable(survey(options.images, options.response), options)
+    with _way_on(options), writing(options.out):
+        with bars(console) as open_bar:
+            source = _from_capture(capture, options) if capture else _from_photos(photos, options, open_bar)
+            summary = lay_out(source, options, open_bar)
+        if summary is None:
+            console.print(f"{options.out}: finished already", highlight=False, soft_wrap=True)
+            return options.out
+        for line in summary.lines:
+            console.print(line, highlight=False, soft_wrap=True)
+        console.print(f"written to {options.out}; look at {options.out / 'summary.png'}", highlight=False, soft_wrap=True)
+    return options.out
+
+
+def _check_place(options: Prepare) -> None:
+    images, out = options.images.resolve(), options.out.resolve()
+    if images.is_relative_to(out) or out.is_relative_to(images):
+        raise UserError(f"{options.out}: the images and the capture lie within one another", "choose another --out")
+    if out.exists() and not out.is_dir():
+        raise UserError(f"{options.out}: not a folder", "choose another --out")
+    if out.is_dir() and any(out.iterdir()) and not (out / WORK).is_dir():
+        raise UserError(f"{options.out}: not empty, and not made by this command", "choose another --out")
+    if options.test_every is not None and (options.test_every < 0 or options.test_every == 1):
+        raise UserError(f"every {options.test_every}-th view cannot be held out", "give 2 or more, or 0 for none")
+
+
+@contextmanager
+def _way_on(options: Prepare) -> Iterator[None]:
+    """A stop names the command that continues."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        given = [str(options.images), "--out", str(options.out)]
+        for field in fields(options)[2:]:
+            value = getattr(options, field.name)
+            name = field.name.replace("_", "-")
+            if isinstance(value, bool) and value != field.default:
+                given.append(f"--{name}" if value else f"--no-{name}")
+            elif value != field.default:
+                given += [f"--{name}", *map(str, value if isinstance(value, tuple) else [value])]
+        raise Stopped("stopped; what is done is kept", f"continue with: neilfpp prepare {shlex.join(given)}") from None
+
+
+# -------------------------------------------------------------------------------------------------------------- sources
+
+
+def _readable(photos: Photos, options: Prepare) -> Photos:
+    if photos.unreadable and not options.allow_partial:
+        raise unreadable(photos.unreadable)
+    return photos
+
+
+def _from_capture(capture: Capture, options: Prepare) -> Source:
+    """A capture keeps its poses; the points of a COLMAP model come with it."""
+    posed = posed_by_capture(capture)
+    files = [path for view in posed.views for path in (view.image, view.mask, view.valid) if path]
+    poses = [[view.name, view.camera.w2c.tolist(), view.camera.intrinsics.tolist()] for view in posed.views]
+    step = begin(options.out / WORK / "poses", images=stamp(files, capture.root), poses=poses, linear=posed.linear)
+    step.complete({})
+    points = None
+    if capture.format == "colmap":
+        points = sparse_points(open_model(model_folder(capture.root)))
+    return Source(posed, step, points)
+
+
+def _from_photos(photos: Photos, options: Prepare, open_bar: Bars) -> Source:
+    """Structure from motion."""
+    work = options.out / WORK
+    step = begin(work / "copies", photos=stamp([p.path for p in photos.items], photos.root), linear=photos.linear)
+    copies = step.folder
+    if step.result is None:
+        broken = write_copies(photos, copies, open_bar("copies for matching", len(photos.items)).advance)
+        if broken and not options.allow_partial:
+            raise unreadable(broken)
+        step = replace(step, result=step.complete({"unreadable": broken}))
+    broken = tuple(step.result["unreadable"])
+    photos = _readable(replace(photos, unreadable=photos.unreadable + broken), options)
+    photos = replace(photos, items=tuple(p for p in photos.items if (copies / f"{p.name}.png").is_file()))
+
+    count = len(photos.items)
+    pairing = choose_pairing(options.matching, count)
+    step = begin(work / "matches", step, cameras=options.cameras, model=options.camera_model, pairing=pairing)
+    database = step.folder / "database.db"
+    if step.result is None:
+        bar = open_bar("finding features", count)
+        extract_features(database, copies, photos.items, options.cameras, options.camera_model, bar.to)
+        match_features(database, pairing, step.folder, open_bar("matching pairs", 1).to)
+        step = replace(step, result=step.complete({"features": feature_counts(database)}))
+    features = step.result["features"]
+
+    step = begin(work / "model", step)
+    if step.result is None:
+        mapped = map_scene(database, copies, step.folder, count, open_bar("placing cameras", count).to)
+        step = replace(step, result=step.complete({"sizes": mapped}))
+    model = open_model(step.folder / "largest")
+    placed = placements(features, model)
+    sizes = tuple(step.result["sizes"])
+    if not options.allow_partial:
+        refuse_partial([p.name for p in placed if p.points is None], sizes)
+    cameras = describe_cameras(model)
+    remarks = (*(f"left out: {problem}" for problem in photos.unreadable), *remarks_on(placed, sizes, cameras))
+    return Source(posed_by_model(photos, model), step, sparse_points(model), placed, sizes, cameras, remarks)

@@ -1,0 +1,134 @@
+"""The last steps: from posed views to the capture's folder.
+
+The folder is laid out when all else is done, `capture.json` last: a folder without it is no capture yet.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from neilfpp_method.data.capture import Capture, load_capture
+from neilfpp_method.data.capture_folder import FILE, recognise, write_capture
+from neilfpp_method.data.formats.write_sfm_scene import write_sfm_scene
+from neilfpp_method.data.formats.write_transforms import write_transforms
+from neilfpp_method.data.point_cloud import WorldPoints, read_oriented_ply, write_oriented_ply
+from neilfpp_method.data.scene_box import find_box
+from neilfpp_method.data.views import CaptureFiles, View
+from neilfpp_method.prepare.dense_cloud import dense_cloud
+from neilfpp_method.prepare.options import Prepare
+from neilfpp_method.prepare.pictures import write_picture
+from neilfpp_method.prepare.posed import Posed, write_views
+from neilfpp_method.prepare.progress import Bars
+from neilfpp_method.prepare.sparse_cloud import SparsePoints, oriented, reliable, without_outliers
+from neilfpp_method.prepare.steps import Step, begin
+from neilfpp_method.prepare.summary import Placement, Summary, write_summary
+
+__all__ = ["WORK", "Source", "lay_out"]
+
+WORK, CLOUD = "work", "points.ply"
+PARTS = ("images", "masks", "valid")
+TEST_EVERY = 8
+WRITERS = {"nerfstudio": write_transforms, "neilf": write_sfm_scene}
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a capture is made from: views with poses, the step that found them, and what is known about how."""
+
+    posed: Posed
+    step: Step
+    points: SparsePoints | None
+    placed: tuple[Placement, ...] = ()
+    models: tuple[int, ...] = ()
+    cameras: tuple[dict, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+
+def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
+    """Write the capture's folder and say what it came to; none where it is there already, of the same source and options.
+
+    Raises:
+        UserError: an image cannot be read, or nothing tells where the scene is.
+    """
+    work, posed = options.out / WORK, source.posed
+    step = begin(work / "views", source.step, undistort=options.undistort)
+    asked = {"test_every": options.test_every, "dense": options.dense, "also": options.also}
+    last = begin(work / "capture", step, **asked)
+    if last.result is not None and recognise(options.out):
+        return None
+    known = source.points.position[reliable(source.points)] if source.points is not None and len(source.points) else None
+    if step.result is None:
+        views = write_views(posed, step.folder, options.undistort, open_bar("writing images", len(posed.views)).advance)
+        box = posed.normalisation or find_box(views, known).normalisation
+        files = CaptureFiles(step.folder, views, box)
+        write_capture(step.folder, files, response="linear" if posed.linear else "srgb")
+        step.complete({})
+    prepared = load_capture(step.folder)
+    cloud, kind = _cloud(source, prepared, options, step, open_bar)
+    return _publish(source, prepared, cloud, kind, options, last)
+
+
+def _cloud(source: Source, prepared: Capture, options: Prepare, after: Step, open_bar: Bars) -> tuple[WorldPoints, str]:
+    """The oriented points, and what they are."""
+    if options.dense:
+        step = begin(options.out / WORK / "dense", after)
+        path = step.folder / CLOUD
+        if step.result is None:
+            write_oriented_ply(path, dense_cloud(prepared, step.folder, open_bar))
+            step.complete({})
+        return read_oriented_ply(path), "dense: plane-sweep stereo"
+    if source.posed.cloud is not None:
+        return without_outliers(read_oriented_ply(source.posed.cloud)), "those of the images' own capture"
+    if source.points is not None:
+        return oriented(source.points), "sparse: structure from motion"
+    return WorldPoints(np.empty((0, 3)), np.empty((0, 3))), "none: poses came without points; --dense makes them"
+
+
+def _publish(source: Source, prepared: Capture, cloud: WorldPoints, kind: str, options: Prepare, last: Step) -> Summary:
+    """Lay out the capture's folder; `capture.json` first goes, and comes back last."""
+    out = options.out
+    (out / FILE).unlink(missing_ok=True)
+    for part in PARTS:
+        shutil.rmtree(out / part, ignore_errors=True)
+        if (prepared.root / part).is_dir():
+            shutil.copytree(prepared.root / part, out / part)
+    points = write_oriented_ply(out / CLOUD, cloud) if len(cloud.position) else None
+    views = tuple(_moved(view, prepared.root, out) for view in prepared.views)
+    test = _test_views(source.posed, views, options.test_every)
+    box = prepared.normalisation
+    summary = Summary(
+        placements=source.placed,
+        models=source.models,
+        cameras=source.cameras,
+        views=len(views),
+        points=len(cloud.position),
+        cloud=kind,
+        radius=box.scale,
+        remarks=source.remarks,
+    )
+    write_summary(out / "summary.json", summary)
+    write_picture(out / "summary.png", views, test, cloud, box, source.placed)
+    files = CaptureFiles(out, views, box, points)
+    write_capture(out, files, response="linear" if prepared.hdr else "srgb", test=test)
+    for name in options.also:
+        WRITERS[name](load_capture(out, format="neilfpp"), out / name)
+    last.complete({})
+    return summary
+
+
+def _moved(view: View, old: Path, new: Path) -> View:
+    moved = {
+        name: path and new / path.relative_to(old) for name in ("image", "mask", "valid") for path in [getattr(view, name)]
+    }
+    return replace(view, **moved)
+
+
+def _test_views(posed: Posed, views: tuple[View, ...], test_every: int | None) -> frozenset[str]:
+    if test_every is None and posed.test is not None:
+        return posed.test
+    every = TEST_EVERY if test_every is None else test_every
+    return frozenset(view.name for view in views[every - 1 :: every]) if every else frozenset()

@@ -1,0 +1,89 @@
+"""Photographs with poses: what every later step works on, whether the poses were found here or came with the images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from neilfpp_method.data.capture import Capture
+from neilfpp_method.data.formats.colmap import camera_of
+from neilfpp_method.data.formats.copies import copy_view
+from neilfpp_method.data.images import read_image, write_exr, write_png
+from neilfpp_method.data.raw import RAW_SUFFIXES
+from neilfpp_method.data.views import Normalisation, View
+from neilfpp_method.prepare.matching_copies import relative_exposures
+from neilfpp_method.prepare.photos import Photos, read_photo
+
+__all__ = ["Posed", "posed_by_capture", "posed_by_model", "write_views"]
+
+
+@dataclass(frozen=True)
+class Posed:
+    """Views whose files lie where they were taken from; `normalisation` and `cloud` where the source knows them."""
+
+    views: tuple[View, ...]
+    linear: bool
+    normalisation: Normalisation | None = None
+    cloud: Path | None = None
+    test: frozenset[str] | None = None
+
+
+def posed_by_model(photos: Photos, model: pycolmap.Reconstruction) -> Posed:
+    """The photographs that a model places, in their order."""
+    poses = {model.image(i).name.removesuffix(".png"): model.image(i) for i in model.reg_image_ids()}
+    exposures = relative_exposures(photos)
+    views = []
+    for photo in photos.items:
+        if (image := poses.get(photo.name)) is not None:
+            w2c = np.concatenate([image.cam_from_world().matrix(), [[0.0, 0.0, 0.0, 1.0]]])
+            camera = camera_of(image.camera, w2c, str(photo.path))
+            views.append(View(photo.name, len(views), camera, photo.path, exposure=exposures[photo.name]))
+    return Posed(tuple(views), photos.linear)
+
+
+def posed_by_capture(capture: Capture) -> Posed:
+    """The views of a capture that has poses."""
+    known = capture.normalisation if capture.scene_from != "cameras" else None
+    return Posed(capture.views, capture.hdr, known, capture.point_cloud, capture.test)
+
+
+def write_views(posed: Posed, folder: Path, straight: bool, advance: Callable[[], None]) -> tuple[View, ...]:
+    """Write `folder`/images, masks and valid; returns the views that they make.
+
+    RAW files, and images with pixels that mean nothing, become EXR with a validity mask.
+
+    Args:
+        posed: where the views come from.
+        folder: where they go.
+        straight: undo lenses.
+        advance: called once per view.
+
+    Raises:
+        UserError: an image cannot be read.
+    """
+    written = []
+    for view in posed.views:
+        written.append(copy_view(_usable(view, folder / "developed"), folder, posed.linear, straight))
+        advance()
+    return tuple(written)
+
+
+def _usable(view: View, developed: Path) -> View:
+    """The view itself, or one whose image can be read anywhere and has no pixel that is not a number."""
+    picture = read_photo(view.image)
+    if picture.valid.all() and view.image.suffix.lower() not in RAW_SUFFIXES:
+        return view
+    image, valid = developed / f"{view.name}.exr", developed / f"{view.name}-valid.png"
+    if picture.alpha is None:
+        write_exr(image, {"RGB": picture.pixels})
+    else:
+        write_exr(image, {"RGBA": np.concatenate([picture.pixels, picture.alpha[..., None]], axis=-1)})
+    usable = picture.valid
+    if view.valid is not None:
+        usable = usable & (read_image(view.valid).pixels.min(axis=-1) > 0.5)
+    write_png(valid, np.where(usable, 255, 0).astype(np.uint8))
+    return replace(view, image=image, valid=valid)

@@ -1,0 +1,134 @@
+"""Empty space that a ray may skip: a coarse grid of the distance field says where no surface can be.
+
+The grid knows the field at its vertices, and how fast it changes between them. Within L · r of a place where it is known
+to be v, a field whose slope is at most L lies in v ± L · r: what is clear by that measure is skipped, and a plate thinner
+than a cell is not. The field moves while it trains. So every use asks it once per ray in the part that would be skipped;
+where one answer breaks the promise no ray skips anything, and the grid is soon sampled anew.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from neilfpp_method.structures import RayBatch
+from neilfpp_method.volume.distance_grid import cell_size, look_up, sample_grid
+from neilfpp_method.volume.intersect import Interval
+
+__all__ = ["EmptySpace"]
+
+LOOK_UPS = 128
+"""Places along a ray at which the grid is read."""
+RESOLUTION = 64
+"""Vertices along an edge of the grid."""
+MARGIN = 1.1
+"""The field's slope over the largest between neighbouring vertices."""
+MISSED = 0.01
+"""Most opacity that the density of skipped space may have."""
+OPAQUE = 8.0
+"""Optical depth behind which nothing is seen."""
+LEAST_LIFE, MOST_LIFE = 20, 100
+"""Steps in which the field moves before the grid may, and must, be sampled anew."""
+
+
+class EmptySpace(nn.Module):
+    """The grid and its age, which are kept in checkpoints: a resumed run must skip the very same space.
+
+    Args:
+        radius: of the scene sphere.
+    """
+
+    def __init__(self, radius: float) -> None:
+        super().__init__()
+        self.radius = radius
+        self.register_buffer("distance", torch.zeros(RESOLUTION, RESOLUTION, RESOLUTION))
+        self.register_buffer("slope", torch.zeros(()))
+        self.age: int | None = None
+
+    def moved(self) -> None:
+        """The field has taken a step."""
+        if self.age is not None:
+            self.age += 1
+
+    @torch.no_grad()
+    def narrow(
+        self,
+        sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]],
+        rays: RayBatch,
+        interval: Interval,
+        beta: Float[Tensor, ""],
+    ) -> Interval:
+        """The part of each ray outside which the density of scale `beta` neither absorbs nor can be seen.
+
+        Costs one query of the field per ray. A ray that is empty all along keeps its whole interval. On a CPU a broken
+        promise is noticed at once; elsewhere nobody waits for the answer, and the age of the grid alone decides.
+        """
+        if self.age is None or self.age >= MOST_LIFE:
+            self._sample(sdf)
+        edges = torch.lerp(
+            interval.near[:, None],
+            interval.far[:, None],
+            torch.linspace(0, 1, LOOK_UPS + 1, device=self.distance.device, dtype=interval.near.dtype),
+        )
+        clearance = beta * math.log(self.radius / MISSED) - beta * beta.log()  # e^(−G/β) · 2 radius / 2β ≤ MISSED
+        empty, opaque = self._known(rays, edges, clearance, beta)
+        if rays.origins.device.type == "cpu" and not self._holds(sdf, rays, edges, empty, clearance):
+            if self.age is not None and self.age >= LEAST_LIFE:
+                self.age = None  # the next use samples it
+            return interval
+        taken = ~empty & ~opaque
+        first = taken.to(torch.int8).argmax(dim=-1, keepdim=True)
+        last = LOOK_UPS - taken.flip(-1).to(torch.int8).argmax(dim=-1, keepdim=True)
+        some = taken.any(-1)
+        return Interval(
+            torch.where(some, edges.gather(-1, first)[:, 0], interval.near),
+            torch.where(some, edges.gather(-1, last)[:, 0], interval.far),
+        )
+
+    def _sample(self, sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]) -> None:
+        self.distance.copy_(sample_grid(sdf, self.radius, RESOLUTION, self.distance))
+        steps = torch.stack([self.distance.diff(dim=axis).abs().amax() for axis in range(3)])
+        self.slope.copy_(MARGIN * steps.amax() / cell_size(self.distance, self.radius))
+        self.age = 0
+
+    def _known(
+        self, rays: RayBatch, edges: Float[Tensor, "N E"], clearance: Float[Tensor, ""], beta: Float[Tensor, ""]
+    ) -> tuple[Bool[Tensor, "N K"], Bool[Tensor, "N K"]]:
+        """Which parts of the rays are empty for sure, and which lie for sure behind what is opaque."""
+        width = edges.diff(dim=-1)
+        middle = edges[:, :-1] + 0.5 * width
+        points = rays.origins[:, None] + middle[..., None] * rays.directions[:, None]
+        distance = look_up(self.distance, self.radius, points.reshape(-1, 3)).view(middle.shape)
+        # A weighted mean of the vertices of a cell is off by no more than the slope times half of its diagonal.
+        reach = 0.5 * math.sqrt(3.0) * cell_size(self.distance, self.radius)
+        doubt = self.slope * (0.5 * width + reach)
+        # Inside, the density is at least half of 1/β.
+        depth = ((distance + doubt < 0.0) * width / (2.0 * beta)).cumsum(dim=-1)
+        return distance - doubt > clearance, depth - width / (2.0 * beta) > OPAQUE
+
+    def _holds(
+        self,
+        sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]],
+        rays: RayBatch,
+        edges: Float[Tensor, "N E"],
+        empty: Bool[Tensor, "N K"],
+        clearance: Float[Tensor, ""],
+    ) -> bool:
+        """Whether the field is clear at one random place of each ray, where the grid says that it is."""
+        at = torch.rand_like(edges[:, :1])
+        part = (at * LOOK_UPS).long().clamp_max(LOOK_UPS - 1)
+        distance = torch.lerp(edges[:, :1], edges[:, -1:], at)
+        found = sdf(rays.origins + distance * rays.directions)
+        return not bool((empty.gather(-1, part)[:, 0] & (found <= clearance)).any())
+
+    def get_extra_state(self) -> dict[str, int | None]:
+        """The age, for checkpoints."""
+        return {"age": self.age}
+
+    def set_extra_state(self, state: dict[str, int | None]) -> None:
+        """The inverse of `get_extra_state`."""
+        self.age = state["age"]

@@ -1,0 +1,62 @@
+"""The true light as a function: it holds at the known directions, and integrals of it are those of what is known."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from benchmarks.light_fields import split
+from benchmarks.shading_samples import error_curves, scene_of, techniques
+from benchmarks.true_light import true_light
+from neilfpp_method.config import IncidentLightConfig
+from neilfpp_method.data.truth import LightField
+from neilfpp_method.fields.free_light import make_incident_light
+from neilfpp_method.shading.sampling import combine, fibonacci
+from neilfpp_method.structures import Material
+
+
+def smooth(wi):
+    """A light without corners, of three colours."""
+    return torch.stack((1 + wi[..., 0], 2 + wi[..., 1] * wi[..., 2], 1.5 - 0.5 * wi[..., 2]), -1)
+
+
+def sky(points: int = 6, directions: int = 4096) -> LightField:
+    torch.manual_seed(0)
+    normal = torch.nn.functional.normalize(torch.randn(points, 3), dim=-1)
+    wi, wo = (combine([(fibonacci(normal), count)], stochastic=False).wi for count in (directions, 4))
+    material = Material(torch.rand(points, 3), torch.rand(points, 1), torch.rand(points, 1))
+    return LightField(torch.rand(points, 3), normal, material, wi, smooth(wi), wo, torch.ones_like(wo))
+
+
+def test_known_directions_keep_their_radiance():
+    field = sky()
+    light = true_light(field.wi, field.incident)
+    assert (light.radiance(field.wi) - field.incident).abs().mean() < 0.02
+    inner = field.wi[:, :3000]  # well above the horizon
+    assert (light.radiance(inner) - smooth(inner)).abs().max() < 0.25  # at the poles, where cells are 14° wide
+    second = light[torch.tensor([1])].radiance(inner[1:2])
+    torch.testing.assert_close(second, light.radiance(inner)[1:2])
+
+
+def test_the_mean_over_the_hemisphere_is_that_of_the_truth():
+    field = sky()
+    light = true_light(field.wi, field.incident)
+    few = combine([(fibonacci(field.normal), 512)], stochastic=True).wi
+    torch.testing.assert_close(light.radiance(few).mean(1), field.incident.mean(1), rtol=0.01, atol=0.01)
+
+
+def test_a_split_fits_nothing_of_what_is_left_out():
+    data = split(sky(8))
+    assert (data.points.sum(), data.directions.sum()) == (6, 3072)
+    assert len(data.fitted.grid) == 6
+
+
+@pytest.mark.parametrize("name", list(techniques()))
+def test_every_sampler_comes_near_the_reference(name):
+    """Smooth light on a rough surface: 256 directions are right to some per cent, and more are better than few."""
+    scene = scene_of(sky(), make_incident_light(IncidentLightConfig(network="factorised"), math.e, 1.0))
+    few, many = error_curves(scene, 1.0, {name: techniques()[name]}, counts=(8, 256))[name].y
+    assert many < (0.6 if name == "lobe" else 0.1)  # a lobe alone seldom looks where the diffuse part does
+    assert many < few

@@ -1,0 +1,147 @@
+"""Lenses against the libraries that define them: pycolmap for every model, OpenCV for its own."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+import torch
+
+from neilfpp_method.data.lens import LENSES, Lens, lens_of
+from neilfpp_method.data.undistort import resample, straight_camera
+from neilfpp_method.data.views import Camera, CameraRays, camera_rays, check_camera, project
+from neilfpp_method.errors import UserError
+from tests.data.make_capture import CENTRE, camera_pose
+
+# Coefficients as calibrations find them, by model.
+COEFFICIENTS = {
+    "SIMPLE_RADIAL": [-0.12],
+    "RADIAL": [-0.12, 0.03],
+    "OPENCV": [-0.12, 0.03, 0.002, -0.001],
+    "FULL_OPENCV": [-0.12, 0.03, 0.002, -0.001, 0.01, 0.02, -0.01, 0.004],
+    "SIMPLE_RADIAL_FISHEYE": [0.03],
+    "RADIAL_FISHEYE": [0.03, -0.005],
+    "OPENCV_FISHEYE": [0.03, -0.005, 0.002, -0.001],
+    "THIN_PRISM_FISHEYE": [0.03, -0.005, 0.001, -0.001, 0.001, 0.0, 0.001, -0.001],
+    "RAD_TAN_THIN_PRISM_FISHEYE": [0.03, -0.005, 0.001, 0.0, 0.0, 0.0, 0.001, -0.001, 0.001, 0.0, -0.001, 0.0],
+    "FOV": [0.6],
+    "SIMPLE_DIVISION": [-0.1],
+    "DIVISION": [-0.1],
+    "SIMPLE_FISHEYE": [],
+    "FISHEYE": [],
+    "EUCM": [0.55, 1.05],
+}
+FOCAL, CENTRE_PIXEL, SIZE = (52.0, 52.0), (41.5, 28.0), (80, 60)
+
+
+def camera(model: str, focal: tuple[float, float] = FOCAL) -> Camera:
+    return Camera(*focal, *CENTRE_PIXEL, *SIZE, camera_pose(1, 6), Lens(model, tuple(COEFFICIENTS[model])))
+
+
+def seen_points(count: int = 200) -> np.ndarray:
+    """Points about the scene's centre, which the camera of `camera_pose` looks at."""
+    return CENTRE + np.random.default_rng(3).uniform(-1.5, 1.5, (count, 3))
+
+
+def local(points: np.ndarray) -> np.ndarray:
+    w2c = camera_pose(1, 6)
+    return points @ w2c[:3, :3].T + w2c[:3, 3]
+
+
+def test_every_model_of_the_library_is_known() -> None:
+    assert set(COEFFICIENTS) >= set(LENSES)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_projection_is_that_of_pycolmap(model: str) -> None:
+    names = pycolmap.Camera.create_from_model_name(0, model, 1.0, 1, 1).params_info.split(", ")
+    focal = [FOCAL[0]] if names[0] == "f" else list(FOCAL)
+    oracle = pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=[*focal, *CENTRE_PIXEL, *COEFFICIENTS[model]])
+    points = seen_points()
+    seen = project(camera(model), torch.from_numpy(points))
+    assert np.abs(seen.pixel.numpy() - oracle.img_from_cam(local(points))).max() < 1e-6
+    assert np.abs(seen.depth.numpy() - local(points)[:, 2]).max() < 1e-9
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"])
+def test_projection_is_that_of_opencv(model: str) -> None:
+    focal = (52.0, 55.0)  # two focal lengths; the simple models take them as well
+    k = np.array([[focal[0], 0, CENTRE_PIXEL[0]], [0, focal[1], CENTRE_PIXEL[1]], [0, 0, 1]])
+    points, zero = local(seen_points())[:, None], np.zeros(3)
+    coefficients = np.array(COEFFICIENTS[model])
+    if model == "OPENCV_FISHEYE":
+        expected = cv2.fisheye.projectPoints(points, zero, zero, k, coefficients)[0]
+    else:
+        padded = np.pad(coefficients, (0, max(4 - len(coefficients), 0)))
+        expected = cv2.projectPoints(points, zero, zero, k, padded)[0]
+    seen = project(camera(model, focal), torch.from_numpy(seen_points()))
+    assert np.abs(seen.pixel.numpy() - expected[:, 0]).max() < 1e-6
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_rays_project_back_to_pixel_centres(model: str) -> None:
+    rays = camera_rays(camera(model))
+    assert torch.allclose(rays.directions.norm(dim=-1), torch.ones(()), atol=1e-5)
+    seen = project(camera(model), (rays.origins + 3.0 * rays.directions).double())
+    rows, columns = np.mgrid[: SIZE[1], : SIZE[0]]
+    expected = np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], axis=1)
+    assert np.abs(seen.pixel.numpy() - expected).max() < 0.01
+
+
+def test_rays_of_many_cameras_keep_apart() -> None:
+    lens, other = camera("OPENCV"), camera("OPENCV_FISHEYE")
+    moved = Camera(*FOCAL, *CENTRE_PIXEL, *SIZE, camera_pose(4, 6), lens.lens)
+    pinhole = Camera(*FOCAL, *CENTRE_PIXEL, 30, 20, camera_pose(2, 6))
+    cameras = [pinhole, lens, other, moved]
+    rays = CameraRays(cameras)
+    number = torch.tensor([3, 0, 2, 1, 1, 3, 0])
+    pixel = torch.tensor([0, 599, 4799, 81, 4000, 4799, 31])
+    together = rays(number, pixel)
+    for i, (n, p) in enumerate(zip(number.tolist(), pixel.tolist(), strict=True)):
+        alone = camera_rays(cameras[n])
+        assert torch.allclose(together.directions[i], alone.directions[p], atol=1e-6)
+        assert torch.allclose(together.origins[i], alone.origins[p])
+
+
+def test_what_bends_nothing_is_a_pinhole() -> None:
+    assert lens_of("PINHOLE", []) is None
+    assert lens_of("OPENCV", [0.0] * 4) is None
+    assert lens_of("OPENCV_FISHEYE", [0.0] * 4) is not None  # the angle, not its tangent, is the radius
+
+
+@pytest.mark.parametrize(
+    ("lens", "words"),
+    [
+        (Lens("WAVY", (1.0,)), "unknown lens model 'WAVY'"),
+        (Lens("PINHOLE", ()), "unknown lens model 'PINHOLE'"),
+        (Lens("OPENCV", (0.1,)), "the lens OPENCV has 4 finite coefficients"),
+        (Lens("RADIAL", (0.1, float("nan"))), "the lens RADIAL has 2 finite coefficients"),
+    ],
+)
+def test_bad_lenses_are_refused(lens: Lens, words: str) -> None:
+    with pytest.raises(UserError, match="view 7.*" + words):
+        check_camera(Camera(*FOCAL, *CENTRE_PIXEL, *SIZE, camera_pose(1, 6), lens), "view 7")
+
+
+def test_a_lens_that_does_not_reach_its_pixels_is_refused() -> None:
+    # x·(1 − 0.8 x²) turns back at x = 0.65, where it is 0.43: no ray reaches the corners at 0.96.
+    with pytest.raises(UserError, match=r"RADIAL shows nothing at .* of its 4800 pixels"):
+        camera_rays(Camera(*FOCAL, *CENTRE_PIXEL, *SIZE, camera_pose(1, 6), Lens("RADIAL", (-0.8, 0.0))))
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
+def test_a_resampled_image_is_that_of_the_pinhole(model: str) -> None:
+    bent = camera(model)
+    straight = straight_camera(bent)
+    assert straight.lens is None
+    assert straight_camera(straight) is straight
+
+    def picture(seen_by: Camera) -> np.ndarray:
+        """A picture at infinity, smooth in the direction of view."""
+        directions = camera_rays(seen_by).directions.numpy()
+        return np.sin(4 * directions + 0.3).reshape(seen_by.height, seen_by.width, 3).astype(np.float32)
+
+    moved = resample(picture(bent), bent, straight)
+    difference = np.abs(moved - picture(straight))
+    assert difference[1:-1, 1:-1].max() < 0.01  # bilinear; half a pixel off would be 0.03

@@ -1,0 +1,93 @@
+"""The scene box: what is known best tells it, and wrong points do not spoil it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.images import read_image, write_png
+from neilfpp_method.data.scene_box import box_of_cameras, box_of_points, find_box
+from neilfpp_method.data.views import View
+from neilfpp_method.errors import UserError
+from tests.data.make_capture import CENTRE, DISTANCE, RADIUS, camera_pose, make_capture
+
+
+def sphere_points(count: int = 2000) -> np.ndarray:
+    points = np.random.default_rng(0).normal(size=(count, 3))
+    return CENTRE + RADIUS * points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def views(root: Path, masks: bool = False, count: int = 8) -> tuple[View, ...]:
+    return load_capture(make_capture(root, views=count, size=(64, 48), masks=masks)).views
+
+
+def test_points_tell_the_box_in_spite_of_outliers() -> None:
+    points = np.concatenate([sphere_points(), 900 * np.eye(3)])
+    box = box_of_points(points)
+    assert np.allclose(box.centre, CENTRE, atol=0.03 * RADIUS)
+    assert RADIUS < box.scale < 1.15 * RADIUS
+
+
+def test_the_visual_hull_holds_the_object_tightly(tmp_path: Path) -> None:
+    box = find_box(views(tmp_path, masks=True, count=16)).normalisation
+    assert np.allclose(box.centre, CENTRE, atol=0.15 * RADIUS)
+    assert RADIUS < box.scale < 1.3 * RADIUS
+    assert np.abs(sphere_points() - box.centre).max() <= box.scale
+
+
+def test_the_cameras_alone_tell_what_they_look_at(tmp_path: Path) -> None:
+    # The shorter side of the image spans 1 / 1.5 of the distance.
+    box = box_of_cameras(views(tmp_path))
+    assert np.allclose(box.centre, CENTRE, atol=1e-6)
+    assert box.scale == pytest.approx(DISTANCE / (2 * 1.5))
+
+
+def test_the_best_source_is_taken(tmp_path: Path) -> None:
+    masked, plain = views(tmp_path / "masked", masks=True), views(tmp_path / "plain")
+    assert find_box(plain).source == "cameras"
+    assert find_box(plain, sphere_points()).source == "points"
+    assert find_box(masked).source == "masks"
+    assert find_box(masked, sphere_points()).source == "points"
+    assert find_box(plain, sphere_points(5)).source == "cameras"
+
+
+def test_points_beside_the_masks_do_not_count(tmp_path: Path) -> None:
+    table = CENTRE + np.random.default_rng(1).uniform(-4, 4, (4000, 3)) * [1, 1, 0] - [0, 0, RADIUS]
+    box = find_box(views(tmp_path, masks=True), np.concatenate([sphere_points(), table])).normalisation
+    assert np.allclose(box.centre, CENTRE, atol=0.15 * RADIUS)
+    assert box.scale < 1.3 * RADIUS
+
+
+def test_alpha_serves_as_mask(tmp_path: Path) -> None:
+    def with_alpha(view: View) -> View:
+        image = tmp_path / f"{view.name}.png"
+        mask = (255 * read_image(view.mask).pixels).astype(np.uint8)
+        write_png(image, np.repeat(mask, 4, axis=2))
+        return replace(view, image=image, mask=None)
+
+    masked = views(tmp_path, masks=True)
+    assert find_box([with_alpha(view) for view in masked]).normalisation == find_box(masked).normalisation
+
+
+def test_cameras_that_look_one_way_or_apart_tell_nothing(tmp_path: Path) -> None:
+    first, second, *_ = views(tmp_path)
+    with pytest.raises(UserError, match="look in one direction"):
+        box_of_cameras([first, replace(second, camera=replace(second.camera, w2c=camera_pose(0, 8)))])
+    turn = np.diag([-1.0, 1.0, -1.0, 1.0])
+    away = [replace(v, camera=replace(v.camera, w2c=turn @ v.camera.w2c)) for v in (first, second)]
+    with pytest.raises(UserError, match="look away"):
+        box_of_cameras(away)
+
+
+def test_masks_with_nothing_in_common_are_refused(tmp_path: Path) -> None:
+    some = views(tmp_path, masks=True)
+    for view in some:
+        corner = np.zeros((48, 64), np.uint8)
+        corner[:6, :6] = 255
+        write_png(view.mask, corner)
+    with pytest.raises(UserError, match="no place in common"):
+        find_box(some)

@@ -1,0 +1,73 @@
+"""Lamps close by, against the closed forms of small spheres."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from neilfpp_method.fields.lamps import Lamps
+from neilfpp_method.shading.brdf import GGX
+from neilfpp_method.shading.rendering_equation import shade
+from neilfpp_method.structures import Material
+
+
+def lamps() -> Lamps:
+    both = Lamps(3, radius=0.05)
+    both.place(torch.tensor([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]]), torch.tensor([[0.2, 0.2, 0.2], [0.3, 0.6, 0.9]]))
+    return both
+
+
+def test_only_as_many_are_lit_as_there_is_room_for():
+    few = Lamps(1, radius=0.05)
+    few.place(torch.tensor([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]]), torch.tensor([[0.2, 0.2, 0.2], [0.3, 0.6, 0.9]]))
+    assert few.lit == 1
+    torch.testing.assert_close(few.position, torch.tensor([[0.0, 0.0, 1.0]]))
+
+
+def test_a_lambertian_surface_shows_cosine_and_inverse_square():
+    """L_o = Σ b/π I cos θ / d²: both lamps are 1 away, one overhead and one at cos θ = 0.8."""
+    light = lamps()
+    x, up = torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]])
+    rays = light.rays_from(x)
+    material = Material(torch.tensor([[0.5, 0.5, 0.5]]), torch.ones(1, 1), torch.zeros(1, 1))
+    radiance = light.radiance().expand_as(rays.wi)
+    color = shade(material, up, up, rays.samples(), radiance, GGX, specular=False).color[0]
+    expected = 0.5 / math.pi * (0.8 * torch.tensor([0.3, 0.6, 0.9]) + 0.2)
+    torch.testing.assert_close(color, expected)
+
+
+def test_the_light_that_is_seen_brings_the_same_irradiance_as_the_rays():
+    """Counted over the hemisphere, the discs of the lamps bring Σ I cos θ / d²."""
+    light = lamps()
+    torch.manual_seed(0)
+    wi = normalize(torch.randn(1, 2_000_000, 3), dim=-1)
+    wi[..., 2] = wi[..., 2].abs()
+    seen = light.seen(torch.zeros(1, 3), wi, torch.full((1, 2_000_000), math.inf))
+    irradiance = 2 * math.pi * (seen * wi[..., 2:]).mean(1)[0]
+    torch.testing.assert_close(irradiance, 0.8 * torch.tensor([0.3, 0.6, 0.9]) + 0.2, rtol=0.05, atol=0.0)
+
+
+def test_what_stands_before_a_lamp_hides_it():
+    light = lamps()
+    up = torch.tensor([[[0.0, 0.0, 1.0]]])
+    x = torch.zeros(1, 3)
+    assert light.seen(x, up, torch.tensor([[0.5]])).sum() == 0
+    assert light.seen(x, up, torch.tensor([[2.0]])).sum() > 0
+    assert light.seen(x, -up, torch.tensor([[math.inf]])).sum() == 0
+
+
+def test_a_point_inside_a_lamp_gets_finite_light():
+    light = lamps()
+    rays = light.rays_from(light.position[:2])
+    assert rays.wi.isfinite().all()
+    assert rays.solid_angle.max().item() == pytest.approx(math.pi / 4)
+
+
+def test_a_checkpoint_knows_how_many_are_lit():
+    again = Lamps(3, radius=0.05)
+    again.load_state_dict(lamps().state_dict())
+    assert again.lit == 2
+    assert torch.equal(again.radiance(), lamps().radiance())

@@ -1,0 +1,69 @@
+"""Figures of views together, against closed forms and pictures made alike on purpose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from neilfpp_method.data.capture import load_capture
+from neilfpp_method.inspection.relations import Stand, duplicates, exposure_factors, stand
+from tests.data.make_capture import DISTANCE, SCALE, make_capture
+
+
+def ring(count: int) -> Stand:
+    """Cameras on a circle, looking inwards."""
+    azimuth = 2 * np.pi * np.arange(count) / count
+    outward = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(count)], axis=1)
+    none = np.zeros(count, bool)
+    return Stand(3 * outward, -outward, none, none, 1.0, 360 / count)
+
+
+def test_a_jump_is_told_from_a_slow_change() -> None:
+    slow = 1 + 0.5 * np.sin(2 * np.pi * np.arange(24) / 24)
+    assert np.allclose(exposure_factors(slow.tolist(), ring(24)), 1, atol=0.15)
+    for i in (0, 7):
+        light = slow.copy()
+        light[i] *= 4
+        factors = exposure_factors(light.tolist(), ring(24))
+        assert factors[i] == pytest.approx(4, rel=0.15)
+        assert np.allclose(np.delete(factors, i), 1, atol=0.15), "its neighbours stay out of it"
+
+
+def test_black_views_and_single_views_have_no_factor() -> None:
+    assert exposure_factors([2.0], ring(1)).tolist() == [1]
+    assert exposure_factors([2.0, 0.0, 2.0, 2.0], ring(4)).tolist() == [1, 1, 1, 1]
+
+
+def test_duplicates_survive_compression_size_and_brightness() -> None:
+    rng = np.random.default_rng(0)
+    flat = [cv2.GaussianBlur(rng.uniform(0, 1, (90, 120, 3)).astype(np.float32), (0, 0), 6) for _ in range(4)]
+    pictures = [cv2.normalize(picture, None, 0, 1, cv2.NORM_MINMAX) for picture in flat]
+    small = cv2.resize(pictures[2], (60, 45), interpolation=cv2.INTER_AREA)
+    rough = (np.rint(pictures[1] * 255 + rng.normal(0, 2, pictures[1].shape)) / 255).clip(0).astype(np.float32)
+    shifted = np.roll(pictures[0], 6, axis=1)
+    black = np.zeros_like(small)
+    assert duplicates([*pictures, 0.5 * small, rough, shifted, black, black]) == ((1, 5), (2, 4))
+
+
+def test_where_cameras_stand(tmp_path: Path) -> None:
+    capture = load_capture(make_capture(tmp_path, views=12))
+    where = stand(capture)
+    assert not where.away.any()
+    assert not where.within.any()
+    assert np.allclose(np.linalg.norm(where.centres, axis=1), DISTANCE / SCALE)
+    assert np.allclose(where.axes, -where.centres / np.linalg.norm(where.centres, axis=1, keepdims=True), atol=1e-9)
+    one = stand(replace(capture, views=capture.views[:1]))
+    cap = (1 - np.cos(np.radians(30))) / 2  # the share of the sphere within 30° of a direction
+    assert one.coverage == pytest.approx(cap, abs=2e-3)
+
+
+def test_a_camera_shifted_out_of_the_picture_looks_away(tmp_path: Path) -> None:
+    capture = load_capture(make_capture(tmp_path))
+    view = capture.views[1]
+    off = replace(view, camera=replace(view.camera, cx=view.camera.width + 0.5))
+    edge = replace(view, camera=replace(view.camera, cx=view.camera.width - 0.5))
+    assert stand(replace(capture, views=(view, off, edge))).away.tolist() == [False, True, False]

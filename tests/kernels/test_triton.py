@@ -1,0 +1,49 @@
+"""Triton's kernels without a GPU: run by the interpreter, and compiled to machine code for one."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("triton")
+ROOT = Path(__file__).parents[2]
+COMPILE = """
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource, compile
+from neilfpp_method.kernels import triton as kernels
+
+fixed = {"width": 2, "with_jacobian": True, "block": kernels.BLOCK}
+for number in ("fp32", "fp64"):
+    pointers = dict.fromkeys(("points", "table", "features", "jacobian", "gradient"), "*" + number) | {"grid": "*i64"}
+    for kernel in (kernels._interpolate, kernels._add_to_table, kernels._pull_to_points):
+        kinds = {p.name: "constexpr" if p.name in fixed else pointers.get(p.name, "i32") for p in kernel.params}
+        code = compile(ASTSource(kernel, kinds, fixed), target=GPUTarget("cuda", 80, 32), options=kernels.FUSED)
+        print(len(code.asm["cubin"]))
+"""
+
+
+def python(*arguments: str, **environment: str) -> str:
+    done = subprocess.run(
+        [sys.executable, *arguments], cwd=ROOT, env={**os.environ, **environment}, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.skipif(os.environ.get("TRITON_INTERPRET") == "1", reason="this is the inner run")
+def test_the_tests_of_every_backend_hold_in_the_interpreter():
+    here = Path(__file__).parent.relative_to(ROOT)
+    told = python("-m", "pytest", "-x", "-p", "no:cacheprovider", str(here), TRITON_INTERPRET="1", OMP_NUM_THREADS="1")
+    assert "passed" in told
+    assert "failed" not in told
+
+
+@pytest.mark.skipif(sys.platform != "linux" or os.environ.get("TRITON_INTERPRET") == "1", reason="needs Triton's compiler")
+def test_the_kernels_compile_for_a_gpu(tmp_path):
+    sizes = python("-c", COMPILE, TRITON_CACHE_DIR=str(tmp_path), TRITON_INTERPRET="0").split()
+    assert len(sizes) == 6
+    assert min(map(int, sizes)) > 1000

@@ -1,0 +1,32 @@
+"""Surface points under known light, for tests."""
+
+from __future__ import annotations
+
+import torch
+from torch.nn.functional import normalize
+
+from neilfpp_method.lighting.memory import Observed
+from neilfpp_method.structures import Material, SceneLight
+
+
+def half_room(x: torch.Tensor, wi: torch.Tensor) -> SceneLight:
+    """A scene: wherever one looks down there is a wall 2 away that sends out radiance 0.7; above there is nothing."""
+    below = wi[..., 2] < 0
+    distance = torch.where(below, 2.0, torch.inf)
+    return SceneLight(below, below[..., None] * torch.full_like(wi, 0.7), distance)
+
+
+def points(count: int, seed: int = 0) -> Observed:
+    """Points near the origin with all normals, each seen from within 60° of its normal."""
+    generator = torch.Generator().manual_seed(seed)
+    normal = normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    wo = normalize(normal + 0.8 * normalize(torch.randn(count, 3, generator=generator), dim=-1), dim=-1)
+    return Observed(0.1 * normal, normal, wo, torch.zeros(count, 3))
+
+
+def material(count: int, seed: int = 1) -> Material:
+    generator = torch.Generator().manual_seed(seed)
+    base_color = 0.2 + 0.6 * torch.rand(count, 3, generator=generator)
+    roughness = 0.3 + 0.5 * torch.rand(count, 1, generator=generator)
+    metallic = torch.rand(count, 1, generator=generator).round()
+    return Material(base_color, roughness, metallic)

@@ -1,0 +1,35 @@
+"""The points that light is fitted to."""
+
+from __future__ import annotations
+
+import torch
+
+from neilfpp_method.lighting.memory import SurfaceMemory
+from tests.lighting.surfaces import points
+
+
+def test_memory_is_due_at_once_then_every_so_often_and_keeps_the_newest():
+    memory = SurfaceMemory(20, every=4)
+    assert not memory.due
+    memory.remember(points(50))
+    assert memory.due
+    assert len(memory.recall()) == 20
+    for step in range(4):
+        assert not memory.due, step
+        memory.remember(points(50, seed=step + 2))
+    assert memory.due
+    kept = memory.recall()
+    for step in range(4):  # five points of each of the four steps
+        newest = points(50, seed=step + 2).normal[:5]
+        assert all((kept.normal == normal).all(-1).any() for normal in newest)
+
+
+def test_memory_survives_a_checkpoint():
+    memory, again = SurfaceMemory(20, every=4), SurfaceMemory(20, every=4)
+    memory.remember(points(12))
+    memory.recall()
+    memory.remember(points(12, seed=5))
+    again.load_state_dict(memory.state_dict())
+    assert (again.filled, again.next, again.age) == (memory.filled, memory.next, memory.age)
+    for one, other in zip(vars(memory.recall()).values(), vars(again.recall()).values(), strict=True):
+        assert torch.equal(one, other)

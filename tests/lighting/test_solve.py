@@ -1,0 +1,96 @@
+"""Maps and lamps together: that lamps are found where there are any, and only there."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from neilfpp_method.config import IncidentLightConfig, LightFitConfig
+from neilfpp_method.fields.environment import EnvironmentLight
+from neilfpp_method.fields.lamps import Lamps
+from neilfpp_method.lighting.candidates import merge, propose
+from neilfpp_method.lighting.memory import Observed
+from neilfpp_method.lighting.solve import solve_light
+from neilfpp_method.lighting.transport import from_lamps, from_texels
+from neilfpp_method.shading.brdf import GGX
+from neilfpp_method.structures import Material
+from tests.lighting.surfaces import material
+
+CONFIG = IncidentLightConfig(kind="auto", environment_height=12, fit=LightFitConfig(points=800, steps=150))
+LAMP = torch.tensor([[0.3, -0.2, 0.5]])
+
+
+def table(count: int) -> Observed:
+    """Points on a table, and on a ball of radius 0.25 on it, seen from above."""
+    generator = torch.Generator().manual_seed(3)
+    half = count // 2
+    flat = torch.cat((1.6 * torch.rand(half, 2, generator=generator) - 0.8, torch.zeros(half, 1)), -1)
+    up = normalize(torch.randn(count - half, 3, generator=generator), dim=-1)
+    up[:, 2] = up[:, 2].abs()
+    position = torch.cat((flat, 0.25 * up - torch.tensor([0.4, 0.3, 0.0])))
+    normal = torch.cat((torch.tensor([[0.0, 0.0, 1.0]]).expand(half, 3), up))
+    wo = normalize(normal + 0.6 * normalize(torch.randn(count, 3, generator=generator), dim=-1), dim=-1)
+    return Observed(position, normal, wo, torch.zeros(count, 3))
+
+
+def photographed(lamp: bool) -> tuple[Observed, Material]:
+    """The table under an even sky, with or without a lamp above it that brings about as much light."""
+    seen, of = table(800), material(800)
+    sky = EnvironmentLight(12, 0.5)
+    image = from_texels(sky, seen, of.roughness, GGX, None).outgoing(of, sky.log_radiance.exp().flatten(1).t())
+    if lamp:
+        carried = from_lamps(LAMP, 0.06, seen, of.roughness, GGX, None)
+        image = image + carried.outgoing(of, torch.tensor([[0.9, 0.7, 0.4]]))
+    return dataclasses.replace(seen, pixel=image), of
+
+
+def solved(seen: Observed, of: Material, rounds: int) -> tuple[Lamps, object]:
+    torch.manual_seed(0)
+    environment, lamps = EnvironmentLight(12, 0.7), Lamps(4, 0.06)
+    for _ in range(rounds):
+        unit = seen.pixel.median().item()
+        evidence = solve_light(environment, lamps, seen, of, GGX, None, "linear", unit, CONFIG)
+    return lamps, evidence
+
+
+def test_a_lamp_is_found_where_it_is():
+    lamps, evidence = solved(*photographed(lamp=True), rounds=6)
+    assert evidence.significant
+    assert lamps.lit >= 1
+    assert (lamps.position[0] - LAMP[0]).norm() < 0.12  # its width
+    red, _, blue = lamps.intensity[0].tolist()
+    assert red / blue == pytest.approx(0.9 / 0.4, rel=0.3)
+    # What is left of it may stay beside it; nothing is elsewhere.
+    beside = (lamps.position - LAMP).norm(dim=-1) < 0.3
+    assert lamps.intensity[beside].sum() > 0.9 * lamps.intensity.sum()
+
+
+def test_under_a_sky_alone_no_lamp_is_lit():
+    lamps, evidence = solved(*photographed(lamp=False), rounds=2)
+    assert not evidence.significant
+    assert lamps.lit == 0
+
+
+def test_proposals_keep_what_is_lit_and_stay_clear_of_surfaces():
+    torch.manual_seed(0)
+    lamps = Lamps(4, 0.06)
+    lamps.place(LAMP, torch.ones(1, 3))
+    surface = table(400).position
+    places = propose(lamps, surface, 100)
+    assert places.shape == (100, 3)
+    assert torch.equal(places[:1], LAMP)
+    assert torch.cdist(places[1:], surface).min() > 3 * 0.06
+    assert ((places - LAMP).norm(dim=-1) < 0.2).sum() >= 5
+
+
+def test_neighbours_become_one_lamp_of_their_joint_power():
+    position = torch.tensor([[0.0, 0.0, 0.5], [0.06, 0.0, 0.5], [0.8, 0.0, 0.5], [-0.8, 0.0, 0.5]])
+    intensity = torch.tensor([[3.0, 3.0, 3.0], [1.0, 1.0, 1.0], [2.0, 0.0, 0.0], [0.01, 0.01, 0.01]])
+    found = merge(position, intensity, torch.ones(4), most=4)
+    torch.testing.assert_close(found.position, torch.tensor([[0.015, 0.0, 0.5], [0.8, 0.0, 0.5]]))
+    torch.testing.assert_close(found.intensity, torch.tensor([[4.0, 4.0, 4.0], [2.0, 0.0, 0.0]]))
+    assert len(merge(position, intensity, torch.ones(4), most=1).position) == 1
+    assert len(merge(position, torch.zeros(4, 3), torch.ones(4), most=4).position) == 0

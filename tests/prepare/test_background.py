@@ -1,0 +1,51 @@
+"""Native calls beside the main thread: results, failures, and a stop that waits for them."""
+
+from __future__ import annotations
+
+import ast
+import signal
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from neilfpp_method import prepare
+from neilfpp_method.prepare.background import in_background
+
+
+def test_the_result_comes_back_and_somebody_looks():
+    looks = []
+    assert in_background(lambda token: time.sleep(0.5) or "done", lambda: looks.append(1)) == "done"
+    assert len(looks) >= 2
+
+
+def test_a_failure_is_raised_where_it_was_called():
+    def fail(token: object) -> None:
+        raise ValueError("broken")
+
+    with pytest.raises(ValueError, match="broken"):
+        in_background(fail)
+
+
+def test_ctrl_c_reaches_the_call_and_waits_for_its_end():
+    ended = []
+
+    def work(token) -> None:
+        while not token.is_cancelled:
+            time.sleep(0.01)
+        time.sleep(0.5)
+        ended.append(1)
+
+    threading.Timer(0.3, signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        in_background(work)
+    assert ended
+
+
+def test_no_second_sqlite_touches_the_database():
+    """Two SQLite libraries in one process do not see each other's locks; COLMAP then dies of a bus error."""
+    for path in Path(prepare.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [getattr(node, "module", "")]
+            assert "sqlite3" not in names, path

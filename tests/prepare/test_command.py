@@ -1,0 +1,353 @@
+"""`neilfpp prepare` from end to end, on a textured corner whose cameras are known."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from neilfpp_method.cli import main
+from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.images import read_image, write_exr, write_png
+from neilfpp_method.data.point_cloud import read_oriented_ply
+from neilfpp_method.data.raw import Developed
+from neilfpp_method.prepare import command
+from neilfpp_method.prepare import photos as photo_files
+from tests.data.make_capture import make_capture
+from tests.prepare.textured_corner import FOCAL, alignment, angle, make_photos, photograph, pose
+
+VIEWS, WIDTH = 9, 240
+DATA = Path(os.environ.get("NEILFPP_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
+
+
+def prepare(images: Path, out: Path, *options: str) -> int:
+    return main(["prepare", str(images), "--out", str(out), *options])
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("photos") / "corner"
+    make_photos(folder, VIEWS, (WIDTH, 180))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def prepared(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("captures") / "corner"
+    assert prepare(photos, out, "--dense", "--also", "nerfstudio", "neilf") == 0
+    return out
+
+
+@pytest.fixture
+def own(photos: Path, tmp_path: Path) -> Path:
+    """A copy of the photographs, to be spoilt."""
+    return Path(shutil.copytree(photos, tmp_path / "photos"))
+
+
+# --------------------------------------------------------------------------------------------------------- the good way
+
+
+def to_truth(capture, poses: dict[str, np.ndarray]):
+    found = np.stack([view.camera.c2w[:, 3] for view in capture.views])
+    true = np.stack([-poses[view.name][:3, :3].T @ poses[view.name][:3, 3] for view in capture.views])
+    scale, rotation, shift = alignment(found, true)
+    centres = np.linalg.norm(scale * found @ rotation.T + shift - true, axis=1)
+    rotations = [angle(view.camera.w2c[:3, :3] @ rotation.T, poses[view.name][:3, :3]) for view in capture.views]
+    return scale, rotation, shift, centres.max(), max(rotations)
+
+
+def test_the_cameras_are_where_they_were(prepared):
+    capture = load_capture(prepared)
+    assert len(capture.views) == VIEWS
+    _, rotation, _, centres, rotations = to_truth(capture, {f"{i:03}": pose(i, VIEWS) for i in range(VIEWS)})
+    assert centres < 0.005
+    assert rotations < 0.2
+    # The cameras are held level, so that the world's up is known as well.
+    assert rotation[2, 2] == pytest.approx(1.0, abs=1e-4)
+    for view in capture.views:
+        assert view.camera.lens is None
+        assert view.camera.fx == pytest.approx(FOCAL * WIDTH, rel=0.01)
+
+
+def test_the_pixels_stay_linear_and_belong_to_their_cameras(prepared):
+    capture = load_capture(prepared)
+    assert capture.hdr
+    view = capture.views[4]
+    camera = view.camera
+    assert (camera.cx, camera.cy) == (camera.width / 2, camera.height / 2)
+    expected = 4.0 * photograph(pose(4, VIEWS), (camera.width, camera.height), camera.fx / camera.width)
+    difference = np.abs(read_image(view.image).pixels - expected)[4:-4, 4:-4]
+    assert np.median(difference) < 0.03 * np.median(expected)
+
+
+def test_the_points_lie_on_the_planes_with_their_normals(prepared):
+    capture = load_capture(prepared)
+    scale, rotation, shift, _, _ = to_truth(capture, {f"{i:03}": pose(i, VIEWS) for i in range(VIEWS)})
+    points = read_oriented_ply(capture.point_cloud)
+    assert len(points.position) > 20_000
+    # A pixel of disparity between the usual sources is about 0.02 in depth.
+    position, normal = scale * points.position @ rotation.T + shift, points.normal @ rotation.T
+    distance = np.abs(position)
+    assert np.median(distance.min(axis=1)) < 0.005
+    assert np.quantile(distance.min(axis=1), 0.9) < 0.01
+    facing = np.take_along_axis(normal, distance.argmin(axis=1)[:, None], axis=1)  # the planes' normals are +x, +y, +z
+    assert np.median(facing) > np.cos(np.radians(3))
+    assert (facing > 0.8).mean() > 0.95
+
+
+def test_the_folder_has_a_split_a_summary_and_other_formats(prepared):
+    assert load_capture(prepared).test == {"007"}
+    summary = json.loads((prepared / "summary.json").read_text())
+    assert [p["name"] for p in summary["placements"]] == [f"{i:03}" for i in range(VIEWS)]
+    assert all(0 < p["error"] < 0.5 and 50 < p["points"] <= p["features"] for p in summary["placements"])
+    assert summary["models"] == [VIEWS]
+    assert summary["views"] == VIEWS
+    assert summary["cameras"][0]["images"] == VIEWS
+    assert any("EXIF" in remark for remark in summary["remarks"])
+    assert read_image(prepared / "summary.png").pixels.shape[1] > 1000
+    for name, format in (("nerfstudio", "transforms"), ("neilf", "sfm_scene")):
+        other = load_capture(prepared / name)
+        assert other.format == format
+        assert len(other.views) == VIEWS
+
+
+def test_what_is_finished_is_left_as_it_is(photos, prepared, capsys):
+    before = {path: path.stat().st_mtime_ns for path in prepared.rglob("*")}
+    assert prepare(photos, prepared, "--dense", "--also", "nerfstudio", "neilf") == 0
+    assert "finished already" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in prepared.rglob("*")} == before
+
+
+def test_a_stopped_command_says_how_it_continues_and_does(photos, tmp_path, monkeypatch, capfd):
+    out = tmp_path / "capture"
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(command, "map_scene", stop)
+        assert prepare(photos, out, "--no-undistort", "--test-every", "3") == 130
+    assert f"neilfpp prepare {photos} --out {out} --no-undistort --test-every 3" in capfd.readouterr().err.replace("\n", "")
+    assert not (out / "capture.json").exists()
+    for done in ("write_copies", "extract_features", "match_features"):
+        monkeypatch.setattr(command, done, stop)
+    assert prepare(photos, out, "--no-undistort", "--test-every", "3") == 0
+    capture = load_capture(out)
+    assert capture.test == {"002", "005", "008"}
+    assert capture.views[0].camera.lens.model == "SIMPLE_RADIAL"
+    assert (read_image(capture.views[0].image).pixels == read_image(photos / "000.exr").pixels).all()
+    # Other photographs: nothing of it holds any more.
+    monkeypatch.undo()
+    more = Path(shutil.copytree(photos, tmp_path / "more"))
+    (more / "000.exr").unlink()
+    assert prepare(more, out) == 0
+    assert [view.name for view in load_capture(out).views] == [f"{i:03}" for i in range(1, VIEWS)]
+    assert not (out / "images" / "000.exr").exists()
+
+
+def test_sub_folders_two_sizes_and_display_values(tmp_path):
+    left, right = tmp_path / "photos" / "left", tmp_path / "photos" / "right"
+    make_photos(left, 6, (WIDTH, 180), hdr=False)
+    for i in range(6):  # a second, smaller camera that sees the same
+        pixels = photograph(pose(i, 6), (200, 150))
+        write_png(right / f"{i:03}.png", np.rint(255 * pixels ** (1 / 2.2)).astype(np.uint8))
+    assert prepare(tmp_path / "photos", tmp_path / "out", "--matching", "sequential") == 0
+    capture = load_capture(tmp_path / "out")
+    assert not capture.hdr
+    assert {view.name for view in capture.views} == {f"{side}-{i:03}" for side in ("left", "right") for i in range(6)}
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert sorted(camera["size"] for camera in summary["cameras"]) == [[200, 150], [WIDTH, 180]]
+    focal = {camera["size"][0]: camera["parameters"]["f"] for camera in summary["cameras"]}
+    assert focal[WIDTH] == pytest.approx(FOCAL * WIDTH, rel=0.01)
+    assert focal[200] == pytest.approx(FOCAL * 200, rel=0.01)
+
+
+def test_look_alikes_are_found_by_words_of_their_own(own, tmp_path):
+    for i in (0, 1, 2, 3):
+        (own / f"{i:03}.exr").unlink()
+    assert prepare(own, tmp_path / "out", "--matching", "vocabulary") == 0
+    assert len(load_capture(tmp_path / "out").views) == VIEWS - 4
+
+
+def test_raw_files_are_developed_and_what_is_saturated_stays_marked(tmp_path, monkeypatch):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for i in range(5):
+        with (folder / f"{i:03}.dng").open("wb") as file:
+            np.save(file, photograph(pose(i, 5, arc=40), (WIDTH, 180)))
+
+    def develop(path: Path) -> Developed:
+        pixels = np.load(path)
+        valid = np.ones(pixels.shape[:2], bool)
+        valid[50:60, 70:80] = False
+        return Developed(pixels, valid, (1.0, 1.0, 1.0))
+
+    monkeypatch.setattr(photo_files, "develop", develop)
+    assert prepare(folder, tmp_path / "out") == 0
+    capture = load_capture(tmp_path / "out")
+    assert capture.hdr
+    assert len(capture.views) == 5
+    for view in capture.views:
+        assert view.image.suffix == ".exr"
+        invalid = read_image(view.valid).pixels[..., 0] < 0.5
+        assert 80 <= invalid.sum() <= 120
+        assert invalid[54:56, 74:76].all()
+
+
+def test_a_capture_with_poses_keeps_them(tmp_path):
+    source = load_capture(make_capture(tmp_path / "sphere", masks=True))
+    assert prepare(tmp_path / "sphere", tmp_path / "out") == 0
+    capture = load_capture(tmp_path / "out")
+    assert capture.format == "neilfpp"
+    assert capture.normalisation == source.normalisation
+    assert capture.test == source.test
+    for view, old in zip(capture.views, source.views, strict=True):
+        assert view.name == old.name
+        np.testing.assert_array_equal(view.camera.w2c, old.camera.w2c)
+        assert view.mask.is_file()
+        assert (read_image(view.image).pixels == read_image(old.image).pixels).all()
+
+
+def test_a_colmap_project_keeps_its_poses_and_points(prepared, tmp_path):
+    project = tmp_path / "project"
+    shutil.copytree(prepared / "work" / "model" / "largest", project / "sparse" / "0")
+    shutil.copytree(prepared / "work" / "copies", project / "images")
+    assert prepare(project, tmp_path / "out", "--test-every", "0") == 0
+    capture, source = load_capture(tmp_path / "out"), load_capture(prepared)
+    assert not capture.hdr
+    assert not capture.test
+    for view, old in zip(capture.views, source.views, strict=True):
+        np.testing.assert_allclose(view.camera.w2c, old.camera.w2c, atol=1e-9)
+        assert view.camera.fx == pytest.approx(old.camera.fx)
+    assert len(read_oriented_ply(capture.point_cloud).position) > 500
+
+
+# ------------------------------------------------------------------------------------------------------------ bad input
+
+
+def refused(capfd, images: Path, out: Path, *options: str, says: str) -> str:
+    """The command ends with one line, and no capture is left behind."""
+    assert prepare(images, out, *options) == 2
+    (line,) = capfd.readouterr().err.strip().splitlines()
+    assert line.startswith("error: ")
+    assert says in line
+    assert not (out / "capture.json").exists()
+    return line
+
+
+def test_a_corrupt_image_is_named_and_can_be_left_out(own, tmp_path, capfd):
+    (own / "003.exr").write_bytes((own / "003.exr").read_bytes()[:5000])
+    line = refused(capfd, own, tmp_path / "out", says="003.exr")
+    assert "--allow-partial" in line
+    assert prepare(own, tmp_path / "out", "--allow-partial") == 0
+    assert "003" not in {view.name for view in load_capture(tmp_path / "out").views}
+    assert "left out: " in capfd.readouterr().out
+
+
+@pytest.mark.parametrize(("kept", "says"), [(0, "no images"), (1, "1 image"), (2, "2 images")])
+def test_too_few_images(own, tmp_path, capfd, kept, says):
+    for path in sorted(own.iterdir())[kept:]:
+        path.unlink()
+    refused(capfd, own, tmp_path / "out", says=says)
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_features(tmp_path, capfd):
+    for i in range(4):
+        write_exr(tmp_path / "photos" / f"{i}.exr", {"RGB": np.full((120, 160, 3), 0.5, np.float32)})
+    refused(capfd, tmp_path / "photos", tmp_path / "out", says="no features")
+
+
+def test_images_of_unlike_things(tmp_path, capfd):
+    for i in range(4):
+        rng = np.random.default_rng(i)
+        pixels = np.kron(rng.random((30, 40, 1)), np.ones((4, 4, 3)))
+        write_exr(tmp_path / "photos" / f"{i}.exr", {"RGB": pixels.astype(np.float32)})
+    refused(capfd, tmp_path / "photos", tmp_path / "out", says="placed")
+
+
+def test_less_than_sixty_per_cent_placed(own, tmp_path, capfd):
+    for i in range(3):
+        (own / f"{i:03}.exr").unlink()
+    for i in range(5):
+        rng = np.random.default_rng(i)
+        write_exr(own / f"other{i}.exr", {"RGB": np.kron(rng.random((45, 60, 1)), np.ones((4, 4, 3))).astype(np.float32)})
+    line = refused(capfd, own, tmp_path / "out", says="only 6 of 11 images")
+    assert "other0" in line
+    assert "--allow-partial" in line
+    assert prepare(own, tmp_path / "out", "--allow-partial") == 0
+    assert len(load_capture(tmp_path / "out").views) == 6
+    assert "not placed, and left out: other0" in capfd.readouterr().out
+
+
+def test_two_sizes_that_are_to_share_a_camera(own, tmp_path, capfd):
+    write_exr(own / "009.exr", {"RGB": photograph(pose(1, VIEWS), (200, 150))})
+    refused(capfd, own, tmp_path / "out", "--cameras", "shared", says="009.exr: 200×150 pixels")
+
+
+def test_two_kinds_of_images(own, tmp_path, capfd):
+    write_png(own / "009.png", np.zeros((180, WIDTH, 3), np.uint8))
+    refused(capfd, own, tmp_path / "out", says="is linear and")
+
+
+def test_two_images_of_one_name(own, tmp_path, capfd):
+    write_png(own / "003.png", np.zeros((180, WIDTH, 3), np.uint8))
+    line = refused(capfd, own, tmp_path / "out", "--response", "linear", says="named '003'")
+    assert "003.exr" in line
+    assert "003.png" in line
+
+
+@pytest.mark.parametrize("every", ["1", "-3"])
+def test_a_split_that_leaves_nothing(photos, tmp_path, capfd, every):
+    refused(capfd, photos, tmp_path / "out", f"--test-every={every}", says="cannot be held out")
+
+
+def test_no_such_folder(tmp_path, capfd):
+    refused(capfd, tmp_path / "nowhere", tmp_path / "out", says="no such folder")
+
+
+def test_an_output_folder_that_cannot_be_written(photos, tmp_path, capfd):
+    (tmp_path / "file").write_text("in the way")
+    refused(capfd, photos, tmp_path / "file" / "out", says="cannot be written")
+    refused(capfd, photos, tmp_path / "file", says="not a folder")
+
+
+def test_an_output_folder_that_is_somebody_elses(photos, tmp_path, capfd):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "letter.txt").write_text("dear")
+    refused(capfd, photos, tmp_path / "out", says="not empty")
+    assert (tmp_path / "out" / "letter.txt").read_text() == "dear"
+
+
+def test_images_and_capture_within_one_another(own, tmp_path, capfd):
+    refused(capfd, own, own / "out", says="within one another")
+    refused(capfd, own, tmp_path, says="within one another")
+
+
+# --------------------------------------------------------------------------------------------------- a rendered capture
+
+
+@pytest.mark.slow
+def test_the_ring_is_placed_exactly(tmp_path):
+    ring = DATA / "ring_capture"
+    if not ring.is_dir():
+        pytest.skip(f"the capture {ring} is not at hand; NEILFPP_DATA names the folder of the captures")
+    assert prepare(ring / "images", tmp_path / "ring") == 0
+    capture = load_capture(tmp_path / "ring")
+    truth = json.loads((ring / "true_cameras.json").read_text())
+    assert {view.name for view in capture.views} == set(truth)
+    poses = {name: np.array(camera["w2c"]) for name, camera in truth.items()}
+    scale, _, _, centres, rotations = to_truth(capture, poses)
+    assert len(capture.views) == 36
+    assert centres < 0.005 * scale * capture.normalisation.scale
+    assert rotations < 0.2
+    assert (
+        main(["train", "--data", str(tmp_path / "ring"), "--out", str(tmp_path / "run"), "--device", "cpu", *FIVE_STEPS]) == 0
+    )
+
+
+FIVE_STEPS = ("--config.train.sdf-steps", "3", "--config.train.material-steps", "1", "--config.train.joint-steps", "1")

@@ -1,0 +1,107 @@
+"""Stereo against depths, planes and normals that are known in closed form."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from neilfpp_method.data.views import Camera, Normalisation
+from neilfpp_method.prepare.depth_fusion import fuse
+from neilfpp_method.prepare.depth_planes import fit_planes
+from neilfpp_method.prepare.plane_sweep import GreyView, choose_sources, grain, sweep
+from tests.prepare.textured_corner import FOCAL, photograph, pose
+
+SIZE = (240, 180)
+BOX = Normalisation(0.8, (0.4, 0.4, 0.4))
+
+
+def camera(w2c: np.ndarray, size: tuple[int, int] = SIZE) -> Camera:
+    focal = FOCAL * size[0]
+    return Camera(focal, focal, size[0] / 2, size[1] / 2, *size, w2c)
+
+
+def rays(view: Camera) -> np.ndarray:
+    """Directions of unit depth, in the world."""
+    rows, columns = np.mgrid[: view.height, : view.width] + 0.5
+    local = np.stack([(columns - view.cx) / view.fx, (rows - view.cy) / view.fy, np.ones_like(rows)], axis=-1)
+    return local @ view.w2c[:3, :3]
+
+
+def plane_depth(view: Camera, normal: np.ndarray, offset: float) -> np.ndarray:
+    """The depth at which each pixel meets the plane normal · x = offset."""
+    eye = view.c2w[:, 3]
+    return ((offset - eye @ normal) / (rays(view) @ normal)).astype(np.float32)
+
+
+def corner_depth(view: Camera) -> np.ndarray:
+    depths = np.stack([plane_depth(view, axis, 0.0) for axis in np.eye(3)])
+    return np.where(depths > 0, depths, np.inf).min(axis=0)
+
+
+def picture(i: int) -> np.ndarray:
+    """Grey, at three times the size and then averaged: the noise is finer than a pixel."""
+    fine = photograph(pose(i, 9), (3 * SIZE[0], 3 * SIZE[1])).mean(axis=2)
+    return cv2.resize(fine, SIZE, interpolation=cv2.INTER_AREA)
+
+
+def test_the_sweep_finds_the_depth_of_the_corner():
+    views = [GreyView(camera(pose(i, 9)), picture(i)) for i in range(9)]
+    sources = choose_sources([view.camera for view in views], np.array(BOX.centre), 4)[4]
+    depth = sweep(views[4], [views[j] for j in sources], BOX)
+    known = depth > 0
+    assert known.mean() > 0.9
+    inverse = np.abs(1 / depth[known] - 1 / corner_depth(views[4].camera)[known])
+    pixel = grain(views[4].camera, [views[j].camera for j in sources])
+    assert np.median(inverse) < 0.2 * pixel
+    assert np.quantile(inverse, 0.9) < 0.5 * pixel
+
+
+def test_without_neighbours_or_texture_nothing_is_known():
+    views = [GreyView(camera(pose(i, 9)), np.full(SIZE[::-1], 0.5, np.float32)) for i in range(3)]
+    assert not sweep(views[0], [], BOX).any()
+    assert not sweep(views[0], views[1:], BOX).any()
+
+
+def test_sources_are_neither_too_close_nor_too_far():
+    cameras = [camera(pose(i, 13, arc=240)) for i in range(13)]
+    chosen = choose_sources([*cameras, cameras[6]], np.array(BOX.centre), 3)
+    assert 13 not in chosen[6]
+    assert set(chosen[6]) <= {4, 5, 7, 8}
+    assert chosen[0]
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.3, 0.2, 0.93), (-0.5, 0.3, 0.81)])
+def test_a_plane_is_its_own_fit(normal):
+    view = camera(pose(2, 9))
+    normal = np.array(normal) / np.linalg.norm(normal)
+    depth = plane_depth(view, normal, 0.1)
+    fitted = fit_planes(view, np.where(depth > 0, depth, 0.0), grain=0.01)
+    inner = np.zeros(depth.shape, bool)
+    inner[10:-10, 10:-10] = True
+    inner &= fitted.depth > 0
+    assert inner.sum() > 10_000
+    np.testing.assert_allclose(fitted.depth[inner], depth[inner], rtol=1e-4)
+    np.testing.assert_allclose(fitted.normal[inner], np.broadcast_to(normal, (inner.sum(), 3)), atol=1e-3)
+
+
+def test_noise_has_no_plane():
+    view = camera(pose(2, 9))
+    depth = 1.5 + np.random.default_rng(0).random(SIZE[::-1]).astype(np.float32)
+    assert not fit_planes(view, depth, grain=0.005).depth.any()
+
+
+def test_what_the_views_agree_on_is_fused_once_and_what_one_says_is_not():
+    cameras = [camera(pose(i, 7)) for i in range(7)]
+    depths = [corner_depth(view).astype(np.float32) for view in cameras]
+    rng = np.random.default_rng(1)
+    liar = rng.random(depths[3].shape) < 0.02
+    depths[3] = np.where(liar, depths[3] * 0.8, depths[3]).astype(np.float32)
+    neighbours = [[j for j in range(7) if j != i] for i in range(7)]
+    points = fuse(cameras, depths, [0.01] * 7, neighbours, lambda: None)
+    assert 20_000 < len(points.position) < sum(depth.size for depth in depths) / 2
+    distance = np.abs(points.position)
+    assert np.median(distance.min(axis=1)) < 1e-3
+    assert np.quantile(distance.min(axis=1), 0.99) < 0.01 * 1.6**2  # a grain at this depth: planes round the creases off
+    facing = np.take_along_axis(points.normal, distance.argmin(axis=1)[:, None], axis=1)
+    assert np.median(facing) > 0.999

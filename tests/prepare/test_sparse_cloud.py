@@ -1,0 +1,63 @@
+"""Normals and outliers on a sphere, where both are known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neilfpp_method.data.point_cloud import WorldPoints
+from neilfpp_method.prepare.sparse_cloud import SparsePoints, estimate_normals, oriented, reliable, without_outliers
+
+
+def sphere(count: int = 2000, noise: float = 0.0) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return direction * (1 + noise * rng.normal(size=(count, 1)))
+
+
+def seen(position: np.ndarray) -> SparsePoints:
+    outward = position / np.linalg.norm(position, axis=1, keepdims=True)
+    return SparsePoints(position, np.full(len(position), 0.5), np.full(len(position), 5), outward)
+
+
+def test_normals_point_to_those_who_see_them():
+    position = sphere(noise=0.002)
+    for side in (1.0, -1.0):
+        normal, flat = estimate_normals(position, side * position)
+        angle = np.degrees(np.arccos(np.clip((normal * side * position).sum(1) / np.linalg.norm(position, axis=1), -1, 1)))
+        assert flat.mean() > 0.9
+        assert np.quantile(angle[flat], 0.95) < 12
+
+
+def test_a_heap_of_points_has_no_normal():
+    position = np.random.default_rng(1).normal(size=(500, 3))
+    _, flat = estimate_normals(position, position)
+    assert flat.mean() < 0.1
+
+
+def test_what_is_alone_uncertain_or_hardly_seen_is_left_out():
+    good = sphere(1000)
+    rng = np.random.default_rng(2)
+    alone = 3.0 + rng.random((20, 3)) * 4
+    position = np.concatenate([good, alone, good[:30] * 1.0001])
+    points = seen(position)
+    points.error[5], points.track[6] = 2.5, 2
+    points.position[7] = np.nan
+    kept = reliable(points)
+    assert not kept[[5, 6, 7]].any()
+    assert kept[:1000].sum() >= 985
+    assert not kept[1000:1020].any()
+    cloud = oriented(points)
+    assert np.abs(np.linalg.norm(cloud.position, axis=1) - 1).max() < 1e-3
+    np.testing.assert_allclose(np.linalg.norm(cloud.normal, axis=1), 1.0)
+
+
+def test_a_handful_of_points_is_no_cloud():
+    assert len(oriented(seen(sphere(8))).position) == 0
+
+
+def test_outliers_of_a_given_cloud():
+    position = np.concatenate([sphere(1000), [[4.0, 0, 0], [0, 5.0, 1.0]]])
+    cloud = without_outliers(WorldPoints(position, position))
+    assert 985 <= len(cloud.position) <= 1000
+    np.testing.assert_array_equal(cloud.position, cloud.normal)

@@ -1,0 +1,52 @@
+"""What is done stays done, what changes is done again, what was interrupted goes on."""
+
+from __future__ import annotations
+
+from neilfpp_method.prepare.steps import begin, stamp
+
+
+def test_a_step_is_to_do_until_it_is_complete(tmp_path):
+    step = begin(tmp_path / "a", size=3)
+    assert step.result is None
+    (step.folder / "half").write_text("done")
+    again = begin(tmp_path / "a", size=3)
+    assert again.result is None
+    assert (again.folder / "half").is_file()  # an interrupted step finds what it has left
+    again.complete({"count": 7})
+    assert begin(tmp_path / "a", size=3).result == {"count": 7}
+
+
+def test_other_inputs_start_from_nothing(tmp_path):
+    step = begin(tmp_path / "a", size=3)
+    (step.folder / "old").write_text("old")
+    step.complete({})
+    fresh = begin(tmp_path / "a", size=4)
+    assert fresh.result is None
+    assert not (fresh.folder / "old").exists()
+
+
+def test_what_changes_changes_all_that_follows(tmp_path):
+    for size, known in ((3, None), (3, {}), (4, None)):
+        first = begin(tmp_path / "a", size=size)
+        first.complete({})
+        second = begin(tmp_path / "b", first, way="same")
+        assert second.result == known
+        second.complete({})
+
+
+def test_a_damaged_marker_means_to_do(tmp_path):
+    step = begin(tmp_path / "a")
+    step.complete({})
+    for text in ("", "[]", "{"):
+        (step.folder / "step.json").write_text(text)
+        assert begin(tmp_path / "a").result is None
+
+
+def test_a_file_that_changes_has_another_stamp(tmp_path):
+    path = tmp_path / "image.png"
+    path.write_bytes(b"one")
+    before = stamp([path], tmp_path)
+    assert before[0][:2] == ["image.png", 3]
+    assert stamp([path], tmp_path) == before
+    path.write_bytes(b"three")
+    assert stamp([path], tmp_path) != before

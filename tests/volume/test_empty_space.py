@@ -1,0 +1,193 @@
+"""Skipped space, against quadrature of the true density: what is skipped neither absorbs nor can be seen."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.nn.functional import normalize
+
+from neilfpp_method.config import VolumeConfig
+from neilfpp_method.structures import RayBatch
+from neilfpp_method.volume import empty_space
+from neilfpp_method.volume.density import laplace_density
+from neilfpp_method.volume.distance_grid import cell_size
+from neilfpp_method.volume.empty_space import EmptySpace
+from neilfpp_method.volume.intersect import sphere_interval
+from neilfpp_method.volume.samplers import error_bounded_samples
+
+RADIUS = 1.75
+CELL = 2 * RADIUS / (empty_space.RESOLUTION - 1)
+
+
+def sphere(x):
+    return x.norm(dim=-1) - 0.6
+
+
+def hollow(x):
+    """The camera's side of a thin shell: a room seen from within."""
+    return 0.01 - (x.norm(dim=-1) - 1.2).abs()
+
+
+def plate(thickness, tilt=0.3, offset=0.1):
+    """An infinite plate, thinner than a cell where the thickness is."""
+    normal = torch.tensor([math.sin(tilt), 0.2, math.cos(tilt)]) / math.sqrt(1.04)
+    return lambda x: (x @ normal - offset).abs() - thickness / 2
+
+
+def bundle(count=200, seed=0, inside=False):
+    """Rays towards the middle of the scene from without, or in all directions from within."""
+    generator = torch.Generator().manual_seed(seed)
+    origins = normalize(torch.randn(count, 3, generator=generator), dim=-1) * (0.9 if inside else 2.5)
+    targets = torch.randn(count, 3, generator=generator) * (3.0 if inside else 0.5)
+    return RayBatch(origins, normalize(targets - origins, dim=-1))
+
+
+def narrowed(sdf, rays, beta, grid=None):
+    grid = grid or EmptySpace(RADIUS)
+    whole = sphere_interval(rays.origins, rays.directions, RADIUS)
+    return whole, grid.narrow(sdf, rays, whole, torch.tensor(beta))
+
+
+def true_weights(sdf, rays, beta, whole):
+    """Places along each ray and their blending weight, by quadrature of the true density."""
+    edges = torch.lerp(whole.near[:, None].double(), whole.far[:, None].double(), torch.linspace(0, 1, 8001).double())
+    middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
+    points = rays.origins[:, None].double() + middle[..., None] * rays.directions[:, None].double()
+    distance = sdf(points.float().reshape(-1, 3)).double().view(middle.shape)
+    depth = laplace_density(distance, torch.tensor(beta, dtype=torch.float64)) * edges.diff(dim=-1)
+    before = torch.nn.functional.pad(depth.cumsum(-1), (1, 0))
+    return middle, torch.exp(-before[:, :-1]) - torch.exp(-before[:, 1:])
+
+
+def assert_nothing_lost(sdf, rays, beta):
+    whole, part = narrowed(sdf, rays, beta)
+    assert (part.near >= whole.near).all()
+    assert (part.far <= whole.far).all()
+    assert (part.far >= part.near).all()
+    allowed = empty_space.MISSED + math.exp(-empty_space.OPAQUE)
+    place, weight = true_weights(sdf, rays, beta, whole)
+    outside = (place < part.near[:, None]) | (place > part.far[:, None])
+    assert (weight * outside).sum(-1).max() < allowed
+    return whole, part
+
+
+@pytest.mark.parametrize("beta", [0.1, 0.01, 0.001])
+@pytest.mark.parametrize("sdf", [sphere, hollow, plate(0.2), plate(1e-3)], ids=["sphere", "hollow", "plate", "foil"])
+@pytest.mark.parametrize("inside", [False, True])
+def test_what_is_skipped_holds_no_weight(sdf, beta, inside):
+    assert_nothing_lost(sdf, bundle(inside=inside), beta)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    share=st.floats(0.001, 2.0),
+    tilt=st.floats(-1.5, 1.5),
+    offset=st.floats(-0.8, 0.8),
+    log_beta=st.floats(-3.0, -1.0),
+    seed=st.integers(0, 99),
+)
+def test_no_thin_plate_is_lost(share, tilt, offset, log_beta, seed):
+    """From a thousandth of a cell to two cells thick, in any place."""
+    assert_nothing_lost(plate(share * CELL, tilt, offset), bundle(20, seed), 10.0**log_beta)
+
+
+def test_grazing_rays_keep_what_they_graze():
+    height = torch.linspace(0.5, 0.75, 101)
+    origins = torch.stack([torch.full_like(height, -2.5), height, torch.zeros_like(height)], -1)
+    rays = RayBatch(origins, torch.tensor([1.0, 0.0, 0.0]).expand(101, 3))
+    assert_nothing_lost(sphere, rays, 0.01)
+
+
+def test_much_is_skipped_where_much_is_empty():
+    whole, part = narrowed(sphere, bundle(), 0.01)
+    assert (part.far - part.near).sum() < 0.4 * (whole.far - whole.near).sum()
+
+
+def test_a_ray_that_meets_nothing_keeps_its_interval():
+    whole, part = narrowed(lambda x: x.norm(dim=-1) + 1.0, bundle(), 0.01)
+    assert torch.equal(part.near, whole.near)
+    assert torch.equal(part.far, whole.far)
+
+
+@pytest.mark.parametrize("sdf", [sphere, plate(0.3 * CELL)], ids=["sphere", "foil"])
+def test_fewer_queries_find_the_same_surface(sdf):
+    """The median of the samples against that of the true weights, from the part and from the whole ray."""
+    rays, beta = bundle(), 0.01
+    whole, part = narrowed(sdf, rays, beta)
+    place, weight = true_weights(sdf, rays, beta, whole)
+    opaque = weight.sum(-1) > 0.99
+    truth = place.gather(-1, (weight.cumsum(-1) > 0.5).to(torch.int8).argmax(-1, keepdim=True))[opaque, 0]
+    assert opaque.sum() > 40
+
+    def run(interval):
+        config = VolumeConfig(radius=RADIUS, samples=64)
+        found = error_bounded_samples(
+            sdf, rays.origins, rays.directions, interval.near, interval.far, torch.tensor(beta), config, False
+        )
+        return (found.distances[opaque].quantile(0.5, dim=-1) - truth).abs(), found.sdf_queries
+
+    (exact, more), (narrow, fewer) = run(whole), run(part)
+    assert exact.max() < 0.5 * beta
+    assert narrow.max() < 0.5 * beta
+    assert fewer < 0.85 * more
+
+
+# ------------------------------------------------------------------------------------------------------- a field that moves
+
+
+def test_a_surface_that_has_come_up_is_noticed_at_once():
+    grid, rays = EmptySpace(RADIUS), bundle()
+    narrowed(sphere, rays, 0.01, grid)
+
+    def moved(x):
+        return torch.minimum(sphere(x), (x - torch.tensor([0.0, 0.0, 1.2])).norm(dim=-1) - 0.5)
+
+    whole, part = narrowed(moved, rays, 0.01, grid)
+    assert torch.equal(part.near, whole.near)  # nobody skips anything
+    for _ in range(empty_space.LEAST_LIFE):
+        grid.moved()
+    narrowed(moved, rays, 0.01, grid)
+    whole, part = narrowed(moved, rays, 0.01, grid)
+    assert grid.age == 0  # sampled anew
+    assert (part.near > whole.near).any()
+
+
+def test_the_grid_is_sampled_when_it_must():
+    grid, rays, asked = EmptySpace(RADIUS), bundle(5), []
+
+    def counted(x):
+        asked.append(len(x))
+        return sphere(x)
+
+    narrowed(counted, rays, 0.01, grid)
+    assert sum(asked) == empty_space.RESOLUTION**3 + 5
+    asked.clear()
+    for _ in range(empty_space.MOST_LIFE):
+        narrowed(counted, rays, 0.01, grid)
+        grid.moved()
+    assert sum(asked) == 5 * empty_space.MOST_LIFE  # one query per ray and use
+    narrowed(counted, rays, 0.01, grid)
+    assert grid.age == 0
+
+
+def test_a_grid_from_a_checkpoint_skips_the_same():
+    one, other, rays = EmptySpace(RADIUS), EmptySpace(RADIUS), bundle()
+    narrowed(sphere, rays, 0.01, one)
+    one.moved()
+    other.load_state_dict(one.state_dict())
+    assert other.age == 1
+    _, first = narrowed(sphere, rays, 0.01, one)
+    _, second = narrowed(sphere, rays, 0.01, other)
+    assert torch.equal(first.near, second.near)
+    assert torch.equal(first.far, second.far)
+
+
+def test_the_slope_is_the_steepest_of_the_field():
+    grid = EmptySpace(RADIUS)
+    narrowed(lambda x: 3.0 * x[:, 1], bundle(2), 0.01, grid)
+    assert grid.slope.item() == pytest.approx(empty_space.MARGIN * 3.0, rel=1e-4)
+    assert cell_size(grid.distance, RADIUS) == pytest.approx(CELL)
