@@ -1,12 +1,13 @@
 """What the method recovers on captures whose truth is known: the tables of docs/results.md.
 
     python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results
-    python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results-mesh --host mesh
+    python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results-mesh --host mesh --compare ladder
 
 For each capture: the preset trained from scratch, beside it the paper's free light field with and without L_ref (the paper's
-Table 2); each measured after the material stage ("Sep.") and after the joint stage
-(Table 3), beside baselines that need no method. The runs share the stage SDF init, which none of this enters; every step
-depends on seed and number alone, so sharing changes nothing. With the mesh host geometry is given, and there is one stage.
+Table 2), with `--compare ladder` every light with every inter-reflection that goes with it; each measured after the material
+stage ("Sep.") and after the joint stage (Table 3), beside baselines that need no method. The runs share the stage SDF init,
+which none of this enters; every step depends on seed and number alone, so sharing changes nothing. With the mesh host
+geometry is given, and there is one stage.
 """
 
 from __future__ import annotations
@@ -67,19 +68,34 @@ class Options:
     """Which settings."""
     host: Literal["volsdf", "mesh"] = "volsdf"
     """Geometry to be found, or given as a mesh."""
+    compare: Literal["preset", "paper", "ladder"] = "paper"
+    """preset: nothing else. paper: the free light field with and without L_ref. ladder: every light with every
+    inter-reflection that goes with it."""
     device: str = "auto"
     """Where to train."""
 
 
-def variants(config: NeilfConfig) -> dict[str, NeilfConfig]:
+def variants(config: NeilfConfig, which: str) -> dict[str, NeilfConfig]:
     """What is compared; the first is the preset as it is."""
+    if which == "preset":
+        return {"preset": config}
     free = free_light(config)
-    off = dataclasses.replace(free.inter_reflection, mode="off")
-    return {
+    compared = {
         "preset": config,
         "free light, with L_ref": free,
-        "free light, without L_ref": dataclasses.replace(free, inter_reflection=off),
+        "free light, without L_ref": between_surfaces(free, "off"),
     }
+    if which == "ladder":
+        compared["free light, hard"] = between_surfaces(free, "hard")
+        for kind, name in (("distant", "map"), ("distant_near", "map and lamps")):
+            light = dataclasses.replace(config, light=dataclasses.replace(config.light, kind=kind))
+            compared |= {f"{name}, {mode}": between_surfaces(light, mode) for mode in ("hard", "off")}
+    return compared
+
+
+def between_surfaces(config: NeilfConfig, mode: str) -> NeilfConfig:
+    """The same settings with this inter-reflection."""
+    return dataclasses.replace(config, inter_reflection=dataclasses.replace(config.inter_reflection, mode=mode))
 
 
 def train(capture: Path, out: Path, config: NeilfConfig, device: str, start_from: Path | None = None) -> None:
@@ -159,7 +175,7 @@ def main(options: Options) -> None:
         rows: dict[str, dict[str, float]] = {}
         times = []
         base = options.out / capture.name
-        for name, settings in variants(config).items():
+        for name, settings in variants(config, options.compare).items():
             run = base if settings is config else options.out / f"{capture.name}-{name.replace(', ', '-').replace(' ', '-')}"
             shares_trunk = run != base and config.train.sdf_steps > 0
             train(capture, run, settings, options.device, start_from=base if shares_trunk else None)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -18,7 +19,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from neilfpp_method.config import NeilfConfig
+from neilfpp_method.data.environment_map import read_environment
 from neilfpp_method.errors import UserError
+from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.hosts.base import HasParameterGroups, Host, LightsItself
 from neilfpp_method.hosts.outputs import check_tensors, host_name
 from neilfpp_method.model import NeilfModel, SceneFacts
@@ -106,7 +109,7 @@ class AttachedNeilf(nn.Module):
         Raises:
             UserError: the host returned what cannot be used, or the batch is on another device.
         """
-        place, own = batch.origins.device, next(self.model.light.parameters()).device
+        place, own = batch.origins.device, next(self.model.brdf.parameters()).device
         if place != own:
             raise UserError(f"rays on {place}, material and light on {own}", "move one of them: neilf.to(device)")
         stage = step if isinstance(step, Stage) else stage_at(step, self.model.config.train).stage
@@ -159,7 +162,7 @@ def attach_neilf(
         radiance_scale: the range of the host's radiance; none: 3 for HDR, 1 for LDR.
 
     Raises:
-        UserError: the host is none of the three.
+        UserError: the host is none of the three, or the environment map that the settings name cannot be used.
     """
     adapted = _adapt(host, response)
     borrowed = not isinstance(host, HasParameterGroups)
@@ -167,6 +170,8 @@ def attach_neilf(
     if config is None:
         config = preset("fast") if isinstance(adapted, LightsItself) else free_light(preset("fast"))
     attached = AttachedNeilf(NeilfModel(adapted, config, facts, borrowed=borrowed))
+    if config.light.map is not None and isinstance(attached.model.light, EnvironmentLight):
+        attached.model.light.show(read_environment(Path(config.light.map)))
     if attached.missing:
         lost = "; ".join(f"no {name}: {loss}" for name, loss in attached.missing.items())
         log.warning("NeILF++ attached to %s, which has %s", host_name(adapted), lost)

@@ -60,6 +60,8 @@ class Train:
     """Where geometry comes from: volsdf recovers it; mesh takes it as given and recovers material and light."""
     mesh: Path | None = None
     """The mesh of --host mesh, in the capture's world frame; none: the capture's inputs/model/mesh.ply."""
+    light: Path | None = None
+    """An environment map that is known (linear EXR, see docs/light.md), in the radiance of the images; none: recovered."""
     resume: bool = False
     """Continue the run in --out from its last checkpoint, exactly as if it had never stopped."""
     format: str | None = None
@@ -92,12 +94,14 @@ class Eval:
 
 @dataclass
 class Render:
-    """Write every map of a run's views as PNG and EXR."""
+    """Write every map of a run's views as PNG and EXR, and a picture of the light that arrives at four points."""
 
     run: tyro.conf.Positional[Path]
     """The run's folder."""
     out: Path | None = None
     """Where the pictures go; none: RUN/renders."""
+    what: tuple[Literal["maps", "light"], ...] = ("maps", "light")
+    """maps: a folder each, and an EXR a view. light: incident_light.png, beside the truth where that is at hand."""
     views: Literal["test", "train", "all"] = "test"
     """Which views."""
     checkpoint: Literal["last", "sdf_init", "material_init", "joint"] = "last"
@@ -110,14 +114,18 @@ class Render:
 
 @dataclass
 class Export:
-    """Write a run's surface as a mesh (PLY) in the capture's frame and scale."""
+    """Write a run's surface and its light for other programs, in the capture's frame and scale."""
 
     run: tyro.conf.Positional[Path]
     """The run's folder."""
+    what: tuple[Literal["mesh", "light"], ...] = ()
+    """mesh: the surface (PLY). light: environment map (EXR), lamps (JSON), probes (EXR). None named: what the run has."""
     out: Path | None = None
-    """The file; none: RUN/mesh.ply."""
+    """The folder; none: RUN/export."""
     resolution: int = 256
-    """Cells along an edge of the scene's cube."""
+    """Cells of the mesh along an edge of the scene's cube."""
+    probes: int | None = None
+    """Light probes, spread over the surface; none: 16 for a light that is free at every point, else 0."""
     checkpoint: Literal["last", "sdf_init", "material_init", "joint"] = "last"
     """Which weights."""
     device: Device = "auto"
@@ -161,6 +169,8 @@ def run_train(options: Train) -> None:
         if config.host != "mesh":
             raise UserError(f"--mesh {options.mesh}: the host {config.host} takes no mesh", "add --host mesh")
         config = replace(config, mesh=replace(config.mesh, path=str(options.mesh.resolve())))
+    if options.light is not None:
+        config = replace(config, light=replace(config.light, map=str(options.light.resolve())))
     as_before = options.resume and options.preset is None and config == preset(DEFAULT_PRESET)
     run_training(
         data=options.data,
@@ -194,25 +204,24 @@ def run_eval(options: Eval) -> None:
 
 def run_render(options: Render) -> None:
     from neilfpp_method.evaluate.render_views import render_run
+    from neilfpp_method.evaluate.report import write_light_picture
     from neilfpp_method.train.device import pick_device
     from neilfpp_method.train.run import load_run
 
     run = load_run(options.run, pick_device(options.device), options.checkpoint)
     out = options.out or options.run / "renders"
-    with _bar("rendering") as advance:
-        render_run(run, out, options.views, overwrite=options.overwrite, on_progress=advance)
+    if "maps" in options.what:
+        with _bar("rendering") as advance:
+            render_run(run, out, options.views, overwrite=options.overwrite, on_progress=advance)
+    if "light" in options.what and not write_light_picture(run, out / "incident_light.png") and options.what == ("light",):
+        raise UserError(f"{options.run}: there is no light to show at step {run.step}", "train the next stage")
     Console().print(f"written to {out}", highlight=False)
 
 
 def run_export(options: Export) -> None:
-    from neilfpp_method.export.mesh import export_mesh
-    from neilfpp_method.train.device import pick_device
-    from neilfpp_method.train.run import load_run
+    from neilfpp_method.export.command import run_export as export
 
-    run = load_run(options.run, pick_device(options.device), options.checkpoint)
-    out = options.out or options.run / "mesh.ply"
-    mesh = export_mesh(run, out, options.resolution)
-    Console().print(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces, written to {out}", highlight=False)
+    export(**vars(options), console=Console())
 
 
 def run_demo(options: Demo) -> None:
@@ -273,6 +282,7 @@ COMMANDS = {
             "neilfpp train --data captures/teapot",
             "neilfpp train --data captures/teapot --preset paper-ngp --out runs/teapot",
             "neilfpp train --data captures/teapot --host mesh --mesh scans/teapot.ply",
+            "neilfpp train --data captures/teapot --light studio.exr",
             "neilfpp train --out runs/teapot --resume",
             "neilfpp train --data captures/teapot --config.train.joint-steps 0   (the separate pipeline)",
             "neilfpp train --data captures/teapot --config.inter-reflection.mode off",
@@ -283,11 +293,15 @@ COMMANDS = {
         run_eval,
         ["neilfpp eval runs/teapot", "neilfpp eval runs/teapot --checkpoint material_init --out sep.json"],
     ),
-    "render": Command(Render, run_render, ["neilfpp render runs/teapot", "neilfpp render runs/teapot --views all"]),
+    "render": Command(
+        Render,
+        run_render,
+        ["neilfpp render runs/teapot", "neilfpp render runs/teapot --views all", "neilfpp render runs/teapot --what light"],
+    ),
     "export": Command(
         Export,
         run_export,
-        ["neilfpp export runs/teapot", "neilfpp export runs/teapot --resolution 512 --out teapot.ply"],
+        ["neilfpp export runs/teapot --resolution 512", "neilfpp export runs/teapot --what light --probes 32 --out teapot"],
     ),
 }
 

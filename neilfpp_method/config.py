@@ -30,7 +30,7 @@ class HashGridConfig:
     max_resolution: int = 4096
     """Cells along an edge at the finest level."""
     backend: Literal["auto", "reference", "cpu", "triton"] = "auto"
-    """Who computes it. auto: the fastest that runs on the device. reference: plain torch. cpu: compiled by Numba. triton: CUDA."""
+    """Who computes it. auto: the fastest that runs on the device. reference: plain torch. cpu: Numba. triton: CUDA."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,8 @@ class BrdfConfig:
     """How positions are encoded."""
     initial_base_color: float = 0.5
     """What the base colour starts as. Light and base colour share a scale that images hardly tell, so it stays near this."""
+    initial_metallic: float = 0.5
+    """What metallic starts as. Most surfaces are no metals, and a light that is found under metals is too weak for others."""
     frequencies: int = 6
     """Octaves of the frequency encoding."""
     grid: HashGridConfig = field(default_factory=HashGridConfig)
@@ -137,6 +139,9 @@ class IncidentLightConfig:
     with inter-reflection hard or off."""
     environment_height: int = 32
     """Rows of the environment map; it has twice as many columns."""
+    map: str | None = None
+    """An environment map that is known, a linear EXR in the layout of docs/light.md; none: the map is recovered. Lamps
+    before it are sought where `kind` says so."""
     fit: LightFitConfig = field(default_factory=LightFitConfig)
     """How the map is found."""
     network: Literal["mlp", "factorised"] = "mlp"

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from neilfpp_method import losses
 from neilfpp_method.config import NeilfConfig
+from neilfpp_method.errors import UserError
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.factorised_light import FactorisedLightField
@@ -24,6 +25,7 @@ from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised
 from neilfpp_method.hosts.outputs import OutputCheck
 from neilfpp_method.inter_reflection import scene_light, trace_light
+from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.memory import Observed, SurfaceMemory
 from neilfpp_method.lighting.solve import solve_light
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, active_losses
@@ -107,6 +109,9 @@ class NeilfModel(nn.Module):
         facts: what the images decided.
         borrowed: the host belongs to another trainer. Its parameters, its device and its mode are then none of this
             module's, though gradients reach it in the joint stage.
+
+    Raises:
+        UserError: the light and the inter-reflection of the settings do not go together.
     """
 
     def __init__(self, host: Host, config: NeilfConfig, facts: SceneFacts, borrowed: bool = False) -> None:
@@ -128,11 +133,18 @@ class NeilfModel(nn.Module):
         self.light: IncidentLightField | FactorisedLightField | EnvironmentLight
         self.lamps: Lamps | None = None
         self.memory: SurfaceMemory | None = None
+        self.evidence: Evidence | None = None
         if config.light.kind != "free":
+            if config.inter_reflection.mode == "soft":
+                raise UserError(
+                    f"soft inter-reflection with the light '{config.light.kind}', which L_ref cannot teach",
+                    "set --config.inter-reflection.mode hard, or --config.light.kind free",
+                )
             fit = config.light.fit
             self.light = EnvironmentLight(config.light.environment_height, first_radiance)
             self.lamps = None if config.light.kind == "distant" else Lamps(fit.lamps, fit.lamp_radius)
-            self.memory = SurfaceMemory(fit.points, fit.every)
+            if config.light.map is None or self.lamps is not None:
+                self.memory = SurfaceMemory(fit.points, fit.every)
         else:
             self.light = make_incident_light(config.light, base, first_radiance)
 
@@ -344,7 +356,9 @@ class NeilfModel(nn.Module):
         """Directional albedo of the material that B starts as, seen from the normal under uniform light."""
         half = torch.full((1, 1), 0.5)
         up = torch.tensor([[0.0, 0.0, 1.0]])
-        material = Material(torch.full((1, 3), self.config.brdf.initial_base_color), half, half)
+        start = self.config.brdf
+        metallic = torch.full((1, 1), start.initial_metallic)
+        material = Material(torch.full((1, 3), start.initial_base_color), half, metallic)
         samples = sample_directions("fibonacci", up, up, half, 4096, self.lobe, stochastic=False)
         white = torch.ones_like(samples.wi)
         return shade(material, up, up, samples, white, self.lobe, self.config.shading.specular).color.mean().item()

@@ -11,6 +11,7 @@ from neilfpp_method.config import (
     HashGridConfig,
     IncidentLightConfig,
     InterReflectionConfig,
+    LightFitConfig,
     LossConfig,
     NeilfConfig,
     OptimizerConfig,
@@ -38,9 +39,7 @@ def paper_ngp() -> NeilfConfig:
         radiance=OutgoingRadianceConfig(encoding="hash", layers=4, width=64, direction_encoding="spherical_harmonics"),
         brdf=BrdfConfig(encoding="hash", activation="relu", layers=2, width=64, skip=None),
         light=IncidentLightConfig(activation="relu", direction_encoding="spherical_harmonics", direction_degree=5),
-        loss=LossConfig(
-            point_cloud=0.1, position_gradient=0.0, normal_gradient=0.1, hessian_method="finite_difference"
-        ),
+        loss=LossConfig(point_cloud=0.1, position_gradient=0.0, normal_gradient=0.1, hessian_method="finite_difference"),
         optimizer=OptimizerConfig(geometry=1e-2, radiance=1e-2, brdf=1e-2, light=1e-3, background=1e-3, beta=1e-3),
         train=TrainConfig(sdf_steps=15_000, material_steps=7_500, joint_steps=7_500),
     )
@@ -48,17 +47,31 @@ def paper_ngp() -> NeilfConfig:
 
 def fast() -> NeilfConfig:
     """Minutes on the two cores of a laptop: the same method with small hash grids, few rays, and as much light as most
-    scenes need: an environment map and what the scene reflects. `free_light` has the paper's light field for it."""
+    scenes need: an environment map, what the scene reflects, and lamps close by where the images ask for them. `free_light`
+    has the paper's light field for it."""
     grid = HashGridConfig(levels=8, log2_entries=16, base_resolution=16, max_resolution=256)
     return NeilfConfig(
         preset="fast",
         sdf=SdfConfig(encoding="hash", grid=grid, layers=1, width=64, skip=None, feature_width=15),
         radiance=OutgoingRadianceConfig(layers=2, width=64, direction_encoding="spherical_harmonics"),
         brdf=BrdfConfig(
-            encoding="hash", grid=grid, activation="relu", layers=2, width=64, skip=None, initial_base_color=0.3
+            encoding="hash",
+            initial_base_color=0.3,
+            initial_metallic=0.1,
+            grid=grid,
+            activation="relu",
+            layers=2,
+            width=64,
+            skip=None,
         ),
         light=IncidentLightConfig(
-            kind="auto", layers=4, width=64, direction_encoding="spherical_harmonics", direction_degree=5
+            kind="auto",
+            environment_height=48,
+            fit=LightFitConfig(points=768, steps=75, smoothness=0.02),
+            layers=4,
+            width=64,
+            direction_encoding="spherical_harmonics",
+            direction_degree=5,
         ),
         background=BackgroundConfig(layers=4, width=64, samples=16),
         volume=VolumeConfig(radius=1.75, beta_init=0.05, initial_samples=64, rounds=2, samples=32),

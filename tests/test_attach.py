@@ -7,11 +7,13 @@ import logging
 import sys
 from types import ModuleType, SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
 from neilfpp_method.attach import attach_neilf, missing_capabilities, pixel_batch
+from neilfpp_method.data.images import write_exr
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.schedule import Stage, active_losses, weigh
@@ -143,6 +145,18 @@ def test_a_mesh_learns_its_light_field_with_the_material():
 
 
 # --------------------------------------------------------------------------------------------------------------- the parts
+
+
+def test_a_map_that_the_settings_name_lights_the_scene_and_stays(tmp_path):
+    known = np.random.default_rng(0).random((6, 12, 3), dtype=np.float32) + 0.5
+    write_exr(tmp_path / "sky.exr", {"RGB": known})
+    config = mesh_config()
+    light = dataclasses.replace(config.light, kind="distant", map=str(tmp_path / "sky.exr"))
+    mode = dataclasses.replace(config.inter_reflection, mode="hard")
+    neilf = attach_neilf(mesh_host(SPHERE), dataclasses.replace(config, light=light, inter_reflection=mode))
+    assert neilf.losses(pixels(), Stage.MATERIAL_INIT).loss.isfinite()
+    shown = neilf.model.light.log_radiance.exp().permute(1, 2, 0)
+    torch.testing.assert_close(shown, torch.from_numpy(known))
 
 
 def test_shading_is_that_of_the_maps_and_nothing_where_nothing_is_hit():

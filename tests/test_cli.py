@@ -94,10 +94,12 @@ def test_render_writes_every_map(trained, tmp_path, capfd):
 
 
 def test_export_writes_the_surface_where_it_was_captured(trained, tmp_path, capfd):
-    out = tmp_path / "sphere.ply"
-    assert main(["export", str(trained), "--device", "cpu", "--resolution", "32", "--out", str(out)]) == 0
+    out = tmp_path / "sphere"
+    command = ["export", str(trained), "--device", "cpu", "--resolution", "32", "--probes", "2", "--out", str(out)]
+    assert main(command) == 0
     assert capfd.readouterr().err == ""
-    mesh = trimesh.load(out)
+    assert {path.name for path in (out / "light").rglob("*.exr")} == {"0000.exr", "0001.exr"}
+    mesh = trimesh.load(out / "mesh.ply")
     assert mesh.is_watertight
     assert np.linalg.norm(mesh.centroid - CENTRE) < 0.25 * RADIUS
     assert mesh.visual.vertex_colors.shape == (len(mesh.vertices), 4)

@@ -9,6 +9,7 @@ from collections import Counter
 import pytest
 import torch
 
+from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.base import LightsItself
 from neilfpp_method.inter_reflection import trace_light
 from neilfpp_method.model import NeilfModel, SceneFacts
@@ -286,7 +287,8 @@ def test_every_light_goes_with_every_kind_of_sampling(kind, sampler):
     position = torch.tensor([[0.0, 0.0, 0.6], [0.6, 0.0, 0.0]])
     normal = position / 0.6
     half = torch.full((2, 1), 0.5)
-    material = Material(torch.full((2, 3), config.brdf.initial_base_color), half, half)
+    metallic = torch.full((2, 1), config.brdf.initial_metallic)
+    material = Material(torch.full((2, 3), config.brdf.initial_base_color), half, metallic)
     shading = model.shade(position, normal, normal, material, 512)
     torch.testing.assert_close(shading.color, torch.full((2, 3), model.facts.median_radiance), rtol=0.1, atol=0.0)
 
@@ -310,3 +312,10 @@ def test_a_lamp_shines_where_nothing_stands_before_it():
     assert gained[1].item() == pytest.approx(0.0, abs=1e-6)
     seen = model.incident_light(x[:1], torch.tensor([[[0.0, 0.0, 1.0]]]))[0, 0]
     assert (seen > model.lamps.radiance()[0]).all()
+
+
+def test_l_ref_cannot_teach_a_map():
+    config = tiny_config()
+    config = dataclasses.replace(config, light=dataclasses.replace(config.light, kind="distant"))
+    with pytest.raises(UserError, match="soft inter-reflection"):
+        sphere_model(config)

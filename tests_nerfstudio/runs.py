@@ -6,6 +6,7 @@ import copy
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,9 +14,10 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts import train
 
-from neilfpp_method.config import NeilfConfig
+from neilfpp_method.config import LightFitConfig, NeilfConfig
 from neilfpp_method.data.images import read_image, write_exr
 from neilfpp_method.demo import demo_scene
+from neilfpp_method.presets import preset
 from neilfpp_method.schedule import stage_steps
 from tests.train.small_runs import small_config
 
@@ -44,8 +46,14 @@ def reduced_tabletop(root: Path) -> Path:
 
 
 def small_settings(**steps: int) -> NeilfConfig:
-    """The tiny settings; four steps a stage but for `steps`."""
-    return small_config(**steps)
+    """The tiny settings with the light of the preset, solved for every third step; four steps a stage but for `steps`."""
+    config, usual = small_config(**steps), preset("fast")
+    fit = LightFitConfig(points=48, every=3, steps=5, candidates=8, lamps=2)
+    return dataclasses.replace(
+        config,
+        light=dataclasses.replace(usual.light, environment_height=8, fit=fit),
+        inter_reflection=dataclasses.replace(config.inter_reflection, mode=usual.inter_reflection.mode),
+    )
 
 
 def trainer_config(
@@ -75,8 +83,8 @@ def checkpoint(run: Path) -> dict:
     return torch.load(path, map_location="cpu", weights_only=True)
 
 
-def parameters(run: Path) -> dict[str, torch.Tensor]:
-    """The weights of a run by their names in `NeilfModel`."""
+def weights(run: Path) -> dict[str, Any]:
+    """The state of a run by its names in `NeilfModel`."""
     prefix = "_model.neilf."
     return {key.removeprefix(prefix): t for key, t in checkpoint(run)["pipeline"].items() if key.startswith(prefix)}
 

@@ -93,7 +93,8 @@ def test_a_step_learns_from_the_pixels_of_the_same_step_of_the_standalone_loop(r
         drawn = pixel_batch(rays.origins, rays.directions, batch)
         assert torch.equal(drawn.color, expected.color)
         assert torch.equal(drawn.view, expected.view)
-        torch.testing.assert_close(drawn.directions, expected.directions, atol=1e-5, rtol=0)
+        assert torch.equal(drawn.origins, expected.origins)
+        assert torch.equal(drawn.directions, expected.directions)
 
 
 def test_pixels_that_are_marked_as_invalid_are_not_drawn(tmp_path: Path) -> None:
@@ -111,6 +112,25 @@ def test_pixels_that_are_marked_as_invalid_are_not_drawn(tmp_path: Path) -> None
         seed_step(7, step)
         assert torch.equal(pixel_batch(rays.origins, rays.directions, batch).color, whole.sample(400).color)
         assert (batch["indices"][:, 2] >= 9).all()
+
+
+def test_object_mask_and_validity_are_not_taken_for_one_another(tmp_path: Path) -> None:
+    capture = load_capture(make_capture(tmp_path, background=0.3))
+    rows, columns = np.indices((HEIGHT, WIDTH))
+    facts = {"mask": rows < 6, "valid": columns < 9}
+    for name, values in facts.items():
+        write_png(tmp_path / f"{name}.png", np.where(values, 255, 0).astype(np.uint8))
+    paths = {name: tmp_path / f"{name}.png" for name in facts}
+    # The last view has no mask: nothing is known of its object.
+    views = [dataclasses.replace(view, **paths) for view in capture.views]
+    views[-1] = dataclasses.replace(views[-1], mask=None)
+    write_capture(tmp_path, dataclasses.replace(capture, views=tuple(views)), response="linear", test=())
+    dataset = CaptureDataset(CaptureParserConfig(data=tmp_path, test_every=0).setup().get_dataparser_outputs("train"))
+    for i in (0, len(views) - 1):
+        item, has_mask = dataset[i], i == 0
+        assert np.array_equal(item["object_mask"][..., 0].numpy() > 0.5, facts["mask"] | (not has_mask))
+        assert (item["mask_known"] == float(has_mask)).all()
+        assert np.array_equal(item["valid"][..., 0].numpy(), facts["valid"])
 
 
 def test_another_dataparser_serves_as_well(root: Path) -> None:

@@ -19,9 +19,10 @@ from neilfpp_method.hosts.nerfstudio import NerfstudioHost
 from neilfpp_method.plugin.foreign import build_foreign
 from neilfpp_method.schedule import Stage
 from neilfpp_method.structures import RayBatch
+from neilfpp_method.train.loop import seed_step
 from tests.data.make_capture import make_capture
 from tests.scenes import sphere_batch
-from tests_nerfstudio.runs import checkpoint, ns_train, parameters, small_settings, trainer_config
+from tests_nerfstudio.runs import checkpoint, ns_train, small_settings, trainer_config, weights
 
 CENTRE, RADIUS = torch.tensor([4.0, -2.0, 1.0]), 1.5
 DRAWN = 0.5
@@ -152,6 +153,23 @@ def test_a_host_asks_its_own_losses_of_itself_where_a_gradient_flows(name: str, 
     assert not host.eval().render_regularised(batch, {"volume"}).terms
 
 
+def test_the_weight_of_a_hosts_own_losses_is_a_setting(tmp_path: Path) -> None:
+    config = trainer_config(make_capture(tmp_path), tmp_path, small_settings(), host="neus")
+    config.pipeline.datamanager.data = tmp_path
+
+    def losses(weight: float) -> dict[str, float]:
+        config.pipeline.model.host_losses = weight
+        pipeline = config.pipeline.setup(device="cpu")
+        seed_step(0, 0)
+        return {name: loss.item() for name, loss in pipeline.get_train_loss_dict(0)[1].items()}
+
+    usual, half, none = losses(1.0), losses(0.5), losses(0.0)
+    assert usual["own"] > 0.0
+    assert half == pytest.approx({**usual, "own": 0.5 * usual["own"]})
+    assert "own" not in none
+    assert none["eikonal"] > 0.0, "ours stands in for it"
+
+
 def test_a_host_that_does_not_render_rays_or_does_not_exist_is_refused() -> None:
     for name in ("splatfacto", "nonsense"):
         with pytest.raises(UserError, match="neus"):
@@ -169,7 +187,7 @@ def test_the_stages_run_on_a_method_of_nerfstudio(name: str, tmp_path: Path) -> 
         config.max_num_iterations = steps
         run = ns_train(config)
         assert checkpoint(run)["step"] == steps - 1
-        ends.append(parameters(run))
+        ends.append(weights(run))
 
     def moved(before: dict, after: dict, prefix: str) -> bool:
         return any(not torch.equal(before[key], after[key]) for key in before if key.startswith(prefix))

@@ -17,22 +17,25 @@ from nerfstudio.scripts.render import DatasetRender
 from nerfstudio.utils.eval_utils import eval_setup
 
 from neilfpp_method.config import NeilfConfig
+from neilfpp_method.data.images import write_exr
 from neilfpp_method.errors import UserError
+from neilfpp_method.evaluate.protocols import evaluate
 from neilfpp_method.model import Maps
-from neilfpp_method.presets import fixed_geometry
-from neilfpp_method.schedule import STAGES, Stage
+from neilfpp_method.presets import fixed_geometry, free_light
+from neilfpp_method.schedule import STAGES, Stage, stage_steps
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.train.loop import train
+from neilfpp_method.train.run import Run
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import differences, small_training
 from tests_nerfstudio.runs import (
     TEST,
     checkpoint,
     ns_train,
-    parameters,
     reduced_tabletop,
     small_settings,
     trainer_config,
+    weights,
     with_steps,
 )
 
@@ -46,6 +49,9 @@ FIELDS = {
     "light": "light.",
 }
 SETTINGS = small_settings()
+# L_ref with a gradient for R: in material init R stays all the same.
+L_REF = dataclasses.replace(SETTINGS.inter_reflection, radiance_gradient=1.0, rays_per_point=4.0, max_angle_deg=90.0)
+FREE = free_light(dataclasses.replace(SETTINGS, inter_reflection=L_REF))
 
 
 @pytest.fixture(scope="module")
@@ -67,57 +73,85 @@ def train_for(data: Path, out: Path, iterations: int, settings: NeilfConfig = SE
 # ------------------------------------------------------------------------------------------------------------- training
 
 
-def test_each_stage_moves_its_fields_and_no_others(data: Path, tmp_path: Path) -> None:
-    # L_ref with a gradient for R: in material init R stays all the same.
-    light = dataclasses.replace(SETTINGS.inter_reflection, radiance_gradient=1.0, rays_per_point=4.0, max_angle_deg=90.0)
-    settings = dataclasses.replace(SETTINGS, inter_reflection=light)
-    ends = [parameters(train_for(data, tmp_path / str(n), n, settings)) for n in (1, 4, 8, 12)]
+@pytest.mark.parametrize("settings", [SETTINGS, FREE], ids=["solved light", "free light"])
+def test_each_stage_moves_its_fields_and_no_others(data: Path, tmp_path: Path, settings: NeilfConfig) -> None:
+    ends = [weights(train_for(data, tmp_path / str(n), n, settings)) for n in (1, 4, 8, 12)]
     # The first is one step into SDF init; the others are the ends of the stages.
     for stage, before, after in zip(Stage, ends, ends[1:], strict=False):
         for field, prefix in FIELDS.items():
             changed = any(
-                not torch.equal(before[key], after[key]) for key in before if key.startswith(prefix) and before[key].numel()
+                bool(differences(before[key], after[key])) for key in before if key.startswith(prefix)
             )
             there = any(key.startswith(prefix) for key in before)
             assert changed == (there and field in STAGES[stage].moves), (stage, field)
 
 
-def test_a_run_that_is_resumed_ends_as_one_that_was_not(data: Path, run: Path, tmp_path: Path) -> None:
-    first = train_for(data, tmp_path / "first", 6)
-    config = trainer_config(data, tmp_path / "second", SETTINGS)
+@pytest.mark.parametrize("kind", ["auto", "distant_near"])
+def test_a_run_that_is_resumed_ends_as_one_that_was_not(data: Path, tmp_path: Path, kind: str) -> None:
+    settings = dataclasses.replace(SETTINGS, light=dataclasses.replace(SETTINGS.light, kind=kind))
+    whole = ns_train(trainer_config(data, tmp_path / "whole", settings))
+    # The light is solved for at steps 4, 7 and 10: what it is to be solved from next is half there.
+    first = train_for(data, tmp_path / "first", 6, settings)
+    config = trainer_config(data, tmp_path / "second", settings)
     config.load_dir = first / "nerfstudio_models"
     # Nerfstudio would run as many iterations again; the stages end where they end.
     second = ns_train(config)
-    assert differences(checkpoint(run)["pipeline"], checkpoint(second)["pipeline"]) == []
-    assert differences(checkpoint(run)["optimizers"], checkpoint(second)["optimizers"]) == []
+    assert differences(checkpoint(whole)["pipeline"], checkpoint(second)["pipeline"]) == []
+    assert differences(checkpoint(whole)["optimizers"], checkpoint(second)["optimizers"]) == []
+    before, after = weights(first), weights(second)
+    assert differences(before["light.log_radiance"], after["light.log_radiance"]), "it was solved for again"
+    if kind == "distant_near":
+        assert before["lamps._extra_state"]["lit"] > 0, "there were lamps to be saved"
 
 
-# Not met at present: last seen 1.0 dB apart (0.03 dB with earlier settings). Whether that is chaos in so short a run or a
-# difference between the loops is not known.
-@pytest.mark.slow
-def test_the_same_scene_seed_and_steps_give_the_same_quality_in_both_loops(data: Path, tmp_path: Path) -> None:
-    settings = with_steps(SETTINGS, sdf_steps=160, material_steps=80, joint_steps=20)
+def test_a_map_that_is_known_is_shown_once_and_then_part_of_the_run(data: Path, tmp_path: Path) -> None:
+    file, radiance = tmp_path / "map.exr", np.random.default_rng(0).uniform(0.5, 2.0, (6, 12, 3)).astype(np.float32)
+    write_exr(file, {"RGB": radiance})
+    settings = dataclasses.replace(SETTINGS, light=dataclasses.replace(SETTINGS.light, map=str(file)))
+    first = train_for(data, tmp_path / "first", 6, settings)
+    file.unlink()
+    config = trainer_config(data, tmp_path / "second", settings)
+    config.load_dir = first / "nerfstudio_models"
+    for run in (first, ns_train(config)):
+        _, pipeline, _, _ = eval_setup(run / "config.yml")
+        shown = pipeline.model.neilf.light.log_radiance.exp().permute(1, 2, 0)
+        np.testing.assert_allclose(shown.numpy(), radiance, rtol=1e-5)
+
+
+@pytest.mark.parametrize("settings", [SETTINGS, FREE], ids=["solved light", "free light"])
+def test_the_same_scene_seed_and_steps_give_the_same_weights_in_both_loops(
+    data: Path, tmp_path: Path, settings: NeilfConfig
+) -> None:
     inside = ns_train(trainer_config(data, tmp_path / "inside", settings))
-    ns = evaluated(inside, tmp_path)
     standalone = small_training(data, tmp_path / "standalone", settings)
     train(standalone)
-    # The same measure for both: nerfstudio's model with the weights of the standalone loop.
-    _, pipeline, _, _ = eval_setup(inside / "config.yml")
-    pipeline.model.neilf.load_state_dict(standalone.model.state_dict())
-    own = pipeline.get_average_eval_image_metrics()
-    for name in ("psnr", "volume_psnr"):
-        assert own[name] > 15.0, "something was learnt, or there is nothing to compare"
-        assert ns[name] == pytest.approx(own[name], abs=0.5), name
+    assert differences(weights(inside), dict(standalone.model.state_dict())) == []
 
 
-def test_on_a_given_mesh_material_and_light_alone_are_trained(tmp_path: Path) -> None:
-    tiny = fixed_geometry(SETTINGS)
+def test_the_same_scene_seed_and_steps_give_the_same_quality_in_both_loops(data: Path, tmp_path: Path) -> None:
+    settings = with_steps(SETTINGS, sdf_steps=60, material_steps=20, joint_steps=5)
+    ns = evaluated(ns_train(trainer_config(data, tmp_path / "inside", settings)), tmp_path)
+    standalone = small_training(data, tmp_path / "standalone", settings)
+    train(standalone)
+    capture, steps = standalone.pixels.capture, sum(stage_steps(settings.train).values())
+    own = evaluate(Run(tmp_path, settings, capture, standalone.model.facts, standalone.model.eval(), steps))
+    for theirs, ours in {"psnr": "pbr_psnr", "volume_psnr": "volume_psnr"}.items():
+        assert own[ours] > 10.0, "something was learnt, or there is nothing to compare"
+        # The weights are the same; the rays that nerfstudio evaluates with are so but for rounding.
+        assert ns[theirs] == pytest.approx(own[ours], abs=0.05), theirs
+
+
+@pytest.mark.parametrize(("settings", "descends"), [(SETTINGS, {"brdf"}), (FREE, {"brdf", "light"})])
+def test_on_a_given_mesh_material_and_light_alone_are_trained(
+    tmp_path: Path, settings: NeilfConfig, descends: set[str]
+) -> None:
+    tiny = fixed_geometry(settings)
     settings = dataclasses.replace(tiny, radiance=dataclasses.replace(tiny.radiance, layers=1, width=16))
     settings = with_steps(settings, sdf_steps=0, material_steps=2, joint_steps=0)
     run = ns_train(trainer_config(make_capture(tmp_path / "capture"), tmp_path / "run", settings, method="neilfpp-mesh"))
-    moved = {key.split(".")[0] for key in parameters(run)}
+    moved = {key.split(".")[0] for key in weights(run)}
     assert {"brdf", "light", "host"} <= moved
-    assert set(checkpoint(run)["optimizers"]) == {"radiance", "brdf", "light"}
+    assert set(checkpoint(run)["optimizers"]) == {"radiance", *descends}
     assert checkpoint(run)["step"] == 1
 
 
@@ -172,6 +206,28 @@ def test_before_there_is_a_material_none_is_shown(data: Path, tmp_path: Path) ->
     assert torch.equal(outputs["rgb"], outputs["rgb_volume"])
     for name in ("base_color", "roughness", "incident_light"):
         assert not outputs[name].any()
+
+
+def test_figures_count_the_pixels_of_the_object_that_are_valid(run: Path) -> None:
+    _, pipeline, _, _ = eval_setup(run / "config.yml")
+    model = pipeline.model
+    image = torch.full((12, 12, 3), 0.5)
+    objects, valid, opacity = (torch.zeros(12, 12, 1, dtype=torch.bool) for _ in range(3))
+    objects[:8], valid[:, :8], opacity[4:] = True, True, True
+
+    def psnr(known: bool, wrong: torch.Tensor) -> float:
+        facts = {"object_mask": objects.float(), "mask_known": torch.full((12, 12, 1), float(known)), "valid": valid}
+        shown = torch.where(wrong, 0.25, image)
+        outputs = {name: shown for name in ("rgb", "rgb_volume", "normal", "base_color", "incident_light")}
+        outputs |= {name: opacity.float() for name in ("accumulation", "depth", "roughness", "metallic")}
+        return model.get_image_metrics_and_images(outputs, {"image": image, **facts})[0]["psnr"]
+
+    nothing = torch.zeros_like(valid)
+    for known, counted in ((True, objects & valid), (False, opacity & valid)):
+        assert psnr(known, ~counted) == psnr(known, nothing) > 60.0
+        # A quarter of the pixels that count: 6 dB above the error of all of them.
+        share = counted & (torch.arange(12).view(1, 12, 1) < 2)
+        assert psnr(known, share) == pytest.approx(psnr(known, counted) + 10 * np.log10(4.0), abs=1e-3)
 
 
 def test_light_on_a_wall_is_its_irradiance_over_pi(run: Path, monkeypatch) -> None:

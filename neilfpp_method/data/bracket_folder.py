@@ -19,16 +19,21 @@ from neilfpp_method.data.raw import RAW_SUFFIXES, develop
 from neilfpp_method.data.views import inside
 from neilfpp_method.errors import UserError
 
-__all__ = ["find_brackets", "merge_folder"]
+__all__ = ["GROUPS", "Brackets", "find_brackets", "merge_brackets"]
+
+Brackets = Mapping[str, Mapping[Path, float]]
+"""By the name of the pose, its images with their exposures."""
 
 GROUPS = "brackets.json"
 NUMBERED = re.compile(r"[_-]\d+$")
 CALIBRATED = 6
 """Most brackets that a response is calibrated from."""
+CALIBRATION_SIDE = 1024
+"""Most pixels a side that it is calibrated from."""
 
 
-def find_brackets(folder: Path, exposures: Path | None = None) -> Mapping[str, Mapping[Path, float]]:
-    """The brackets of a folder: by the name of the pose, its images with their exposures.
+def find_brackets(folder: Path, exposures: Path | None = None) -> Brackets:
+    """The brackets of a folder.
 
     Images belong together when `brackets.json` says so ({"pose": ["a.jpg", "b.jpg"]}); when they lie in one sub-folder;
     when their names are NAME_0, NAME_1, …; or when, in the order of their names, the same exposures return again and
@@ -99,44 +104,40 @@ def _is_bracket(images: Sequence[Path], exposures: Mapping[Path, float]) -> bool
     return 2 <= len(images) == len({exposures[image] for image in images})
 
 
-def merge_folder(
-    folder: Path,
+def merge_brackets(
+    brackets: Brackets,
     images: Path,
     valid: Path,
     response: Literal["auto", "linear", "srgb"] = "auto",
-    exposures: Path | None = None,
-    on_merged: Callable[[str], None] | None = None,
-) -> tuple[str, ...]:
-    """Merge all brackets of a folder; returns the names of the poses, in order.
+    on_merged: Callable[[str], None] = lambda name: None,
+) -> None:
+    """Write linear float `images/NAME.exr`, and `valid/NAME.png`, white where the radiance is known, for every pose.
 
-    Writes linear float `images/NAME.exr`, all on one radiance scale, in which 1 is about the white of the middle
-    exposure, and `valid/NAME.png`, white where the radiance is known.
+    All are on one radiance scale, in which 1 is about the white of the middle exposure. A pose whose two files are there is
+    passed over, so that a call that was interrupted goes on.
 
     Args:
-        folder: the photographs, grouped as `find_brackets` says.
+        brackets: the photographs, as `find_brackets` tells them.
         images: where the merged images go.
         valid: where the validity masks go.
         response: what the pixels are; auto: linear for camera RAW, else calibrated from the brackets themselves.
-        exposures: a file of exposures.
-        on_merged: called with the name of each pose once it is written.
+        on_merged: called with the name of each pose once its files are there.
 
     Raises:
-        UserError: as `find_brackets`; an image cannot be read; the images of a pose differ in size; or the response
-            cannot be calibrated.
+        UserError: an image cannot be read; the images of a pose differ in size; or the response cannot be calibrated.
     """
-    brackets = find_brackets(folder, exposures)
     middle = float(np.median([exposure for bracket in brackets.values() for exposure in bracket.values()]))
     decode = _response(brackets, response)
     for name, bracket in brackets.items():
-        merged = merge(_read(bracket, middle), decode)
-        write_exr(images / f"{name}.exr", {"RGB": merged.radiance})
-        write_png(valid / f"{name}.png", np.where(merged.valid, 255, 0).astype(np.uint8))
-        if on_merged:
-            on_merged(name)
-    return tuple(brackets)
+        image, mask = images / f"{name}.exr", valid / f"{name}.png"
+        if not (image.is_file() and mask.is_file()):
+            merged = merge(_read(bracket, middle), decode)
+            write_exr(image, {"RGB": merged.radiance})
+            write_png(mask, np.where(merged.valid, 255, 0).astype(np.uint8))
+        on_merged(name)
 
 
-def _response(brackets: Mapping[str, Mapping[Path, float]], response: str) -> Response:
+def _response(brackets: Brackets, response: str) -> Response:
     raw = {image.suffix.lower() in RAW_SUFFIXES for bracket in brackets.values() for image in bracket}
     if response != "auto" or raw == {True}:
         return {"linear": linear_response, "srgb": srgb_response}["linear" if response == "auto" else response]
@@ -145,7 +146,13 @@ def _response(brackets: Mapping[str, Mapping[Path, float]], response: str) -> Re
     alike = Counter(tuple(bracket.values()) for bracket in brackets.values()).most_common(1)[0][0]
     usable = [bracket for bracket in brackets.values() if tuple(bracket.values()) == alike]
     step = -(-len(usable) // CALIBRATED)
-    return calibrate([_read(bracket, 1.0) for bracket in usable[::step]])
+    return calibrate([_thin(_read(bracket, 1.0)) for bracket in usable[::step]])
+
+
+def _thin(bracket: Bracket) -> Bracket:
+    """Some of the pixels, enough to calibrate from; all photographs of a camera at once would fill the memory."""
+    step = -(-max(bracket.pixels[0].shape[:2]) // CALIBRATION_SIDE)
+    return Bracket(tuple(pixels[::step, ::step].copy() for pixels in bracket.pixels), bracket.exposures)
 
 
 def _read(bracket: Mapping[Path, float], unit: float) -> Bracket:

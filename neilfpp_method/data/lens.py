@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float64
 
+from neilfpp_method.data.colmap_library import pycolmap
 from neilfpp_method.errors import UserError
 
 __all__ = ["PANORAMAS", "PINHOLES", "Lens", "lens_of"]

@@ -12,7 +12,7 @@ from PIL import Image
 
 from neilfpp_method.errors import UserError
 
-__all__ = ["exposures_of", "photo_exposure", "read_exposures"]
+__all__ = ["LISTS", "exposures_of", "photo_exposure", "read_exposures"]
 
 EXIF_FOLDER, TIME, APERTURE, SENSITIVITY = 0x8769, 0x829A, 0x829D, 0x8827
 LISTS = ("exposures.json", "exposures.txt")

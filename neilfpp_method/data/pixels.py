@@ -32,7 +32,8 @@ class PixelDataset:
 
     Colours, masks, validity and image gradients are stored, 19 bytes a pixel; rays are computed from the cameras when
     asked for. Colours of a linear capture are radiance on the scale that its views share: the exposure and the white
-    balance of each view are divided out.
+    balance of each view are divided out. A pixel is valid unless its view's validity mask is black there, or its view's
+    lens shows nothing there.
 
     Args:
         capture: where the views come from.
@@ -56,19 +57,20 @@ class PixelDataset:
             raise UserError(f"{capture.root}: no views to load", "hold out fewer views, or more")
         self.capture = capture
         self.views = tuple(views)
+        cameras = [capture.normalisation.camera(view.camera) for view in views]
+        self._rays = CameraRays(cameras, device)
         loaded = _load(self.views, capture.hdr, on_view)
         self._color, self._mask, self._mask_known, self._gradient, valid = (tensor.to(device) for tensor in loaded)
+        valid &= torch.cat([self._rays.shown(i) for i in range(len(views))])
         if not valid.any():
             raise UserError(f"{capture.root}: no pixel is valid", "check the validity masks: white is valid")
         self._drawn = ValidPixels(valid)
         self._valid = self._drawn.valid
-        cameras = [capture.normalisation.camera(view.camera) for view in views]
         sizes = [camera.width * camera.height for camera in cameras]
         self._starts = tuple(itertools.accumulate(sizes, initial=0))
         if not self._mask_known.any():
             self._mask_from_background()
         self._first = torch.tensor(self._starts[:-1], device=device)
-        self._rays = CameraRays(cameras, device)
 
     def __len__(self) -> int:
         return self._color.shape[0]
@@ -86,7 +88,7 @@ class PixelDataset:
         return self._batch(torch.arange(self._starts[i], self._starts[i + 1], device=self._color.device))
 
     def valid(self, i: int) -> Bool[Tensor, " N"]:
-        """Which pixels of `views[i]` count: all but those that its validity mask leaves out."""
+        """Which pixels of `views[i]` count: all but those that its validity mask, or its lens, leaves out."""
         return self._valid[self._starts[i] : self._starts[i + 1]]
 
     def _batch(self, index: Int[Tensor, " N"]) -> PixelBatch:

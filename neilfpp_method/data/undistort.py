@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import pycolmap
 from jaxtyping import Float32
 
+from neilfpp_method.data.colmap_library import pycolmap
 from neilfpp_method.data.views import Camera
 
 __all__ = ["resample", "straight_camera"]

@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from neilfpp_method.data.lens import Lens
@@ -35,6 +35,9 @@ __all__ = [
     "plain_name",
     "project",
 ]
+
+MOST_BLIND = 0.6
+"""A fisheye's circle fills 44 % of a picture of 16:9. A lens that shows less was calibrated for other images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,10 +210,11 @@ class CameraRays:
     """Rays through the centres of pixels of many cameras, in the frame of their poses.
 
     The rays of a pinhole are computed when asked for; those of a lens are looked up, as its equations have no closed
-    inverse: 8 bytes a pixel, shared by cameras that differ in their pose alone.
+    inverse: 8 bytes a pixel, shared by cameras that differ in their pose alone. A pixel at which a lens shows nothing, as
+    in the corners of a fisheye, has a ray that leads backwards, away from what the camera sees.
 
     Raises:
-        UserError: a lens shows nothing at some of its pixels.
+        UserError: a lens shows nothing at most of its pixels.
     """
 
     def __init__(
@@ -228,6 +232,14 @@ class CameraRays:
             self._lens_plane = torch.tensor(planes, dtype=dtype, device=device)
         else:
             self._lens_plane = None
+        self._sizes = [camera.width * camera.height for camera in cameras]
+
+    def shown(self, i: int) -> Bool[Tensor, " P"]:
+        """Which pixels of camera `i`, row by row, have a ray of their own; all but those where its lens shows nothing."""
+        if self._lens_plane is None or self._lens_start[i] < 0:
+            return torch.ones(self._sizes[i], dtype=torch.bool, device=self._width.device)
+        start = int(self._lens_start[i])
+        return ~self._lens_plane[start : start + self._sizes[i]].isnan().any(dim=-1)
 
     def __call__(self, camera: Int[Tensor, " N"], pixel: Int[Tensor, " N"]) -> RayBatch:
         """Rays of cameras, by number, through pixels, counted row by row."""
@@ -239,6 +251,8 @@ class CameraRays:
             looked_up = self._lens_plane[torch.where(start < 0, 0, start + pixel)]
             plane = torch.where((start < 0)[:, None], plane, looked_up)
         local = torch.nn.functional.pad(plane, (0, 1), value=1.0)
+        if self._lens_plane is not None:
+            local = torch.where(local.isnan().any(dim=-1, keepdim=True), local.new_tensor([0.0, 0.0, -1.0]), local)
         directions = torch.einsum("nij,nj->ni", c2w[:, :, :3], torch.nn.functional.normalize(local, dim=-1))
         return RayBatch(c2w[:, :, 3], directions)
 
@@ -249,11 +263,12 @@ def _shape(camera: Camera) -> tuple[Lens | None, float, float, float, float, int
 
 
 def _straight_plane(camera: Camera) -> Float64[np.ndarray, "P 2"]:
-    """Where the rays through the pixels of a camera with a lens meet the plane at unit distance, row by row."""
+    """Where the rays through the pixels of a camera with a lens meet the plane at unit distance, row by row; NaN: no ray."""
     rows, columns = np.mgrid[: camera.height, : camera.width].reshape(2, -1) + 0.5
     bent = (np.stack([columns, rows], axis=1) - camera.intrinsics[2:]) / camera.intrinsics[:2]
     plane = camera.lens.straighten(bent)
-    if blind := int(np.isnan(plane).any(axis=1).sum()):
+    blind = int(np.isnan(plane).any(axis=1).sum())
+    if blind > MOST_BLIND * len(plane):
         raise UserError(
             f"a camera of the lens {camera.lens.model} shows nothing at {blind} of its {len(plane)} pixels",
             "crop or undistort the images, or calibrate the camera again",

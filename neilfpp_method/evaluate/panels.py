@@ -23,14 +23,18 @@ from neilfpp_method.evaluate.pictures import (
     display_error,
     lat_long_directions,
     nearest_radiance,
+    ring,
 )
 from neilfpp_method.evaluate.views import KnownView, RenderedView, has_material
+from neilfpp_method.export.probes import spread
 from neilfpp_method.shading.color import srgb_to_linear
+from neilfpp_method.structures import OrientedPoints
 from neilfpp_method.train.run import Run
 
 __all__ = ["albedo_scale", "light_sections", "view_sections"]
 
-POINTS = 3
+POINTS = 4
+POINTS_PER_SECTION = 2
 LIGHT_HEIGHT = 120
 SHADE = (232, 232, 229)
 """The directions below a surface."""
@@ -181,7 +185,8 @@ def light_sections(run: Run, rendered: Sequence[RenderedView], scale: Float[np.n
     """Incident light: the truth, the estimate, and the estimate divided by what the base colour is scaled with.
 
     What is scaled out of the one is scaled into the other: their product is what the images see. The points are from
-    the capture's light field where it has one, else from the first view; no section where that shows no surface.
+    the capture's light field where it has one, else from the first view; no section where that shows no surface. Rings
+    in the estimate are about the middles of the lamps that the run has found, those behind something else too.
     """
     directions = lat_long_directions(LIGHT_HEIGHT)
     points = _known_points(run, directions) or _seen_points(run, rendered[0])
@@ -197,21 +202,35 @@ def light_sections(run: Run, rendered: Sequence[RenderedView], scale: Float[np.n
         titles.insert(0, "truth")
     above = [directions @ point.normal > 0 for point in points]
     exposure = auto_exposure(np.concatenate([light[a] for light, a in zip(columns[0], above, strict=True)]))
-    pictures = tuple(
-        cut_out(display_color(column[i], exposure), above[i], SHADE) for i in range(len(points)) for column in columns
-    )
-    groups = tuple(
-        Group("Light at ({:.2f}, {:.2f}, {:.2f})".format(*point.position), tuple(titles)) for point in points
-    )
-    return [Section(groups, (Row("Incident light", pictures, f"+z at the top\nexposure {exposure:.2g}"),))]
+    note = f"+z at the top\nexposure {exposure:.2g}"
+    sections = []
+    for first in range(0, len(points), POINTS_PER_SECTION):
+        groups, pictures = [], []
+        for i, point in list(enumerate(points))[first : first + POINTS_PER_SECTION]:
+            groups.append(Group("Light at ({:.2f}, {:.2f}, {:.2f})".format(*point.position), tuple(titles)))
+            for title, column in zip(titles, columns, strict=True):
+                picture = cut_out(display_color(column[i], exposure), above[i], SHADE)
+                pictures.append(picture if title == "truth" else ring(picture, _lamps_above(run, point)))
+        sections.append(Section(tuple(groups), (Row("Incident light", tuple(pictures), note),)))
+    return sections
+
+
+def _lamps_above(run: Run, point: LightPoint) -> Float[np.ndarray, "K 3"]:
+    """Directions from a point to the lamps on its surface's side."""
+    lamps = run.model.lamps
+    if lamps is None:
+        return np.zeros((0, 3), np.float32)
+    towards = lamps.position[: lamps.lit].cpu().numpy() - point.position
+    towards = towards[towards @ point.normal > 0]
+    return towards / np.maximum(np.linalg.norm(towards, axis=-1, keepdims=True), 1e-9)
 
 
 def _known_points(run: Run, directions: Float[np.ndarray, "H W 3"]) -> list[LightPoint]:
-    """Points of the capture's light field, spread over its list; none where there is no light field."""
+    """Points of the capture's light field that are unlike one another; none where there is no light field."""
     field = Truth(run.capture).light_field()
     if field is None:
         return []
-    rows = np.linspace(0, len(field.position) - 1, POINTS).round().astype(int)
+    rows = spread(OrientedPoints(field.position, field.normal), POINTS).tolist()
     position, normal, wi, incident = (t.numpy() for t in (field.position, field.normal, field.wi, field.incident))
     return [LightPoint(position[i], normal[i], nearest_radiance(wi[i], incident[i], directions)) for i in rows]
 

@@ -30,6 +30,7 @@ __all__ = [
     "display_error",
     "lat_long_directions",
     "nearest_radiance",
+    "ring",
 ]
 
 PAPER = (250, 250, 248)
@@ -100,6 +101,19 @@ def nearest_radiance(
 ) -> Float[np.ndarray, "H W 3"]:
     """Radiance known along `wi`, looked up along `directions`: that of the nearest direction."""
     return radiance[cKDTree(wi).query(directions.reshape(-1, 3))[1]].reshape(directions.shape)
+
+
+def ring(
+    picture: UInt8[np.ndarray, "H W 3"], directions: Float[np.ndarray, "K 3"], color: tuple[int, int, int] = (255, 64, 64)
+) -> UInt8[np.ndarray, "H W 3"]:
+    """A latitude-longitude picture with a ring about each of some unit directions; the inverse of `lat_long_directions`."""
+    height, width, _ = picture.shape
+    marked = np.ascontiguousarray(picture).copy()
+    for x, y, z in directions:
+        column = np.arctan2(x, y) / (2 * np.pi) % 1 * width
+        row = np.arccos(np.clip(z, -1, 1)) / np.pi * height
+        cv2.circle(marked, (int(column), int(row)), max(2, height // 20), color, 1, cv2.LINE_AA)
+    return marked
 
 
 def auto_exposure(radiance: Float[np.ndarray, "P 3"]) -> float:

@@ -1,6 +1,6 @@
 """The report of a run: one HTML file that holds its pictures and explains its figures, and a contact sheet.
 
-Both show the same: views of the run beside the truth where it is at hand, and the light that arrives at three points.
+Both show the same: views of the run beside the truth where it is at hand, and the light that arrives at four points.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from neilfpp_method.evaluate.panels import albedo_scale, light_sections, view_se
 from neilfpp_method.evaluate.pictures import contact_sheet
 from neilfpp_method.evaluate.views import RenderedView, has_material, known_test_views, render_view
 from neilfpp_method.schedule import stage_steps
+from neilfpp_method.train.light_record import in_words, read_fits
 from neilfpp_method.train.run import Run, read_json
 
-__all__ = ["write_report"]
+__all__ = ["write_light_picture", "write_report"]
 
 SHOWN_VIEWS = 3
 
@@ -28,9 +29,9 @@ VIEWS_CAPTION = (
     "beside it, averaged over their channels; for normals it is the angle between them."
 )
 LIGHT_CAPTION = (
-    "The light that arrives at three points of the surface, all directions unrolled: +z of the scene at the top, the "
-    "azimuth from left to right. Directions below the surface are left blank. One exposure for all. Positions are in "
-    "the scene frame, where the object has radius 1."
+    "The light that arrives at four points of the surface, all directions unrolled: +z of the scene at the top, the "
+    "azimuth from left to right. Directions below the surface are left blank. One exposure for all. Rings are about the "
+    "lamps that were found. Positions are in the scene frame, where the object has radius 1."
 )
 
 
@@ -72,6 +73,19 @@ def write_report(
     return path
 
 
+def write_light_picture(run: Run, path: Path) -> bool:
+    """Write the report's pictures of incident light alone, as a PNG. Returns whether the run has any to show."""
+    if not has_material(run):
+        return False
+    shown = _with_shown_views(run)
+    rendered = [render_view(run, run.capture.views.index(view)) for view in shown.capture.test_views]
+    scale = albedo_scale(rendered, known_test_views(shown, rendered).views)
+    sections = light_sections(shown, rendered, scale)
+    if sections:
+        write_png(path, contact_sheet("", "", sections))
+    return bool(sections)
+
+
 def _with_shown_views(run: Run) -> Run:
     """The run with up to three views held out, spread over those that are, or over the training views where none is."""
     views = run.capture.test_views or run.capture.train_views
@@ -88,6 +102,7 @@ def _facts(run: Run) -> dict[str, str]:
         "Shading": f"{shading.lobe} lobe, {shading.sampler} sampler, {shading.train_samples} directions a point in "
         f"training and {shading.eval_samples} here",
         "Inter-reflection": run.config.inter_reflection.mode,
+        "Light": in_words(run.config.light, read_fits(run.path, run.step)),
         "Rays a step": str(train.rays),
     }
     path = run.path / "environment.json"

@@ -27,7 +27,7 @@ class BrdfSample:
 
 
 class BrdfField(nn.Module):
-    """Every parameter is ½ + ½ tanh of an output of the network, and starts close to ½, base colour to what is set."""
+    """Every parameter is ½ + ½ tanh of an output of the network; roughness starts close to ½, the others to what is set."""
 
     def __init__(self, config: BrdfConfig, radius: float) -> None:
         super().__init__()
@@ -38,6 +38,7 @@ class BrdfField(nn.Module):
         nn.init.zeros_(self.mlp.layers[-1].bias)
         with torch.no_grad():
             self.mlp.layers[-1].bias[:3] = math.atanh(2 * config.initial_base_color - 1)
+            self.mlp.layers[-1].bias[4] = math.atanh(2 * config.initial_metallic - 1)
 
     def forward(self, x: Float[Tensor, "N 3"]) -> Material:
         return _material(torch.tanh(self.mlp(self.encoding(x))))

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["interpolate"]
+__all__ = ["interpolate", "map_directions"]
 
 
 def interpolate(values: Float[Tensor, "C H W"], wi: Float[Tensor, "M S 3"]) -> Float[Tensor, "M S C"]:
@@ -27,3 +27,11 @@ def interpolate(values: Float[Tensor, "C H W"], wi: Float[Tensor, "M S 3"]) -> F
     closed = torch.cat((values[..., -1:], values, values[..., :1]), -1)
     at = torch.stack((2 * (column + 1) / (width + 1) - 1, 2 * row / (height - 1) - 1), -1)
     return functional.grid_sample(closed[None], at[None].to(closed.dtype), align_corners=True)[0].permute(1, 2, 0)
+
+
+def map_directions(height: int, width: int) -> Float[Tensor, "height width 3"]:
+    """The unit direction of each texel of a map."""
+    theta = math.pi * torch.arange(height, dtype=torch.float64)[:, None] / (height - 1)
+    phi = 2 * math.pi * (torch.arange(width, dtype=torch.float64)[None] + 0.5) / width
+    axes = (phi.sin() * theta.sin(), phi.cos() * theta.sin(), theta.cos().expand(-1, width))
+    return torch.stack(axes, -1).float()

@@ -6,7 +6,9 @@ The map is laid out as `direction_map` says.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -20,6 +22,10 @@ __all__ = ["EnvironmentLight", "TexelDirections"]
 
 UNIFORM_SHARE = 0.1
 """Share of the samples that is spread evenly over the sphere, so that no direction is left out of the density."""
+MEAN_OF_CELL = (1 / 8, 3 / 4)
+"""What is linear between the middles of cells has this mean in one: shares of each neighbour, and of the cell itself."""
+DARKEST = 1e-6
+"""Of the mean of a map that is shown: what is darker counts as this, as radiance is kept as its logarithm."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +37,9 @@ class TexelDirections:
 
 
 class EnvironmentLight(nn.Module):
-    """A grid of log radiance; radiance between the texels is the exponential of the bilinear interpolation.
+    """A grid of log radiance; between the texels radiance is bilinear, so that it brings what the texels hold together.
 
-    The map is no parameter: what surfaces send is linear in it, so `light_fit` solves for it.
+    The map is no parameter: what surfaces send is linear in it, so `lighting` solves for it.
 
     Args:
         height: rows of the map; it has twice as many columns.
@@ -43,12 +49,37 @@ class EnvironmentLight(nn.Module):
     def __init__(self, height: int, initial_radiance: float) -> None:
         super().__init__()
         self.register_buffer("log_radiance", torch.full((3, height, 2 * height), math.log(initial_radiance)))
-        edges = (torch.arange(height + 1) - 0.5).clamp(0, height - 1) * math.pi / (height - 1)
-        self.register_buffer("cos_edges", edges.cos(), persistent=False)
+        self.register_buffer("cos_edges", _cos_edges(height), persistent=False)
+        # A map that was shown has a size that no setting knows.
+        self.register_load_state_dict_pre_hook(_take_size)
+
+    @torch.no_grad()
+    def show(self, radiance: Float[Tensor, "3 H W"]) -> None:
+        """Be this map, of any size from 2 rows on, and not all black; its device stays."""
+        self._resize(*radiance.shape[1:])
+        self.log_radiance.copy_(radiance.clamp_min(DARKEST * radiance.mean()).log())
+
+    @torch.no_grad()
+    def at_most(self, height: int) -> EnvironmentLight:
+        """This map; where it has more rows, one of so many, whose texels are the means of what lies in each."""
+        _, rows, columns = self.log_radiance.shape
+        if rows <= height:
+            return self
+        coarse = EnvironmentLight(height, 1.0).to(self.log_radiance.device)
+        width = min(2 * height, columns)
+        coarse._resize(height, width)
+        weight = self._texel_solid_angles()
+        row = (torch.arange(rows, device=weight.device) * (height - 1) / (rows - 1) + 0.5).long()
+        column = ((torch.arange(columns, device=weight.device) + 0.5) * width / columns).long()
+        cell = (row[:, None] * width + column).reshape(-1)
+        sums = weight.new_zeros(3, height * width).index_add(1, cell, self.log_radiance.exp().flatten(1) * weight)
+        total = weight.new_zeros(height * width).index_add(0, cell, weight)
+        coarse.show((sums / total).view_as(coarse.log_radiance))
+        return coarse
 
     def radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "#N S 3"]) -> Float[Tensor, "#N S 3"]:
         """Radiance > 0 from wi, whatever x; what stands between is not this model's."""
-        return interpolate(self.log_radiance, wi).exp()
+        return interpolate(self.log_radiance.exp(), wi)
 
     @torch.no_grad()
     def sample(self, like: Float[Tensor, "N 3"], count: int, stochastic: bool) -> IncidentSamples:
@@ -71,10 +102,18 @@ class EnvironmentLight(nn.Module):
     @torch.no_grad()
     def pdf(self, wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S"]:
         """Density of `sample`, per steradian of the sphere: constant on each texel."""
+        return (self._texel_shares() / self._texel_solid_angles())[self._cells(wi)]
+
+    def _cells(self, wi: Float[Tensor, "*B 3"]) -> Int[Tensor, "*B"]:
+        """The number of the texel that a direction lies in."""
         column, row = self._columns_and_rows(wi)
         _, height, width = self.log_radiance.shape
-        cell = (row + 0.5).long().clamp(0, height - 1) * width + (column + 0.5).floor().long() % width
-        return (self._texel_shares() / self._texel_solid_angles())[cell]
+        return (row + 0.5).long().clamp(0, height - 1) * width + (column + 0.5).floor().long() % width
+
+    def _resize(self, height: int, width: int) -> None:
+        """A map of this size, of which nothing is known."""
+        self.log_radiance = self.log_radiance.new_zeros(3, height, width)
+        self.cos_edges = _cos_edges(height).to(self.log_radiance)
 
     def _columns_and_rows(self, wi: Float[Tensor, "*B 3"]) -> tuple[Float[Tensor, "*B"], Float[Tensor, "*B"]]:
         """Where a direction lies in the map, in texels: column in [−½, w − ½), row in [0, h − 1]."""
@@ -101,7 +140,23 @@ class EnvironmentLight(nn.Module):
         return rows[:, None].expand(-1, width).reshape(-1)
 
     def _texel_shares(self) -> Float[Tensor, " T"]:
-        """The probability of each texel."""
+        """The probability of each texel: of what bilinear radiance brings within it, also next to a lamp of one texel."""
         solid_angles = self._texel_solid_angles()
-        power = luminance(self.log_radiance.detach().permute(1, 2, 0).exp()).reshape(-1) * solid_angles
+        mean = luminance(self.log_radiance.detach().permute(1, 2, 0).exp())
+        mean = MEAN_OF_CELL[0] * (mean.roll(1, 1) + mean.roll(-1, 1)) + MEAN_OF_CELL[1] * mean
+        above, below = torch.cat((mean[:1], mean[:-1])), torch.cat((mean[1:], mean[-1:]))
+        mean = MEAN_OF_CELL[0] * (above + below) + MEAN_OF_CELL[1] * mean
+        power = mean.reshape(-1) * solid_angles
         return (1 - UNIFORM_SHARE) * power / power.sum() + UNIFORM_SHARE * solid_angles / (4 * math.pi)
+
+
+def _cos_edges(height: int) -> Float[Tensor, " E"]:
+    """The cosines of the angles from +z between which the rows lie, halfway from row to row."""
+    return ((torch.arange(height + 1) - 0.5).clamp(0, height - 1) * math.pi / (height - 1)).cos()
+
+
+def _take_size(light: EnvironmentLight, state: Mapping[str, Any], prefix: str, *_: object) -> None:
+    """Before weights are loaded: the size of the map that they hold."""
+    saved = state.get(f"{prefix}log_radiance")
+    if isinstance(saved, Tensor) and saved.ndim == 3 and min(saved.shape[1:]) >= 2:
+        light._resize(*saved.shape[1:])

@@ -52,11 +52,12 @@ class Target(Indexable):
 
 @dataclass(frozen=True)
 class Evidence:
-    """How much lower the relative error of the second of two lights is at points that neither was fitted to, and the standard
-    error of that mean."""
+    """How much lower the relative error of the second of two lights is at `points` that neither was fitted to, and the
+    standard error of that mean."""
 
     gain: float
     deviation: float
+    points: int
 
     @property
     def significant(self) -> bool:
@@ -133,14 +134,14 @@ def compare(
         for light, transport in zip(lights, carried, strict=True)
     )
     gain = one - other
-    return Evidence(gain.mean().item(), (gain.std(correction=0) / max(1, len(gain)) ** 0.5).item())
+    return Evidence(gain.mean().item(), (gain.std(correction=0) / max(1, len(gain)) ** 0.5).item(), len(gain))
 
 
 def total_variation(values: Float[Tensor, "C H W"]) -> Float[Tensor, ""]:
     """Σ |difference of neighbours| per texel, of a map that is closed in azimuth."""
     across = torch.cat((values, values[..., :1]), -1).diff(dim=-1)
     down = values.diff(dim=1)
-    size = values[0].numel()
+    size = max(1, values[0].numel())
     return sum((step.square() + SMOOTHED**2).sqrt().sum() for step in (across, down)) / size
 
 

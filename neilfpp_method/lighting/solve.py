@@ -18,6 +18,8 @@ __all__ = ["solve_light"]
 
 KEPT_BACK = 5
 """One point in so many is not fitted to, and decides between two lights."""
+KNOWN_ROWS = 32
+"""Rows of a known map as the fit of the lamps before it sees it: that fit traces every texel from every point."""
 
 
 @torch.no_grad()
@@ -32,7 +34,7 @@ def solve_light(
     unit: float,
     config: IncidentLightConfig,
 ) -> Evidence | None:
-    """Set the map, and the lamps where there may be any, to what explains the points.
+    """Set the map, and the lamps where there may be any, to what explains the points. A map that is known stays.
 
     Args:
         environment, lamps: what is set; the search starts from what they are.
@@ -45,12 +47,19 @@ def solve_light(
     Returns:
         What spoke for lamps, or against them; none where the settings had decided.
     """
-    texels = from_texels(environment, seen, material.roughness, lobe, scene)
     target = Target(material, seen.pixel)
     dark = environment.log_radiance.new_zeros(0, 3)
-    plain_start = Light(environment.log_radiance, dark)
+    if config.map is None:
+        sought = environment.log_radiance
+        texels = from_texels(environment, seen, material.roughness, lobe, scene)
+    else:
+        sought = environment.log_radiance.new_zeros(3, 0, 0)
+        known = environment.at_most(KNOWN_ROWS)
+        texels = from_texels(known, seen, material.roughness, lobe, scene)
+        texels = texels.lit(known.log_radiance.exp().flatten(1).t())
+    plain_start = Light(sought, dark)
     if lamps is None:
-        environment.log_radiance.copy_(fit_light(plain_start, texels, target, response, unit, config.fit).log_radiance)
+        sought.copy_(fit_light(plain_start, texels, target, response, unit, config.fit).log_radiance)
         return None
 
     places = propose(lamps, seen.position, config.fit.candidates)
@@ -58,7 +67,7 @@ def solve_light(
     both = texels.beside(near)
     intensity = dark.new_zeros(len(places), 3)
     intensity[: lamps.lit] = lamps.intensity[: lamps.lit]
-    start = Light(environment.log_radiance, intensity)
+    start = Light(sought, intensity)
     if config.kind != "auto":
         found, evidence = fit_light(start, both, target, response, unit, config.fit), None
     else:
@@ -70,10 +79,10 @@ def solve_light(
         carried = (texels[kept_back], both[kept_back])
         evidence = compare((plain, found), carried, target[kept_back], response, unit, config.fit)
         if not evidence.significant:
-            environment.log_radiance.copy_(plain.log_radiance)
+            sought.copy_(plain.log_radiance)
             lamps.place(dark, dark)
             return evidence
-    environment.log_radiance.copy_(found.log_radiance)
+    sought.copy_(found.log_radiance)
     lit = merge(places, found.intensity, near.sources[0].mean(0), len(lamps.position))
     lamps.place(lit.position, lit.intensity)
     return evidence

@@ -53,6 +53,10 @@ class Transport:
         """Both sets of sources."""
         return Transport(torch.cat((self.sources, other.sources), -1), self.scene + other.scene)
 
+    def lit(self, strength: Float[Tensor, "T 3"]) -> Transport:
+        """No sources: these, of a strength that is known, count as the scene's."""
+        return Transport(self.sources[..., :0], self.scene + self.sources @ strength)
+
     def outgoing(self, material: Material, strength: Float[Tensor, "T 3"]) -> Float[Tensor, "N 3"]:
         """L_o under sources of this strength; `material` brings the colours, its roughness is in the matrices."""
         diffuse, *reflected = self.sources @ strength + self.scene

@@ -31,7 +31,7 @@ from neilfpp_method.schedule import Stage, active_losses, stage_at, stage_steps,
 from neilfpp_method.shading.color import apply_response, tone_map
 from neilfpp_method.shading.sampling import sample_directions
 from neilfpp_method.structures import RayBatch
-from neilfpp_method.train.build import build_model, scene_facts
+from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.loop import seed_step, set_rates
 
 __all__ = ["FieldAdamConfig", "NeilfMethod", "NeilfMethodConfig"]
@@ -59,6 +59,8 @@ class NeilfMethodConfig(ModelConfig):
     host: Optional[str] = None  # noqa: UP045  (tyro reads it at run time)
     """A nerfstudio method that renders rays as the host (neus, nerfacto, …); none: the host of `neilf`. It trains at its
     own rate and with its own regularisers."""
+    host_losses: float = 1.0
+    """Weight of the regularisers of `host`; 0: none of them, and of ours L_Eik where it is a surface model."""
     neilf: NeilfConfig = field(default_factory=lambda: preset("fast"))
     """The settings of the method. Of `train` only the seed and the steps of the stages count here."""
 
@@ -92,15 +94,18 @@ class NeilfMethod(Model):
             foreign = build_foreign(self.config.host, arguments)
             self.rates = dataclasses.replace(settings.optimizer, geometry=foreign.rate)
             host = NerfstudioHost(
-                foreign.model, response=facts.response, radiance_scale=facts.radiance_scale, own_losses=True
+                foreign.model,
+                response=facts.response,
+                radiance_scale=facts.radiance_scale,
+                own_losses=self.config.host_losses > 0.0,
             )
             self.neilf = NeilfModel(host, settings, facts)
-        self.step = 0
+        self.step = -1
         self.set_up_for: Stage | None = None
 
     @property
     def stage(self) -> Stage:
-        """The stage of the step in progress."""
+        """The stage of the step in progress, or of the last one; before training the first."""
         return stage_at(self.step, self.config.neilf.train).stage
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -113,11 +118,14 @@ class NeilfMethod(Model):
         """Ours, and those of a host that comes from nerfstudio.
 
         Raises:
-            UserError: training on several devices; the losses are computed where nerfstudio's wrapper does not look.
+            UserError: training on several devices; the losses are computed where nerfstudio's wrapper does not look. Or
+                an environment map that is known cannot be read.
         """
         trainer, optimizers = training_callback_attributes.trainer, training_callback_attributes.optimizers
         if trainer.world_size > 1:
             raise UserError("several devices under nerfstudio", "use `neilfpp train --devices N`, or one device")
+        if self.step < 0:  # no checkpoint was loaded, which would hold the map
+            show_known_light(self.neilf)
         host = self.neilf.host
         theirs = (
             host.model.get_training_callbacks(training_callback_attributes) if isinstance(host, NerfstudioHost) else []
@@ -160,11 +168,18 @@ class NeilfMethod(Model):
             return {"rgb": (outputs["rgb"] - batch["image"].to(self.device)).abs().mean()}
         pixels = pixel_batch(outputs["origins"], outputs["directions"], batch)
         terms = self.neilf.losses(pixels, self.stage)
-        weights = {**active_losses(self.stage, self.config.neilf, self.neilf.stages), OWN_LOSSES: 1.0}
+        weights = {**active_losses(self.stage, self.neilf.config, self.neilf.stages), OWN_LOSSES: self.config.host_losses}
         if metrics_dict is not None:
             # Known only now, and logged after this: the terms before their weights.
-            metrics_dict |= weigh(terms, weights).terms
+            metrics_dict |= weigh(terms, weights).terms | self._light_found()
         return {name: weigh({name: term}, weights).loss for name, term in terms.items()}
+
+    def _light_found(self) -> dict[str, Tensor]:
+        """What spoke for lamps when the light was last solved for, where the settings leave that open."""
+        found, lamps = self.neilf.evidence, self.neilf.lamps
+        if found is None or lamps is None:
+            return {}
+        return {"lamp_gain": torch.tensor(found.gain), "lamps": torch.tensor(float(lamps.lit))}
 
     # ------------------------------------------------------------------------------------------------------------ outputs
 
@@ -209,9 +224,11 @@ class NeilfMethod(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """PSNR and SSIM of display values over the object, as `neilfpp eval` has them, and all maps as pictures."""
+        """PSNR and SSIM of display values over the object, as `neilfpp eval` has them without true depths, and all maps as pictures."""
         truth, rgb, volume = (self._display(image.to(self.device)) for image in _images(batch, outputs))
-        mask = ((batch["object_mask"] > 0.5) & batch[VALID])[..., 0].cpu().numpy()
+        # Where nothing is known of the object, what is rendered of it chooses the pixels.
+        shown = batch["object_mask"].cpu() > 0.5 if batch["mask_known"].any() else outputs["accumulation"].cpu() > 0.5
+        mask = (shown & batch[VALID].cpu())[..., 0].numpy()
         arrays = {"": rgb, "volume_": volume}
         figures = {
             f"{name}{kind}": measure(image.cpu().numpy(), truth.cpu().numpy(), mask)

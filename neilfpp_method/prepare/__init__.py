@@ -1,1 +1,1 @@
-"""From a folder of photographs to a capture: structure from motion, undistortion, scene box, oriented points."""
+"""From a folder of photographs to a capture: brackets, structure from motion, scene box, oriented points."""

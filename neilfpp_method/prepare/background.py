@@ -6,8 +6,7 @@ import threading
 from collections.abc import Callable
 from typing import TypeVar
 
-import cv2  # noqa: F401  before pycolmap: loaded after it, OpenCV writes PNG with the wrong zlib and aborts
-import pycolmap
+from neilfpp_method.data.colmap_library import pycolmap
 
 __all__ = ["in_background", "silent"]
 

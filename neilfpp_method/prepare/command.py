@@ -1,6 +1,6 @@
 """`neilfpp prepare`: from a folder of photographs to a capture.
 
-copies ──► matches ──► model ──► views ──► cloud ──► capture       each a step in CAPTURE/work, done once
+merged ──► copies ──► matches ──► model ──► views ──► cloud ──► capture       each a step in CAPTURE/work, done once
 
 The capture's own files are laid out from the steps' results at the end, `capture.json` last: a folder without it is no
 capture yet.
@@ -16,6 +16,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from neilfpp_method.data.bracket_folder import Brackets
 from neilfpp_method.data.capture import READERS, Capture, load_capture
 from neilfpp_method.data.formats.colmap import model_folder, open_model
 from neilfpp_method.data.formats.copies import writing
@@ -25,6 +26,7 @@ from neilfpp_method.prepare.layout import WORK, Source, lay_out
 from neilfpp_method.prepare.mapping import map_scene, refuse_partial
 from neilfpp_method.prepare.matching import choose_pairing, extract_features, feature_counts, match_features
 from neilfpp_method.prepare.matching_copies import write_copies
+from neilfpp_method.prepare.merging import brackets_among, merge_photos
 from neilfpp_method.prepare.options import Prepare
 from neilfpp_method.prepare.photos import Photos, survey, unreadable
 from neilfpp_method.prepare.posed import posed_by_capture, posed_by_model
@@ -48,9 +50,10 @@ def run_prepare(options: Prepare, console: Console) -> Path:
     posed = any(reader.recognise(options.images) for reader in READERS.values())
     capture = load_capture(options.images, response=options.response) if posed else None
     photos = None if posed else _readable(survey(options.images, options.response), options)
+    brackets = photos and brackets_among(photos, options.brackets)
     with _way_on(options), writing(options.out):
         with bars(console) as open_bar:
-            source = _from_capture(capture, options) if capture else _from_photos(photos, options, open_bar)
+            source = _from_capture(capture, options) if capture else _from_photos(photos, brackets, options, open_bar)
             summary = lay_out(source, options, open_bar)
         if summary is None:
             console.print(f"{options.out}: finished already", highlight=False, soft_wrap=True)
@@ -112,10 +115,13 @@ def _from_capture(capture: Capture, options: Prepare) -> Source:
     return Source(posed, step, points)
 
 
-def _from_photos(photos: Photos, options: Prepare, open_bar: Bars) -> Source:
+def _from_photos(photos: Photos, brackets: Brackets | None, options: Prepare, open_bar: Bars) -> Source:
     """Structure from motion."""
     work = options.out / WORK
-    step = begin(work / "copies", photos=stamp([p.path for p in photos.items], photos.root), linear=photos.linear)
+    merged = merge_photos(photos, brackets, options.response, work / "merged", open_bar) if brackets else None
+    photos = merged.photos if merged else photos
+    files = stamp([photo.path for photo in photos.items], photos.root)
+    step = begin(work / "copies", merged and merged.step, photos=files, linear=photos.linear)
     copies = step.folder
     if step.result is None:
         broken = write_copies(photos, copies, open_bar("copies for matching", len(photos.items)).advance)
@@ -147,5 +153,6 @@ def _from_photos(photos: Photos, options: Prepare, open_bar: Bars) -> Source:
     if not options.allow_partial:
         refuse_partial([p.name for p in placed if p.points is None], sizes)
     cameras = describe_cameras(model)
-    remarks = (*(f"left out: {problem}" for problem in photos.unreadable), *remarks_on(placed, sizes, cameras))
+    remarks = [f"left out: {problem}" for problem in photos.unreadable] + remarks_on(placed, sizes, cameras)
+    remarks = (*([merged.remark] if merged else []), *remarks)
     return Source(posed_by_model(photos, model), step, sparse_points(model), placed, sizes, cameras, remarks)

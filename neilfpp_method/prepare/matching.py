@@ -12,10 +12,9 @@ from contextlib import closing
 from pathlib import Path
 from typing import Literal
 
-import cv2  # noqa: F401  before pycolmap, see `background`
 import numpy as np
-import pycolmap
 
+from neilfpp_method.data.colmap_library import pycolmap
 from neilfpp_method.data.images import image_header
 from neilfpp_method.errors import UserError
 from neilfpp_method.prepare.background import in_background

@@ -29,7 +29,9 @@ class Prepare:
     """COLMAP's model of the lens that is estimated."""
     response: Literal["auto", "linear", "srgb"] = "auto"
     """What the pixels are: linear radiance (HDR) or sRGB (LDR); auto: floating-point and RAW files are linear."""
-    undistort: bool = True
+    brackets: Literal["auto", "off"] = "auto"
+    """Merge exposure brackets into linear images first; auto: where the folder is one of brackets."""
+    undistort: bool = False
     """Resample images to pinhole cameras; otherwise pixels stay as they are and cameras keep their lens."""
     dense: bool = False
     """Compute a dense oriented cloud by plane-sweep stereo; otherwise the sparse points are used."""

@@ -19,7 +19,7 @@ from neilfpp_method.data.raw import RAW_SUFFIXES, develop
 from neilfpp_method.data.views import plain_name
 from neilfpp_method.errors import UserError
 
-__all__ = ["FEWEST", "Photo", "Photos", "Picture", "read_photo", "survey", "unreadable"]
+__all__ = ["FEWEST", "Photo", "Photos", "Picture", "check_names", "read_photo", "survey", "unreadable"]
 
 FEWEST = 3
 EXIF_FOLDER, MAKE, MODEL, FOCAL, FOCAL_35MM = 0x8769, 0x010F, 0x0110, 0x920A, 0xA405
@@ -31,7 +31,8 @@ class Photo:
     """A photograph that is to become a view.
 
     `exposure` is the light that the picture took in, relative to the others, where EXIF says it. `device` names camera
-    and focal length as far as EXIF does, `focal` is the focal length in units of the image's longer side.
+    and focal length as far as EXIF does, `focal` is the focal length in units of the image's longer side. `valid` is a
+    validity mask where there is one.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Photo:
     exposure: float | None
     device: str
     focal: float | None
+    valid: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ def survey(root: Path, response: Literal["auto", "linear", "srgb"]) -> Photos:
         raise UserError(f"{hdr} is linear and {ldr} is not", "keep images of one kind, or give --response")
     linear = next(iter(kinds.values())) if response == "auto" else response == "linear"
     names = view_names([path.relative_to(root).as_posix() for path in kinds])
-    _check_names(names, tuple(kinds))
+    check_names(names, tuple(kinds))
     items = tuple(_photo(root, name, path, linear) for name, path in zip(names, kinds, strict=True))
     return Photos(root, items, linear, tuple(problems))
 
@@ -125,7 +127,12 @@ def _is_photo(path: Path, root: Path) -> bool:
     return not hidden and path.suffix.lower() in IMAGE_SUFFIXES + RAW_SUFFIXES and path.is_file()
 
 
-def _check_names(names: Sequence[str], paths: Sequence[Path]) -> None:
+def check_names(names: Sequence[str], paths: Sequence[Path]) -> None:
+    """Refuse names of views that two of the files would share, or that cannot name a file everywhere.
+
+    Raises:
+        UserError: names the files.
+    """
     often = Counter(names)
     for name, path in zip(names, paths, strict=True):
         if often[name] > 1:

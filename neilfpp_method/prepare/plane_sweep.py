@@ -1,6 +1,6 @@
 """Depth maps without CUDA: each view is compared with its neighbours, warped over planes in front of it.
 
-OpenCV does the warping and the windows' sums; on a CPU that is several times faster than the same in torch.
+OpenCV does the warping and the windows' sums.
 """
 
 from __future__ import annotations

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from neilfpp_method.data.capture import Capture
+from neilfpp_method.data.colmap_library import pycolmap
 from neilfpp_method.data.formats.colmap import camera_of
 from neilfpp_method.data.formats.copies import copy_view
 from neilfpp_method.data.images import read_image, write_exr, write_png
@@ -41,7 +41,7 @@ def posed_by_model(photos: Photos, model: pycolmap.Reconstruction) -> Posed:
         if (image := poses.get(photo.name)) is not None:
             w2c = np.concatenate([image.cam_from_world().matrix(), [[0.0, 0.0, 0.0, 1.0]]])
             camera = camera_of(image.camera, w2c, str(photo.path))
-            views.append(View(photo.name, len(views), camera, photo.path, exposure=exposures[photo.name]))
+            views.append(View(photo.name, len(views), camera, photo.path, None, photo.valid, exposures[photo.name]))
     return Posed(tuple(views), photos.linear)
 
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2  # noqa: F401  before pycolmap, see `background`
 import numpy as np
-import pycolmap
 from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import cKDTree
 
+from neilfpp_method.data.colmap_library import pycolmap
 from neilfpp_method.data.point_cloud import WorldPoints
 
 __all__ = ["SparsePoints", "estimate_normals", "oriented", "reliable", "sparse_points", "without_outliers"]

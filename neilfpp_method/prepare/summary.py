@@ -8,10 +8,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2  # noqa: F401  before pycolmap, see `background`
 import numpy as np
-import pycolmap
 
+from neilfpp_method.data.colmap_library import pycolmap
 from neilfpp_method.data.images import replacing
 
 __all__ = ["Placement", "Summary", "describe_cameras", "placements", "remarks_on", "write_summary"]

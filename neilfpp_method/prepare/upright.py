@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float64
+
+from neilfpp_method.data.colmap_library import pycolmap
 
 __all__ = ["turn_upright", "upright_rotation"]
 

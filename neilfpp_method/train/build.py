@@ -9,6 +9,7 @@ import torch
 
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import Capture
+from neilfpp_method.data.environment_map import read_environment
 from neilfpp_method.data.mesh import read_mesh
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.point_cloud import load_point_cloud
@@ -21,7 +22,7 @@ from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel, SceneFacts
 from neilfpp_method.structures import OrientedPoints
 
-__all__ = ["build_model", "scene_facts"]
+__all__ = ["build_model", "scene_facts", "show_known_light"]
 
 # METHOD §5: the sigmoid of R reaches 1 for LDR and 3 for HDR input; a brighter capture needs more room, and the few
 # brightest pixels (a lamp in view) do not set the scale of all others.
@@ -55,6 +56,18 @@ def build_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> Nei
         UserError: the settings ask for a point cloud or a mesh that the capture does not have.
     """
     return NeilfModel(HOSTS[config.host](capture, facts, config), config, facts)
+
+
+def show_known_light(model: NeilfModel) -> None:
+    """Read the environment map that is known into a new model, where the settings name one.
+
+    It is part of the checkpoints, so a run needs the file no more once it has one.
+
+    Raises:
+        UserError: the map cannot be used.
+    """
+    if model.config.light.map is not None:
+        model.light.show(read_environment(Path(model.config.light.map)))
 
 
 def _volsdf(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> VolSdfHost:

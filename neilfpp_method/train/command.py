@@ -16,12 +16,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import Capture
+from neilfpp_method.data.environment_map import check_environment
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, stage_steps
-from neilfpp_method.train.build import build_model, scene_facts
+from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.device import pick_device
+from neilfpp_method.train.light_record import in_words
 from neilfpp_method.train.loop import Training, seed_step, train
 from neilfpp_method.train.preview import write_preview
 from neilfpp_method.train.progress import Reporter, reporting
@@ -87,6 +89,8 @@ def run_training(
     facts = described.facts if resume else scene_facts(capture, pixels, config)
     seed_step(config.train.seed, step=-1)
     model = build_model(capture, facts, config)
+    if not (out / "checkpoints" / "last.pt").exists():
+        show_known_light(model)
     if fabric.is_global_zero:
         if not resume:
             create_run(out, config, source, facts)
@@ -96,7 +100,10 @@ def run_training(
     continue_with = _continue_with(command, out, device, devices)
     with reporting(out, console, fabric.is_global_zero) as reporter, _stop_request() as stopped:
         preview = _preview(out, capture, fabric, reporter)
-        train(Training(out, config, model, pixels, fabric, reporter, stopped, preview, continue_with))
+        training = Training(out, config, model, pixels, fabric, reporter, stopped, preview, continue_with)
+        train(training)
+    if fabric.is_global_zero and training.fits:
+        console.print(f"light: {in_words(config.light, training.fits)}", highlight=False, soft_wrap=True)
     return out
 
 
@@ -154,11 +161,13 @@ def _check(config: NeilfConfig) -> None:
         if getattr(config.train, name) < 1:
             option = f"--config.train.{name.replace('_', '-')}"
             raise UserError(f"{option} is {getattr(config.train, name)}", "set it to 1 or more")
-    if config.light.kind == "distant" and config.inter_reflection.mode == "soft":
-        raise UserError(
-            "a distant light is the same at every point, so L_ref has nothing to teach it",
-            "set --config.inter-reflection.mode hard or off",
-        )
+    if config.light.map is not None:
+        if config.light.kind == "free":
+            raise UserError(
+                f"{config.light.map}: a light that is free at every point takes no map",
+                "add --config.light.kind distant, or auto to look for lamps before the map as well",
+            )
+        check_environment(Path(config.light.map))
     steps = config.train
     for name, needed in {"volume": steps.sdf_steps, "physical": steps.material_steps + steps.joint_steps}.items():
         if needed and getattr(config.loss, name) <= 0.0:

@@ -18,6 +18,7 @@ from neilfpp_method.errors import Diverged, Stopped
 from neilfpp_method.model import NeilfModel, RadianceUnits
 from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, stage_at, stage_steps, weigh
 from neilfpp_method.structures import LossTerms
+from neilfpp_method.train.light_record import LightFit, note_fit, read_fits, write_fits
 from neilfpp_method.train.progress import Reporter
 from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, save_checkpoint, write_json
 
@@ -40,6 +41,7 @@ class Training:
     should_stop: Callable[[], bool]
     preview: Callable[[NeilfModel, Stage], None]
     continue_with: str
+    fits: list[LightFit] = field(default_factory=list)
     skipped: int = 0
     skipped_in_a_row: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
@@ -85,6 +87,7 @@ def _train_stage(
         set_rates(optimizer, run.config.optimizer, stage, number / position.length)
         batch = run.pixels.sample(settings.rays)
         terms = wrapped(batch, stage)
+        note_fit(run.fits, model, step)
         stop = _update(run, model, optimizer, terms, weigh(terms, weights), step)
         step += 1
         run.seconds[stage.value] = before + time.perf_counter() - started
@@ -190,6 +193,8 @@ def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
 
 def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str | None = None) -> None:
     if run.fabric.is_global_zero:
+        # Before the checkpoint: what it knows too much is left out when a run continues, and what it lacks would be lost.
+        write_fits(run.path, run.fits)
         for name in filter(None, (also, "last")):
             save_checkpoint(run.path / "checkpoints" / f"{name}.pt", run.model, optimizer, step)
         write_json(run.path / "timing.json", run.seconds)
@@ -205,6 +210,7 @@ def _restore(run: Training, optimizer: torch.optim.Optimizer) -> int:
     optimizer.load_state_dict(saved["optimizer"])
     if (run.path / "timing.json").exists():
         run.seconds.update(read_json(run.path / "timing.json"))
+    run.fits += read_fits(run.path, saved["step"])
     return saved["step"]
 
 
@@ -214,4 +220,6 @@ def _log(run: Training, model: NeilfModel, total: Total, decibels: float, loss: 
     width = getattr(model.host, "surface_width", None)
     if width is not None:
         values["beta"] = width().item()
+    if run.fits:
+        values |= {f"light/{name}": float(getattr(run.fits[-1], name)) for name in ("gain", "deviation", "lamps")}
     run.reporter.scalars(step, values)

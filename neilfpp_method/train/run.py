@@ -4,6 +4,7 @@
     capture.json      where the images are        timing.json       seconds of each stage
     scene.json        what the images decided     checkpoints/      last.pt, and one at the end of each stage
     previews/         a picture per stage         tensorboard/      scalars and pictures
+    light.json        what spoke for lamps, fit by fit; not there where the settings had decided
 """
 
 from __future__ import annotations

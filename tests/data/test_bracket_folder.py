@@ -11,7 +11,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from neilfpp_method.data.bracket_folder import find_brackets, merge_folder
+from neilfpp_method.data.bracket_folder import find_brackets, merge_brackets
 from neilfpp_method.errors import UserError
 from tests.data.test_brackets import TIMES, photographs, relative_error, scene
 
@@ -42,7 +42,9 @@ def test_a_folder_of_photographs_becomes_radiance(tmp_path: Path, layout: str, r
     if layout == "list":
         (photos / "brackets.json").write_text(json.dumps(listed))
     seen: list[str] = []
-    names = merge_folder(photos, tmp_path / "images", tmp_path / "valid", response, on_merged=seen.append)
+    brackets = find_brackets(photos)
+    merge_brackets(brackets, tmp_path / "images", tmp_path / "valid", response, on_merged=seen.append)
+    names = tuple(brackets)
     assert names == tuple(seen)
     assert names == (("IMG_0000", "IMG_0005") if layout == "sequence" else ("left", "right"))
     scales = []
@@ -91,7 +93,7 @@ def bad_folder(root: Path, kind: str) -> None:
 def test_bad_folders_are_named(tmp_path: Path, kind: str, complaint: str) -> None:
     bad_folder(tmp_path / "photos", kind)
     with pytest.raises(UserError, match=complaint):
-        merge_folder(tmp_path / "photos", tmp_path / "images", tmp_path / "valid", "srgb")
+        merge_brackets(find_brackets(tmp_path / "photos"), tmp_path / "images", tmp_path / "valid", "srgb")
 
 
 def test_an_empty_folder_is_named(tmp_path: Path) -> None:

@@ -124,10 +124,33 @@ def test_bad_lenses_are_refused(lens: Lens, words: str) -> None:
         check_camera(Camera(*FOCAL, *CENTRE_PIXEL, *SIZE, camera_pose(1, 6), lens), "view 7")
 
 
-def test_a_lens_that_does_not_reach_its_pixels_is_refused() -> None:
-    # x·(1 − 0.8 x²) turns back at x = 0.65, where it is 0.43: no ray reaches the corners at 0.96.
+def barrel(strength: float) -> Camera:
+    """x·(1 − s x²) turns back at x = 1/√(3 s), where it is 2/3 of that: no ray reaches what lies beyond."""
+    return Camera(*FOCAL, *CENTRE_PIXEL, *SIZE, camera_pose(1, 6), Lens("RADIAL", (-strength, 0.0)))
+
+
+def test_a_lens_that_shows_nothing_at_most_pixels_is_refused() -> None:
     with pytest.raises(UserError, match=r"RADIAL shows nothing at .* of its 4800 pixels"):
-        camera_rays(Camera(*FOCAL, *CENTRE_PIXEL, *SIZE, camera_pose(1, 6), Lens("RADIAL", (-0.8, 0.0))))
+        camera_rays(barrel(0.8))
+
+
+def test_pixels_at_which_a_lens_shows_nothing_are_told_and_look_away() -> None:
+    seen_by = barrel(0.3)
+    pinhole = Camera(*FOCAL, *CENTRE_PIXEL, 30, 20, camera_pose(2, 6))
+    rays = CameraRays([pinhole, seen_by])
+    assert rays.shown(0).shape == (600,)
+    assert rays.shown(0).all()
+    rows, columns = np.mgrid[: SIZE[1], : SIZE[0]]
+    radius = np.hypot(columns.ravel() + 0.5 - CENTRE_PIXEL[0], rows.ravel() + 0.5 - CENTRE_PIXEL[1]) / FOCAL[0]
+    edge = 2 / 3 / np.sqrt(3 * 0.3)
+    shown = rays.shown(1).numpy()
+    assert shown[radius < edge - 0.01].all()
+    assert not shown[radius > edge + 0.01].any()
+    assert 0.1 < 1 - shown.mean() < 0.3
+    directions = camera_rays(seen_by).directions.numpy()
+    axis = seen_by.w2c[2, :3]
+    assert np.allclose(directions[~shown], -axis, atol=1e-6)
+    assert (directions[shown] @ axis > 0).all()
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])

@@ -14,6 +14,7 @@ from scipy import stats
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.drawing import ValidPixels
 from neilfpp_method.data.images import write_exr, write_png
+from neilfpp_method.data.lens import Lens
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.errors import UserError
 from tests.data.make_capture import RADIUS, SCALE, make_capture, radiance, srgb
@@ -182,6 +183,21 @@ def test_nothing_valid_is_refused(tmp_path: Path) -> None:
     capture = marked(tmp_path, slice(0, WIDTH))
     with pytest.raises(UserError, match="no pixel is valid"):
         PixelDataset(capture, capture.views)
+
+
+def test_pixels_at_which_a_lens_shows_nothing_are_never_drawn(tmp_path: Path) -> None:
+    capture = load_capture(make_capture(tmp_path, masks=True))
+    whole = PixelDataset(capture, capture.views)
+    bent = [replace(view, camera=replace(view.camera, lens=Lens("RADIAL", (-0.6, 0.0)))) for view in capture.views[:3]]
+    pixels = PixelDataset(replace(capture, views=(*bent, *capture.views[3:])), (*bent, *capture.views[3:]))
+    assert 0.5 < pixels.valid(1).float().mean() < 0.98
+    assert pixels.valid(4).all()
+    everywhere = torch.cat([pixels.valid(i) for i in range(6)])
+    assert everywhere[pixels.draw(5000)].all()
+    blind = pixels.view(1).directions[~pixels.valid(1)]
+    axis = torch.from_numpy(bent[1].camera.w2c[2, :3]).float()
+    assert torch.allclose(blind @ axis, torch.tensor(-1.0))
+    assert torch.equal(pixels.view(4).directions, whole.view(4).directions)
 
 
 def test_pixels_without_meaning_need_a_mark(tmp_path: Path) -> None:

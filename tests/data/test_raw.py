@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from neilfpp_method.data.bracket_folder import merge_folder
+from neilfpp_method.data.bracket_folder import find_brackets, merge_brackets
 from neilfpp_method.data.images import read_image
 from neilfpp_method.data.raw import develop
 from neilfpp_method.errors import UserError
@@ -95,7 +95,7 @@ def test_raw_brackets_merge(tmp_path: Path, rawpy) -> None:
     for name, time in times.items():
         write_dng(tmp_path / "photos" / "pose" / name, light * float(Fraction(time)))
     (tmp_path / "photos" / "exposures.txt").write_text("".join(f"{n} {t}\n" for n, t in times.items()))
-    assert merge_folder(tmp_path / "photos", tmp_path / "images", tmp_path / "valid") == ("pose",)
+    merge_brackets(find_brackets(tmp_path / "photos"), tmp_path / "images", tmp_path / "valid")
     quotient = middles(read_image(tmp_path / "images" / "pose.exr").pixels) / middles(light)
     assert np.allclose(quotient, np.median(quotient), rtol=0.02)
     assert (read_image(tmp_path / "valid" / "pose.png").pixels == 1).all()

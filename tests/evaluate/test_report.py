@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import OpenEXR
 import pytest
+import torch
 
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.errors import UserError
@@ -21,8 +22,10 @@ from neilfpp_method.evaluate.glossary import explain
 from neilfpp_method.evaluate.panels import albedo_scale, light_sections, view_sections
 from neilfpp_method.evaluate.pictures import display
 from neilfpp_method.evaluate.render_views import render_run, view_names
-from neilfpp_method.evaluate.report import write_report
+from neilfpp_method.evaluate.report import write_light_picture, write_report
 from neilfpp_method.evaluate.views import RenderedView, known_test_views, render_test_views, render_view
+from neilfpp_method.fields.lamps import Lamps
+from neilfpp_method.train.light_record import LightFit, write_fits
 from neilfpp_method.train.run import Run
 from tests.data.make_capture import make_capture
 from tests.scenes import sphere_model, tiny_config
@@ -179,9 +182,10 @@ def test_known_light_stands_beside_the_estimate_of_it(root: Path, tmp_path: Path
     write_light_field(lit, lambda wi: 1.0 + 0.5 * wi)
     run = make_run(lit)
     monkeypatch.setattr(run.model, "incident_light", lambda x, wi: 1.0 + 0.5 * wi)
-    (section,) = light_sections(run, render_test_views(run), scale=np.array([2.0, 1.0, 1.0]))
-    assert [group.columns for group in section.groups] == 3 * [("truth", "estimate", "estimate, scaled")]
-    pictures = section.rows[0].pictures
+    sections = light_sections(run, render_test_views(run), scale=np.array([2.0, 1.0, 1.0]))
+    columns = [group.columns for section in sections for group in section.groups]
+    assert columns == 3 * [("truth", "estimate", "estimate, scaled")]  # the capture knows three points
+    pictures = [picture for section in sections for picture in section.rows[0].pictures]
     for truth, estimate, scaled in (pictures[3 * i : 3 * i + 3] for i in range(3)):
         # The known directions lie 1.9° apart: the sky changes by less than 2 % on the way to the nearest.
         assert np.abs(truth.astype(int) - estimate).max() <= 6
@@ -194,12 +198,47 @@ def test_known_light_stands_beside_the_estimate_of_it(root: Path, tmp_path: Path
 
 def test_without_known_light_points_of_the_surface_are_shown(root: Path):
     run = make_run(root)
-    (section,) = light_sections(run, render_test_views(run), scale=None)
-    assert [group.columns for group in section.groups] == 3 * [("estimate",)]
-    for group in section.groups:
+    groups = [group for section in light_sections(run, render_test_views(run), scale=None) for group in section.groups]
+    assert [group.columns for group in groups] == 4 * [("estimate",)]
+    for group in groups:
         position = np.array(eval(group.title.removeprefix("Light at ")))
-        # The sphere that every field starts as, seen at β = 0.02 and written with two digits.
-        assert np.linalg.norm(position) == pytest.approx(0.6, abs=0.1)
+        # The sphere that every field starts as, seen at β = 0.02, blended where it is seen from the side.
+        assert np.linalg.norm(position) == pytest.approx(0.6, abs=0.15)
+
+
+def test_rings_are_about_the_lamps_above_the_surface(root: Path, tmp_path: Path):
+    lit = Path(shutil.copytree(root, tmp_path / "lit"))
+    write_light_field(lit, lambda wi: 0 * wi + 1.0)  # at the world's origin, facing along x, y and z
+    run = make_run(lit)
+    origin = run.capture.normalisation.to_scene(torch.zeros(3))
+    run.model.lamps = Lamps(4, 0.06)
+    run.model.lamps.place(origin + torch.tensor([[2.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), torch.ones(2, 3))
+    pictures = [p for s in light_sections(run, render_test_views(run), scale=None) for p in s.rows[0].pictures]
+    red = [(estimate[..., 0] > 200) & (estimate[..., 1:] < 110).all(-1) for estimate in pictures[1::2]]
+    facing_x = [found for found in red if found.any()]
+    assert len(facing_x) == 1  # the other lamp is below or level with all three
+    rows, columns = np.nonzero(facing_x[0])
+    # +x is at θ = 90° and φ = 90°: half of the height, a quarter of the width.
+    assert rows.mean() == pytest.approx(60, abs=1)
+    assert columns.mean() == pytest.approx(60, abs=1)
+
+
+def test_the_light_is_drawn_alone(root: Path, tmp_path: Path):
+    path = tmp_path / "light.png"
+    assert write_light_picture(make_run(root), path)
+    assert cv2.imread(str(path)).std() > 5
+    path.unlink()
+    assert not write_light_picture(make_run(root, step=4), path)  # no stage has moved the light
+    assert not path.exists()
+
+
+def test_the_report_says_what_spoke_for_lamps(root: Path, tmp_path: Path):
+    run = make_run(root)
+    light = replace(run.config.light, kind="auto")
+    run = replace(run, path=tmp_path, config=replace(run.config, light=light))
+    write_fits(tmp_path, [LightFit(5, 0.02, 0.004, 204, True, 3), LightFit(run.step, -0.001, 0.003, 204, False, 0)])
+    text = Page(write_report(run, tmp_path, {}, {}).read_text()).text
+    assert "an environment map and 3 lamps before it (error −2.0 ± 0.4 % at 204 points kept back)" in text
 
 
 # -------------------------------------------------------------------------------------------------------------- renders

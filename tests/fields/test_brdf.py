@@ -25,10 +25,15 @@ def test_starts_at_the_middle_and_at_the_base_colour_that_is_set(name):
     torch.manual_seed(0)
     config = preset(name)
     material = BrdfField(config.brdf, config.volume.radius)(positions(200).float())
-    start = config.brdf.initial_base_color
-    for values, width, first in ((material.base_color, 3, start), (material.roughness, 1, 0.5), (material.metallic, 1, 0.5)):
+    starts = {
+        "base_color": (3, config.brdf.initial_base_color),
+        "roughness": (1, 0.5),
+        "metallic": (1, config.brdf.initial_metallic),
+    }
+    for name, (width, start) in starts.items():
+        values = getattr(material, name)
         assert values.shape == (200, width)
-        assert (values - first).abs().max() < 0.05
+        assert (values - start).abs().max() < 0.05, name
 
 
 @pytest.mark.parametrize("kind", SMALL)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
+from neilfpp_method.fields.direction_map import map_directions
 from neilfpp_method.fields.environment import EnvironmentLight
 
 
@@ -91,3 +92,59 @@ def test_there_is_one_direction_in_every_texel_and_the_texels_cover_the_sphere()
     shares = light.pdf(drawn.wi) * drawn.solid_angle
     torch.testing.assert_close(shares, shares[:1].expand(5, -1))
     assert shares[0].sum().item() == pytest.approx(1.0, rel=1e-4)
+
+
+# ------------------------------------------------------------------------------------------------- maps that are known
+
+
+def test_a_bright_texel_shows_where_the_layout_puts_it():
+    """Row j ↔ θ = πj/(h − 1) from +z, column i ↔ φ = 2π(i + ½)/w, direction (sin φ sin θ, cos φ sin θ, cos θ)."""
+    known = torch.full((3, 9, 12), 0.5)
+    known[:, 4, 2] = torch.tensor([40.0, 20.0, 10.0])  # θ = 90°, φ = 75°: mostly +x, and a little +y
+    light = EnvironmentLight(16, 1.0)
+    light.show(known)
+    along = [(math.sin(math.radians(75)), math.cos(math.radians(75)), 0.0), (-1, 0, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
+    radiance = light.radiance(torch.zeros(1, 3), torch.tensor([along], dtype=torch.float32))[0]
+    torch.testing.assert_close(radiance[0], torch.tensor([40.0, 20.0, 10.0]), rtol=1e-3, atol=0.0)
+    torch.testing.assert_close(radiance[1:], torch.full((4, 3), 0.5))
+    torch.testing.assert_close(map_directions(9, 12)[4, 2], torch.tensor(along[0]))
+
+
+def test_a_known_map_brings_what_its_texels_hold():
+    """Bilinear between its texels: a lamp of one texel brings its radiance times its solid angle, π/12 · 2π/24."""
+    known = torch.zeros(3, 13, 24)
+    known[:, 6, 10] = 1000.0
+    light = EnvironmentLight(8, 1.0)
+    light.show(known)
+    torch.manual_seed(0)
+    drawn = light.sample(torch.zeros(2000, 3), 64, stochastic=True)
+    brought = (light.radiance(torch.zeros(2000, 3), drawn.wi) / drawn.pdf[..., None]).mean()
+    assert brought.item() == pytest.approx(1000 * math.pi / 12 * math.pi / 12, rel=0.02)
+
+
+def test_a_map_comes_back_from_a_checkpoint_in_its_own_size():
+    light, other = EnvironmentLight(8, 1.0), EnvironmentLight(8, 1.0)
+    light.show(torch.rand(3, 11, 30) + 0.1)
+    other.load_state_dict(light.state_dict())
+    wi = directions(40)
+    torch.testing.assert_close(other.radiance(torch.zeros(1, 3), wi), light.radiance(torch.zeros(1, 3), wi), rtol=0, atol=0)
+    torch.testing.assert_close(other.pdf(wi), light.pdf(wi), rtol=0, atol=0)
+    with pytest.raises(RuntimeError):
+        other.load_state_dict({"log_radiance": torch.zeros(2, 11, 30)})
+
+
+@pytest.mark.parametrize("size", [(40, 96), (33, 50), (48, 35), (17, 33)])
+def test_a_coarser_map_is_the_mean_of_what_lies_in_each_texel(size):
+    light = EnvironmentLight(4, 1.0)
+    theta = math.pi * torch.arange(size[0]) / (size[0] - 1)
+    phi = 2 * math.pi * (torch.arange(size[1]) + 0.5) / size[1]
+    slope = 2 + theta.cos()[:, None] + theta.sin()[:, None] * phi.cos()
+    light.show(slope.expand(3, -1, -1))
+    coarse = light.at_most(16)
+    assert coarse.log_radiance.shape == (3, 16, 32)
+    assert coarse.log_radiance.isfinite().all()
+    # 2 + y + z changes by at most √2 a radian, and what lies in a texel is up to half of one off each way: 0.1 · √2.
+    wi = directions(200)
+    shown = coarse.radiance(torch.zeros(1, 3), wi)[0, :, 0]
+    torch.testing.assert_close(shown, 2 + wi[0, :, 1] + wi[0, :, 2], rtol=0, atol=0.2)
+    assert light.at_most(size[0]) is light

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -207,6 +208,22 @@ def test_light_between_two_planes_is_what_they_emit():
     assert term.mean().item() == pytest.approx(2.0, abs=0.01)  # y cancels
 
 
+def test_the_scene_sends_light_from_its_outsides_alone_and_says_from_how_far():
+    """From the middle between floor and ceiling; and from below the floor, whose back is dark and in the way."""
+    host = mesh_host(two_planes())
+    host.radiance_field.forward = lambda x, wo, n, f: torch.where(n[:, 2:] < 0, 1.0, 3.0).expand(-1, 3)
+    x = torch.tensor([[0.1, 0.0, 0.25], [0.1, 0.0, -0.25]])
+    up = torch.tensor([0.0, 0.0, 1.0])
+    met = host.scene_light(x, torch.stack((up, -up, torch.tensor([1.0, 0.0, 0.0]))).expand(2, 3, 3))
+    assert met.hit.tolist() == [[True, True, False], [True, False, False]]
+    sent = [[1.0, 3.0, 0.0], [0.0, 0.0, 0.0]]
+    torch.testing.assert_close(met.radiance, torch.tensor(sent)[..., None].expand(2, 3, 3))
+    # Rays start a little way along: the distance is what is left of it.
+    near = 0.25 - host.offset
+    expected = torch.tensor([[near, near, math.inf], [near, math.inf, math.inf]])
+    torch.testing.assert_close(met.distance, expected)
+
+
 FACTS = SceneFacts("linear", 0.2, 3.0, "constant")
 
 
@@ -249,7 +266,7 @@ def test_a_mesh_run_from_the_command_line(tmp_path: Path, monkeypatch, capsys):
     assert write_report(load_run(out), tmp_path / "report", metrics, {"material_init": 1.0}).is_file()
     assert main(["render", str(out), "--device", "cpu"]) == 0
     assert list((out / "renders").glob("*.exr"))
-    assert main(["export", str(out), "--device", "cpu"]) == 2
+    assert main(["export", str(out), "--what", "mesh", "--device", "cpu"]) == 2
     assert "no distance field" in capsys.readouterr().err
 
 

@@ -94,3 +94,31 @@ def test_neighbours_become_one_lamp_of_their_joint_power():
     torch.testing.assert_close(found.intensity, torch.tensor([[4.0, 4.0, 4.0], [2.0, 0.0, 0.0]]))
     assert len(merge(position, intensity, torch.ones(4), most=1).position) == 1
     assert len(merge(position, torch.zeros(4, 3), torch.ones(4), most=4).position) == 0
+
+
+def test_before_a_known_map_lamps_are_found_and_the_map_stays():
+    seen, of = photographed(lamp=True)
+    known = dataclasses.replace(CONFIG, map="sky.exr")
+    environment, lamps = EnvironmentLight(4, 1.0), Lamps(4, 0.06)
+    environment.show(torch.full((3, 48, 70), 0.5))  # finer than the fit needs it
+    before = environment.log_radiance.clone()
+    torch.manual_seed(0)
+    for _ in range(6):
+        evidence = solve_light(environment, lamps, seen, of, GGX, None, "linear", seen.pixel.median().item(), known)
+    assert torch.equal(environment.log_radiance, before)
+    assert evidence.significant
+    assert evidence.points == 160
+    assert (lamps.position[0] - LAMP[0]).norm() < 0.12
+    beside = (lamps.position - LAMP).norm(dim=-1) < 0.3
+    # The sky is no unknown that could take a share of it.
+    assert lamps.intensity[beside].sum().item() == pytest.approx(0.9 + 0.7 + 0.4, rel=0.15)
+
+
+def test_under_a_known_sky_alone_no_lamp_is_lit():
+    seen, of = photographed(lamp=False)
+    environment, lamps = EnvironmentLight(12, 0.5), Lamps(4, 0.06)
+    torch.manual_seed(0)
+    known = dataclasses.replace(CONFIG, map="sky.exr")
+    evidence = solve_light(environment, lamps, seen, of, GGX, None, "linear", seen.pixel.median().item(), known)
+    assert not evidence.significant
+    assert lamps.lit == 0

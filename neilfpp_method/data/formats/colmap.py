@@ -13,9 +13,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float64
 
+from neilfpp_method.data.colmap_library import pycolmap
 from neilfpp_method.data.formats.colmap_sizes import check_sizes
 from neilfpp_method.data.formats.places import stored, stored_image, view_names
 from neilfpp_method.data.lens import PANORAMAS, lens_of

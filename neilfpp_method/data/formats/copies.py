@@ -20,6 +20,10 @@ from neilfpp_method.shading.color import linear_to_srgb, srgb_to_linear
 
 __all__ = ["copy_file", "copy_view", "writing"]
 
+MOST_OF_A_PIXEL = 0.5
+ALL_OF_A_PIXEL = 0.9995
+"""OpenCV interpolates in steps of 1/32: a neighbour that counts at all weighs 1/1024 or more."""
+
 
 @contextmanager
 def writing(out: Path) -> Iterator[None]:
@@ -36,7 +40,8 @@ def copy_view(view: View, out: Path, hdr: bool, straight: bool) -> View:
 
     The files are copied as they are where that says all. An exposure or white balance is divided out, as the layouts
     know none: the image is then written as EXR. With `straight` a lens is undone: the image is resampled as linear
-    radiance and written as EXR, or as 16-bit PNG where it is not linear.
+    radiance and written as EXR, or as 16-bit PNG where it is not linear. A pixel is then valid where all that it is made
+    of is, and on the object where most of it is.
 
     Raises:
         UserError: an image cannot be read.
@@ -52,8 +57,8 @@ def copy_view(view: View, out: Path, hdr: bool, straight: bool) -> View:
         view,
         camera=camera,
         image=image,
-        mask=_copy_mask(view.mask, view.camera, camera, out / "masks" / f"{view.name}.png"),
-        valid=_copy_mask(view.valid, view.camera, camera, out / "valid" / f"{view.name}.png"),
+        mask=_copy_mask(view.mask, view.camera, camera, out / "masks" / f"{view.name}.png", MOST_OF_A_PIXEL),
+        valid=_copy_mask(view.valid, view.camera, camera, out / "valid" / f"{view.name}.png", ALL_OF_A_PIXEL),
         exposure=1.0,
         white_balance=(1.0, 1.0, 1.0),
     )
@@ -82,12 +87,13 @@ def _write_image(view: View, camera: Camera, factor: Float32[np.ndarray, " 3"], 
     return path
 
 
-def _copy_mask(mask: Path | None, camera: Camera, straight: Camera, target: Path) -> Path | None:
+def _copy_mask(mask: Path | None, camera: Camera, straight: Camera, target: Path, least: float) -> Path | None:
+    """Copy a mask; a resampled pixel is white where more than `least` of it was."""
     if mask is None:
         return None
     if camera is straight and mask.suffix.lower() == ".png":
         return copy_file(mask, target)
-    values = read_image(mask).pixels.max(axis=-1, keepdims=True)
-    moved = values if camera is straight else resample(np.ascontiguousarray(values), camera, straight)
-    write_png(target, np.where(moved > 0.5, 255, 0).astype(np.uint8))
+    white = (read_image(mask).pixels.max(axis=-1, keepdims=True) > 0.5).astype(np.float32)
+    moved = white if camera is straight else resample(white, camera, straight)
+    write_png(target, np.where(moved > least, 255, 0).astype(np.uint8))
     return target

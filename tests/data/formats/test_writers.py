@@ -14,7 +14,7 @@ import torch
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.formats.write_sfm_scene import write_sfm_scene
 from neilfpp_method.data.formats.write_transforms import write_transforms
-from neilfpp_method.data.images import read_image, write_png
+from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.data.lens import Lens
 from neilfpp_method.data.views import View, project
 from neilfpp_method.errors import UserError
@@ -113,6 +113,19 @@ def test_other_lenses_are_undone(tmp_path: Path, writer: str, hdr: bool) -> None
         assert (shown <= around.max(axis=(0, 1)) + 1e-3).all()
         inside, outside = read_image(new.mask).pixels.mean(), read_image(old.mask).pixels.mean()
         assert 0.7 * outside < inside < 1.4 * outside
+
+
+def test_a_resampled_pixel_is_valid_where_all_that_it_is_made_of_is(tmp_path: Path, writer: str) -> None:
+    first = bent(capture(tmp_path / "in", masks=False), "THIN_PRISM_FISHEYE")
+    usable = np.random.default_rng(0).random((18, 24)) > 0.1
+    write_png(tmp_path / "usable.png", np.where(usable, 255, 0).astype(np.uint8))
+    write_exr(tmp_path / "clipped.exr", {"RGB": np.where(usable, 1.0, 1e6)[..., None].repeat(3, axis=2)})
+    files = {"image": tmp_path / "clipped.exr", "valid": tmp_path / "usable.png"}
+    for view in written(with_views(first, lambda view: replace(view, **files)), writer, tmp_path / "out").views:
+        kept, pixels = read_image(view.valid).pixels[..., 0] == 1, read_image(view.image).pixels
+        assert (pixels[kept] == 1.0).all()
+        assert (pixels[~kept] > 1.0).all()
+        assert 0.3 < kept.mean() < 0.9
 
 
 def test_a_fisheye_beside_a_pinhole_is_undone(tmp_path: Path) -> None:

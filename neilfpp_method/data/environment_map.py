@@ -1,0 +1,49 @@
+"""Environment maps in: a file whose radiance is known, in latitude and longitude (docs/light.md)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neilfpp_method.data.images import image_header, read_image
+from neilfpp_method.errors import UserError
+
+__all__ = ["check_environment", "read_environment"]
+
+FEWEST_ROWS, FEWEST_COLUMNS = 4, 8
+MOST_ROWS, MOST_COLUMNS = 2048, 4096
+
+
+def check_environment(path: Path) -> None:
+    """That a file says of itself that it can be an environment map; its pixels are not read.
+
+    Raises:
+        UserError: no such file, no EXR, or a size from below 4×8 or above 2048×4096 (rows×columns).
+    """
+    if path.suffix.lower() != ".exr":
+        raise UserError(f"{path}: an environment map is linear radiance in an EXR file", "convert it to EXR")
+    header = image_header(path)
+    small = header.height < FEWEST_ROWS or header.width < FEWEST_COLUMNS
+    if small or header.height > MOST_ROWS or header.width > MOST_COLUMNS:
+        raise UserError(
+            f"{path}: an environment map of {header.height} rows and {header.width} columns",
+            f"scale it to between {FEWEST_ROWS}×{FEWEST_COLUMNS} and {MOST_ROWS}×{MOST_COLUMNS}",
+        )
+
+
+def read_environment(path: Path) -> Float[Tensor, "3 H W"]:
+    """Linear radiance of a lat-long map, rows from +z down; one channel counts for all three.
+
+    Raises:
+        UserError: as `check_environment`, or the pixels cannot be read, are NaN, infinite or negative, or all black.
+    """
+    check_environment(path)
+    radiance = torch.from_numpy(read_image(path).pixels).permute(2, 0, 1)
+    if not radiance.isfinite().all() or radiance.amin() < 0:
+        raise UserError(f"{path}: a texel is NaN, infinite or negative", "store radiance as it is, from 0 on")
+    if not radiance.any():
+        raise UserError(f"{path}: the environment map is black", "give the light that was there, or leave --light out")
+    return radiance.expand(3, -1, -1)

@@ -1,0 +1,108 @@
+"""Which training views see a surface point, from where, and what they hold of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from neilfpp_method.data.capture import Capture
+from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.views import Camera, project
+from neilfpp_method.inter_reflection import scene_light
+from neilfpp_method.model import NeilfModel
+from neilfpp_method.structures import Indexable, PixelBatch
+
+__all__ = ["Sightings", "TrainingViews"]
+
+TOLERANCE = 0.02
+"""What may lie before a camera and hide nothing, scene units."""
+LEAST_COSINE = 0.05
+"""Flatter looks see a pixel's width of surface, and a bend of the normal."""
+
+
+@dataclass(frozen=True)
+class Sightings(Indexable):
+    """N points as up to V views see them; `wo` of a place that no view fills is the normal, its pixel black."""
+
+    seen: Bool[Tensor, "N V"]
+    wo: Float[Tensor, "N V 3"]
+    pixel: Float[Tensor, "N V 3"]
+
+
+class TrainingViews:
+    """The training views of a capture, ordered such that the first few look from all around.
+
+    Args:
+        capture: where the views come from.
+        device: where the pixels are kept, and points are looked for.
+    """
+
+    def __init__(self, capture: Capture, device: torch.device | str = "cpu") -> None:
+        self.hdr = capture.hdr
+        self.pixels = PixelDataset(capture, capture.train_views, device)
+        self.cameras = [capture.normalisation.camera(view.camera) for view in capture.train_views]
+        self.centres = torch.stack([torch.as_tensor(camera.c2w[:, 3], dtype=torch.float32) for camera in self.cameras]).to(
+            device
+        )
+        self.order = _far_from_one_another(self.centres)
+
+    def evenly(self, count: int) -> PixelBatch:
+        """About `count` pixels of the object, evenly over the views and over each; the same at every call."""
+        each = max(1, count // len(self.cameras))
+        batches = []
+        for i in range(len(self.cameras)):
+            view = self.pixels.view(i)
+            rows = torch.nonzero((view.mask > 0.5) & self.pixels.valid(i))[:, 0]
+            batches.append(view[rows[:: max(1, math.ceil(len(rows) / each))]])
+        return PixelBatch(**{f.name: torch.cat([getattr(batch, f.name) for batch in batches]) for f in fields(PixelBatch)})
+
+    @torch.no_grad()
+    def sightings(
+        self, model: NeilfModel, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"], most: int
+    ) -> Sightings:
+        """The first views, `most` at most, in which nothing hides a point and whose pixel there can be used: it is valid, on
+        the object, and not clipped."""
+        seen = torch.zeros(len(position), most, dtype=torch.bool, device=position.device)
+        wo = normal[:, None].repeat(1, most, 1)
+        pixel = torch.zeros_like(wo)
+        config = model.config
+        for i in self.order:
+            rows = torch.nonzero(~seen.all(1))[:, 0]
+            if not len(rows):
+                break
+            view, index = self.pixels.view(i), _pixel_numbers(self.cameras[i], position[rows])
+            usable = (view.mask > 0.5) & self.pixels.valid(i) & (self.hdr | (view.color < 1).all(-1))
+            towards = self.centres[i] - position[rows]
+            distance = towards.norm(dim=-1)
+            direction = towards / distance[:, None]
+            kept = (index >= 0) & usable[index] & ((direction * normal[rows]).sum(-1) > LEAST_COSINE)
+            rows, direction, distance, index = rows[kept], direction[kept], distance[kept], index[kept]
+            met = scene_light(model.host, position[rows], direction[:, None], config.inter_reflection, config.shading.hit_share)
+            free = met.distance[:, 0] >= distance - TOLERANCE
+            rows, slot = rows[free], seen[rows[free]].sum(1)
+            seen[rows, slot], wo[rows, slot], pixel[rows, slot] = True, direction[free], view.color[index[free]]
+        return Sightings(seen, wo, pixel)
+
+
+def _pixel_numbers(camera: Camera, position: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
+    """Which pixel of a camera points are in, counted row by row; −1 outside of its picture."""
+    at = project(camera, position)
+    size = at.pixel.new_tensor([camera.width, camera.height])
+    inside = (at.depth > 0) & ((at.pixel >= 0) & (at.pixel < size)).all(-1)
+    column, row = torch.where(inside[:, None], at.pixel, 0.0).long().unbind(-1)
+    return torch.where(inside, row * camera.width + column, -1)
+
+
+def _far_from_one_another(centres: Float[Tensor, "C 3"]) -> list[int]:
+    """An order in which each centre is as far as can be from all before it; the first is the first."""
+    order = [0]
+    distance = torch.full_like(centres[:, 0], torch.inf)
+    while len(order) < len(centres):
+        distance = torch.minimum(distance, (centres - centres[order[-1]]).norm(dim=-1))
+        distance[order] = -1.0
+        order.append(int(distance.argmax()))
+    return order

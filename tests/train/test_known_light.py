@@ -1,0 +1,162 @@
+"""Light in and out: what a run exports is what another trains under, and the record of why there are lamps."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from neilfpp_method.cli import main
+from neilfpp_method.config import IncidentLightConfig, LightFitConfig, NeilfConfig
+from neilfpp_method.data.images import read_image
+from neilfpp_method.errors import UserError
+from neilfpp_method.presets import PRESETS
+from neilfpp_method.train.light_record import LightFit, in_words, read_fits, write_fits
+from neilfpp_method.train.run import load_run
+from tests.data.make_capture import make_capture
+from tests.train.small_runs import small_config
+
+
+def mapped_config() -> NeilfConfig:
+    """Milliseconds a step, with an environment map and lamps that are fitted at every other step."""
+    config = small_config()
+    fit = LightFitConfig(points=60, every=2, steps=4, candidates=8)
+    return dataclasses.replace(
+        config,
+        light=dataclasses.replace(config.light, kind="auto", environment_height=6, fit=fit),
+        inter_reflection=dataclasses.replace(config.inter_reflection, mode="off"),
+    )
+
+
+@pytest.fixture(autouse=True)
+def _mapped_preset(monkeypatch):
+    monkeypatch.setitem(PRESETS, "mapped", mapped_config)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_capture(tmp_path_factory.mktemp("capture") / "sphere", masks=True)
+
+
+def command(*options: object) -> int:
+    return main([*map(str, options), "--device", "cpu"])
+
+
+def train(capture: Path, out: Path, *options: object) -> int:
+    return command("train", "--preset", "mapped", "--data", capture, "--out", out, *options)
+
+
+def radiance_of(run: Path) -> torch.Tensor:
+    return load_run(run).model.light.log_radiance.exp()
+
+
+def test_an_exported_map_is_trained_under_and_no_longer_needed(capture, tmp_path, capfd):
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert train(capture, first) == 0
+    said = capfd.readouterr().out
+    record = read_fits(first, before=10**9)
+    assert f"light: {in_words(mapped_config().light, record)}" in said
+    assert [fit.step for fit in record] == sorted({fit.step for fit in record})
+    assert len(record) >= 3
+    assert read_fits(first, before=record[1].step) == record[:1]
+
+    assert command("export", first, "--what", "light") == 0
+    exported = first / "export" / "light" / "environment.exr"
+    assert read_image(exported).pixels.shape == (6, 12, 3)
+    sky = tmp_path / "sky.exr"
+    exported.rename(sky)
+    assert train(capture, second, "--light", sky, "--config.light.environment-height", 9) == 0
+    assert "light: the given environment map" in capfd.readouterr().out
+    sky.unlink()
+    torch.testing.assert_close(radiance_of(second), radiance_of(first), rtol=1e-5, atol=0.0)
+    assert load_run(second).config.light.map == str(sky)
+
+
+def test_a_map_alone_leaves_nothing_to_fit(capture, tmp_path, capfd):
+    assert train(capture, tmp_path / "first") == 0
+    assert command("export", tmp_path / "first", "--what", "light") == 0
+    sky = tmp_path / "first" / "export" / "light" / "environment.exr"
+    out = tmp_path / "second"
+    assert train(capture, out, "--light", sky, "--config.light.kind", "distant") == 0
+    run = load_run(out)
+    assert run.model.memory is None
+    assert read_fits(out, before=10**9) == []
+    assert not (out / "light.json").exists()
+
+
+def test_a_stopped_run_goes_on_without_the_file(capture, tmp_path):
+    """A checkpoint after every step; the first part of a run stands for one that was stopped there."""
+    assert train(capture, tmp_path / "first") == 0
+    assert command("export", tmp_path / "first", "--what", "light") == 0
+    sky = tmp_path / "first" / "export" / "light" / "environment.exr"
+    out = tmp_path / "second"
+    assert train(capture, out, "--light", sky) == 0
+    expected, record = radiance_of(out), read_fits(out, before=10**9)
+    stage = (out / "checkpoints" / "material_init.pt").read_bytes()
+    (out / "checkpoints" / "last.pt").write_bytes(stage)
+    (out / "checkpoints" / "joint.pt").unlink()
+    sky.unlink()
+    assert command("train", "--out", out, "--resume") == 0
+    torch.testing.assert_close(radiance_of(out), expected, rtol=0, atol=0)
+    assert read_fits(out, before=10**9) == record  # nothing twice, and the same again
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (["--light", "none.exr"], "none.exr: no such image"),
+        (["--light", "none.png"], "none.png: an environment map is linear radiance in an EXR file"),
+        (["--light", "none.exr", "--config.light.kind", "free"], "a light that is free at every point takes no map"),
+    ],
+)
+def test_a_map_that_cannot_be_is_refused_and_leaves_nothing(capture, tmp_path, capfd, monkeypatch, options, complaint):
+    monkeypatch.chdir(tmp_path)
+    assert train(capture, tmp_path / "run", *options) == 2
+    said = capfd.readouterr().err
+    assert said.count("\n") == 1
+    assert complaint in said
+    assert list(tmp_path.iterdir()) == []
+
+
+# --------------------------------------------------------------------------------------------------------------- record
+
+FITS = [LightFit(0, 0.021, 0.004, 204, True, 3), LightFit(100, -0.001, 0.003, 204, False, 0)]
+
+
+def test_the_record_says_why():
+    auto = IncidentLightConfig(kind="auto")
+    assert in_words(auto, FITS) == "an environment map; lamps were not needed (error +0.1 ± 0.3 % at 204 points kept back)"
+    assert in_words(auto, FITS[:1]) == "an environment map and 3 lamps before it (error −2.1 ± 0.4 % at 204 points kept back)"
+    given = dataclasses.replace(auto, map="sky.exr")
+    assert in_words(given, [dataclasses.replace(FITS[0], lamps=1)]).startswith("the given environment map and 1 lamp before")
+    assert in_words(auto, []) == "an environment map"
+    assert in_words(IncidentLightConfig(kind="free"), []) == "a field that is free at every point"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        "[]",
+        '{"format": 2, "fits": []}',
+        '{"format": 1, "fits": 3}',
+        '{"format": 1, "fits": [3]}',
+        '{"format": 1, "fits": [{"step": 1}]}',
+        '{"format": 1, "fits": [{"step": "one"}]}',
+    ],
+)
+def test_a_damaged_record_is_refused(tmp_path, text):
+    (tmp_path / "light.json").write_text(text)
+    with pytest.raises(UserError, match=r"light\.json"):
+        read_fits(tmp_path, before=1)
+
+
+def test_the_record_is_plain_json(tmp_path):
+    write_fits(tmp_path, FITS)
+    stored = json.loads((tmp_path / "light.json").read_text())
+    assert stored["format"] == 1
+    assert stored["fits"][0] == dataclasses.asdict(FITS[0])
+    assert read_fits(tmp_path, before=101) == FITS
