@@ -108,6 +108,8 @@ class Render:
     """Which weights."""
     overwrite: bool = False
     """Render again what is there already."""
+    confidence: bool = False
+    """Add maps of how far off base colour, roughness and metallic may be (base_color_std, …); takes about twice as long."""
     device: Device = "auto"
     """Where to compute."""
 
@@ -212,7 +214,7 @@ def run_render(options: Render) -> None:
     out = options.out or options.run / "renders"
     if "maps" in options.what:
         with _bar("rendering") as advance:
-            render_run(run, out, options.views, overwrite=options.overwrite, on_progress=advance)
+            render_run(run, out, options.views, options.overwrite, options.confidence, advance)
     if "light" in options.what and not write_light_picture(run, out / "incident_light.png") and options.what == ("light",):
         raise UserError(f"{options.run}: there is no light to show at step {run.step}", "train the next stage")
     Console().print(f"written to {out}", highlight=False)

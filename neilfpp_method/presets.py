@@ -67,7 +67,7 @@ def fast() -> NeilfConfig:
         light=IncidentLightConfig(
             kind="auto",
             environment_height=48,
-            fit=LightFitConfig(points=768, steps=75, smoothness=0.02),
+            fit=LightFitConfig(smoothness=0.02),
             layers=4,
             width=64,
             direction_encoding="spherical_harmonics",

@@ -79,9 +79,7 @@ def test_each_stage_moves_its_fields_and_no_others(data: Path, tmp_path: Path, s
     # The first is one step into SDF init; the others are the ends of the stages.
     for stage, before, after in zip(Stage, ends, ends[1:], strict=False):
         for field, prefix in FIELDS.items():
-            changed = any(
-                bool(differences(before[key], after[key])) for key in before if key.startswith(prefix)
-            )
+            changed = any(bool(differences(before[key], after[key])) for key in before if key.startswith(prefix))
             there = any(key.startswith(prefix) for key in before)
             assert changed == (there and field in STAGES[stage].moves), (stage, field)
 

@@ -11,22 +11,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from neilfpp_method.errors import UserError
+from neilfpp_method.data.views import camera_rays
 from neilfpp_method.evaluate.arriving import PATCHES, arriving_light, by_patch, patch_count
 from neilfpp_method.evaluate.posterior import ROUGHNESS_NODES, Deviation, Looks, Sights, expected_error
 from neilfpp_method.evaluate.sightings import Sightings, TrainingViews
+from neilfpp_method.evaluate.views import RenderedView
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading.brdf import cosines, diffuse_reflectance, normal_reflectance
 from neilfpp_method.shading.color import apply_response, srgb_to_linear
+from neilfpp_method.structures import OrientedPoints
 from neilfpp_method.train.run import Run
 
-__all__ = ["Evidence", "gather_evidence", "material_deviation"]
+__all__ = ["Evidence", "gather_evidence", "material_deviation", "shown_surface", "with_deviation"]
 
 VIEWS = 16
 """Views of a point that count. Those that lie between them add little that is new."""
@@ -39,6 +42,7 @@ PIXELS = 1024
 """Training pixels that say how well the run explains its images, and what light a typical point receives."""
 POINTS_AT_ONCE, SIGHTED_AT_ONCE = 512, 2**16
 LEAST_NOISE = 1e-3
+"""No image is better than this."""
 STEP = 1e-3
 """Of a pixel, for the slope of radiance over it."""
 TINY = 1e-9
@@ -62,7 +66,13 @@ class Evidence:
 
 @torch.no_grad()
 def gather_evidence(run: Run) -> Evidence:
-    """Load a run's training views, and compare some of their pixels with what the run shows of them."""
+    """Load a run's training views, and compare some of their pixels with what the run shows of them.
+
+    Where it shows no surface in any of them, the noise is as large as the pixels.
+
+    Raises:
+        UserError: there are no training views, or one cannot be read.
+    """
     model = run.model
     views = TrainingViews(run.capture, next(model.parameters()).device)
     errors, shares = [], []
@@ -82,8 +92,8 @@ def gather_evidence(run: Run) -> Evidence:
         parts = by_patch(arriving.light, arriving.patch, patch_count(model))
         shares.append(parts / parts.sum(-1, keepdim=True).clamp_min(TINY))
     if not errors:
-        raise UserError(f"{run.path}: its surface is in none of the training views", "train it for longer")
-    return Evidence(views, torch.cat(errors).median().item(), torch.cat(shares).mean(0))
+        return Evidence(views, 1.0, views.centres.new_zeros(3, patch_count(model)))
+    return Evidence(views, max(torch.cat(errors).median().item(), LEAST_NOISE), torch.cat(shares).mean(0))
 
 
 @torch.no_grad()
@@ -119,6 +129,35 @@ def material_deviation(
     return Deviation(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Deviation)))
 
 
+def with_deviation(run: Run, evidence: Evidence, view: RenderedView, step: int = 1) -> RenderedView:
+    """A rendered view with the maps base_color_std, roughness_std and metallic_std, 0 where it shows no surface.
+
+    With a `step` of k only every k-th pixel of every k-th row is asked, and the k × k about it take after it. A Lambertian
+    run has the first map alone.
+    """
+    height, width = view.maps["opacity"].shape[:2]
+    asked = np.zeros((height, width), bool)
+    asked[::step, ::step] = view.maps["opacity"][::step, ::step, 0] > 0.5
+    points = shown_surface(run, view, np.flatnonzero(asked))
+    deviation = material_deviation(run.model, evidence, points.position, points.normal)
+    maps = dict(view.maps)
+    for name in ("base_color", "roughness", "metallic") if run.config.shading.specular else ("base_color",):
+        values = np.zeros((height, width, 1), np.float32)
+        values[asked] = getattr(deviation, name).cpu().numpy()
+        maps[f"{name}_std"] = values[::step, ::step].repeat(step, 0).repeat(step, 1)[:height, :width]
+    return replace(view, maps=maps)
+
+
+def shown_surface(run: Run, view: RenderedView, pixels: Int[np.ndarray, " P"]) -> OrientedPoints:
+    """The surface at pixels of a rendered view, counted row by row, on the device of the run's model."""
+    camera = next(v.camera for v in run.capture.views if v.name == view.name)
+    rays = camera_rays(run.capture.normalisation.camera(camera))[torch.from_numpy(pixels)]
+    depth, normal = (
+        torch.from_numpy(view.maps[name].reshape(-1, size)[pixels]) for name, size in (("depth", 1), ("normal", 3))
+    )
+    return OrientedPoints(rays.origins + depth * rays.directions, normal).to(next(run.model.parameters()).device)
+
+
 def _deviation(
     model: NeilfModel, evidence: Evidence, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"], seen: Sightings
 ) -> Deviation:
@@ -149,7 +188,7 @@ def _deviation(
     outside = torch.cat((peculiar[..., :PATCHES], peculiar[..., 2 * PATCHES :]), -1).sum(-1, keepdim=True)
     errors = torch.cat((peculiar * deviations[:-1], outside * deviations[-1]), -1)
     radiance, brighter = (_to_radiance(model, seen.pixel + step) for step in (0.0, STEP))
-    noise = max(evidence.noise, LEAST_NOISE) * _brightness(model, seen.pixel) * (brighter - radiance) / STEP
+    noise = evidence.noise * _brightness(model, seen.pixel) * (brighter - radiance) / STEP
     sights = Sights(seen.seen, radiance, noise, errors)
     return expected_error(Looks(diffuse, facing, grazing), sights, material, specular)
 

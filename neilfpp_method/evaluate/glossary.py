@@ -35,35 +35,26 @@ def _log(title: str, meaning: str) -> Entry:
     return Entry(title, "%.3f", "lower", meaning)
 
 
+def _ratio(title: str) -> Entry:
+    meaning = "Error where the run is surest, over the error elsewhere, half of the pixels each; 1 is no better than chance."
+    return Entry(title, "%.2f", "lower", meaning)
+
+
 ENTRIES: Mapping[str, Entry] = {
-    "volume_psnr": _decibels(
-        "Image, volume rendering", "New views as the outgoing radiance field shows them, tone-mapped."
-    ),
-    "volume_ssim": Entry(
-        "Structure, volume rendering", "%.4f", "higher", "Likeness of local structure; 1 is the same."
-    ),
-    "volume_psnr_linear": _decibels(
-        "Image, volume rendering, linear", "On linear radiance, where highlights weigh most."
-    ),
-    "pbr_psnr": _decibels(
-        "Image, rendering equation", "New views rendered from material and incident light, tone-mapped."
-    ),
+    "volume_psnr": _decibels("Image, volume rendering", "New views as the outgoing radiance field shows them, tone-mapped."),
+    "volume_ssim": Entry("Structure, volume rendering", "%.4f", "higher", "Likeness of local structure; 1 is the same."),
+    "volume_psnr_linear": _decibels("Image, volume rendering, linear", "On linear radiance, where highlights weigh most."),
+    "pbr_psnr": _decibels("Image, rendering equation", "New views rendered from material and incident light, tone-mapped."),
     "pbr_ssim": Entry("Structure, rendering equation", "%.4f", "higher", "Likeness of local structure; 1 is the same."),
-    "pbr_psnr_linear": _decibels(
-        "Image, rendering equation, linear", "On linear radiance, where highlights weigh most."
-    ),
+    "pbr_psnr_linear": _decibels("Image, rendering equation, linear", "On linear radiance, where highlights weigh most."),
     "base_color_psnr": _decibels("Base colour", "As estimated, with the free factor between light and base colour."),
     "base_color_psnr_gamma": _decibels("Base colour, one gamma", "After one global exponent that matches the medians."),
-    "base_color_psnr_scaled": _decibels(
-        "Base colour, scaled", "After the best factor per channel: the free factor is out."
-    ),
+    "base_color_psnr_scaled": _decibels("Base colour, scaled", "After the best factor per channel: the free factor is out."),
     "roughness_psnr": _decibels("Roughness", "As estimated; 0 is a mirror, 1 is matt."),
     "metallic_psnr": _decibels("Metallic", "As estimated; 0 is no metal, 1 is metal."),
     "normal_mae_deg": Entry("Normals", "%.2f°", "lower", "Mean angle between estimated and true normals."),
     "chamfer": _length("Surface", "Mean distance between the surfaces, scene units (the object has radius 1)."),
-    "chamfer_accuracy": _length(
-        "Surface, accuracy", "From the estimate to the truth: what is there and should not be."
-    ),
+    "chamfer_accuracy": _length("Surface, accuracy", "From the estimate to the truth: what is there and should not be."),
     "chamfer_completeness": _length(
         "Surface, completeness", "From the truth to the estimate: what should be there and is not."
     ),
@@ -71,12 +62,13 @@ ENTRIES: Mapping[str, Entry] = {
         "Incident light", "Mean |ln(estimate/truth)| over points and directions; 0.69 is a factor of 2."
     ),
     "incident_light_log_mae_scaled": _log("Incident light, scaled", "As above, with one factor per channel taken out."),
-    "incident_light_log_mae_occluded": _log(
-        "Light from surfaces", "As above, over the directions that meet the scene again."
-    ),
+    "incident_light_log_mae_occluded": _log("Light from surfaces", "As above, over the directions that meet the scene again."),
     "incident_light_log_mae_occluded_scaled": _log(
         "Light from surfaces, scaled", "As above, with one factor per channel taken out."
     ),
+    "confidence_base_color_ratio": _ratio("Confidence, base colour"),
+    "confidence_roughness_ratio": _ratio("Confidence, roughness"),
+    "confidence_metallic_ratio": _ratio("Confidence, metallic"),
 }
 
 

@@ -22,6 +22,7 @@ __all__ = [
     "align_scale",
     "angular_error",
     "chamfer",
+    "confidence_ratio",
     "log_error",
     "log_ratio",
     "psnr",
@@ -72,9 +73,7 @@ def psnr_frame(
     return _decibels((_squared_error(estimate, truth) * mask[..., None]).mean(), peak)
 
 
-def ssim(
-    estimate: Float[np.ndarray, "H W C"], truth: Float[np.ndarray, "H W C"], mask: Bool[np.ndarray, "H W"]
-) -> float:
+def ssim(estimate: Float[np.ndarray, "H W C"], truth: Float[np.ndarray, "H W C"], mask: Bool[np.ndarray, "H W"]) -> float:
     """Structural similarity of one view, values in [0, 1]: the mean of its map over the masked pixels.
 
     Windows as in Wang et al. 2004. They reach across the mask's border; what they see there is the truth for both, so
@@ -187,3 +186,13 @@ def log_ratio(estimate: Float[np.ndarray, "P C"], truth: Float[np.ndarray, "P C"
 def log_error(ratio: Float[np.ndarray, "P C"]) -> float:
     """Mean absolute log ratio; 0.69 is a factor of two."""
     return float(np.abs(ratio).mean())
+
+
+# ----------------------------------------------------------------------------------------------------------- confidence
+
+
+def confidence_ratio(error: Float[np.ndarray, " P"], expected: Float[np.ndarray, " P"]) -> float | None:
+    """The mean error of the half with the smallest expected error over that of the other; none where that is 0."""
+    order = np.argsort(expected, kind="stable")
+    sure, unsure = np.split(error[order], [len(order) // 2])
+    return float(sure.mean() / unsure.mean()) if len(sure) and unsure.mean() > 0 else None

@@ -83,6 +83,7 @@ def view_sections(
     maps = [
         _image_map(run, rendered, known),
         *_material_maps(run, rendered, known, scale),
+        *_deviation_maps(rendered),
         _normal_map(rendered, known),
     ]
     compared = tuple(m.row for m in maps if m.has_truth)
@@ -137,6 +138,14 @@ def _material_map(
             comparison = replace(comparison, truth=cut_out(truth, k.mask), error=error)
         comparisons.append(comparison)
     return ComparedMap(title, note, tuple(comparisons), 0.5)
+
+
+def _deviation_maps(rendered: Sequence[RenderedView]) -> Iterator[ComparedMap]:
+    """How far off the material may be, on the scale of its errors, of views that have been asked."""
+    for title, name in (("Base colour", "base_color_std"), ("Roughness", "roughness_std"), ("Metallic", "metallic_std")):
+        if all(name in view.maps for view in rendered):
+            shown = tuple(Comparison(cut_out(display_error(view.maps[name][..., 0], 0.5), _hit(view))) for view in rendered)
+            yield ComparedMap(f"{title} ±", "expected error\ndark 0, bright 0.5", shown, 0.5)
 
 
 def _normal_map(rendered: Sequence[RenderedView], known: Sequence[KnownView]) -> ComparedMap:

@@ -12,6 +12,8 @@ the run has an estimate of it. Alignments are never silent: each has a key of it
     chamfer, _accuracy, _completeness scene units
     incident_light_log_mae            mean |ln L − ln L_true| over points and directions of the true light field
       _occluded, _scaled              over directions that meet the scene again; without the scale of each channel
+    confidence_*_ratio                mean error of the half of the pixels with the smallest expected error over that of the
+                                      other half; base colour scaled
     baseline_*                        what needs no method, on the same pixels
 """
 
@@ -30,6 +32,7 @@ from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.data.truth import LightField, Truth
 from neilfpp_method.evaluate import metrics
+from neilfpp_method.evaluate.confidence import gather_evidence, material_deviation, shown_surface
 from neilfpp_method.evaluate.views import (
     KnownView,
     RenderedView,
@@ -51,6 +54,8 @@ RENDERING = 0.9
 SURFACE_POINTS = 500_000
 """Points on each surface for Chamfer distances. Sampling alone gives a mean distance of about ½ √(area / points)."""
 MESH_RESOLUTION = 256
+CONFIDENCE_PIXELS = 8192
+"""Test pixels, evenly spread, whose error is compared with the one that is expected there."""
 MARGIN = 0.05
 """The estimate counts up to this share of the diagonal of the truth's bounding box around that box: beyond it, where no
 image looks, a distance field closes its surface as it likes."""
@@ -79,7 +84,7 @@ def evaluate(
     known = known_test_views(run, rendered)
     pairs = [(r, k) for r, k in zip(rendered, known.views, strict=True) if k.mask.any()]
     figures = image_metrics(run, pairs) | material_metrics(run, pairs) | normal_metrics(pairs)
-    figures |= baseline_metrics(run.capture, pairs)
+    figures |= confidence_metrics(run, pairs) | baseline_metrics(run.capture, pairs)
     truth = Truth(run.capture)
     mesh, light = truth.mesh(), truth.light_field()
     if mesh is not None and isinstance(run.model.host, HasSdf):
@@ -161,6 +166,32 @@ def material_metrics(run: Run, pairs: Pairs) -> dict[str, float]:
             scores[key].append(metrics.psnr(values, known.material[name], known.mask))
             scores[f"{key}_frame"].append(metrics.psnr_frame(values, known.material[name], known.mask))
     return scores.means()
+
+
+def confidence_metrics(run: Run, pairs: Pairs) -> dict[str, float]:
+    """Whether the run knows where its material is wrong; absent where the other half is without error."""
+    pairs = [(view, known) for view, known in pairs if known.material is not None]
+    if not pairs or not has_material(run) or not run.capture.train_views:
+        return {}
+    rows = [np.flatnonzero(known.mask & (view.maps["opacity"][..., 0] > 0.5)) for view, known in pairs]
+    step = max(1, sum(map(len, rows)) // CONFIDENCE_PIXELS)
+    rows = [r[::step] for r in rows]
+    points = [shown_surface(run, view, r) for (view, _), r in zip(pairs, rows, strict=True)]
+    position, normal = (torch.cat([getattr(p, name) for p in points]) for name in ("position", "normal"))
+    deviation = material_deviation(run.model, gather_evidence(run), position, normal)
+
+    figures = {}
+    for name in ("base_color", "roughness", "metallic") if run.config.shading.specular else ("base_color",):
+        estimate, true = (
+            np.concatenate([maps[name].reshape(-1, maps[name].shape[-1])[r] for maps, r in zip(side, rows, strict=True)])
+            for side in ([view.maps for view, _ in pairs], [known.material for _, known in pairs])
+        )
+        scale = metrics.align_scale(estimate, true) if name == "base_color" else 1.0
+        error = np.abs(estimate * scale - true).mean(-1)
+        ratio = metrics.confidence_ratio(error, getattr(deviation, name)[:, 0].cpu().numpy())
+        if ratio is not None:
+            figures[f"confidence_{name}_ratio"] = ratio
+    return figures
 
 
 def normal_metrics(pairs: Pairs) -> dict[str, float]:

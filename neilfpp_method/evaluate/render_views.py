@@ -11,8 +11,9 @@ from jaxtyping import Float
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.images import write_exr, write_png
 from neilfpp_method.errors import UserError
+from neilfpp_method.evaluate.confidence import gather_evidence, with_deviation
 from neilfpp_method.evaluate.pictures import display
-from neilfpp_method.evaluate.views import RenderedView, render_view
+from neilfpp_method.evaluate.views import RenderedView, has_material, render_view
 from neilfpp_method.train.run import Run
 
 __all__ = ["render_run"]
@@ -25,6 +26,7 @@ def render_run(
     out: Path,
     views: str | Collection[str] = "test",
     overwrite: bool = False,
+    confidence: bool = False,
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> list[Path]:
     """Render views of a run: `<out>/<map>/<view>.png` to look at, `<out>/<view>.exr` with all maps as they are.
@@ -38,22 +40,28 @@ def render_run(
         out: the folder to write.
         views: "test", "train", "all", or names of views.
         overwrite: render again what is there.
+        confidence: also write how far off base colour, roughness and metallic may be (`confidence.with_deviation`).
         on_progress: told the share that is done after each view.
 
     Returns:
         The EXR files, in the order of the capture.
 
     Raises:
-        UserError: a view that the capture does not have.
+        UserError: a view that the capture does not have, or confidence of a material that is not there yet.
     """
     names = view_names(run.capture, views)
+    if confidence and not has_material(run):
+        raise UserError(f"{run.path}: there is no material at step {run.step}", "train the next stage")
+    evidence = gather_evidence(run) if confidence else None
     written = []
     for i, view in enumerate(run.capture.views):
         if view.name not in names:
             continue
         written.append(out / f"{view.name}.exr")
-        if overwrite or not written[-1].exists():
-            _write(render_view(run, i), out)
+        complete = written[-1].exists() and (not confidence or _picture(out, "base_color_std", view.name).exists())
+        if overwrite or not complete:
+            rendered = render_view(run, i)
+            _write(rendered if evidence is None else with_deviation(run, evidence, rendered), out)
         on_progress(len(written) / len(names))
     return written
 
@@ -78,9 +86,13 @@ def _write(view: RenderedView, out: Path) -> None:
     # Where a ray meets nothing its depth means nothing; the picture's range is that of the surface.
     seen = np.where(view.maps["opacity"] > 0.5, view.maps["depth"], np.nan)
     for name, values in {**view.maps, "depth": seen}.items():
-        write_png(out / name / f"{view.name}.png", display(name, values))
+        write_png(_picture(out, name, view.name), display(name, values))
     channels = {key: plane for name, values in view.maps.items() for key, plane in _channels(name, values)}
     write_exr(out / f"{view.name}.exr", channels)
+
+
+def _picture(out: Path, map_name: str, view_name: str) -> Path:
+    return out / map_name / f"{view_name}.png"
 
 
 def _channels(name: str, values: Float[np.ndarray, "H W C"]) -> Iterator[tuple[str, Float[np.ndarray, "H W"]]]:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from neilfpp_method.data.images import replacing, write_png
+from neilfpp_method.evaluate.confidence import gather_evidence, with_deviation
 from neilfpp_method.evaluate.page import Figure, report_page
 from neilfpp_method.evaluate.panels import albedo_scale, light_sections, view_sections
 from neilfpp_method.evaluate.pictures import contact_sheet
@@ -23,10 +24,13 @@ from neilfpp_method.train.run import Run, read_json
 __all__ = ["write_light_picture", "write_report"]
 
 SHOWN_VIEWS = 3
+CONFIDENCE_STEP = 2
+"""One pixel in so many by so many is asked how far off it may be."""
 
 VIEWS_CAPTION = (
     "Views that were not trained on, where the capture holds any out. An error is the difference of the two pictures "
-    "beside it, averaged over their channels; for normals it is the angle between them."
+    "beside it, averaged over their channels; for normals it is the angle between them. Maps with ± say, without the truth, "
+    "how far off the material may be, judged by what the training views saw of each point."
 )
 LIGHT_CAPTION = (
     "The light that arrives at four points of the surface, all directions unrolled: +z of the scene at the top, the "
@@ -59,6 +63,9 @@ def write_report(
     rendered = [at_hand.get(view.name) or render_view(run, run.capture.views.index(view)) for view in shown.capture.test_views]
     known = known_test_views(shown, rendered).views
     scale = albedo_scale(rendered, known) if has_material(run) else None
+    if has_material(run) and run.capture.train_views:
+        evidence = gather_evidence(run)
+        rendered = [with_deviation(run, evidence, view, CONFIDENCE_STEP) for view in rendered]
     views = view_sections(shown, rendered, known, scale)
     light = light_sections(shown, rendered, scale) if has_material(run) else []
 
@@ -108,9 +115,7 @@ def _facts(run: Run) -> dict[str, str]:
     path = run.path / "environment.json"
     if path.is_file():
         machine = read_json(path)
-        facts["Processor"] = (
-            f"{machine.get('processor')}, {machine.get('cores')} cores, {machine.get('threads')} threads"
-        )
+        facts["Processor"] = f"{machine.get('processor')}, {machine.get('cores')} cores, {machine.get('threads')} threads"
         facts["GPU"] = ", ".join(machine.get("gpus", [])) or "none"
         facts["Versions"] = ", ".join(f"{name} {version}" for name, version in machine.get("packages", {}).items())
     return facts

@@ -127,9 +127,7 @@ class NeilfMethod(Model):
         if self.step < 0:  # no checkpoint was loaded, which would hold the map
             show_known_light(self.neilf)
         host = self.neilf.host
-        theirs = (
-            host.model.get_training_callbacks(training_callback_attributes) if isinstance(host, NerfstudioHost) else []
-        )
+        theirs = host.model.get_training_callbacks(training_callback_attributes) if isinstance(host, NerfstudioHost) else []
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
         return [
@@ -224,7 +222,8 @@ class NeilfMethod(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """PSNR and SSIM of display values over the object, as `neilfpp eval` has them without true depths, and all maps as pictures."""
+        """PSNR and SSIM of display values over the object, as `neilfpp eval` has them without true depths, and all maps as
+        pictures."""
         truth, rgb, volume = (self._display(image.to(self.device)) for image in _images(batch, outputs))
         # Where nothing is known of the object, what is rendered of it chooses the pixels.
         shown = batch["object_mask"].cpu() > 0.5 if batch["mask_known"].any() else outputs["accumulation"].cpu() > 0.5

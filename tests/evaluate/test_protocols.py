@@ -98,6 +98,8 @@ def captures(tmp_path_factory):
 def _few_points(monkeypatch):
     monkeypatch.setattr(protocols, "SURFACE_POINTS", 20_000)
     monkeypatch.setattr(protocols, "MESH_RESOLUTION", 64)
+    # The known sphere has no material to ask; what confidence is worth is tested in test_confidence.
+    monkeypatch.setattr(protocols, "confidence_metrics", lambda run, pairs: {})
 
 
 # --------------------------------------------------------------------------------------------------- a perfect estimate
@@ -284,9 +286,7 @@ def test_baselines_on_the_same_pixels(captures):
     normals = [known.normal[known.mask].astype(np.float64) for known in known_test_views(run, ()).views]
     seen, true = [np.concatenate([f(n) for n in normals]) for f in (scene.radiance, scene.base_color)]
     scale = (seen * true).sum(0) / (seen * seen).sum(0)
-    expected = np.mean(
-        [-10 * np.log10(np.square(scene.radiance(n) * scale - scene.base_color(n)).mean()) for n in normals]
-    )
+    expected = np.mean([-10 * np.log10(np.square(scene.radiance(n) * scale - scene.base_color(n)).mean()) for n in normals])
     assert figures["baseline_base_color_psnr_scaled"] == pytest.approx(expected, abs=0.3)
     assert figures["baseline_roughness_psnr"] == pytest.approx(100.0)  # the sphere's roughness is one constant
 
@@ -312,9 +312,7 @@ def test_light_that_is_too_bright_by_a_factor(captures):
 
 def test_occluded_directions_are_those_that_meet_the_scene(captures):
     # A roof one unit above the points, on the side of +x alone.
-    roof = Mesh(
-        torch.tensor([[0.1, -5, 1], [9, -5, 1], [9, 5, 1], [0.1, 5, 1]]), torch.tensor([[0, 1, 2], [0, 2, 3]])
-    )
+    roof = Mesh(torch.tensor([[0.1, -5, 1], [9, -5, 1], [9, 5, 1], [0.1, 5, 1]]), torch.tensor([[0, 1, 2], [0, 2, 3]]))
     directions = [[1.0, 0, 1], [1, 1, 1], [-1, 0, 1], [-1, 1, 1], [-1, -1, 1]]
     field = light_field(directions)
     field.incident[:, :2] *= math.e  # true light is brighter than the estimate where the roof is, and only there
