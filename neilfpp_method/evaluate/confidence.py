@@ -168,7 +168,7 @@ def _deviation(
     patches = patch_count(model)
     diffuse = arriving.light.sum(1) / math.pi
     kd, f0 = diffuse_reflectance(material, specular), normal_reflectance(material)
-    nodes = diffuse.new_tensor(ROUGHNESS_NODES)
+    nodes = diffuse.new_tensor(ROUGHNESS_NODES)[:, None, None].expand(-1, len(diffuse), 1)
     facing = diffuse.new_zeros(len(diffuse), seen.wo.shape[1], len(nodes), 3)
     grazing, sent = torch.zeros_like(facing), []
     for v, wo in enumerate(seen.wo.unbind(1)):
@@ -193,7 +193,7 @@ def _deviation(
     return expected_error(Looks(diffuse, facing, grazing), sights, material, specular)
 
 
-def _light_deviations(model: NeilfModel) -> Float[Tensor, " K+1"]:
+def _light_deviations(model: NeilfModel) -> Float[Tensor, " E"]:
     """Of each patch, and last of all light from outside together."""
     known = model.config.light.map is not None
     direct, overall = (KNOWN, KNOWN) if known else (DIRECT, OVERALL)

@@ -69,24 +69,26 @@ class Sights(Indexable):
 def expected_error(looks: Looks, sights: Sights, estimate: Material, specular: bool = True) -> Deviation:
     """The deviation of an estimate under the posterior, what it is off from the posterior's mean included.
 
-    The prior of base colour and roughness is even on [0, 1]. That of metallic is arcsine: most surfaces are a metal or none.
+    The prior of base colour and roughness is even on [0, 1]; that of metallic leans to the ends, as the arcsine distribution
+    does: most surfaces are a metal or none.
     A point that no view saw has the deviation from the prior. Without a specular part L is b D, and the deviations of
     roughness and metallic mean nothing.
     """
-    metallic = torch.linspace(0, 1, METALLIC_CELLS).to(looks.diffuse) if specular else looks.diffuse.new_zeros(1)
-    roughness = (torch.arange(ROUGHNESS_CELLS).to(looks.diffuse) + 0.5) / ROUGHNESS_CELLS
+    wide = {"dtype": torch.float64, "device": looks.diffuse.device}
+    metallic = torch.linspace(0, 1, METALLIC_CELLS, **wide) if specular else torch.zeros(1, **wide)
+    roughness = (torch.arange(ROUGHNESS_CELLS, **wide) + 0.5) / ROUGHNESS_CELLS
     products = _Products.of(looks, sights, _between_nodes(roughness))
     base_color = _solve(products, metallic)
 
-    edges = torch.linspace(0, 1, len(metallic) + 1).to(metallic)
-    log_prior = edges.sqrt().asin().diff().log()
+    log_prior = torch.linspace(0, 1, len(metallic) + 1).to(metallic).sqrt().asin().diff().log()
     weight = (base_color.log_evidence.sum(1) + log_prior).flatten(1).softmax(-1).unflatten(1, (ROUGHNESS_CELLS, -1))
     off = base_color.variance + (base_color.mean - estimate.base_color[:, :, None, None]).square()
-    return Deviation(
-        (weight[:, None] * off).sum((2, 3)).mean(1, keepdim=True).sqrt(),
-        (weight.sum(2) * (roughness - estimate.roughness).square()).sum(1, keepdim=True).sqrt(),
-        (weight.sum(1) * (metallic - estimate.metallic).square()).sum(1, keepdim=True).sqrt(),
+    squares = (
+        (weight[:, None] * off).sum((2, 3)).mean(1, keepdim=True),
+        (weight.sum(2) * (roughness - estimate.roughness).square()).sum(1, keepdim=True),
+        (weight.sum(1) * (metallic - estimate.metallic).square()).sum(1, keepdim=True),
     )
+    return Deviation(*(square.sqrt().to(looks.diffuse.dtype) for square in squares))
 
 
 def _between_nodes(roughness: Float[Tensor, " Q"]) -> Float[Tensor, "R Q"]:
@@ -115,7 +117,9 @@ class _Products:
     @classmethod
     def of(cls, looks: Looks, sights: Sights, between: Float[Tensor, "R Q"]) -> _Products:
         """Errors that views have in common are taken out by the Cholesky factor of their covariance."""
-        scale = sights.seen[..., None] / sights.noise
+        # In double precision: shared errors are far larger than those of single views, and what tells one cell of the grid
+        # from another is a small difference of large numbers.
+        scale = (sights.seen[..., None] / sights.noise).double()
         shared = (sights.shared * scale[..., None]).transpose(1, 2)
         covariance = shared @ shared.mT + torch.eye(shared.shape[2], device=shared.device, dtype=shared.dtype)
         factor = torch.linalg.cholesky(covariance)

@@ -14,12 +14,12 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.views import Camera, project
 from neilfpp_method.inter_reflection import scene_light
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.structures import Indexable, PixelBatch
+from neilfpp_method.structures import Indexable, PixelBatch, RayBatch
 
 __all__ = ["Sightings", "TrainingViews"]
 
-TOLERANCE = 0.02
-"""What may lie before a camera and hide nothing, scene units."""
+TOLERANCE = 0.05
+"""Surfaces this close to one another count as one, scene units, as they do for a hit."""
 LEAST_COSINE = 0.05
 """Flatter looks see a pixel's width of surface, and a bend of the normal."""
 
@@ -69,7 +69,6 @@ class TrainingViews:
         seen = torch.zeros(len(position), most, dtype=torch.bool, device=position.device)
         wo = normal[:, None].repeat(1, most, 1)
         pixel = torch.zeros_like(wo)
-        config = model.config
         for i in self.order:
             rows = torch.nonzero(~seen.all(1))[:, 0]
             if not len(rows):
@@ -81,11 +80,29 @@ class TrainingViews:
             direction = towards / distance[:, None]
             kept = (index >= 0) & usable[index] & ((direction * normal[rows]).sum(-1) > LEAST_COSINE)
             rows, direction, distance, index = rows[kept], direction[kept], distance[kept], index[kept]
-            met = scene_light(model.host, position[rows], direction[:, None], config.inter_reflection, config.shading.hit_share)
-            free = met.distance[:, 0] >= distance - TOLERANCE
+            free = _nothing_between(model, self.centres[i], position[rows], direction, distance)
             rows, slot = rows[free], seen[rows[free]].sum(1)
             seen[rows, slot], wo[rows, slot], pixel[rows, slot] = True, direction[free], view.color[index[free]]
         return Sightings(seen, wo, pixel)
+
+
+def _nothing_between(
+    model: NeilfModel,
+    centre: Float[Tensor, " 3"],
+    position: Float[Tensor, "N 3"],
+    direction: Float[Tensor, "N 3"],
+    distance: Float[Tensor, " N"],
+) -> Bool[Tensor, " N"]:
+    """Whether a camera sees surface points that lie in its picture: traced as light is, or else rendered from there."""
+    settings, share = model.config.inter_reflection, model.config.shading.hit_share
+    if settings.mode == "hard":
+        met = scene_light(model.host, position, direction[:, None], settings, share)
+        return met.distance[:, 0] >= distance - TOLERANCE
+    free = torch.zeros_like(distance, dtype=torch.bool)
+    for rows in torch.arange(len(free), device=free.device).split(model.config.train.eval_chunk):
+        hits = model.host.render(RayBatch(centre.expand(len(rows), 3), -direction[rows]))
+        free[rows] = hits.is_hit(share) & ((hits.position - position[rows]).norm(dim=-1) <= TOLERANCE)
+    return free
 
 
 def _pixel_numbers(camera: Camera, position: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
