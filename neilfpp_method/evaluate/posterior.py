@@ -157,7 +157,11 @@ def _solve(products: _Products, m: Float[Tensor, " M"]) -> _BaseColor:
     below = torch.special.log_ndtr(torch.where(mirrored, -high, low))
     above = torch.special.log_ndtr(torch.where(mirrored, -low, high))
     log_mass = above + (-torch.expm1(below - above)).clamp_min(1e-7).log()
-    at_low, at_high = (torch.exp(-end.square() / 2 - math.log(2 * math.pi) / 2 - log_mass) for end in (low, high))
+    # No density at an end exceeds what bounds it here; far out, where exponents have lost their digits, the bound holds.
+    at_low, at_high = (
+        torch.exp(-end.square() / 2 - math.log(2 * math.pi) / 2 - log_mass).minimum(end.abs() + 1 + 1 / (high - low))
+        for end in (low, high)
+    )
     shift = at_low - at_high
     mean = (centre + width * shift).clamp(0, 1)
     variance = (1 + low * at_low - high * at_high - shift.square()).clamp(0, 1) * width.square()

@@ -127,14 +127,16 @@ def compare(
     unit: float,
     config: LightFitConfig,
 ) -> Evidence:
-    """Which of two lights explains the points better that neither was fitted to."""
+    """Which of two lights explains the points better that neither was fitted to; without any, nothing speaks for either."""
     scale = target.pixel + config.floor * unit
     one, other = (
         ((_shown(light, transport, target.material, 1.0, response) - target.pixel) / scale).abs().clamp_max(1).mean(-1)
         for light, transport in zip(lights, carried, strict=True)
     )
     gain = one - other
-    return Evidence(gain.mean().item(), (gain.std(correction=0) / max(1, len(gain)) ** 0.5).item(), len(gain))
+    if not len(gain):
+        return Evidence(0.0, 0.0, 0)
+    return Evidence(gain.mean().item(), (gain.std(correction=0) / len(gain) ** 0.5).item(), len(gain))
 
 
 def total_variation(values: Float[Tensor, "C H W"]) -> Float[Tensor, ""]:

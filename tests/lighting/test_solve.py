@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -122,3 +123,15 @@ def test_under_a_known_sky_alone_no_lamp_is_lit():
     evidence = solve_light(environment, lamps, seen, of, GGX, None, "linear", seen.pixel.median().item(), known)
     assert not evidence.significant
     assert lamps.lit == 0
+
+
+@pytest.mark.parametrize("count", [1, 3, 5])
+def test_hardly_any_points_speak_for_no_lamp(count):
+    """Of a few points none or one is kept back: evidence that JSON can hold, and nothing that is not finite."""
+    seen, of = photographed(lamp=False)
+    few = torch.arange(count)
+    lamps, evidence = solved(seen[few], of[few], rounds=1)
+    assert evidence.points == count // 5
+    assert math.isfinite(evidence.gain)
+    assert math.isfinite(evidence.deviation)
+    assert lamps.intensity.isfinite().all()

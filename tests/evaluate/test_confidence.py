@@ -1,0 +1,195 @@
+"""What a run says of its own errors: which views it asks, what they see, and that the sum does not depend on how it is cut."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from neilfpp_method.data.capture import Capture, load_capture
+from neilfpp_method.errors import UserError
+from neilfpp_method.evaluate import confidence
+from neilfpp_method.evaluate.arriving import arriving_light, by_patch, patch_count
+from neilfpp_method.evaluate.confidence import gather_evidence, material_deviation, shown_surface, with_deviation
+from neilfpp_method.evaluate.metrics import confidence_ratio
+from neilfpp_method.evaluate.protocols import confidence_metrics
+from neilfpp_method.evaluate.render_views import render_run
+from neilfpp_method.evaluate.sightings import TrainingViews
+from neilfpp_method.evaluate.views import known_test_views, render_test_views
+from neilfpp_method.model import NeilfModel, SceneFacts
+from neilfpp_method.structures import RayBatch, SurfaceHits
+from neilfpp_method.train.run import Run
+from tests.data.make_capture import RADIUS, SCALE, make_capture
+from tests.scenes import tiny_config
+
+SPHERE = RADIUS / SCALE  # radius in the scene frame
+
+
+class Ball:
+    """The sphere of `make_capture`, as a host: white, and sharp."""
+
+    def render(self, rays: RayBatch) -> SurfaceHits:
+        middle = -(rays.origins * rays.directions).sum(-1)
+        inside = middle.square() - rays.origins.square().sum(-1) + SPHERE**2
+        depth = middle - inside.clamp_min(0).sqrt()
+        hit = ((inside > 0) & (depth > 0)).float()
+        position = rays.origins + (depth * hit)[:, None] * rays.directions
+        return SurfaceHits(hit[:, None].expand(-1, 3), position, hit[:, None] * position / SPHERE, hit, hit)
+
+
+def make_run(capture: Capture, mode: str = "soft") -> Run:
+    """Nothing is learned yet."""
+    torch.manual_seed(0)
+    config = tiny_config()
+    config = replace(config, inter_reflection=replace(config.inter_reflection, mode=mode))
+    model = NeilfModel(Ball(), config, SceneFacts("linear", 0.3, 3.0, "none")).eval()
+    return Run(Path("run"), config, capture, model.facts, model, 12)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Run:
+    return make_run(load_capture(make_capture(tmp_path_factory.mktemp("captures") / "ball", size=(96, 72), views=6, test=(0,))))
+
+
+@pytest.fixture(scope="module")
+def evidence(run: Run):
+    return gather_evidence(run)
+
+
+def on_sphere(count: int) -> torch.Tensor:
+    torch.manual_seed(0)
+    return torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
+
+
+# ---------------------------------------------------------------------------------------------------------------- views
+
+
+@pytest.mark.parametrize("mode", ["soft", "hard"])
+def test_a_view_sees_the_part_of_a_sphere_that_faces_it(run: Run, mode: str):
+    run = make_run(run.capture, mode)
+    views = TrainingViews(run.capture)
+    normal = on_sphere(200)
+    seen = views.sightings(run.model, SPHERE * normal, normal, len(views.cameras))
+    for i, n in enumerate(normal):
+        towards = views.centres - SPHERE * n
+        cosine = (towards / towards.norm(dim=-1, keepdim=True)) @ n
+        # Pixels at the rim are half off the object, and flat looks do not count.
+        assert (cosine > 0.2).sum() <= seen.seen[i].sum() <= (cosine > 0.05).sum()
+    cosine = (seen.wo * normal[:, None]).sum(-1)
+    assert (cosine[seen.seen] > 0).all()
+    assert torch.equal(seen.wo[~seen.seen], normal[:, None].expand_as(seen.wo)[~seen.seen])
+    assert not seen.pixel[~seen.seen].any()
+    assert (seen.pixel[seen.seen] > 0).any(-1).all()
+
+
+def test_the_first_views_are_far_from_one_another(run: Run):
+    views = TrainingViews(run.capture)
+    assert sorted(views.order) == list(range(len(views.cameras)))
+    gap = (views.centres[views.order[0]] - views.centres[views.order[1]]).norm()
+    assert gap == (views.centres - views.centres[views.order[0]]).norm(dim=-1).max()
+
+
+# ---------------------------------------------------------------------------------------------------------------- light
+
+
+def test_patches_add_up_to_all_light(run: Run):
+    normal = on_sphere(20)
+    material = run.model.materials(SPHERE * normal)
+    arriving = arriving_light(run.model, SPHERE * normal, normal, normal[:, None], material)
+    parts = by_patch(arriving.light, arriving.patch, patch_count(run.model))
+    torch.testing.assert_close(parts.sum(-1), arriving.light.sum(1))
+    assert ((parts > 0).any(1).sum(-1) > 5).all()
+
+
+# ------------------------------------------------------------------------------------------------------------ deviation
+
+
+def test_it_does_not_depend_on_how_points_are_divided(run: Run, evidence, monkeypatch):
+    normal = on_sphere(40)
+    whole = material_deviation(run.model, evidence, SPHERE * normal, normal)
+    monkeypatch.setattr(confidence, "POINTS_AT_ONCE", 7)
+    monkeypatch.setattr(confidence, "SIGHTED_AT_ONCE", 16)
+    shares: list[float] = []
+    parts = material_deviation(run.model, evidence, SPHERE * normal, normal, shares.append)
+    for f in fields(whole):
+        torch.testing.assert_close(getattr(parts, f.name), getattr(whole, f.name), rtol=1e-3, atol=1e-4)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+def test_what_no_view_sees_is_a_guess(run: Run, evidence):
+    normal = on_sphere(60)
+    with torch.no_grad():
+        material = run.model.materials(SPHERE * normal)
+    prior = (1 / 12 + (material.base_color - 0.5).square().mean(-1, keepdim=True)).sqrt()
+    inside_out = material_deviation(run.model, evidence, SPHERE * normal, -normal)
+    torch.testing.assert_close(inside_out.base_color, prior, rtol=1e-2, atol=0.0)
+    outside = material_deviation(run.model, evidence, SPHERE * normal, normal)
+    seen = evidence.views.sightings(run.model, SPHERE * normal, normal, 5).seen.any(1)
+    assert ((outside.base_color - prior)[seen].abs() > 1e-3).all()
+    torch.testing.assert_close(outside.base_color[~seen], prior[~seen], rtol=1e-2, atol=0.0)
+
+
+def test_the_better_the_images_are_explained_the_less_is_left_to_guess(run: Run, evidence):
+    normal = on_sphere(60)
+    doubt = [
+        material_deviation(run.model, replace(evidence, noise=noise), SPHERE * normal, normal).roughness.var().item()
+        for noise in (1e4, 0.05)
+    ]
+    assert doubt[0] < 1e-6 < doubt[1]  # nothing is learned: every point has the deviation of a guess
+
+
+def test_no_points_have_no_deviation(run: Run, evidence):
+    assert len(material_deviation(run.model, evidence, torch.zeros(0, 3), torch.zeros(0, 3))) == 0
+
+
+# ----------------------------------------------------------------------------------------------------- maps and figures
+
+
+def test_maps_lie_on_the_surface_and_a_step_repeats_pixels(run: Run, evidence):
+    view = render_test_views(run)[0]
+    hit = view.maps["opacity"][..., 0] > 0.5
+    coarse = with_deviation(run, evidence, view, step=4)
+    for name in ("base_color_std", "roughness_std", "metallic_std"):
+        values = coarse.maps[name]
+        assert values.shape == (*hit.shape, 1)
+        asked = values[::4, ::4, 0]
+        assert np.array_equal(asked > 0, hit[::4, ::4])
+        assert np.array_equal(values[1::4, 2::4, 0], asked[: len(values[1::4]), : values[:, 2::4].shape[1]])
+
+
+def test_the_surface_at_pixels_is_where_the_sphere_is(run: Run):
+    view = render_test_views(run)[0]
+    pixels = np.flatnonzero(view.maps["opacity"][..., 0] > 0.99)
+    points = shown_surface(run, view, pixels)
+    torch.testing.assert_close(points.position.norm(dim=-1), torch.full((len(pixels),), SPHERE), rtol=1e-4, atol=0.0)
+
+
+def test_the_figures_are_of_the_maps_that_have_a_truth(run: Run):
+    rendered = render_test_views(run)
+    pairs = list(zip(rendered, known_test_views(run, rendered).views, strict=True))
+    figures = confidence_metrics(run, pairs)
+    assert figures.keys() == {f"confidence_{name}_ratio" for name in ("base_color", "roughness", "metallic")}
+    assert all(value > 0 for value in figures.values())
+    assert confidence_metrics(replace(run, step=0), pairs) == {}
+
+
+def test_a_ratio_compares_the_surer_half_with_the_other():
+    error = np.array([4.0, 1.0, 2.0, 3.0, 9.0])
+    assert confidence_ratio(error, error) == pytest.approx(((1 + 2) / 2) / ((3 + 4 + 9) / 3))
+    assert confidence_ratio(error, -error) == pytest.approx(((9 + 4) / 2) / ((1 + 2 + 3) / 3))
+    assert confidence_ratio(np.zeros(4), np.arange(4.0)) is None
+    assert confidence_ratio(np.ones(1), np.ones(1)) is None
+
+
+def test_a_render_with_confidence_completes_one_without(run: Run, tmp_path: Path):
+    path = render_run(run, tmp_path, "test")[0]
+    picture = tmp_path / "metallic_std" / f"{path.stem}.png"
+    assert not picture.exists()
+    render_run(run, tmp_path, "test", confidence=True)
+    assert picture.exists()
+    with pytest.raises(UserError, match="no material"):
+        render_run(replace(run, step=0), tmp_path, "test", confidence=True)
