@@ -128,7 +128,7 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
 
     R has no feature of G that knows the place, so it encodes positions as G would; 8×128 is the paper's surface light
     field. A surface without thickness needs no distance to leave it, and what leaves it is known well enough to learn
-    from L_ref (METHOD §2, §4).
+    from L_ref (METHOD §2, §4). Steps without volume rendering are cheap, and R is new as well: there are three times as many.
     """
     replace, train = dataclasses.replace, config.train
     return replace(
@@ -145,5 +145,5 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
         ),
         inter_reflection=replace(config.inter_reflection, radiance_gradient=0.7, offset=2e-3),
         loss=replace(config.loss, lambertian=10.0 * config.loss.lambertian),
-        train=replace(train, sdf_steps=0, material_steps=train.material_steps + train.joint_steps, joint_steps=0),
+        train=replace(train, sdf_steps=0, material_steps=3 * (train.material_steps + train.joint_steps), joint_steps=0),
     )

@@ -27,6 +27,8 @@ LEAST_RATE = 0.05
 """The last step's rate over the first's."""
 LEAST_REACH = 0.05
 """A lamp that brings less than this share of the mean, were all alike, is not sought: behind a wall anything fits."""
+LEAST_GAIN = 0.01
+"""Of the relative error. Many points make any difference significant; lamps that explain less than a hundredth are no lamps."""
 FIRST_SHARE = 0.1
 """Of the light that typical points receive, what all lamps that are not yet lit start with together."""
 
@@ -61,8 +63,8 @@ class Evidence:
 
     @property
     def significant(self) -> bool:
-        """Whether chance would bring it about less than once in forty times."""
-        return self.gain > 2 * self.deviation
+        """Whether chance would bring it about less than once in forty times, and it is worth a more complicated light."""
+        return self.gain > max(2 * self.deviation, LEAST_GAIN)
 
 
 def fit_light(
