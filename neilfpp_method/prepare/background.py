@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 from neilfpp_method.data.colmap_library import pycolmap
 
-__all__ = ["in_background", "silent"]
+__all__ = ["in_background", "sigterm_as_ctrl_c", "silent"]
 
 Result = TypeVar("Result")
 INTERVAL = 0.2
@@ -45,6 +47,20 @@ def in_background(call: Callable[[pycolmap.CancellationToken], Result], look: Ca
     if failure:
         raise failure[0]
     return outcome[0]
+
+
+@contextmanager
+def sigterm_as_ctrl_c() -> Iterator[None]:
+    """SIGTERM, by which schedulers and containers end a command, is a person's stop: a `KeyboardInterrupt`."""
+    try:
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    except ValueError:  # not the main thread: somebody else handles signals
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def silent() -> None:

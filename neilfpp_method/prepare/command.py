@@ -21,7 +21,7 @@ from neilfpp_method.data.capture import READERS, Capture, load_capture
 from neilfpp_method.data.formats.colmap import model_folder, open_model
 from neilfpp_method.data.formats.copies import writing
 from neilfpp_method.errors import Stopped, UserError
-from neilfpp_method.prepare.background import silent
+from neilfpp_method.prepare.background import silent, sigterm_as_ctrl_c
 from neilfpp_method.prepare.layout import WORK, Source, lay_out
 from neilfpp_method.prepare.mapping import map_scene, refuse_partial
 from neilfpp_method.prepare.matching import choose_pairing, extract_features, feature_counts, match_features
@@ -47,11 +47,16 @@ def run_prepare(options: Prepare, console: Console) -> Path:
     """
     _check_place(options)
     silent()
+    with _way_on(options):
+        return _prepare(options, console)
+
+
+def _prepare(options: Prepare, console: Console) -> Path:
     posed = any(reader.recognise(options.images) for reader in READERS.values())
     capture = load_capture(options.images, response=options.response) if posed else None
     photos = None if posed else _readable(survey(options.images, options.response), options)
     brackets = photos and brackets_among(photos, options.brackets)
-    with _way_on(options), writing(options.out):
+    with writing(options.out):
         with bars(console) as open_bar:
             source = _from_capture(capture, options) if capture else _from_photos(photos, brackets, options, open_bar)
             summary = lay_out(source, options, open_bar)
@@ -80,7 +85,8 @@ def _check_place(options: Prepare) -> None:
 def _way_on(options: Prepare) -> Iterator[None]:
     """A stop names the command that continues."""
     try:
-        yield
+        with sigterm_as_ctrl_c():
+            yield
     except KeyboardInterrupt:
         given = [str(options.images), "--out", str(options.out)]
         for field in fields(options)[2:]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from neilfpp_method import prepare
-from neilfpp_method.prepare.background import in_background
+from neilfpp_method.prepare.background import in_background, sigterm_as_ctrl_c
 
 
 def test_the_result_comes_back_and_somebody_looks():
@@ -28,7 +28,8 @@ def test_a_failure_is_raised_where_it_was_called():
         in_background(fail)
 
 
-def test_ctrl_c_reaches_the_call_and_waits_for_its_end():
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stop_reaches_the_call_and_waits_for_its_end(number):
     ended = []
 
     def work(token) -> None:
@@ -37,10 +38,12 @@ def test_ctrl_c_reaches_the_call_and_waits_for_its_end():
         time.sleep(0.5)
         ended.append(1)
 
-    threading.Timer(0.3, signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT)).start()
-    with pytest.raises(KeyboardInterrupt):
+    threading.Timer(0.3, signal.pthread_kill, (threading.main_thread().ident, number)).start()
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt), sigterm_as_ctrl_c():
         in_background(work)
     assert ended
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_no_second_sqlite_touches_the_database():
