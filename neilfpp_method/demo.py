@@ -64,5 +64,5 @@ def run_demo(out: Path, *, short: bool, resume: bool, device: str, console: Cons
     write_metrics(out / "metrics.json", run, metrics)
     console.print("drawing the report …")
     report = write_report(run, out, metrics, read_json(out / "timing.json"), rendered)
-    console.print(f"done: open {report}", highlight=False)
+    console.print(f"done: open {report}", soft_wrap=True)
     return report

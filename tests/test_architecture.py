@@ -29,6 +29,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("export",),
     ("evaluate",),
     ("demo", "plugin", "inspection", "prepare"),
+    ("commands",),
     ("cli",),
 )
 # Rooms that keep out of more than their layer says. Data is read and prepared without a network in sight, settings included.

@@ -146,6 +146,12 @@ def test_the_examples_parse(monkeypatch):
             assert isinstance(seen[0], command.options)
 
 
+@pytest.mark.parametrize("arguments", [["--help"], ["train", "--help"], ["train", "--data", "x", "--colour", "red"]])
+def test_help_and_mistyped_options_do_not_wait_for_torch(arguments):
+    asks = f"import sys; from neilfpp_method.cli import main; main({arguments}); sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", asks], capture_output=True, timeout=60, check=False).returncode == 0
+
+
 def test_version(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("neilfpp 0.")

@@ -44,8 +44,8 @@ def run_export(
     if "mesh" in what:
         mesh = export_mesh(trained, out / "mesh.ply", resolution)
         size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces"
-        console.print(f"{size}, written to {out / 'mesh.ply'}", highlight=False, soft_wrap=True)
+        console.print(f"{size}, written to {out / 'mesh.ply'}", soft_wrap=True)
     if "light" in what:
         light = export_light(trained, out / "light", probes)
         parts = (["an environment map", f"{light.lamps} lamps"] if light.environment else []) + [f"{light.probes} probes"]
-        console.print(f"{', '.join(parts)}, written to {out / 'light'}", highlight=False, soft_wrap=True)
+        console.print(f"{', '.join(parts)}, written to {out / 'light'}", soft_wrap=True)

@@ -74,7 +74,7 @@ def run_training(
         _refuse_changes(out, described, data, config, test_every, response, format)
         config, source = described.config, described.source
         if _is_finished(out, config):
-            console.print(f"run folder {out}: finished already, nothing to continue", highlight=False, soft_wrap=True)
+            console.print(f"run folder {out}: finished already, nothing to continue", soft_wrap=True)
             return out
     else:
         if data is None or config is None:
@@ -94,8 +94,8 @@ def run_training(
     if fabric.is_global_zero:
         if not resume:
             create_run(out, config, source, facts)
-        console.print(capture.summary, highlight=False)
-        console.print(f"run folder {out}", highlight=False, soft_wrap=True)
+        console.print(capture.summary, soft_wrap=True)
+        console.print(f"run folder {out}", soft_wrap=True)
     fabric.barrier()
     continue_with = _continue_with(command, out, device, devices)
     with reporting(out, console, fabric.is_global_zero) as reporter, _stop_request() as stopped:
@@ -103,7 +103,7 @@ def run_training(
         training = Training(out, config, model, pixels, fabric, reporter, stopped, preview, continue_with)
         train(training)
     if fabric.is_global_zero and training.fits:
-        console.print(f"light: {in_words(config.light, training.fits)}", highlight=False, soft_wrap=True)
+        console.print(f"light: {in_words(config.light, training.fits)}", soft_wrap=True)
     return out
 
 

@@ -134,7 +134,7 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], step: int) ->
     culprits = [name for name, value in total.terms.items() if not math.isfinite(value.item())]
     fields = [name for name, value in norms.items() if not math.isfinite(value)]
     where = f"loss {', '.join(culprits)}" if culprits else f"the gradient of {', '.join(fields) or 'another process'}"
-    run.reporter.say(f"[yellow]step {step} skipped: {where} is not finite ({run.skipped} skipped so far)[/yellow]")
+    run.reporter.warn(f"step {step} skipped: {where} is not finite ({run.skipped} skipped so far)")
     if run.skipped_in_a_row >= MOST_SKIPPED:
         raise Diverged(
             f"{MOST_SKIPPED} steps in a row were not finite, the last one in {where}",

@@ -58,10 +58,10 @@ class Reporter:
         if self.writer is not None:
             self.writer.add_image(name, pixels, step, dataformats="HWC")
 
-    def say(self, text: str) -> None:
+    def warn(self, text: str) -> None:
         """A line for the person, above the bars."""
         if self.progress is not None:
-            self.console.print(text)
+            self.console.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)
 
 
 @contextmanager

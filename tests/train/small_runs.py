@@ -39,7 +39,7 @@ class Listener(Reporter):
     def step(self, loss: float, psnr: float) -> None:
         self.losses.append(loss)
 
-    def say(self, text: str) -> None:
+    def warn(self, text: str) -> None:
         self.said.append(text)
 
 

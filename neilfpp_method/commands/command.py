@@ -1,0 +1,54 @@
+"""What a command is, and the options that several of them have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+
+__all__ = ["Checkpoint", "Command", "Device", "progress_bar", "terminal"]
+
+Device = Annotated[str, tyro.conf.arg(metavar="cpu|cuda|cuda:N|auto")]
+Checkpoint = Literal["last", "sdf_init", "material_init", "joint"]
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of the command line.
+
+    Attributes:
+        options: a dataclass; its docstring is the command's summary, those of its fields are the help.
+        run: does it.
+        examples: command lines for the help.
+        default: the options that a command line starts from, where some of its words decide what others default to;
+            none: the defaults of the dataclass.
+    """
+
+    options: type
+    run: Callable[[Any], None]
+    examples: Sequence[str]
+    default: Callable[[Sequence[str]], Any] | None = None
+
+    @property
+    def summary(self) -> str:
+        return (self.options.__doc__ or "").strip()
+
+
+def terminal() -> Console:
+    """Where a command speaks; what it says is shown as it is, brackets in a path included."""
+    return Console(markup=False, highlight=False)
+
+
+@contextmanager
+def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
+    """A bar that takes the share of the work that is done."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    share = TextColumn("{task.percentage:3.0f} %")
+    with Progress(TextColumn(title), BarColumn(), share, TimeRemainingColumn()) as progress:
+        task = progress.add_task(title, total=1.0)
+        yield lambda done: progress.update(task, completed=done)

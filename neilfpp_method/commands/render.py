@@ -1,0 +1,59 @@
+"""`neilfpp render`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from neilfpp_method.commands.command import Checkpoint, Command, Device, progress_bar, terminal
+from neilfpp_method.errors import UserError
+
+__all__ = ["COMMAND"]
+
+
+@dataclass
+class Render:
+    """Write every map of a run's views as PNG and EXR, and a picture of the light that arrives at four points."""
+
+    run: tyro.conf.Positional[Path]
+    """The run's folder."""
+    out: Path | None = None
+    """Where the pictures go; none: RUN/renders."""
+    what: tuple[Literal["maps", "light"], ...] = ("maps", "light")
+    """maps: a folder each, and an EXR a view. light: incident_light.png, beside the truth where that is at hand."""
+    views: Literal["test", "train", "all"] = "test"
+    """Which views."""
+    checkpoint: Checkpoint = "last"
+    """Which weights."""
+    overwrite: bool = False
+    """Render again what is there already."""
+    confidence: bool = False
+    """Add maps of how far off base colour, roughness and metallic may be (base_color_std, …); takes about twice as long."""
+    device: Device = "auto"
+    """Where to compute."""
+
+
+def run(options: Render) -> None:
+    from neilfpp_method.evaluate.render_views import render_run
+    from neilfpp_method.evaluate.report import write_light_picture
+    from neilfpp_method.train.device import pick_device
+    from neilfpp_method.train.run import load_run
+
+    run = load_run(options.run, pick_device(options.device), options.checkpoint)
+    out = options.out or options.run / "renders"
+    if "maps" in options.what:
+        with progress_bar("rendering") as advance:
+            render_run(run, out, options.views, options.overwrite, options.confidence, advance)
+    if "light" in options.what and not write_light_picture(run, out / "incident_light.png") and options.what == ("light",):
+        raise UserError(f"{options.run}: there is no light to show at step {run.step}", "train the next stage")
+    terminal().print(f"written to {out}", soft_wrap=True)
+
+
+COMMAND = Command(
+    Render,
+    run,
+    ["neilfpp render runs/teapot", "neilfpp render runs/teapot --views all", "neilfpp render runs/teapot --what light"],
+)
