@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32
 
+from neilfpp_method.data.bracket_alignment import Aligned, align
 from neilfpp_method.data.brackets import Bracket, Response, calibrate, linear_response, merge, srgb_response
 from neilfpp_method.data.images import IMAGE_SUFFIXES, read_image, write_exr, write_png
 from neilfpp_method.data.photo_exposure import exposures_of
@@ -109,19 +110,20 @@ def merge_brackets(
     images: Path,
     valid: Path,
     response: Literal["auto", "linear", "srgb"] = "auto",
-    on_merged: Callable[[str], None] = lambda name: None,
+    on_merged: Callable[[str, float | None], None] = lambda name, moved: None,
 ) -> None:
     """Write linear float `images/NAME.exr`, and `valid/NAME.png`, white where the radiance is known, for every pose.
 
-    All are on one radiance scale, in which 1 is about the white of the middle exposure. A pose whose two files are there is
-    passed over, so that a call that was interrupted goes on.
+    All are on one radiance scale, in which 1 is about the white of the middle exposure; photographs taken by hand are brought
+    onto the middle one. A pose whose two files are there is passed over, so that a call that was interrupted goes on.
 
     Args:
         brackets: the photographs, as `find_brackets` tells them.
         images: where the merged images go.
         valid: where the validity masks go.
         response: what the pixels are; auto: linear for camera RAW, else calibrated from the brackets themselves.
-        on_merged: called with the name of each pose once its files are there.
+        on_merged: called once a pose's files are there, with its name and by how many pixels, at most, its photographs had
+            to be moved; none where the pose was passed over.
 
     Raises:
         UserError: an image cannot be read; the images of a pose differ in size; or the response cannot be calibrated.
@@ -130,11 +132,14 @@ def merge_brackets(
     decode = _response(brackets, response)
     for name, bracket in brackets.items():
         image, mask = images / f"{name}.exr", valid / f"{name}.png"
+        moved = None
         if not (image.is_file() and mask.is_file()):
-            merged = merge(_read(bracket, middle), decode)
+            aligned = _read(bracket, middle)
+            merged = merge(aligned.bracket, decode)
             write_exr(image, {"RGB": merged.radiance})
             write_png(mask, np.where(merged.valid, 255, 0).astype(np.uint8))
-        on_merged(name)
+            moved = aligned.moved
+        on_merged(name, moved)
 
 
 def _response(brackets: Brackets, response: str) -> Response:
@@ -146,7 +151,7 @@ def _response(brackets: Brackets, response: str) -> Response:
     alike = Counter(tuple(bracket.values()) for bracket in brackets.values()).most_common(1)[0][0]
     usable = [bracket for bracket in brackets.values() if tuple(bracket.values()) == alike]
     step = -(-len(usable) // CALIBRATED)
-    return calibrate([_thin(_read(bracket, 1.0)) for bracket in usable[::step]])
+    return calibrate([_thin(_read(bracket, 1.0).bracket) for bracket in usable[::step]])
 
 
 def _thin(bracket: Bracket) -> Bracket:
@@ -155,14 +160,14 @@ def _thin(bracket: Bracket) -> Bracket:
     return Bracket(tuple(pixels[::step, ::step].copy() for pixels in bracket.pixels), bracket.exposures)
 
 
-def _read(bracket: Mapping[Path, float], unit: float) -> Bracket:
-    """The pixels of a bracket, and its exposures in a unit."""
+def _read(bracket: Mapping[Path, float], unit: float) -> Aligned:
+    """The pixels of a bracket, on one another, and its exposures in a unit."""
     frames = {path: _frame(path) for path in bracket}
     first = next(iter(frames))
     for path, frame in frames.items():
         if frame.shape != frames[first].shape:
             raise UserError(f"{path}: another size than {first.name}", "do not crop or turn single images of a bracket")
-    return Bracket(tuple(frames.values()), tuple(exposure / unit for exposure in bracket.values()))
+    return align(Bracket(tuple(frames.values()), tuple(exposure / unit for exposure in bracket.values())))
 
 
 def _frame(path: Path) -> Float32[np.ndarray, "H W 3"]:

@@ -24,6 +24,10 @@ Response = Callable[[Float32[np.ndarray, "H W 3"]], Float32[np.ndarray, "H W 3"]
 
 DARKEST, BRIGHTEST = 4 / 255, 250 / 255
 SAMPLES_SIDE = 16
+SMOOTHNESS = 30.0
+"""Of the response; OpenCV's own 10 follows the errors of photographs that were taken by hand."""
+NOISE = 3
+"""Of 255 levels: a longer exposure is not darker than this."""
 
 
 @dataclass(frozen=True)
@@ -59,20 +63,25 @@ def calibrate(brackets: Sequence[Bracket]) -> Response:
     """The response of the camera that took brackets, all at the same exposures, with 8 bits a pixel.
 
     Debevec and Malik's linear system for 256 pixels, whose sums over the exposures are evenly spaced: so all levels of
-    light count alike, whatever fills most of the picture.
+    light count alike, whatever fills most of the picture. Pixels that a longer exposure shows darker are left out, unless
+    most are: there something moved, or an image that was aligned shows nothing.
 
     Raises:
         UserError: the images do not determine a response that increases.
     """
     stacks = [np.stack([np.rint(255 * image).reshape(-1, 3) for image in bracket.pixels]) for bracket in brackets]
     levels = np.concatenate(stacks, axis=1).astype(np.uint8)
+    more = np.diff(levels[np.argsort(brackets[0].exposures)].astype(np.int16), axis=0)
+    lighter = (more >= -NOISE).all(axis=(0, 2))
+    if lighter.mean() > 0.5:
+        levels = levels[:, lighter]
     total = levels.sum(axis=(0, 2), dtype=np.int64)
     order = np.argsort(total, kind="stable")
     wanted = np.linspace(total[order[0]], total[order[-1]], SAMPLES_SIDE**2)
     chosen = order[np.searchsorted(total[order], wanted)]
     samples = [np.ascontiguousarray(image[chosen].reshape(SAMPLES_SIDE, SAMPLES_SIDE, 3)) for image in levels]
     times = np.array(brackets[0].exposures, dtype=np.float32)
-    curve = cv2.createCalibrateDebevec(samples=SAMPLES_SIDE**2).process(samples, times).reshape(256, 3)
+    curve = cv2.createCalibrateDebevec(SAMPLES_SIDE**2, SMOOTHNESS).process(samples, times).reshape(256, 3)
     inner = curve[round(255 * DARKEST) : round(255 * BRIGHTEST) : 16]
     if not np.isfinite(curve).all() or (np.diff(inner, axis=0) <= 0).any():
         raise UserError(
@@ -97,7 +106,7 @@ def merge(bracket: Bracket, response: Response) -> Merged:
     w = t · max(min(z − z₀, z₁ − z), 0): photon noise makes the variance of f(z)/t proportional to 1/t, and values fade
     out towards both ends of the range. A channel that is dark at every exposure takes its value from the longest, whose
     error is small as an amount of light; one that is clipped at every exposure takes the shortest's, and the pixel is
-    invalid.
+    invalid. 1, a clipped value, also stands for what an image does not show.
     """
     first, *_ = order = np.argsort(bracket.exposures)
     total = np.zeros_like(bracket.pixels[0])
@@ -111,4 +120,4 @@ def merge(bracket: Bracket, response: Response) -> Merged:
         weights += weight
     known = weights > 0
     radiance = np.where(known, total / np.where(known, weights, 1), fallback)
-    return Merged(radiance.astype(np.float32), (bracket.pixels[first] < BRIGHTEST).all(axis=-1))
+    return Merged(radiance.astype(np.float32), (np.min(bracket.pixels, axis=0) < BRIGHTEST).all(axis=-1))

@@ -21,7 +21,7 @@ from neilfpp_method.data.capture import READERS, Capture, load_capture
 from neilfpp_method.data.formats.colmap import model_folder, open_model
 from neilfpp_method.data.formats.copies import writing
 from neilfpp_method.errors import Stopped, UserError
-from neilfpp_method.prepare.background import silent, sigterm_as_ctrl_c
+from neilfpp_method.prepare.background import sigterm_as_ctrl_c, silent
 from neilfpp_method.prepare.layout import WORK, Source, lay_out
 from neilfpp_method.prepare.mapping import map_scene, refuse_partial
 from neilfpp_method.prepare.matching import choose_pairing, extract_features, feature_counts, match_features

@@ -9,14 +9,16 @@ from typing import Literal
 import numpy as np
 
 from neilfpp_method.data.bracket_folder import GROUPS, Brackets, find_brackets, merge_brackets
+from neilfpp_method.data.json_entry import Entry, write_json
 from neilfpp_method.data.photo_exposure import LISTS
 from neilfpp_method.errors import UserError
 from neilfpp_method.prepare.photos import FEWEST, Photos, check_names
-from neilfpp_method.prepare.progress import Bars
+from neilfpp_method.prepare.progress import Bar, Bars
 from neilfpp_method.prepare.steps import Step, begin, stamp
 
 __all__ = ["Merged", "brackets_among", "merge_photos"]
 
+IMAGES, VALID, MOVED = "images", "valid", "moved.json"
 SAME_STEP = 0.2
 """In stops: what EXIF rounds an exposure to is off by less."""
 AS_THEY_ARE = "or take the photographs as they are: --brackets off"
@@ -88,18 +90,33 @@ def merge_photos(
     exposures = {name: list(bracket.values()) for name, bracket in brackets.items()}
     used = [path for bracket in brackets.values() for path in bracket]
     step = begin(folder, photos=stamp(used, photos.root), brackets=exposures, response=response)
-    images, valid = folder / "images", folder / "valid"
     if step.result is None:
-        bar = open_bar("merging brackets", len(brackets))
-        merge_brackets(brackets, images, valid, response, lambda name: bar.advance())
-        step.complete({})
+        moved = _merge(brackets, folder, response, open_bar("merging brackets", len(brackets)))
+        step = replace(step, result=step.complete({"moved": moved}))
     by_path = {photo.path: photo for photo in photos.items}
     items = []
     for name, bracket in brackets.items():
         middle = by_path[sorted(bracket, key=lambda path, of=bracket: of[path])[len(bracket) // 2]]
-        files = {"path": images / f"{name}.exr", "valid": valid / f"{name}.png"}
+        files = {"path": folder / IMAGES / f"{name}.exr", "valid": folder / VALID / f"{name}.png"}
         items.append(replace(middle, name=name, folder=".", exposure=None, **files))
     remark = f"{len(used)} photographs in {len(brackets)} exposure brackets became {len(items)} linear images"
     if unused := len(photos.items) - len(set(used)):
         remark += f"; {unused} in no bracket left out"
+    if by_hand := [shift for shift in step.result["moved"].values() if shift]:
+        remark += f"; taken by hand: those of {len(by_hand)} were moved onto one another, by up to {max(by_hand):.1f} pixels"
     return Merged(replace(photos, root=folder, items=tuple(items), linear=True), step, remark)
+
+
+def _merge(brackets: Brackets, folder: Path, response: Literal["auto", "linear", "srgb"], bar: Bar) -> dict[str, float]:
+    """Merge what is not merged yet; returns by how many pixels the photographs of each pose were moved, now or before."""
+    known = folder / MOVED
+    moved = dict(Entry.load(known).entries()) if known.is_file() else {}
+
+    def done(name: str, shift: float | None) -> None:
+        if shift is not None:
+            moved[name] = shift
+            write_json(known, moved)
+        bar.advance()
+
+    merge_brackets(brackets, folder / IMAGES, folder / VALID, response, done)
+    return moved

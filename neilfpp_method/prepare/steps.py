@@ -20,7 +20,7 @@ from neilfpp_method.data.images import replacing
 __all__ = ["Step", "begin", "stamp"]
 
 MARKER = "step.json"
-VERSION = 1
+VERSION = 2
 """Of what the steps leave in their folders; what another version left is done again."""
 
 

@@ -41,11 +41,11 @@ def test_a_folder_of_photographs_becomes_radiance(tmp_path: Path, layout: str, r
             listed.setdefault(name, []).append(path)
     if layout == "list":
         (photos / "brackets.json").write_text(json.dumps(listed))
-    seen: list[str] = []
+    seen: list[tuple[str, float | None]] = []
     brackets = find_brackets(photos)
-    merge_brackets(brackets, tmp_path / "images", tmp_path / "valid", response, on_merged=seen.append)
+    merge_brackets(brackets, tmp_path / "images", tmp_path / "valid", response, on_merged=lambda *done: seen.append(done))
     names = tuple(brackets)
-    assert names == tuple(seen)
+    assert seen == [(name, 0.0) for name in names]  # a tripod's
     assert names == (("IMG_0000", "IMG_0005") if layout == "sequence" else ("left", "right"))
     scales = []
     for name, truth in zip(names, truths.values(), strict=True):

@@ -88,6 +88,29 @@ def test_brackets_become_a_linear_capture(tmp_path: Path, capsys) -> None:
     assert "finished already" in capsys.readouterr().out
 
 
+def test_brackets_taken_by_hand_say_so_also_after_a_stop(tmp_path: Path, monkeypatch) -> None:
+    for p in range(3):
+        for i, time in enumerate((1 / 32, 1 / 10, 1 / 3)):
+            write(tmp_path / "photos" / f"{p}_{i}.png", np.roll(radiance(p), 3 * i if p else 0, axis=1), time)
+    photos = survey(tmp_path / "photos", "auto")
+    merge, seen = bracket_folder.merge, []
+
+    def counted(*arguments):
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        seen.append(arguments)
+        return merge(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(bracket_folder, "merge", counted)
+        with pytest.raises(KeyboardInterrupt):
+            merged(photos, tmp_path / "merged")
+    done = merged(photos, tmp_path / "merged")
+    assert "taken by hand: those of 2 were moved onto one another, by up to 3." in done.remark
+    assert merged(photos, tmp_path / "merged").remark == done.remark
+    assert [photo.name for photo in done.photos.items] == ["0", "1", "2"]
+
+
 def merged(photos: Photos, folder: Path):
     with bars(Console(quiet=True)) as open_bar:
         return merge_photos(photos, brackets_among(photos, "auto"), "srgb", folder, open_bar)

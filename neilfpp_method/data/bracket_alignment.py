@@ -1,0 +1,181 @@
+"""Brackets taken by hand: the photographs of a pose are brought onto its middle exposure before they are merged.
+
+Neighbours in exposure are compared, as these share most levels of light that neither clips, and the motions are chained.
+No response is needed: the levels of one image are first mapped to those of the other by their histograms (Grossberg and Nayar,
+2003), which a motion of the camera hardly changes. OpenCV's median threshold bitmaps find the shift, least squares from coarse
+to fine (Baker and Matthews, 2004) the rest: a homography, which is what a turn of the camera does to a picture.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+
+from neilfpp_method.data.brackets import BRIGHTEST, DARKEST, Bracket
+
+__all__ = ["Aligned", "align"]
+
+SIDES = (128, 256, 512, 1024)
+"""Of the reduced images that are compared, the longer ones."""
+ROUNDS = 20
+SETTLED = 0.01
+"""Pixels of a reduced image: no round goes on below."""
+STILL = 0.25
+"""Pixels: what moves less in all corners is left as it is, and not resampled."""
+WORTH_IT = 0.8
+"""A motion counts where no more than this share of what differs is left."""
+LARGEST_SHARE = 0.15
+"""Of the longer side: what a hand does between two exposures stays below."""
+FEWEST_SEEN = 0.02
+SHIFT_BITS = 5
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """A bracket whose images lie on one another, and the largest motion that was undone, in pixels; 0: a tripod's.
+
+    What an image does not show after its motion, and what it had clipped, is 1 there: no evidence.
+    """
+
+    bracket: Bracket
+    moved: float
+
+
+def align(bracket: Bracket) -> Aligned:
+    """Bring all images of a bracket onto the middle exposure.
+
+    An image in which nothing tells how it moved goes the way of its neighbour in exposure.
+    """
+    order = [int(i) for i in np.argsort(bracket.exposures)]
+    middle = len(order) // 2
+    motions = {order[middle]: np.eye(3)}
+    for outward in (order[middle:], order[middle::-1]):
+        for inner, outer in pairwise(outward):
+            motions[outer] = _motion(bracket.pixels[inner], bracket.pixels[outer]) @ motions[inner]
+    size = bracket.pixels[0].shape[:2]
+    moved = {i: _corner_shift(motion, size) for i, motion in motions.items()}
+    pixels = tuple(_moved(image, motions[i]) if moved[i] > STILL else image for i, image in enumerate(bracket.pixels))
+    return Aligned(Bracket(pixels, bracket.exposures), max((shift for shift in moved.values() if shift > STILL), default=0.0))
+
+
+# -------------------------------------------------------------------------------------------------------------- motion
+
+
+def _motion(fixed: Float32[np.ndarray, "H W 3"], moving: Float32[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "3 3"]:
+    """The homography from pixels of `fixed` to those of `moving`; the identity where none explains the images better."""
+    size = fixed.shape[:2]
+    still = np.eye(3)
+    pair = _pair(fixed, moving, SIDES[1])
+    if min(pair.moving_seen.mean(), pair.fixed_seen.mean()) < FEWEST_SEEN:
+        return still
+    starts = [still, _first_shift(pair)]
+    motion = min(starts, key=lambda start: _difference(pair, start))
+    for side in SIDES:
+        pair = _pair(fixed, moving, side)
+        motion = _refined(pair, motion)
+        if side >= max(size):
+            break
+    far = not np.isfinite(motion).all() or _corner_shift(motion, size) > LARGEST_SHARE * max(size)
+    return still if far or _difference(pair, motion) > WORTH_IT * _difference(pair, still) else motion
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Two exposures in grey, reduced, the levels of the second mapped to those of the first; where they are neither dark
+    nor clipped; and the map from reduced to full pixels. Motions are said in full pixels."""
+
+    fixed: Float32[np.ndarray, "h w"]
+    moving: Float32[np.ndarray, "h w"]
+    fixed_seen: Bool[np.ndarray, "h w"]
+    moving_seen: Bool[np.ndarray, "h w"]
+    scale: Float64[np.ndarray, "3 3"]
+
+    def warped(self, motion: Float64[np.ndarray, "3 3"]) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+        """The second image after a motion, and where both are seen."""
+        reduced = np.linalg.inv(self.scale) @ motion @ self.scale
+        size, flags = self.fixed.shape[::-1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        seen = cv2.warpPerspective(self.moving_seen.astype(np.float32), reduced, size, flags=flags) > 0.99
+        return cv2.warpPerspective(self.moving, reduced, size, flags=flags), seen & self.fixed_seen
+
+
+def _pair(fixed: Float32[np.ndarray, "H W 3"], moving: Float32[np.ndarray, "H W 3"], side: int) -> _Pair:
+    height, width = fixed.shape[:2]
+    share = min(1.0, side / max(height, width))
+    size = (max(2, round(share * width)), max(2, round(share * height)))
+    small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (fixed, moving)]
+    seen = [(image.max(axis=2) < BRIGHTEST) & (image.max(axis=2) > DARKEST) for image in small]
+    first, second = (image.mean(axis=2) for image in small)
+    steps = np.linspace(0, 1, 256)
+    matched = np.interp(second, np.quantile(second, steps), np.quantile(first, steps)).astype(np.float32)
+    across, down = width / size[0], height / size[1]
+    # Pixels are counted from the centre of the first.
+    scale = np.array([[across, 0, (across - 1) / 2], [0, down, (down - 1) / 2], [0, 0, 1]])
+    return _Pair(first, matched, *seen, scale)
+
+
+def _first_shift(pair: _Pair) -> Float64[np.ndarray, "3 3"]:
+    """The shift under which both images are brighter than their medians in the same places."""
+    levels = [np.rint(255 * image).astype(np.uint8) for image in (pair.fixed, pair.moving)]
+    x, y = cv2.createAlignMTB(max_bits=SHIFT_BITS).calculateShift(*levels)
+    motion = np.eye(3)
+    motion[:2, 2] = -x, -y
+    return pair.scale @ motion @ np.linalg.inv(pair.scale)
+
+
+def _refined(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
+    """The motion, from one that is nearly right, under which the images differ least but for gain and offset.
+
+    Inverse compositional Gauss–Newton: the small motion is one of the fixed image, whose derivatives are taken once.
+    """
+    height, width = pair.fixed.shape
+    unit = max(height, width) / 2
+    rows, columns = np.mgrid[:height, :width].astype(np.float32)
+    x, y = (columns - (width - 1) / 2) / unit, (rows - (height - 1) / 2) / unit
+    dx, dy = (cv2.Sobel(pair.fixed, cv2.CV_32F, *axis, ksize=3, scale=unit / 8) for axis in ((1, 0), (0, 1)))
+    along = dx * x + dy * y
+    slopes = np.stack([dx * x, dx * y, dx, dy * x, dy * y, dy, -along * x, -along * y, pair.fixed, np.ones_like(x)])
+    centred = pair.scale @ np.array([[unit, 0, (width - 1) / 2], [0, unit, (height - 1) / 2], [0, 0, 1]])
+    for _ in range(ROUNDS):
+        warped, seen = pair.warped(motion)
+        if seen.mean() < FEWEST_SEEN:
+            break
+        off, known = (warped - pair.fixed)[seen], slopes[:, seen]
+        typical = 1.5 * np.median(np.abs(off - np.median(off))) + 1e-4
+        weighted = known / np.maximum(np.abs(off - np.median(off)) / typical, 1.0)  # Huber: what moves on its own counts little
+        step = np.linalg.lstsq(weighted @ known.T, weighted @ off, rcond=1e-9)[0]
+        small = np.eye(3) + np.append(step[:8], 0).reshape(3, 3)
+        change = centred @ np.linalg.inv(small) @ np.linalg.inv(centred)
+        motion = motion @ change
+        motion = motion / motion[2, 2]
+        if _corner_shift(change, (height, width)) < SETTLED:
+            break
+    return motion
+
+
+def _difference(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> float:
+    """How unlike the images are after a motion: 1 − their correlation where both are seen."""
+    warped, seen = pair.warped(motion)
+    if seen.mean() < FEWEST_SEEN:
+        return 1.0
+    a, b = pair.fixed[seen] - pair.fixed[seen].mean(), warped[seen] - warped[seen].mean()
+    return 1.0 - float((a * b).mean() / max(a.std() * b.std(), 1e-12))
+
+
+def _corner_shift(motion: Float64[np.ndarray, "3 3"], size: tuple[int, int]) -> float:
+    """How far the corner that moves most does, in pixels."""
+    height, width = size
+    corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], np.float64)
+    return float(np.linalg.norm(cv2.perspectiveTransform(corners[None], motion)[0] - corners, axis=1).max())
+
+
+def _moved(image: Float32[np.ndarray, "H W 3"], motion: Float64[np.ndarray, "3 3"]) -> Float32[np.ndarray, "H W 3"]:
+    """The image seen from where the middle exposure was; 1 where a clipped pixel, or none, has a part in it."""
+    size, flags = image.shape[1::-1], cv2.WARP_INVERSE_MAP
+    moved = cv2.warpPerspective(image, motion, size, flags=cv2.INTER_CUBIC | flags, borderMode=cv2.BORDER_REPLICATE)
+    clipped = cv2.dilate((image >= BRIGHTEST).astype(np.float32), np.ones((3, 3), np.uint8))
+    unseen = cv2.warpPerspective(clipped, motion, size, flags=cv2.INTER_LINEAR | flags, borderValue=(1.0, 1.0, 1.0))
+    return np.where(unseen > 1e-3, np.float32(1.0), moved.clip(0, 1))
