@@ -20,6 +20,7 @@ import tifffile
 from jaxtyping import Float, Shaped
 from PIL import Image
 
+from neilfpp_method.data.exr import exr_header, exr_samples
 from neilfpp_method.errors import UserError
 
 __all__ = [
@@ -35,6 +36,8 @@ __all__ = [
 
 MAX_SIDE = 65_536
 MAX_PIXELS = 2**30
+RADIANCE_HEADER = 4096
+"""Bytes; longer ones are not written."""
 
 
 @dataclass(frozen=True)
@@ -59,59 +62,14 @@ class ImageFile:
     hdr: bool
 
 
-# -------------------------------------------------------------------------------------------------------------- OpenEXR
-
-
-@dataclass(frozen=True)
-class ExrWindow:
-    """Where the stored pixels lie in the frame; both in OpenEXR's inclusive integer coordinates."""
-
-    left: int
-    top: int
-    width: int
-    height: int
-
-    @staticmethod
-    def of(box) -> ExrWindow:
-        (left, top), (right, bottom) = (tuple(int(v) for v in corner) for corner in box)
-        return ExrWindow(left, top, right - left + 1, bottom - top + 1)
+# ----------------------------------------------------------------------------------------------------- kinds of files
 
 
 def _exr_header(path: Path) -> ImageHeader:
-    header = OpenEXR.File(str(path), header_only=True).header()
-    data = ExrWindow.of(header["dataWindow"])
-    _check_size(path, data.width, data.height)
-    frame = ExrWindow.of(header["displayWindow"])
-    return ImageHeader(frame.width, frame.height, hdr=True)
-
-
-def _exr_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
-    file = OpenEXR.File(str(path), separate_channels=True)
-    channels = {name: channel.pixels for name, channel in file.channels().items()}
-    names = _exr_color_channels(path, tuple(channels)) + (("A",) if "A" in channels else ())
-    stored = np.stack([channels[name].astype(np.float32) for name in names], axis=-1)
-    header = file.header()
-    data, frame = ExrWindow.of(header["dataWindow"]), ExrWindow.of(header["displayWindow"])
-    if data == frame:
-        return stored
-    # A cropped render stores a part of its frame, an overscanned one more than it; the camera speaks of the frame.
-    samples = np.zeros((frame.height, frame.width, len(names)), np.float32)
-    x, y = data.left - frame.left, data.top - frame.top
-    seen = stored[max(-y, 0) : max(frame.height - y, 0), max(-x, 0) : max(frame.width - x, 0)]
-    samples[max(y, 0) :, max(x, 0) :][: seen.shape[0], : seen.shape[1]] = seen
-    return samples
-
-
-def _exr_color_channels(path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
-    single = tuple(name for name in names if name != "A")
-    if "RY" not in names:  # luminance with subsampled chroma
-        for wanted in (("R", "G", "B"), ("X", "Y", "Z"), ("Y",), ("Z",), single[:1] if len(single) == 1 else ()):
-            if wanted and set(wanted) <= set(names):
-                return wanted
-    raise UserError(f"{path}: no RGB or single channel among {', '.join(names)}", "store the image as R, G, B")
-
-
-# ------------------------------------------------------------------------------------------------ the formats of OpenCV
+    header = exr_header(path)
+    for stored in header.stored:  # OpenEXR decodes all parts of a file
+        _check_size(path, stored.width, stored.height)
+    return ImageHeader(header.frame.width, header.frame.height, hdr=True)
 
 
 def _pillow_header(path: Path) -> ImageHeader:
@@ -125,13 +83,30 @@ def _tiff_header(path: Path) -> ImageHeader:
         return ImageHeader(page.imagewidth, page.imagelength, hdr=np.issubdtype(page.dtype, np.floating))
 
 
-def _radiance_header(path: Path) -> ImageHeader:
+def _radiance_lines(path: Path) -> list[bytes]:
+    """The lines of the header, and after an empty one that of the size."""
     with path.open("rb") as file:
-        lines = file.read(4096).split(b"\n")
-    y, height, x, width = lines[lines.index(b"") + 1].split()
+        lines = file.read(RADIANCE_HEADER).split(b"\n")
+    return lines[: lines.index(b"") + 2]
+
+
+def _radiance_header(path: Path) -> ImageHeader:
+    lines = _radiance_lines(path)
+    y, height, x, width = lines[-1].split()
     if (y, x) != (b"-Y", b"+X"):
         raise ValueError("its rows are not stored from top to bottom")
+    if b"FORMAT=32-bit_rle_xyze" in lines:
+        raise ValueError("its colours are XYZ, not RGB")
     return ImageHeader(int(width), int(height), hdr=True)
+
+
+def _radiance_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
+    """Radiance: what is stored has been multiplied by every exposure that the header names, and OpenCV leaves it so."""
+    exposures = [float(line.split(b"=")[1]) for line in _radiance_lines(path) if line.startswith(b"EXPOSURE=")]
+    factor = float(np.prod(exposures))
+    if not (np.isfinite(factor) and factor > 0):
+        raise ValueError(f"an exposure of {factor:g}")
+    return _opencv_samples(path) / np.float32(factor)
 
 
 def _opencv_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
@@ -148,6 +123,8 @@ def _tiff_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
         page = file.pages[0]
         if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and page.samplesperpixel > 1:
             return np.moveaxis(page.asarray(), 0, -1)  # OpenCV would take the planes for pixels, and says nothing
+        if page.dtype == np.float16:
+            return np.atleast_3d(page.asarray())  # which OpenCV does not know
     return _opencv_samples(path)
 
 
@@ -171,8 +148,8 @@ class Format:
 TIFF = Format(_tiff_header, _tiff_samples)
 JPEG = Format(_pillow_header, _jpeg_samples)
 FORMATS: Mapping[str, Format] = {
-    ".exr": Format(_exr_header, _exr_samples),
-    ".hdr": Format(_radiance_header, _opencv_samples),
+    ".exr": Format(_exr_header, exr_samples),
+    ".hdr": Format(_radiance_header, _radiance_samples),
     ".tif": TIFF,
     ".tiff": TIFF,
     ".png": Format(_pillow_header, _opencv_samples),
@@ -180,7 +157,7 @@ FORMATS: Mapping[str, Format] = {
     ".jpeg": JPEG,
 }
 IMAGE_SUFFIXES = tuple(FORMATS)
-FULL_SCALE = {"uint8": 255.0, "uint16": 65_535.0, "float32": 1.0, "float64": 1.0}
+FULL_SCALE = {"uint8": 255.0, "uint16": 65_535.0, "float16": 1.0, "float32": 1.0, "float64": 1.0}
 
 
 def image_header(path: Path) -> ImageHeader:

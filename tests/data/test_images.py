@@ -89,6 +89,17 @@ def test_floating_point_files_are_hdr(tmp_path: Path, suffix: str) -> None:
     assert np.allclose(image.pixels, RGB[..., ::-1], atol=0 if suffix == ".tif" else 4 / 128)
 
 
+def test_the_exposure_of_a_radiance_file_is_divided_out(tmp_path: Path) -> None:
+    path = tmp_path / "a.hdr"
+    cv2.imwrite(str(path), RGB)
+    before = read_image(path).pixels
+    path.write_bytes(path.read_bytes().replace(b"\n\n", b"\nEXPOSURE=0.5\nEXPOSURE= 8.0\n\n", 1))
+    assert np.allclose(read_image(path).pixels, before / 4)
+    path.write_bytes(path.read_bytes().replace(b"=0.5", b"=0.0"))
+    with pytest.raises(UserError, match=r"a\.hdr: cannot be read \(an exposure of 0\)"):
+        read_image(path)
+
+
 @pytest.mark.parametrize("kind", ["NO", "ZIP", "PIZ", "RLE"])
 @pytest.mark.parametrize("layout", ["scanline", "tiled"])
 def test_exr_compressions_and_layouts(tmp_path: Path, kind: str, layout: str) -> None:
@@ -98,7 +109,7 @@ def test_exr_compressions_and_layouts(tmp_path: Path, kind: str, layout: str) ->
     assert np.array_equal(read_image(openexr(tmp_path / "a.exr", {"RGB": RGB}, **header)).pixels, RGB)
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float16, np.float32, np.float64])
 @pytest.mark.parametrize("layout", [{}, {"tile": (16, 16)}, {"byteorder": ">"}, {"compression": "zlib"}, {"planarconfig": 2}])
 def test_tiff_of_another_writer(tmp_path: Path, dtype: type, layout: dict) -> None:
     full = np.iinfo(dtype).max if np.issubdtype(dtype, np.integer) else 1
