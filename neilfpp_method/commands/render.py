@@ -40,10 +40,11 @@ def run(options: Render) -> None:
     from neilfpp_method.evaluate.render_views import render_run
     from neilfpp_method.evaluate.report import write_light_picture
     from neilfpp_method.train.device import pick_device
-    from neilfpp_method.train.run import load_run
+    from neilfpp_method.train.run import check_writable, load_run
 
     run = load_run(options.run, pick_device(options.device), options.checkpoint)
     out = options.out or options.run / "renders"
+    check_writable(out)
     if "maps" in options.what:
         with progress_bar("rendering") as advance:
             render_run(run, out, options.views, options.overwrite, options.confidence, advance)

@@ -27,7 +27,7 @@ class Entry:
     def load(path: Path) -> Entry:
         """The root of a file."""
         try:
-            return Entry(json.loads(path.read_text("utf-8")), str(path))
+            return Entry(json.loads(path.read_text("utf-8-sig")), str(path))  # Windows puts a byte order mark first
         except (ValueError, OSError, RecursionError) as error:
             raise UserError(f"{path}: not valid JSON ({error})", "export the cameras again") from error
 
@@ -57,10 +57,11 @@ class Entry:
         return None if self.entries().get(key) is None else self[key]
 
     def text(self) -> str:
-        """A file name."""
-        if not isinstance(self.value, str) or not Path(self.value).name:
+        """A file name; Windows's separators become the usual ones."""
+        name = self.value.replace("\\", "/") if isinstance(self.value, str) else ""
+        if not Path(name).name:
             raise UserError(f"{self.where}: not a file name", "give a path relative to the capture")
-        return self.value
+        return name
 
     def word(self, *choices: str) -> str:
         """One of the words; any, where none are given."""
@@ -76,8 +77,9 @@ class Entry:
             numbers = np.full((), np.nan)
         fits = numbers.shape in shapes if shapes else numbers.ndim == 1
         if not fits or not np.isfinite(numbers).all():
-            wanted = " or ".join(dict.fromkeys("×".join(map(str, shape)) or "1" for shape in shapes))
-            raise UserError(f"{self.where}: not {wanted or 'a list of'} finite numbers", "export the cameras again")
+            wanted = " or ".join(dict.fromkeys("×".join(map(str, shape)) for shape in shapes if shape))
+            problem = "not a finite number" if shapes == ((),) else f"not {wanted or 'a list of'} finite numbers"
+            raise UserError(f"{self.where}: {problem}", "export the cameras again")
         return numbers
 
     def number(self) -> float:

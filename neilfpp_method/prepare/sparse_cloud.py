@@ -38,14 +38,15 @@ class SparsePoints:
 
 
 def sparse_points(model: pycolmap.Reconstruction) -> SparsePoints:
-    """All points of a model."""
+    """All points of a model. Those that no image sees, as models of known points have, look nowhere."""
     centres = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
     points = list(model.points3D.values())
     position = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
     towards = np.zeros_like(position)
     for i, point in enumerate(points):
-        directions = np.stack([centres[element.image_id] for element in point.track.elements]) - point.xyz
-        towards[i] = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).sum(axis=0)
+        for element in point.track.elements:
+            direction = centres[element.image_id] - point.xyz
+            towards[i] += direction / np.linalg.norm(direction)
     return SparsePoints(
         position=position,
         error=np.array([point.error for point in points], dtype=np.float64),

@@ -3,9 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+import pycolmap
 
 from neilfpp_method.data.point_cloud import WorldPoints
-from neilfpp_method.prepare.sparse_cloud import SparsePoints, estimate_normals, oriented, reliable, without_outliers
+from neilfpp_method.prepare.sparse_cloud import (
+    SparsePoints,
+    estimate_normals,
+    oriented,
+    reliable,
+    sparse_points,
+    without_outliers,
+)
 
 
 def sphere(count: int = 2000, noise: float = 0.0) -> np.ndarray:
@@ -61,3 +69,14 @@ def test_outliers_of_a_given_cloud():
     cloud = without_outliers(WorldPoints(position, position))
     assert 985 <= len(cloud.position) <= 1000
     np.testing.assert_array_equal(cloud.position, cloud.normal)
+
+
+def test_points_that_no_image_sees_look_nowhere_and_are_left_out():
+    model = pycolmap.Reconstruction()
+    for point in sphere(50):
+        model.add_point3D(point, pycolmap.Track(), np.zeros(3, np.uint8))
+    points = sparse_points(model)
+    assert len(points) == 50
+    assert not points.towards.any()
+    assert not reliable(points).any()
+    assert len(oriented(points).position) == 0

@@ -52,16 +52,17 @@ def read(root: Path) -> CaptureFiles:
     registered = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
     if not registered:
         raise UserError(f"{folder}: the model has no registered image", "reconstruct the cameras again")
-    first = registered[0].name
+    names = [image.name.replace("\\", "/") for image in registered]  # a model from Windows has its separators
+    first = names[0]
     inputs = next((root / place for place in IMAGE_FOLDERS if stored(root, root / place / first)), None)
     if inputs is None:
         raise UserError(f"{root}: there is no images/{first}", "put the images of the model into the folder images")
     views = []
-    for index, (image, name) in enumerate(zip(registered, view_names([i.name for i in registered]), strict=True)):
-        file = stored_image(root, inputs / image.name, f"{folder}: {image.name}")
+    for index, (image, listed, name) in enumerate(zip(registered, names, view_names(names), strict=True)):
+        file = stored_image(root, inputs / listed, f"{folder}: {listed}")
         w2c = np.concatenate([image.cam_from_world().matrix(), [[0.0, 0.0, 0.0, 1.0]]])
-        camera = camera_of(image.camera, w2c, f"{folder}: {image.name}")
-        views.append(View(name, index, camera, file, _mask(root, image.name)))
+        camera = camera_of(image.camera, w2c, f"{folder}: {listed}")
+        views.append(View(name, index, camera, file, _mask(root, listed)))
     points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
     cloud = next((inside(root, root / place) for place in POINT_CLOUDS if (root / place).is_file()), None)
     box = find_box(views, points[np.isfinite(points).all(axis=1)])
@@ -76,7 +77,10 @@ def open_model(folder: Path) -> pycolmap.Reconstruction:
     """
     try:
         check_sizes(folder)
-        return pycolmap.Reconstruction(folder)
+        model = pycolmap.Reconstruction(folder)
+        for i in model.reg_image_ids():
+            model.image(i)  # an error where a frame speaks of an image that is not there
+        return model
     except (ValueError, IndexError, RuntimeError, MemoryError, OSError) as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise UserError(f"{folder}: not a COLMAP model that can be read ({reason})", "export the model again") from error

@@ -75,7 +75,7 @@ def _matrices(archive: Path) -> Mapping[str, np.ndarray]:
 def _matrix(matrices: Mapping[str, np.ndarray], name: str, archive: Path) -> Float64[np.ndarray, "4 4"]:
     matrix = matrices.get(name)
     if matrix is None:
-        raise UserError(f"{archive}: {name} is missing", "export the cameras again")
+        raise UserError(f"{archive}: {name} is missing", "number the matrices from 0, in the order of the images' names")
     if matrix.shape not in ((4, 4), (3, 4)) or matrix.dtype.kind not in "fiu" or not np.isfinite(matrix).all():
         raise UserError(f"{archive}: {name} is not a 4×4 matrix of finite numbers", "export the cameras again")
     return np.concatenate([matrix[:3], [[0, 0, 0, 1]]]).astype(np.float64)

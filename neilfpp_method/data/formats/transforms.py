@@ -1,6 +1,7 @@
 """Reader of nerfstudio's transforms.json, and of what instant-ngp and others write under that name.
 
 camera_model                         OPENCV (also where missing), OPENCV_FISHEYE, or one of COLMAP's pinholes
+is_fisheye                           instant-ngp's word for OPENCV_FISHEYE, in the place of camera_model
 fl_x, fl_y, cx, cy, w, h, k1 … p2    for all frames, or in a frame for itself; camera_angle_x (radians) may stand for fl_x
 frames[].file_path, .mask_path       relative to the file; a mask is white on the object
 frames[].transform_matrix            camera to world, 4×4, OpenGL axes (x right, y up, z back)
@@ -129,7 +130,8 @@ def _camera(entry: Entry, frame: Entry, image: Path) -> Camera:
         raise UserError(f"{frame.where}: no focal length", "add fl_x, in pixels, or camera_angle_x, in radians")
     cx, cy = number("cx"), number("cy")
     distortion = {name: value for name in ("k1", "k2", "k3", "k4", "p1", "p2") if (value := number(name)) is not None}
-    model = frame.get("camera_model") or entry.get("camera_model")
+    model, fisheye = (frame.get(name) or entry.get(name) for name in ("camera_model", "is_fisheye"))
+    unnamed = FISHEYE if fisheye and fisheye.value is True else "OPENCV"
     return Camera(
         fx=fx,
         fy=fy,
@@ -138,7 +140,7 @@ def _camera(entry: Entry, frame: Entry, image: Path) -> Camera:
         width=width,
         height=height,
         w2c=_pose(frame["transform_matrix"]),
-        lens=lens_from_nerfstudio(model.word(*MODELS) if model else "OPENCV", distortion, frame.where),
+        lens=lens_from_nerfstudio(model.word(*MODELS) if model else unnamed, distortion, frame.where),
     )
 
 

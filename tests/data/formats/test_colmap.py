@@ -133,6 +133,15 @@ def test_images_of_one_name_in_two_folders(tmp_path: Path) -> None:
     assert np.allclose(capture.views[1].camera.w2c, POSES[2])
 
 
+def test_a_model_from_windows(tmp_path: Path) -> None:
+    images = material(tmp_path, masks=None) / "images"
+    (images / "left").mkdir()
+    for i in range(VIEWS):
+        (images / f"{i:03d}.exr").rename(images / "left" / f"{i:03d}.exr")
+    write(tmp_path, reconstruction(colmap_camera("PINHOLE"), [f"left\\{i:03d}.png" for i in range(VIEWS)]))
+    assert [view.image for view in load_capture(tmp_path).views] == [images / "left" / f"{i:03d}.exr" for i in range(VIEWS)]
+
+
 # --------------------------------------------------------------------------------------------------------------- refused
 
 
@@ -174,6 +183,13 @@ def test_damaged_models(tmp_path: Path, file: str, damage: str) -> None:
     }
     path.write_bytes(damaged[damage])
     refused(tmp_path, "sparse")
+
+
+def test_a_frame_without_its_image(tmp_path: Path) -> None:
+    write(material(tmp_path, masks=None), reconstruction(colmap_camera("PINHOLE")), text=True)
+    path = tmp_path / "sparse" / "0" / "images.txt"
+    path.write_text("\n".join(line for line in path.read_text().splitlines() if "004.png" not in line) + "\n")
+    refused(tmp_path, "sparse", "image 5 in frame 5 does not exist")
 
 
 def test_a_model_without_images_and_a_panorama(tmp_path: Path) -> None:
