@@ -29,17 +29,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Beside the first process of a parallel run the others keep silent, and leave the status to it.
     first = os.environ.get("LOCAL_RANK", "0") == "0"
     errors = Console(stderr=True, quiet=not first)
-    name, rest = arguments[0], arguments[1:]
     try:
-        if name == "--version":
-            from neilfpp_method import __version__
-
-            print(f"neilfpp {__version__}")
-            return 0
-        if name not in COMMANDS:
-            raise UserError(f"unknown command '{name}'", f"choose one of {', '.join(COMMANDS)}")
-        command = COMMANDS[name]
-        command.run(_parse(name, command, rest))
+        _run(arguments[0], arguments[1:])
     except EarlyEnd as end:
         text = str(end) if isinstance(end, Stopped) else f"error: {end}"
         errors.print(text, highlight=False, soft_wrap=True, markup=False)
@@ -50,6 +41,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         errors.print("stopped")
         return Stopped.status
     return 0
+
+
+def _run(name: str, arguments: Sequence[str]) -> None:
+    if name == "--version":
+        from neilfpp_method import __version__
+
+        print(f"neilfpp {__version__}")
+        return
+    if name not in COMMANDS:
+        raise UserError(f"unknown command '{name}'", f"choose one of {', '.join(COMMANDS)}")
+    command = COMMANDS[name]
+    try:
+        command.run(_parse(name, command, arguments))
+    except OSError as error:  # what nobody nearer to it has explained
+        where = f"{error.filename}: " if error.filename else ""
+        remedy = "see that it is there, can be read or written, and has room"
+        raise UserError(f"{where}{error.strerror or error}", remedy) from error
 
 
 def _parse(name: str, command: Command, arguments: Sequence[str]) -> Any:

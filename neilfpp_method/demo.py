@@ -14,6 +14,7 @@ from neilfpp_method.evaluate.report import write_report
 from neilfpp_method.evaluate.views import render_test_views
 from neilfpp_method.presets import preset
 from neilfpp_method.train.command import run_training
+from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.run import load_run, read_json
 
 __all__ = ["demo_config", "demo_scene", "run_demo"]
@@ -57,7 +58,7 @@ def run_demo(out: Path, *, short: bool, resume: bool, device: str, console: Cons
         console=console,
         command="neilfpp demo",
     )
-    run = load_run(out)
+    run = load_run(out, pick_device(device))
     console.print("measuring on the test views …")
     rendered = render_test_views(run)
     metrics = evaluate(run, rendered=rendered)

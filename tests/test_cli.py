@@ -324,13 +324,33 @@ def test_a_folder_that_is_no_run(tmp_path, capfd, trained, name):
         refused(capfd, command, path, complaint, leaves=tmp_path)
 
 
-@pytest.mark.parametrize("name", ["eval", "render", "export"])
+@pytest.mark.parametrize("name", ["train", "eval", "render", "export"])
 def test_a_run_whose_capture_has_moved(tmp_path, capfd, trained, name):
     run = tmp_path / "run"
     shutil.copytree(trained, run)
+    (run / "checkpoints" / "last.pt").write_bytes((run / "checkpoints" / "sdf_init.pt").read_bytes())
     source = json.loads((run / "capture.json").read_text())
     (run / "capture.json").write_text(json.dumps({**source, "root": str(tmp_path / "away")}))
-    refused(capfd, [name, run, "--device", "cpu"], tmp_path / "away", "no such folder", leaves=tmp_path)
+    command = [name, "--out", run, "--resume"] if name == "train" else [name, run]
+    complaint = ("the run's capture is not there", run / "capture.json")
+    refused(capfd, [*command, "--device", "cpu"], tmp_path / "away", *complaint, leaves=tmp_path)
+    if name == "export":  # what the remedy says mends it
+        (run / "capture.json").write_text(json.dumps(source))
+        assert main(["export", str(run), "--device", "cpu", "--resolution", "16"]) == 0
+
+
+@pytest.mark.parametrize("name", ["train", "eval", "render", "export"])
+def test_a_place_that_cannot_be_written(tmp_path, capfd, capture, trained, name):
+    """A file stands where a folder would have to."""
+    (tmp_path / "file").write_text("")
+    out = tmp_path / "file" / "out"
+    options = ["--data", capture, "--preset", "tiny"] if name == "train" else [trained]
+    complaint = f"cannot be written, for nothing can be made in {tmp_path / 'file'}"
+    refused(capfd, [name, *options, "--out", out, "--device", "cpu"], out, complaint, leaves=tmp_path)
+
+
+def test_a_name_that_the_system_refuses(tmp_path, capfd):
+    refused(capfd, ["eval", tmp_path / ("x" * 300)], "x" * 300, "File name too long", leaves=tmp_path)
 
 
 def test_a_real_process_says_one_line_and_no_more(tmp_path):

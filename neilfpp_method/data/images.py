@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -243,14 +243,23 @@ def replacing(path: Path) -> Iterator[Path]:
     """A temporary path beside `path` that takes its place in one step when the block ends, and vanishes when it fails.
 
     A reader, or a run that is killed, never meets half a file. Folders that are missing are made.
+
+    Raises:
+        UserError: the system does not let it be written; what was there before is kept.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    temporary = path.parent / f".{path.stem}.{os.getpid()}{path.suffix}"
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
         os.replace(temporary, path)
+    except (OSError, RuntimeError) as error:  # The second is what OpenEXR and torch make of the first.
+        system = error if isinstance(error, OSError) else error.__context__
+        reason = system.strerror if isinstance(system, OSError) else " ".join(str(error).split()).rstrip(".")
+        remedy = "make room there, or choose a folder that can be written"
+        raise UserError(f"{path}: cannot be written ({reason})", remedy) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def write_exr(path: Path, channels: Mapping[str, Shaped[np.ndarray, "H W ..."]]) -> None:

@@ -10,7 +10,7 @@ from rich.console import Console
 from neilfpp_method.export.light import export_light, has_light
 from neilfpp_method.export.mesh import HasSdf, export_mesh
 from neilfpp_method.train.device import pick_device
-from neilfpp_method.train.run import load_run
+from neilfpp_method.train.run import check_writable, load_run
 
 __all__ = ["run_export"]
 
@@ -39,6 +39,7 @@ def run_export(
     """
     trained = load_run(run, pick_device(device), checkpoint)
     out = out or run / "export"
+    check_writable(out)
     has = {"mesh": isinstance(trained.model.host, HasSdf), "light": has_light(trained)}
     what = what or [name for name, there in has.items() if there] or ["mesh"]
     if "mesh" in what:

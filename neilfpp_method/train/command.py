@@ -83,7 +83,7 @@ def run_training(
         source = CaptureSource(str(data.resolve()), test_every, response, format)
         out = out or Path("runs") / f"{data.resolve().name}-{config.preset}"
         check_free(out)
-    capture = source.load()
+    capture = source.load_again(out) if resume else source.load()
     fabric = _launch(place, devices)
     pixels = _load_pixels(capture, fabric, console)
     facts = described.facts if resume else scene_facts(capture, pixels, config)
@@ -176,7 +176,8 @@ def _check(config: NeilfConfig) -> None:
 
 def _load_pixels(capture: Capture, fabric: Fabric, console: Console) -> PixelDataset:
     columns = (TextColumn("reading images"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, console=console, transient=True, disable=not fabric.is_global_zero) as progress:
+    hidden = not (fabric.is_global_zero and console.is_terminal)
+    with Progress(*columns, console=console, transient=True, disable=hidden) as progress:
         task = progress.add_task("", total=len(capture.train_views))
         return PixelDataset(
             capture, capture.train_views, device=fabric.device, on_view=lambda _: progress.advance(task)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neilfpp_method.config import NeilfConfig, OptimizerConfig
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.errors import Diverged, Stopped
+from neilfpp_method.errors import Diverged, Stopped, UserError
 from neilfpp_method.model import NeilfModel, RadianceUnits
 from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, stage_at, stage_steps, weigh
 from neilfpp_method.structures import LossTerms
@@ -193,11 +193,14 @@ def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
 
 def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str | None = None) -> None:
     if run.fabric.is_global_zero:
-        # Before the checkpoint: what it knows too much is left out when a run continues, and what it lacks would be lost.
-        write_fits(run.path, run.fits)
-        for name in filter(None, (also, "last")):
-            save_checkpoint(run.path / "checkpoints" / f"{name}.pt", run.model, optimizer, step)
-        write_json(run.path / "timing.json", run.seconds)
+        try:
+            # Before the checkpoint: what it knows too much is left out when a run continues, and what it lacks would be lost.
+            write_fits(run.path, run.fits)
+            for name in filter(None, (also, "last")):
+                save_checkpoint(run.path / "checkpoints" / f"{name}.pt", run.model, optimizer, step)
+            write_json(run.path / "timing.json", run.seconds)
+        except UserError as error:
+            raise UserError(error.problem, f"make room, and continue with: {run.continue_with}") from error
     run.fabric.barrier()
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -86,4 +86,5 @@ def reporting(run: Path, console: Console, first_process: bool) -> Iterator[Repo
         with progress:
             yield Reporter(console, progress, writer)
     finally:
-        writer.close()
+        with suppress(OSError):  # A disk that is full ends the run by what could not be saved, not by its log.
+            writer.close()

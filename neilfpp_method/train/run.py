@@ -35,6 +35,7 @@ __all__ = [
     "Description",
     "Run",
     "check_free",
+    "check_writable",
     "create_run",
     "load_checkpoint",
     "load_run",
@@ -71,6 +72,17 @@ class CaptureSource:
     def load(self) -> Capture:
         return load_capture(Path(self.root), self.format, self.test_every, response=self.response)
 
+    def load_again(self, run: Path) -> Capture:
+        """The capture of a run that is there already.
+
+        Raises:
+            UserError: the capture has moved, or cannot be read any more.
+        """
+        if not Path(self.root).is_dir():
+            place = run / "capture.json"
+            raise UserError(f"{self.root}: the run's capture is not there", f"move it back, or give its new place in {place}")
+        return self.load()
+
 
 @dataclass(frozen=True)
 class Run:
@@ -88,21 +100,42 @@ def check_free(path: Path) -> None:
     """That a new run may take this folder.
 
     Raises:
-        UserError: the folder is there already and not empty.
+        UserError: the folder is there already and not empty, or cannot be made.
     """
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise UserError(f"{path}: exists already", "choose another --out, or continue it with --resume")
+    check_writable(path)
+
+
+def check_writable(path: Path) -> None:
+    """That a file or a folder can be made, told before there is work to lose.
+
+    Raises:
+        UserError: it cannot.
+    """
+    above = next(folder for folder in path.absolute().parents if folder.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK):
+        raise UserError(f"{path}: cannot be written, for nothing can be made in {above}", "choose another --out")
 
 
 def create_run(path: Path, config: NeilfConfig, source: CaptureSource, facts: SceneFacts) -> None:
-    """Write the description of a new run into a folder that is missing or empty."""
+    """Write the description of a new run, whole or not at all, into a folder that is missing or empty."""
     check_free(path)
     path.mkdir(parents=True, exist_ok=True)
-    write_json(path / "capture.json", dataclasses.asdict(source))
-    write_json(path / "scene.json", dataclasses.asdict(facts))
-    write_json(path / "environment.json", environment())
-    # The settings come last: a folder that has them is a run.
-    write_json(path / "config.json", {"format": FORMAT, "config": to_dict(config)})
+    description = {
+        "capture.json": dataclasses.asdict(source),
+        "scene.json": dataclasses.asdict(facts),
+        "environment.json": environment(),
+        # The settings come last: a folder that has them is a run.
+        "config.json": {"format": FORMAT, "config": to_dict(config)},
+    }
+    try:
+        for name, content in description.items():
+            write_json(path / name, content)
+    except UserError:
+        for name in description:
+            (path / name).unlink(missing_ok=True)
+        raise
 
 
 def load_run(path: Path | str, device: torch.device | str = "cpu", checkpoint: str = "last") -> Run:
@@ -119,7 +152,7 @@ def load_run(path: Path | str, device: torch.device | str = "cpu", checkpoint: s
     path = Path(path)
     described = read_description(path)
     saved = load_checkpoint(path / "checkpoints" / f"{checkpoint}.pt")
-    capture = described.source.load()
+    capture = described.source.load_again(path)
     model = build_model(capture, described.facts, described.config)
     load_weights(model, saved, path)
     return Run(path, described.config, capture, described.facts, model.to(device).eval(), saved["step"])
@@ -171,8 +204,8 @@ def _described(kind: type[Part], values: Any, where: str) -> Part:
 def save_checkpoint(path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer, step: int) -> None:
     """Weights and optimiser after `step` steps, in one step: never half a file."""
     contents = {"format": FORMAT, "step": step, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
-    with replacing(path) as temporary:
-        torch.save(contents, temporary)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        torch.save(contents, file)
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import platform
 from importlib import metadata
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 import torch
@@ -64,12 +67,12 @@ def test_a_crash_while_writing_leaves_the_old_checkpoint(tmp_path, monkeypatch):
     save_checkpoint(path, *learner(), 7)
     before = path.read_bytes()
 
-    def half_a_save(contents: object, file: Path) -> None:
-        Path(file).write_bytes(before[: len(before) // 2])
-        raise OSError("No space left on device")
+    def half_a_save(contents: object, file: BinaryIO) -> None:
+        file.write(before[: len(before) // 2])
+        raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(torch, "save", half_a_save)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(UserError, match=r"last\.pt: cannot be written \(No space left on device\); make room"):
         save_checkpoint(path, *learner(), 8)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
@@ -167,6 +170,23 @@ def test_a_run_does_not_move_into_somebodys_folder(tmp_path):
         with pytest.raises(UserError, match=f"{name}: exists already; choose another --out"):
             described(tmp_path / name)
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["thesis.tex"]
+
+
+def test_a_description_that_finds_no_room_leaves_nothing(tmp_path, monkeypatch):
+    """So that the same command may be given again."""
+
+    def full(source: Path, target: Path) -> None:
+        if Path(target).name == "config.json":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        rename(source, target)
+
+    rename = os.replace
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(UserError, match=r"config\.json: cannot be written"):
+        described(tmp_path / "run")
+    assert list((tmp_path / "run").iterdir()) == []
+    monkeypatch.undo()
+    described(tmp_path / "run")
 
 
 def change(path: Path, **values) -> None:

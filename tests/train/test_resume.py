@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
 import shlex
@@ -11,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 import torch
@@ -127,6 +129,25 @@ def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint(tmp_path, captur
         with pytest.raises(MemoryError):
             run(capture, out, small_config())
     assert state(out)["step"] == 6
+    run(None, out, resume=True)
+    assert differences(state(out), state(whole)) == []
+
+
+def test_a_run_that_found_no_room_goes_on_once_there_is_some(tmp_path, capture, whole, monkeypatch):
+    """The disk is full when the checkpoint after step 6 is due."""
+
+    def save(contents: dict, file: BinaryIO) -> None:
+        if contents["step"] == 6:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(contents, file)
+
+    write, out = torch.save, tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "save", save)
+        with pytest.raises(UserError, match=r"last\.pt: cannot be written \(No space .*; make room, and continue with: "):
+            run(capture, out, small_config())
+    assert state(out)["step"] == 4
+    assert not [path for path in (out / "checkpoints").iterdir() if path.name.startswith(".")]
     run(None, out, resume=True)
     assert differences(state(out), state(whole)) == []
 
