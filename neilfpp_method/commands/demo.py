@@ -26,8 +26,10 @@ class Demo:
 
 def run(options: Demo) -> None:
     from neilfpp_method.demo import run_demo
+    from neilfpp_method.kernels.process import computing_fast
 
-    run_demo(options.out, short=options.short, resume=options.resume, device=options.device, console=terminal())
+    with computing_fast():
+        run_demo(options.out, short=options.short, resume=options.resume, device=options.device, console=terminal())
 
 
 COMMAND = Command(Demo, run, ["neilfpp demo", "neilfpp demo --short --out trial"])

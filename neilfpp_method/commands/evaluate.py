@@ -28,13 +28,14 @@ class Eval:
 
 def run(options: Eval) -> None:
     from neilfpp_method.evaluate.protocols import evaluate, write_metrics
+    from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.device import pick_device
     from neilfpp_method.train.run import check_writable, load_run
 
     run = load_run(options.run, pick_device(options.device), options.checkpoint)
     out = options.out or options.run / "metrics.json"
     check_writable(out)
-    with progress_bar("evaluating") as advance:
+    with computing_fast(), progress_bar("evaluating") as advance:
         metrics = evaluate(run, advance)
     write_metrics(out, run, metrics)
     console = terminal()

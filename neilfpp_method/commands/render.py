@@ -39,6 +39,7 @@ class Render:
 def run(options: Render) -> None:
     from neilfpp_method.evaluate.render_views import render_run
     from neilfpp_method.evaluate.report import write_light_picture
+    from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.device import pick_device
     from neilfpp_method.train.run import check_writable, load_run
 
@@ -46,7 +47,7 @@ def run(options: Render) -> None:
     out = options.out or options.run / "renders"
     check_writable(out)
     if "maps" in options.what:
-        with progress_bar("rendering") as advance:
+        with computing_fast(), progress_bar("rendering") as advance:
             render_run(run, out, options.views, options.overwrite, options.confidence, advance)
     if "light" in options.what and not write_light_picture(run, out / "incident_light.png") and options.what == ("light",):
         raise UserError(f"{options.run}: there is no light to show at step {run.step}", "train the next stage")

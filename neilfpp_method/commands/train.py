@@ -50,22 +50,24 @@ class Train:
 
 
 def run(options: Train) -> None:
+    from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.command import run_training
 
     config = _settings(options)
     as_before = options.resume and options.preset is None and config == preset(DEFAULT_PRESET)
-    run_training(
-        data=options.data,
-        out=options.out,
-        config=None if as_before else config,
-        resume=options.resume,
-        test_every=options.test_every,
-        response=options.response,
-        format=options.format,
-        device=options.device,
-        devices=options.devices,
-        console=terminal(),
-    )
+    with computing_fast():
+        run_training(
+            data=options.data,
+            out=options.out,
+            config=None if as_before else config,
+            resume=options.resume,
+            test_every=options.test_every,
+            response=options.response,
+            format=options.format,
+            device=options.device,
+            devices=options.devices,
+            console=terminal(),
+        )
 
 
 def _settings(options: Train) -> NeilfConfig:

@@ -1,0 +1,70 @@
+"""The settings of a process that computes, each in a process of its own: what is set stays set."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+SMALL = "import torch\nsmall = lambda: (torch.full((64,), 1e-38) * 0.01).count_nonzero().item()\n"
+FAULTS = """
+import resource, torch
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(20):
+        torch.ones(16_000_000)  # 64 MB: a page of 4 kB fault each, where they are new
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+"""
+
+
+def say(program: str) -> list[str]:
+    """What a program prints, by words."""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+def test_denormal_numbers_count_as_zero():
+    if not torch.set_flush_denormal(False):
+        pytest.skip("this processor has no such setting")
+    program = "from neilfpp_method.kernels.process import computing_fast\n" + SMALL
+    program += "print(small())\nwith computing_fast():\n    print(small())\nprint(small())"
+    assert say(program) == ["64", "0", "64"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc alone is asked")
+def test_memory_that_is_freed_is_kept():
+    program = "from neilfpp_method.kernels.process import computing_fast\n" + FAULTS
+    program += "print(faults())\nwith computing_fast():\n    faults()\n    print(faults())\nprint(faults())"
+    before, kept, after = map(int, say(program))
+    assert kept < 0.1 * before
+    assert after > 0.5 * before
+
+
+@pytest.mark.parametrize(
+    ("words", "does"),
+    [
+        (["train", "--data", "x"], "train.command.run_training"),
+        (["demo"], "demo.run_demo"),
+        (["eval", "x"], "evaluate.protocols.evaluate"),
+    ],
+)
+def test_a_command_that_computes_makes_them(words, does):
+    if not torch.set_flush_denormal(False):
+        pytest.skip("this processor has no such setting")
+    module, name = f"neilfpp_method.{does}".rsplit(".", 1)
+    program = f"""{SMALL}
+import {module} as place, neilfpp_method.train.run as run
+from neilfpp_method.cli import main
+def tell(*_, **__):
+    print(small())
+    raise KeyboardInterrupt
+place.{name} = tell
+run.load_run = lambda *_: None
+main({words!r})
+print(small())
+"""
+    first, *_, last = say(program)  # between them a bar of progress
+    assert (first, last) == ("0", "64")
