@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -33,7 +34,7 @@ CALIBRATION_SIDE = 1024
 """Most pixels a side that it is calibrated from."""
 
 
-def find_brackets(folder: Path, exposures: Path | None = None) -> Brackets:
+def find_brackets(folder: Path, exposures: Path | None = None, unreadable: Collection[Path] = ()) -> Brackets:
     """The brackets of a folder.
 
     Images belong together when `brackets.json` says so ({"pose": ["a.jpg", "b.jpg"]}); when they lie in one sub-folder;
@@ -43,15 +44,18 @@ def find_brackets(folder: Path, exposures: Path | None = None) -> Brackets:
     Args:
         folder: where the images are.
         exposures: a file of exposures, as `exposures_of` reads it; none: beside the images, or from EXIF.
+        unreadable: images that are known to be damaged. They keep their places in the brackets, with the exposure NaN, so
+            that the brackets they spoil can be told from the others.
 
     Raises:
         UserError: no brackets, an image without an exposure, or two images of a bracket with the same one.
     """
-    listed = _listed_groups(folder)
+    listed = _listed_groups(folder, unreadable)
     images = [image for group in listed.values() for image in group]
     if not images:
         raise UserError(f"{folder}: no images", f"one of {', '.join((*IMAGE_SUFFIXES, *RAW_SUFFIXES))}")
-    known = exposures_of(folder, images, exposures)
+    known = exposures_of(folder, [image for image in images if image not in unreadable], exposures)
+    listed = {name: group for name, group in listed.items() if any(image in known for image in group)}
     by_name = images[0].parent == folder and not (folder / GROUPS).is_file()
     guess = by_name and not all(_is_bracket(group, known) for group in listed.values())
     groups = _returning_groups(images, known) if guess else listed
@@ -61,10 +65,10 @@ def find_brackets(folder: Path, exposures: Path | None = None) -> Brackets:
                 f"{folder}: the {len(group)} images of '{name}' are no bracket: their exposures do not all differ",
                 f"put each pose in a folder of its own, or list the poses in {GROUPS}",
             )
-    return {name: {image: known[image] for image in group} for name, group in groups.items()}
+    return {name: {image: known.get(image, math.nan) for image in group} for name, group in groups.items()}
 
 
-def _listed_groups(folder: Path) -> Mapping[str, Sequence[Path]]:
+def _listed_groups(folder: Path, unreadable: Collection[Path]) -> Mapping[str, Sequence[Path]]:
     """Groups as files and folders name them; of images that only differ in a number, one group."""
     path = folder / GROUPS
     if path.is_file():
@@ -82,8 +86,10 @@ def _listed_groups(folder: Path) -> Mapping[str, Sequence[Path]]:
     groups: dict[str, list[Path]] = defaultdict(list)
     for image in _images(folder):
         groups[NUMBERED.sub("", image.stem)].append(image)
+    if any(image not in unreadable for group in groups.values() for image in group):
+        return groups
     folders = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
-    return groups or {path.name: images for path in folders if (images := _images(path))}
+    return {path.name: images for path in folders if (images := _images(path))}
 
 
 def _images(folder: Path) -> list[Path]:
@@ -96,13 +102,18 @@ def _returning_groups(images: Sequence[Path], exposures: Mapping[Path, float]) -
     period = next(
         n
         for n in range(1, len(images) + 1)
-        if len(images) % n == 0 and all(exposures[a] == exposures[b] for a, b in zip(images, images[n:], strict=False))
+        if len(images) % n == 0 and all(len(set(_told(images[k::n], exposures))) <= 1 for k in range(n))
     )
     return {images[i].stem: images[i : i + period] for i in range(0, len(images), period)}
 
 
 def _is_bracket(images: Sequence[Path], exposures: Mapping[Path, float]) -> bool:
-    return 2 <= len(images) == len({exposures[image] for image in images})
+    told = _told(images, exposures)
+    return len(images) >= 2 and len(set(told)) == len(told)
+
+
+def _told(images: Sequence[Path], exposures: Mapping[Path, float]) -> list[float]:
+    return [exposures[image] for image in images if image in exposures]
 
 
 def merge_brackets(

@@ -54,7 +54,8 @@ def run_prepare(options: Prepare, console: Console) -> Path:
 def _prepare(options: Prepare, console: Console) -> Path:
     posed = any(reader.recognise(options.images) for reader in READERS.values())
     capture = load_capture(options.images, response=options.response) if posed else None
-    photos = None if posed else _readable(survey(options.images, options.response), options)
+    photos = None if posed else survey(options.images, options.response)
+    _check_readable(tuple(photos.unreadable.values()) if photos else (), options)
     brackets = photos and brackets_among(photos, options.brackets)
     with writing(options.out):
         with bars(console) as open_bar:
@@ -102,10 +103,9 @@ def _way_on(options: Prepare) -> Iterator[None]:
 # -------------------------------------------------------------------------------------------------------------- sources
 
 
-def _readable(photos: Photos, options: Prepare) -> Photos:
-    if photos.unreadable and not options.allow_partial:
-        raise unreadable(photos.unreadable)
-    return photos
+def _check_readable(problems: tuple[str, ...], options: Prepare) -> None:
+    if problems and not options.allow_partial:
+        raise unreadable(problems)
 
 
 def _from_capture(capture: Capture, options: Prepare) -> Source:
@@ -131,11 +131,10 @@ def _from_photos(photos: Photos, brackets: Brackets | None, options: Prepare, op
     copies = step.folder
     if step.result is None:
         broken = write_copies(photos, copies, open_bar("copies for matching", len(photos.items)).advance)
-        if broken and not options.allow_partial:
-            raise unreadable(broken)
+        _check_readable(broken, options)
         step = replace(step, result=step.complete({"unreadable": broken}))
-    broken = tuple(step.result["unreadable"])
-    photos = _readable(replace(photos, unreadable=photos.unreadable + broken), options)
+    problems = (*photos.unreadable.values(), *step.result["unreadable"])
+    _check_readable(problems, options)
     photos = replace(photos, items=tuple(p for p in photos.items if (copies / f"{p.name}.png").is_file()))
 
     count = len(photos.items)
@@ -159,6 +158,6 @@ def _from_photos(photos: Photos, brackets: Brackets | None, options: Prepare, op
     if not options.allow_partial:
         refuse_partial([p.name for p in placed if p.points is None], sizes)
     cameras = describe_cameras(model)
-    remarks = [f"left out: {problem}" for problem in photos.unreadable] + remarks_on(placed, sizes, cameras)
+    remarks = [f"left out: {problem}" for problem in problems] + remarks_on(placed, sizes, cameras)
     remarks = (*([merged.remark] if merged else []), *remarks)
     return Source(posed_by_model(photos, model), step, sparse_points(model), placed, sizes, cameras, remarks)

@@ -29,7 +29,7 @@ def brackets_among(photos: Photos, wanted: Literal["auto", "off"]) -> Brackets |
 
     A list of brackets or of exposures beside the photographs says that they are brackets. Without one they are where
     `find_brackets` puts every one of them into a bracket, there are enough poses, and all brackets have the same steps:
-    exposures that the camera chose for each picture do not.
+    exposures that the camera chose for each picture do not. A bracket with a photograph that cannot be read is left out.
 
     Raises:
         UserError: there is a list, and the photographs are no brackets, or too few.
@@ -38,13 +38,15 @@ def brackets_among(photos: Photos, wanted: Literal["auto", "off"]) -> Brackets |
         return None
     listed = next((photos.root / name for name in (GROUPS, *LISTS) if (photos.root / name).is_file()), None)
     try:
-        found = find_brackets(photos.root)
+        found = find_brackets(photos.root, unreadable=photos.unreadable)
         check_names(tuple(found), tuple(next(iter(bracket)) for bracket in found.values()))
     except UserError as error:
         if listed is None:
             return None
         raise UserError(error.problem, f"{error.remedy}, {AS_THEY_ARE}") from error
-    photographs, used = {photo.path for photo in photos.items}, {path for bracket in found.values() for path in bracket}
+    photographs = {photo.path for photo in photos.items}
+    used = {path for bracket in found.values() for path in bracket if path not in photos.unreadable}
+    found = {name: bracket for name, bracket in found.items() if not any(path in photos.unreadable for path in bracket)}
     if listed is not None:
         if strange := sorted(used - photographs):
             raise UserError(f"{listed}: {strange[0]} is no photograph that can be read", "correct the list")

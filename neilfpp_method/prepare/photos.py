@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -46,12 +46,13 @@ class Photo:
 
 @dataclass(frozen=True)
 class Photos:
-    """The photographs of a folder in the order of their paths; all of one kind. `unreadable`: what is wrong with others."""
+    """The photographs of a folder in the order of their paths; all of one kind. `unreadable`: what is wrong with others.
+    """
 
     root: Path
     items: tuple[Photo, ...]
     linear: bool
-    unreadable: tuple[str, ...] = ()
+    unreadable: Mapping[Path, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -81,15 +82,15 @@ def survey(root: Path, response: Literal["auto", "linear", "srgb"]) -> Photos:
         raise UserError(f"{root}: no such folder", "give a folder of photographs")
     paths = sorted(path for path in root.rglob("*") if _is_photo(path, root))
     kinds: dict[Path, bool] = {}
-    problems: list[str] = []
+    problems: dict[Path, str] = {}
     for path in paths:
         try:
             kinds[path] = path.suffix.lower() in RAW_SUFFIXES or image_header(path).hdr
         except UserError as error:
-            problems.append(error.problem)
+            problems[path] = error.problem
     if len(kinds) < FEWEST:
         count = f"{len(kinds) or 'no'} image{'s' * (len(kinds) != 1)}"
-        also = f", and {len(problems)} that cannot be read ({problems[0]})" if problems else ""
+        also = f", and {len(problems)} that cannot be read ({next(iter(problems.values()))})" if problems else ""
         raise UserError(f"{root}: {count}{also}", f"give at least {FEWEST}, better 30, from all around the object")
     if response == "auto" and len(set(kinds.values())) > 1:
         hdr, ldr = (next(path for path, kind in kinds.items() if kind is wanted) for wanted in (True, False))
@@ -98,7 +99,7 @@ def survey(root: Path, response: Literal["auto", "linear", "srgb"]) -> Photos:
     names = view_names([path.relative_to(root).as_posix() for path in kinds])
     check_names(names, tuple(kinds))
     items = tuple(_photo(root, name, path, linear) for name, path in zip(names, kinds, strict=True))
-    return Photos(root, items, linear, tuple(problems))
+    return Photos(root, items, linear, problems)
 
 
 def unreadable(problems: Sequence[str]) -> UserError:

@@ -187,6 +187,24 @@ def test_photographs_beside_brackets_in_folders_are_not_lost(tmp_path: Path) -> 
     assert among(tmp_path) is None
 
 
+@pytest.mark.parametrize("name", ["{p}_{i}.png", "{p}/{i}.png", "IMG_{n:04}.png", "IMG{n:04}.png", "listed_{n:04}.png"])
+@pytest.mark.parametrize("damaged", [0, 4, 11])
+def test_a_damaged_photograph_costs_its_own_bracket_alone(tmp_path: Path, name: str, damaged: int) -> None:
+    root = plain(tmp_path / "photos", [TIMES] * 4, name)
+    paths = sorted(path for path in root.rglob("*.png"))
+    if name.startswith("listed"):
+        poses = {f"pose{p}": [path.name for path in paths[3 * p : 3 * p + 3]] for p in range(4)}
+        (root / "brackets.json").write_text(json.dumps(poses))
+    paths[damaged].write_bytes(b"no picture")
+    if not name.startswith("IMG"):  # one more would break the order of a sequence
+        (root / "scrap.jpg").write_bytes(b"nor this")
+    spoilt = {path for path in paths if paths.index(path) // 3 == damaged // 3}
+    photos = survey(root, "auto")
+    brackets = brackets_among(photos, "auto")
+    assert {path for bracket in brackets.values() for path in bracket} == set(paths) - spoilt
+    assert "2 in no bracket left out" in merged(photos, tmp_path / "merged").remark
+
+
 def test_a_list_says_what_is_used(tmp_path: Path) -> None:
     root = plain(tmp_path / "photos", [TIMES] * 4, "IMG_{n:04}.png")
     listed = {f"pose{p}": [f"IMG_{3 * p + i:04}.png" for i in range(3)] for p in range(3)}

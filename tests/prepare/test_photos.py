@@ -52,7 +52,7 @@ def test_unreadable_files_are_listed(tmp_path):
     (tmp_path / "3.exr").write_bytes(b"nothing")
     photos = survey(tmp_path, "auto")
     assert len(photos.items) == 3
-    assert "3.exr" in photos.unreadable[0]
+    assert "3.exr" in photos.unreadable[tmp_path / "3.exr"]
     (tmp_path / "2.exr").unlink()
     with pytest.raises(UserError, match="2 images, and 1 that cannot be read"):
         survey(tmp_path, "auto")
