@@ -349,6 +349,21 @@ def test_a_place_that_cannot_be_written(tmp_path, capfd, capture, trained, name)
     refused(capfd, [name, *options, "--out", out, "--device", "cpu"], out, complaint, leaves=tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["export", "--what", "mesh", "light"], ("no light yet at step 4",)),
+        (["render", "--what", "light"], ("no light to show at step 4",)),
+        (["render", "--confidence"], ("no material at step 4",)),
+    ],
+)
+def test_what_a_stage_does_not_have_yet(tmp_path, capfd, trained, options, words):
+    """Nothing of what is asked for is written, not even what there is."""
+    name, *rest = options
+    command = [name, trained, "--checkpoint", "sdf_init", "--device", "cpu", "--out", tmp_path / "out", *rest]
+    refused(capfd, command, *words, leaves=tmp_path)
+
+
 def test_a_name_that_the_system_refuses(tmp_path, capfd):
     refused(capfd, ["eval", tmp_path / ("x" * 300)], "x" * 300, "File name too long", leaves=tmp_path)
 

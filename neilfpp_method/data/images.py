@@ -252,11 +252,9 @@ def replacing(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
         os.replace(temporary, path)
-    except (OSError, RuntimeError) as error:  # The second is what OpenEXR and torch make of the first.
-        system = error if isinstance(error, OSError) else error.__context__
-        reason = system.strerror if isinstance(system, OSError) else " ".join(str(error).split()).rstrip(".")
+    except OSError as error:
         remedy = "make room there, or choose a folder that can be written"
-        raise UserError(f"{path}: cannot be written ({reason})", remedy) from error
+        raise UserError(f"{path}: cannot be written ({error.strerror or error})", remedy) from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -271,7 +269,10 @@ def write_exr(path: Path, channels: Mapping[str, Shaped[np.ndarray, "H W ..."]])
     arrays = {name: np.ascontiguousarray(array, kinds[name]) for name, array in channels.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with replacing(path) as temporary:
-        OpenEXR.File(header, arrays).write(str(temporary))
+        try:
+            OpenEXR.File(header, arrays).write(str(temporary))
+        except RuntimeError as error:  # a full disk, as OpenEXR tells it
+            raise OSError(" ".join(str(error).split()).rstrip(".")) from error
 
 
 def write_png(path: Path, samples: Shaped[np.ndarray, "H W ..."]) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from neilfpp_method.export.light import export_light, has_light
+from neilfpp_method.export.light import check_light, export_light, has_light
 from neilfpp_method.export.mesh import HasSdf, export_mesh
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.run import check_writable, load_run
@@ -42,6 +42,8 @@ def run_export(
     check_writable(out)
     has = {"mesh": isinstance(trained.model.host, HasSdf), "light": has_light(trained)}
     what = what or [name for name, there in has.items() if there] or ["mesh"]
+    if "light" in what:
+        check_light(trained, probes)
     if "mesh" in what:
         mesh = export_mesh(trained, out / "mesh.ply", resolution)
         size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces"

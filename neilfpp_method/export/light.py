@@ -22,7 +22,7 @@ from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.train.run import Run, write_json
 
-__all__ = ["ExportedLight", "export_light", "has_light"]
+__all__ = ["ExportedLight", "check_light", "export_light", "has_light"]
 
 FORMAT = 1
 PROBE_HEIGHT = 64
@@ -45,6 +45,18 @@ def has_light(run: Run) -> bool:
     return run.step > run.config.train.sdf_steps
 
 
+def check_light(run: Run, probes: int | None) -> None:
+    """That there is what `export_light` is asked for.
+
+    Raises:
+        UserError: no stage has moved the light, or the number of probes is not within 0 … 1024.
+    """
+    if not has_light(run):
+        raise UserError(f"{run.path}: there is no light yet at step {run.step}", "train the next stage")
+    if probes is not None and not 0 <= probes <= MOST_PROBES:
+        raise UserError(f"{probes} probes", f"ask for 0 to {MOST_PROBES} with --probes")
+
+
 def export_light(run: Run, out: Path, probes: int | None = None) -> ExportedLight:
     """Write the light of a run. Radiance is in the units of the images, lengths in those of the capture's world.
 
@@ -54,12 +66,9 @@ def export_light(run: Run, out: Path, probes: int | None = None) -> ExportedLigh
         probes: how many; none: 16 for a light that is free at every point, else 0.
 
     Raises:
-        UserError: no stage has moved the light, the number of probes is not within 0 … 1024, or there is no surface.
+        UserError: see `check_light`; or there is no surface for probes.
     """
-    if not has_light(run):
-        raise UserError(f"{run.path}: there is no light yet at step {run.step}", "train the next stage")
-    if probes is not None and not 0 <= probes <= MOST_PROBES:
-        raise UserError(f"{probes} probes", f"ask for 0 to {MOST_PROBES} with --probes")
+    check_light(run, probes)
     light, lamps, environment = run.model.light, 0, None
     if isinstance(light, EnvironmentLight):
         environment = out / "environment.exr"
