@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from neilfpp_method.config import InterReflectionConfig
-from neilfpp_method.hosts.base import HasSurfaceWidth, Host, LightsItself
+from neilfpp_method.hosts.base import HasSurfaceWidth, Host, KnowsMisses, LightsItself
 from neilfpp_method.losses import scale_gradient
 from neilfpp_method.shading.frame import local_frame
 from neilfpp_method.structures import RayBatch, SceneLight
@@ -27,7 +27,10 @@ MOST_RENDERED = 2048
 
 @dataclass(frozen=True)
 class TracedLight:
-    """Rays that left the surface: where from, which way, the radiance that arrives along them, and which ones hit."""
+    """Rays that left the surface: where from, which way, the radiance that arrives along them, and which ones hit.
+
+    Rays of which the host knows at once that they meet nothing are left out.
+    """
 
     position: Float[Tensor, "K 3"]
     wi: Float[Tensor, "K 3"]
@@ -61,6 +64,9 @@ def trace_light(
     wi, cosine = _cone_directions(normal, math.cos(math.radians(config.max_angle_deg)))
     width = host.surface_width() if isinstance(host, HasSurfaceWidth) else 0.0
     start = position + ((config.offset + HEIGHT_IN_WIDTHS * width) / cosine) * wi
+    if isinstance(host, KnowsMisses):
+        worth = torch.nonzero(host.may_meet(RayBatch(start, wi)))[:, 0]
+        position, start, wi = position[worth], start[worth], wi[worth]
     with torch.set_grad_enabled(torch.is_grad_enabled() and config.radiance_gradient > 0.0):
         hits = host.render(RayBatch(start, wi))
     radiance = scale_gradient(hits.color, config.radiance_gradient)

@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -22,6 +22,7 @@ __all__ = [
     "HasStages",
     "HasSurfaceWidth",
     "Host",
+    "KnowsMisses",
     "LightsItself",
     "Regularised",
     "RegularisedHits",
@@ -60,6 +61,15 @@ class LightsItself(Protocol):
 
     def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
         """What arrives at surface points x from the scene's own surfaces in the directions wi; constants, no gradient."""
+        ...
+
+
+@runtime_checkable
+class KnowsMisses(Protocol):
+    """A host that knows cheaply which rays meet nothing. Without: every ray for L_ref is rendered."""
+
+    def may_meet(self, rays: RayBatch) -> Bool[Tensor, " N"]:
+        """Which of the rays, which leave a surface, may meet one: the others are not worth rendering."""
         ...
 
 

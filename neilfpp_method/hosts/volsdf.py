@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from neilfpp_method import losses
@@ -132,6 +132,14 @@ class VolSdfHost(nn.Module):
         )
         distance = torch.where(found.hit, found.distance, torch.inf)
         return SceneLight(found.hit.view(wi.shape[:2]), radiance.view(wi.shape), distance.view(wi.shape[:2]))
+
+    @torch.no_grad()
+    def may_meet(self, rays: RayBatch) -> Bool[Tensor, " N"]:
+        """Which rays that leave a surface may meet one, as the grid of empty space has it; all, where there is none."""
+        if self.empty_space is None:
+            return torch.ones(len(rays), dtype=torch.bool, device=rays.origins.device)
+        interval = sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
+        return self.empty_space.may_meet(self.sdf, rays, interval, self.surface_width())
 
     def get_extra_state(self) -> dict[str, int | None]:
         """The age of the distance grid, for checkpoints."""

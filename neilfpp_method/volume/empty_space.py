@@ -67,14 +67,8 @@ class EmptySpace(nn.Module):
         Costs one query of the field per ray. A ray that is empty all along keeps its whole interval. On a CPU a broken
         promise is noticed at once; elsewhere nobody waits for the answer, and the age of the grid alone decides.
         """
-        if self.age is None or self.age >= MOST_LIFE:
-            self._sample(sdf)
-        edges = torch.lerp(
-            interval.near[:, None],
-            interval.far[:, None],
-            torch.linspace(0, 1, LOOK_UPS + 1, device=self.distance.device, dtype=interval.near.dtype),
-        )
-        clearance = beta * math.log(self.radius / MISSED) - beta * beta.log()  # e^(−G/β) · 2 radius / 2β ≤ MISSED
+        self._renew(sdf)
+        edges, clearance = self._edges(interval), self._clearance(beta)
         empty, opaque = self._known(rays, edges, clearance, beta)
         if rays.origins.device.type == "cpu" and not self._holds(sdf, rays, edges, empty, clearance):
             if self.age is not None and self.age >= LEAST_LIFE:
@@ -89,6 +83,30 @@ class EmptySpace(nn.Module):
             torch.where(some, edges.gather(-1, last)[:, 0], interval.far),
         )
 
+    @torch.no_grad()
+    def may_meet(
+        self,
+        sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]],
+        rays: RayBatch,
+        interval: Interval,
+        beta: Float[Tensor, ""],
+    ) -> Bool[Tensor, " N"]:
+        """Which rays may come down on a surface: for rays that leave one, where nearly all of a ray's start is never clear.
+
+        A ray that enters a surface does so where the distance falls. So a ray may meet one if somewhere the grid's distance
+        falls along it in a part that is not empty for sure. Between vertices the grid knows a falling distance less well than a
+        small one: a surface within a cell or two of the start may be overlooked. Costs look-ups alone.
+        """
+        self._renew(sdf)
+        edges = self._edges(interval)
+        distance = self._read(rays, edges)
+        empty = distance - self._doubt(edges) > self._clearance(beta)
+        return ((distance.diff(dim=-1) < 0.0) & ~empty[:, 1:]).any(-1)
+
+    def _renew(self, sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]) -> None:
+        if self.age is None or self.age >= MOST_LIFE:
+            self._sample(sdf)
+
     def _sample(self, sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]) -> None:
         self.distance.copy_(sample_grid(sdf, self.radius, RESOLUTION, self.distance))
         steps = torch.stack([self.distance.diff(dim=axis).abs().amax() for axis in range(3)])
@@ -99,16 +117,31 @@ class EmptySpace(nn.Module):
         self, rays: RayBatch, edges: Float[Tensor, "N E"], clearance: Float[Tensor, ""], beta: Float[Tensor, ""]
     ) -> tuple[Bool[Tensor, "N K"], Bool[Tensor, "N K"]]:
         """Which parts of the rays are empty for sure, and which lie for sure behind what is opaque."""
-        width = edges.diff(dim=-1)
-        middle = edges[:, :-1] + 0.5 * width
-        points = rays.origins[:, None] + middle[..., None] * rays.directions[:, None]
-        distance = look_up(self.distance, self.radius, points.reshape(-1, 3)).view(middle.shape)
-        # A weighted mean of the vertices of a cell is off by no more than the slope times half of its diagonal.
-        reach = 0.5 * math.sqrt(3.0) * cell_size(self.distance, self.radius)
-        doubt = self.slope * (0.5 * width + reach)
+        width, distance, doubt = edges.diff(dim=-1), self._read(rays, edges), self._doubt(edges)
         # Inside, the density is at least half of 1/β.
         depth = ((distance + doubt < 0.0) * width / (2.0 * beta)).cumsum(dim=-1)
         return distance - doubt > clearance, depth - width / (2.0 * beta) > OPAQUE
+
+    def _edges(self, interval: Interval) -> Float[Tensor, "N E"]:
+        """The ends of the parts of each ray."""
+        share = torch.linspace(0, 1, LOOK_UPS + 1, device=self.distance.device, dtype=interval.near.dtype)
+        return torch.lerp(interval.near[:, None], interval.far[:, None], share)
+
+    def _read(self, rays: RayBatch, edges: Float[Tensor, "N E"]) -> Float[Tensor, "N K"]:
+        """The grid's distance in the middle of each part."""
+        middle = 0.5 * (edges[:, :-1] + edges[:, 1:])
+        points = rays.origins[:, None] + middle[..., None] * rays.directions[:, None]
+        return look_up(self.distance, self.radius, points.reshape(-1, 3)).view(middle.shape)
+
+    def _doubt(self, edges: Float[Tensor, "N E"]) -> Float[Tensor, "N K"]:
+        """How far the field in a part may be from what the grid says in its middle."""
+        # A weighted mean of the vertices of a cell is off by no more than the slope times half of its diagonal.
+        reach = 0.5 * math.sqrt(3.0) * cell_size(self.distance, self.radius)
+        return self.slope * (0.5 * edges.diff(dim=-1) + reach)
+
+    def _clearance(self, beta: Float[Tensor, ""]) -> Float[Tensor, ""]:
+        """The distance from which on a density of scale β adds up to no more than MISSED along a whole ray."""
+        return beta * math.log(self.radius / MISSED) - beta * beta.log()  # e^(−G/β) · 2 radius / 2β ≤ MISSED
 
     def _holds(
         self,

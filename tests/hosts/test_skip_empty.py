@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from neilfpp_method.hosts.volsdf import VolSdfHost
+from neilfpp_method.inter_reflection import trace_light
 from neilfpp_method.volume import empty_space
 from tests.scenes import sphere_batch, tiny_config
 
@@ -51,6 +52,29 @@ def test_hits_stay_where_they_are():
     solid = (one.opacity > 0.99) & (other.opacity > 0.99)
     assert solid.sum() > 5
     assert (one.position - other.position)[solid].norm(dim=-1).median() < 0.03
+
+
+def test_traced_rays_that_meet_nothing_are_not_rendered():
+    """On a sphere no ray meets anything: none is rendered. Where the start lies before it, all are, and hit as they did."""
+    skipping, plain = host().train(), host(skip=False).train()
+    plain.load_state_dict(skipping.state_dict(), strict=False)
+    skipping.density.above_floor.data.fill_(2e-3)
+    plain.density.above_floor.data.fill_(2e-3)
+    out = torch.nn.functional.normalize(torch.randn(200, 3), dim=-1)
+    settings = tiny_config().inter_reflection
+    above = trace_light(skipping, 0.6 * out, out, dataclasses.replace(settings, max_angle_deg=60.0), hit_share=0.8)
+    assert len(above.hit) < 20
+    torch.manual_seed(1)
+    towards = trace_light(skipping, 1.2 * out, -out, dataclasses.replace(settings, max_angle_deg=20.0), hit_share=0.8)
+    torch.manual_seed(1)
+    all_of_them = trace_light(plain, 1.2 * out, -out, dataclasses.replace(settings, max_angle_deg=20.0), hit_share=0.8)
+    assert len(towards.hit) == len(all_of_them.hit)
+    assert abs(towards.hit.float().mean() - all_of_them.hit.float().mean()) < 0.05
+
+
+def test_no_ray_to_render_is_no_error():
+    none = trace_light(host().train(), torch.zeros(0, 3), torch.zeros(0, 3), tiny_config().inter_reflection, hit_share=0.8)
+    assert none.hit.shape == (0,)
 
 
 def test_a_checkpoint_goes_on_with_the_same_grid():

@@ -136,6 +136,46 @@ def test_fewer_queries_find_the_same_surface(sdf):
     assert fewer < 0.85 * more
 
 
+# ------------------------------------------------------------------------------------------------ rays that leave a surface
+
+
+def may_meet(sdf, rays, beta=0.01):
+    whole = sphere_interval(rays.origins, rays.directions, RADIUS)
+    return EmptySpace(RADIUS).may_meet(sdf, rays, whole, torch.tensor(beta))
+
+
+def leaving(steepest=0.2, height=0.06):
+    """Rays away from the sphere, at least so steep, from so far above it."""
+    generator = torch.Generator().manual_seed(0)
+    normal = normalize(torch.randn(300, 3, generator=generator), dim=-1)
+    away = normalize(torch.randn(300, 3, generator=generator), dim=-1)
+    away = torch.where((away * normal).sum(-1, keepdim=True) < 0, -away, away)
+    steep = (away * normal).sum(-1) > steepest
+    return RayBatch((0.6 + height) * normal[steep], away[steep])
+
+
+def test_rays_that_leave_a_round_thing_meet_nothing():
+    assert may_meet(sphere, leaving()).float().mean() < 0.03
+
+
+@settings(max_examples=25, deadline=None)
+@given(share=st.floats(0.001, 2.0), seed=st.integers(0, 99), tilt=st.floats(-1.5, 1.5), log_beta=st.floats(-3.0, -1.5))
+def test_no_thin_plate_before_a_ray_is_overlooked(share, seed, tilt, log_beta):
+    """Rays from two cells or more before the plate, by no less than 10° towards it, from above a surface of their own."""
+    normal = torch.tensor([math.sin(tilt), 0.2, math.cos(tilt)]) / math.sqrt(1.04)
+    foil, generator = plate(share * CELL, tilt, 0.3), torch.Generator().manual_seed(seed)
+    origins = normalize(torch.randn(200, 3, generator=generator), dim=-1)
+    directions = normalize(torch.randn(200, 3, generator=generator), dim=-1)
+    along = (0.3 - origins @ normal) / (directions @ normal)
+    meets = (along > 0) & ((directions @ normal).abs() > math.sin(math.radians(10.0))) & (foil(origins) > 2 * CELL)
+    meets &= (origins + along[:, None] * directions).norm(dim=-1) < RADIUS - CELL
+
+    def scene(x):
+        return torch.minimum(foil(x), (x.norm(dim=-1) - 0.9).abs() + 0.03)  # a shell that all rays leave, or pass
+
+    assert may_meet(scene, RayBatch(origins, directions)[meets], 10.0**log_beta).all()
+
+
 # ------------------------------------------------------------------------------------------------------- a field that moves
 
 
