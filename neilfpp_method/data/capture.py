@@ -14,7 +14,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from neilfpp_method.data import capture_folder
-from neilfpp_method.data.formats import blender, colmap, dtu, sfm_scene, transforms
+from neilfpp_method.data.formats import blender, colmap, dtu, nero, sfm_scene, transforms
 from neilfpp_method.data.images import image_header
 from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, SceneSource, View, check_camera, inside, plain_name
 from neilfpp_method.errors import UserError
@@ -49,6 +49,7 @@ READERS: Mapping[str, Reader] = {
     "transforms": transforms,
     "blender": blender,
     "colmap": colmap,
+    "nero": nero,
 }
 """In the order in which they are asked."""
 

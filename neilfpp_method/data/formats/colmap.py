@@ -4,6 +4,7 @@ sparse/0, sparse, …, or the folder itself     cameras, images, points3D (.bin 
 images/                                       the images, or beside the model; EXR files may stand for the listed ones
 masks/<image>.png, masks/<stem>.png           optional
 fused.ply, dense/fused.ply                    optional: COLMAP's dense points with normals
+object_point_cloud.ply                        optional: points of the object alone, which tell where it is (NeRO's scenes)
 
 The images are used as they are: a lens keeps its distortion, and its rays are bent instead of the image.
 """
@@ -19,6 +20,7 @@ from neilfpp_method.data.colmap_library import pycolmap
 from neilfpp_method.data.formats.colmap_sizes import check_sizes
 from neilfpp_method.data.formats.places import stored, stored_image, view_names
 from neilfpp_method.data.lens import PANORAMAS, lens_of
+from neilfpp_method.data.point_cloud import read_positions
 from neilfpp_method.data.scene_box import find_box
 from neilfpp_method.data.views import Camera, CaptureFiles, View, inside
 from neilfpp_method.errors import UserError
@@ -28,6 +30,7 @@ __all__ = ["LAYOUT", "camera_of", "model_folder", "open_model", "read", "recogni
 LAYOUT = "a COLMAP model in sparse/0, sparse or the folder itself"
 MODELS = ("sparse/0", "sparse", ".", "colmap/sparse/0", "dense/sparse", "dense/0/sparse")
 IMAGE_FOLDERS = ("images", "dense/images", "dense/0/images", ".")
+OBJECT = "object_point_cloud.ply"
 POINT_CLOUDS = ("fused.ply", "dense/fused.ply", "dense/0/fused.ply")
 FILES = ("cameras", "images", "points3D")
 
@@ -63,7 +66,9 @@ def read(root: Path) -> CaptureFiles:
         w2c = np.concatenate([image.cam_from_world().matrix(), [[0.0, 0.0, 0.0, 1.0]]])
         camera = camera_of(image.camera, w2c, f"{folder}: {listed}")
         views.append(View(name, index, camera, file, _mask(root, listed)))
-    points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+    known = (root / OBJECT).is_file()
+    points = read_positions(inside(root, root / OBJECT)) if known else np.array([p.xyz for p in model.points3D.values()])
+    points = points.reshape(-1, 3)
     cloud = next((inside(root, root / place) for place in POINT_CLOUDS if (root / place).is_file()), None)
     box = find_box(views, points[np.isfinite(points).all(axis=1)])
     return CaptureFiles(inputs, tuple(views), box.normalisation, cloud, scene_from=box.source)

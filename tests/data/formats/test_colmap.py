@@ -112,6 +112,18 @@ def test_the_sparse_points_tell_where_the_scene_is(tmp_path: Path) -> None:
     assert capture.point_cloud is None  # sparse points have no normals
 
 
+def test_the_points_of_the_object_tell_where_it_is(tmp_path: Path) -> None:
+    model = reconstruction(colmap_camera("PINHOLE"))
+    for point in np.random.default_rng(4).uniform(-20, 20, (600, 3)):  # the room
+        model.add_point3D(point, pycolmap.Track(), np.zeros(3, np.uint8))
+    write(material(tmp_path, masks=None), model, "colmap/sparse/0")
+    assert load_capture(tmp_path).normalisation.scale > 10
+    (tmp_path / "cloud.ply").rename(tmp_path / "object_point_cloud.ply")
+    capture = load_capture(tmp_path)
+    assert np.allclose(capture.normalisation.centre, CENTRE, atol=0.05 * RADIUS)
+    assert RADIUS < capture.normalisation.scale < 1.15 * RADIUS
+
+
 def test_the_dense_cloud_and_masks_are_found(tmp_path: Path) -> None:
     write(material(tmp_path), reconstruction(colmap_camera("PINHOLE")))
     (tmp_path / "cloud.ply").rename(tmp_path / "fused.ply")
