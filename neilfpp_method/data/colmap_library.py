@@ -2,6 +2,9 @@
 
 Loaded before OpenCV, it brings its own zlib into the process first, and OpenCV's PNG writer then aborts with "free():
 invalid pointer". OpenCV is therefore loaded before it, here and nowhere else.
+
+Its interface changes with its versions, so others than those that this project is made for are refused when they are
+loaded, and not somewhere in the middle of the work.
 """
 
 from __future__ import annotations
@@ -9,4 +12,11 @@ from __future__ import annotations
 import cv2  # noqa: F401
 import pycolmap
 
+from neilfpp_method.errors import UserError
+
 __all__ = ["pycolmap"]
+
+OLDEST, END = (4, 2), (5, 0)
+
+if not OLDEST <= tuple(int(part) for part in pycolmap.__version__.split(".")[:2]) < END:
+    raise UserError(f"pycolmap {pycolmap.__version__} is installed, of another interface", "pip install 'pycolmap>=4.2,<5'")

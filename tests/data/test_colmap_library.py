@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import subprocess
 import sys
 
@@ -30,3 +31,16 @@ def test_png_files_are_written_after_a_module_with_pycolmap(tmp_path, first):
 def test_one_module_loads_pycolmap():
     loading = [name for name, path in SOURCES.items() if "pycolmap" in imports(ast.parse(path.read_text()))]
     assert loading == ["neilfpp_method.data.colmap_library"]
+
+
+@pytest.mark.parametrize("version", ["3.13.0", "4.1.2", "5.0.0.dev0"])
+@pytest.mark.parametrize("command", ["prepare", "inspect"])
+def test_another_version_of_pycolmap_is_refused_in_one_line(tmp_path, version, command):
+    (tmp_path / "pycolmap.py").write_text(f"__version__ = '{version}'\n")
+    program = "import sys; from neilfpp_method.cli import main; sys.exit(main())"
+    line = [sys.executable, "-c", program, command, str(tmp_path), *(["--out", "x"] if command == "prepare" else [])]
+    paths = os.pathsep.join([str(tmp_path), *sys.path])
+    done = subprocess.run(line, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": paths})
+    assert done.returncode == 2
+    (error,) = done.stderr.splitlines()
+    assert error == f"error: pycolmap {version} is installed, of another interface; pip install 'pycolmap>=4.2,<5'"
