@@ -54,7 +54,8 @@ class ImageFile:
     """A decoded image, rows from top to bottom, contiguous.
 
     `pixels` is RGB or one channel: as stored where `hdr`, else scaled to [0, 1] and still display values, as no curve
-    is applied. `alpha` in [0, 1] is none where the file has no alpha channel.
+    is applied. `alpha` in [0, 1] is none where the file has no alpha channel, or one that is opaque everywhere: programs write
+    that without meaning that the object fills the picture.
     """
 
     pixels: Float[np.ndarray, "H W C"]
@@ -189,7 +190,8 @@ def read_image(path: Path) -> ImageFile:
     values = samples.astype(np.float32) / np.float32(FULL_SCALE[samples.dtype.name])
     colors = channels if channels in (1, 3) else channels - 1
     alpha = np.ascontiguousarray(values[..., colors]) if channels > colors else None
-    return ImageFile(np.ascontiguousarray(values[..., :colors]), alpha, header.hdr)
+    opaque = alpha is None or bool((alpha == 1).all())
+    return ImageFile(np.ascontiguousarray(values[..., :colors]), None if opaque else alpha, header.hdr)
 
 
 @contextmanager

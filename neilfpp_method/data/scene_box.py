@@ -121,16 +121,15 @@ class Outline:
 
 
 def _outlines(views: Sequence[View]) -> list[Outline]:
-    """The silhouettes of at most `MOST_MASKS` views, evenly chosen; none where the capture has none."""
+    """The silhouettes of at most `MOST_MASKS` views, evenly chosen; none where fewer than half of these have one."""
     step = -(-len(views) // MOST_MASKS)
-    outlines = []
-    for view in views[::step]:
+    outlines, chosen = [], views[::step]
+    for view in chosen:
         image = read_image(view.mask or view.image)
         values = image.alpha if view.mask is None else image.pixels.max(axis=-1)
-        if values is None:
-            return []
-        outlines.append(Outline(view, values > 0.5))
-    return outlines
+        if values is not None:
+            outlines.append(Outline(view, values > 0.5))
+    return outlines if len(outlines) >= len(chosen) / 2 else []
 
 
 def _agreement(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, " P"]:

@@ -80,6 +80,21 @@ def test_integer_samples_scale_to_one(tmp_path: Path, suffix: str, dtype: type, 
     assert not image.hdr
 
 
+@pytest.mark.parametrize("kind", ["8", "16", "float"])
+def test_an_alpha_that_is_opaque_everywhere_says_nothing(tmp_path: Path, kind: str) -> None:
+    def alpha_of(values: np.ndarray) -> np.ndarray | None:
+        if kind == "float":
+            write_exr(tmp_path / "a.exr", {"RGBA": values.astype(np.float32)})
+            return read_image(tmp_path / "a.exr").alpha
+        write_png(tmp_path / "a.png", (values * (2 ** int(kind) - 1)).astype(f"uint{kind}"))
+        return read_image(tmp_path / "a.png").alpha
+
+    values = np.ones((HEIGHT, WIDTH, 4))
+    assert alpha_of(values) is None
+    values[2, 3, 3] = 0
+    assert alpha_of(values)[2, 3] == 0
+
+
 @pytest.mark.parametrize("suffix", [".tif", ".hdr"])
 def test_floating_point_files_are_hdr(tmp_path: Path, suffix: str) -> None:
     cv2.imwrite(str(tmp_path / f"f{suffix}"), RGB)

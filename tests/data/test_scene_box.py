@@ -73,6 +73,20 @@ def test_alpha_serves_as_mask(tmp_path: Path) -> None:
     assert find_box([with_alpha(view) for view in masked]).normalisation == find_box(masked).normalisation
 
 
+def test_opaque_images_have_no_silhouettes(tmp_path: Path) -> None:
+    def opaque(view: View) -> View:
+        image = tmp_path / f"{view.name}.png"
+        write_png(image, np.full((48, 64, 4), 255, np.uint8))
+        return replace(view, image=image, mask=None)
+
+    masked = views(tmp_path, masks=True, count=16)
+    assert find_box([opaque(view) for view in masked]).source == "cameras"
+    one = find_box([opaque(masked[0]), *masked[1:]])  # a close-up, perhaps
+    assert one.source == "masks"
+    assert one.normalisation.scale == pytest.approx(find_box(masked).normalisation.scale, rel=0.1)
+    assert find_box([*map(opaque, masked[:9]), *masked[9:]]).source == "cameras"
+
+
 def test_cameras_that_look_one_way_or_apart_tell_nothing(tmp_path: Path) -> None:
     first, second, *_ = views(tmp_path)
     with pytest.raises(UserError, match="look in one direction"):
