@@ -32,6 +32,9 @@ SUITES: Mapping[str, str] = {
     "shading": "benchmarks.shading_samples",
     "light": "benchmarks.light_fields",
     "steps": "benchmarks.steps",
+    "sampler": "benchmarks.sampler",
+    "trace": "benchmarks.trace",
+    "joint": "benchmarks.joint",
 }
 
 

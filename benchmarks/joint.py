@@ -1,0 +1,175 @@
+"""A whole joint step: what it costs in the package, and in the plain implementation beside it.
+
+    python -m benchmarks joint
+
+256 rays, all of which meet the object, 128 incident directions each for the paper's networks. The scene is a table with two
+balls; each geometry is fitted to it first, so that rays converge, and traced rays hit, as in a scene that trains. Everything
+runs in one process and takes turns; a figure is the median of the CPU time that the process spends. The plain implementation
+runs twice: as any process starts, and with the settings that the commands make (`kernels.process`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from benchmarks.light_fields import KINDS
+from benchmarks.measure import Measurement
+from benchmarks.shading_samples import Scene, error_curves, scene_of, techniques
+from benchmarks.straightforward import straightforward
+from benchmarks.true_light import read_light
+from neilfpp_method.config import NeilfConfig
+from neilfpp_method.demo import demo_scene
+from neilfpp_method.fields.free_light import make_incident_light
+from neilfpp_method.fields.sdf import SdfField
+from neilfpp_method.hosts.volsdf import VolSdfHost
+from neilfpp_method.kernels.process import computing_fast
+from neilfpp_method.model import NeilfModel, SceneFacts
+from neilfpp_method.presets import preset
+from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.shading.sampling import shared_sphere
+from neilfpp_method.structures import IncidentSamples, PixelBatch
+from neilfpp_method.train.loop import make_optimizer, seed_step
+
+__all__ = ["cheap_paper", "fitted_model", "measurements", "rays_at_the_table", "step_on", "table"]
+
+RAYS = 256
+REPETITIONS = 3
+SHARP = 3e-3  # β of a surface that counts as trained, scene units
+FIT_STEPS, FIT_POINTS = 300, 1024
+BALLS = (((0.2, 0.1, 0.0), 0.35), ((-0.45, 0.0, -0.1), 0.25))  # centre and radius
+
+
+def table(x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
+    """Signed distance, up to the edges: a round table top and two balls on it."""
+    balls = [(x - x.new_tensor(centre)).norm(dim=-1) - radius for centre, radius in BALLS]
+    top = torch.maximum((x[:, 2] + 0.4).abs() - 0.05, x[:, :2].norm(dim=-1) - 0.95)
+    return torch.stack([*balls, top]).amin(0)
+
+
+def fit_table(field: SdfField) -> None:
+    """Move a distance field from the sphere that it starts as to the table."""
+    optimizer = torch.optim.Adam(field.parameters(), lr=2e-3)
+    for _ in range(FIT_STEPS):
+        x = torch.rand(FIT_POINTS, 3) * 2.4 - 1.2
+        sample = field.with_gradient(x)
+        unit = (sample.gradient.square().sum(-1) + 1e-12).sqrt()
+        loss = (sample.distance - table(x)).abs().mean() + 0.05 * (unit - 1.0).abs().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+
+def fitted_model(config: NeilfConfig) -> NeilfModel:
+    """A model whose surface is the table, sharp."""
+    config = dataclasses.replace(
+        config,
+        loss=dataclasses.replace(config.loss, point_cloud=0.0),
+        volume=dataclasses.replace(config.volume, beta_init=SHARP),
+    )
+    torch.manual_seed(0)
+    facts = SceneFacts("linear", 0.2, 3.0, "constant")
+    host = VolSdfHost(config, facts.radiance_scale, facts.background)
+    fit_table(host.sdf_field)
+    return NeilfModel(host, config, facts)
+
+
+def rays_at_the_table(count: int) -> PixelBatch:
+    """Rays from a ring of cameras towards points on the table and the balls; grey pixels."""
+    generator = torch.Generator().manual_seed(1)
+    turn = 2 * math.pi * torch.rand(16 * count, generator=generator)
+    origins = torch.stack([2.0 * turn.cos(), 2.0 * turn.sin(), torch.full_like(turn, 1.2)], -1)
+    directions = normalize(torch.rand(16 * count, 3, generator=generator) * 1.4 - 0.7 - origins, dim=-1)
+    depth = torch.zeros(16 * count)
+    for _ in range(100):
+        depth += table(origins + depth[:, None] * directions).clamp_min(0.0)
+    rows = torch.nonzero(table(origins + depth[:, None] * directions).abs() < 1e-3)[:count, 0]
+    flat = torch.zeros(count)
+    grey = torch.full((count, 3), 0.2)
+    return PixelBatch(origins[rows], directions[rows], grey, flat + 1.0, flat, flat, flat.long())
+
+
+def step_on(model: NeilfModel, batch: PixelBatch) -> Callable[[], None]:
+    """A joint step on a batch; the rates are 0, so every step is the same one but for its random numbers."""
+    weights = active_losses(Stage.JOINT, model.config, model.stages)
+    optimizer = make_optimizer(model, model.config.optimizer)
+    for group in optimizer.param_groups:
+        group["lr"] = 0.0
+    model.train().freeze_for(Stage.JOINT)
+
+    def step() -> None:
+        optimizer.zero_grad(set_to_none=True)
+        weigh(model(batch, Stage.JOINT), weights).loss.backward()
+        optimizer.step()
+
+    return step
+
+
+def cheap_paper() -> NeilfConfig:
+    """The networks of `paper-mlp`, with what makes them cheap: directions that points share, empty space skipped, and half of
+    the cuts a round for what is left of a ray (`benchmarks.sampler` has the error of that)."""
+    config = preset("paper-mlp")
+    return dataclasses.replace(
+        config,
+        volume=dataclasses.replace(config.volume, skip_empty=True, initial_samples=64),
+        shading=dataclasses.replace(config.shading, sampler="shared"),
+    )
+
+
+def cpu_seconds(steps: Mapping[str, Callable[[], None]], fast: Mapping[str, bool]) -> dict[str, float]:
+    """The median CPU time of each step, after one that does not count; they take turns."""
+    taken: dict[str, list[float]] = {name: [] for name in steps}
+    for number in range(REPETITIONS + 1):
+        for name, step in steps.items():
+            with computing_fast() if fast[name] else nullcontext():
+                seed_step(0, number)
+                began = time.process_time()
+                step()
+                taken[name].append(time.process_time() - began)
+    return {name: statistics.median(seconds[1:]) for name, seconds in taken.items()}
+
+
+def measurements() -> Iterator[Measurement]:
+    """Ratios of whole steps, and the error of the integral over directions that are shared."""
+    batch = rays_at_the_table(RAYS)
+    with computing_fast():
+        cheap, published, fast = (fitted_model(c) for c in (cheap_paper(), preset("paper-mlp"), preset("fast")))
+    plain = straightforward(cheap)
+    steps = {
+        "plain": step_on(plain, batch),
+        "plain, settings of the process": step_on(plain, batch),
+        "paper-mlp": step_on(published, batch),
+        "paper-mlp, made cheap": step_on(cheap, batch),
+        "fast": step_on(fast, batch),
+    }
+    seconds = cpu_seconds(steps, {name: name != "plain" for name in steps})
+    yield Measurement("joint/plain", seconds["plain"], "s", "lower")
+    for name in list(steps)[1:]:
+        yield Measurement(f"joint/plain over {name}", seconds["plain"] / seconds[name], "×", "higher", tolerance=0.5)
+    yield from _errors()
+
+
+def _shared(scene: Scene, roughness: float, count: int) -> IncidentSamples:
+    """`count` directions above each horizon, of twice as many that all points share."""
+    drawn = shared_sphere(scene.normal, 2 * count, stochastic=True)
+    return IncidentSamples(drawn.wi.expand(len(scene.normal), -1, -1), drawn.pdf.expand(len(scene.normal), -1))
+
+
+def _errors() -> Iterator[Measurement]:
+    """What sharing directions does to the error of the shading integral, under the true light of the scene in the package."""
+    torch.manual_seed(0)
+    scene = scene_of(read_light(demo_scene()), make_incident_light(KINDS["factorised"].config, 10.0, 1.0))
+    draws = {"fibonacci": techniques()["fibonacci"], "shared": _shared}
+    for roughness in (0.1, 0.35, 1.0):
+        curves = error_curves(scene, roughness, draws, counts=(128,))
+        ratio = curves["shared"].y[0] / curves["fibonacci"].y[0]
+        yield Measurement(f"joint/error of shared over own directions, roughness {roughness:g}", ratio, "×", "lower", 1.0)

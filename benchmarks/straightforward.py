@@ -1,0 +1,134 @@
+"""The method as one writes it down from the paper, in plain torch: the yardstick of whole steps.
+
+The networks, their weights, the losses and the order of a step are those of the package; what is computed is the same. How it
+is computed is not:
+
+- normals, Hessians and gradients of the material by autograd, which a loss on them differentiates once more;
+- every ray in every round of VolSDF's Algorithm 1 until all rays of the batch have converged, and no space skipped;
+- every traced ray of L_ref rendered, whether or not it meets anything;
+- every pair of a point and a direction through the whole network of the light.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from neilfpp_method.config import NeilfConfig
+from neilfpp_method.fields.brdf import BrdfField, BrdfSample
+from neilfpp_method.fields.incident_light import IncidentLightField
+from neilfpp_method.fields.sdf import SdfField, SdfSample
+from neilfpp_method.hosts.volsdf import VolSdfHost
+from neilfpp_method.model import NeilfModel
+from neilfpp_method.structures import Material, RayBatch
+from neilfpp_method.volume.samplers import (
+    bound_shares,
+    bounded_beta,
+    first_cuts,
+    log_error_bound,
+    opacity_samples,
+    with_cuts,
+)
+
+__all__ = ["straightforward"]
+
+
+def gradient_of(output: Float[Tensor, " N"], x: Float[Tensor, "N 3"], differentiable: bool) -> Float[Tensor, "N 3"]:
+    """∂output/∂x, which autograd may differentiate again."""
+    return torch.autograd.grad(output.sum(), x, create_graph=differentiable, retain_graph=True)[0]
+
+
+class PlainSdf(nn.Module):
+    """G, with ∇G and H G by autograd."""
+
+    def __init__(self, field: SdfField) -> None:
+        super().__init__()
+        self.encoding, self.mlp = field.encoding, field.mlp
+
+    def forward(self, x: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+        return self.mlp(self.encoding(x))[:, 0]
+
+    def with_gradient(self, x: Float[Tensor, "N 3"]) -> SdfSample:
+        trains = torch.is_grad_enabled()
+        with torch.enable_grad():
+            x = x if x.requires_grad else x.detach().requires_grad_()
+            outputs = self.mlp(self.encoding(x))
+            sample = SdfSample(outputs[:, 0], gradient_of(outputs[:, 0], x, trains), outputs[:, 1:])
+        return sample if trains else SdfSample(sample.distance.detach(), sample.gradient, sample.feature.detach())
+
+    def hessian(self, x: Float[Tensor, "N 3"], method: str) -> Float[Tensor, "N 3 3"]:
+        x = x.detach().requires_grad_()
+        gradient = self.with_gradient(x).gradient
+        return torch.stack([gradient_of(gradient[:, axis], x, differentiable=True) for axis in range(3)], 1)
+
+
+class PlainBrdf(nn.Module):
+    """B, with the gradients of roughness and metallic by autograd."""
+
+    def __init__(self, field: BrdfField) -> None:
+        super().__init__()
+        self.field = field
+
+    def forward(self, x: Float[Tensor, "N 3"]) -> Material:
+        return self.field(x)
+
+    def with_gradients(self, x: Float[Tensor, "N 3"]) -> BrdfSample:
+        x = x if x.requires_grad else x.detach().requires_grad_()
+        material = self.field(x)
+        roughness, metallic = (gradient_of(value[:, 0], x, True) for value in (material.roughness, material.metallic))
+        return BrdfSample(material, roughness, metallic)
+
+
+class PlainLight(nn.Module):
+    """L, asked for one pair of a point and a direction at a time."""
+
+    def __init__(self, field: IncidentLightField) -> None:
+        super().__init__()
+        self.field = field
+
+    def radiance(
+        self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"], asked: Bool[Tensor, "N S"] | None = None
+    ) -> Float[Tensor, "N S 3"]:
+        points = x[:, None].expand_as(wi).reshape(-1, 3)
+        return self.field.radiance(points, wi.reshape(-1, 1, 3)).view(wi.shape)
+
+
+class PlainHost(VolSdfHost):
+    """VolSDF with its sampler as published: a batch of rays takes a round more as long as one of them asks for it."""
+
+    def __init__(self, config: NeilfConfig, radiance_scale: float, background: str) -> None:
+        super().__init__(config, radiance_scale, background)
+        self.sdf_field = PlainSdf(self.sdf_field)
+
+    @torch.no_grad()
+    def _sample(self, rays: RayBatch, near: Float[Tensor, " N"], far: Float[Tensor, " N"]) -> Float[Tensor, "N M"]:
+        volume, beta = self.config.volume, self.density.beta().reshape(1, 1)
+        partition = first_cuts(self.sdf, rays, near, far, volume.initial_samples, self.training)
+        worst = partition.width.square().sum(dim=-1, keepdim=True).div(4.0 * math.log1p(volume.epsilon)).sqrt()
+        wide = torch.maximum(worst, beta)
+        for number in range(volume.rounds + 1):
+            converged = log_error_bound(partition, beta) <= math.log(volume.epsilon)
+            wide = torch.where(converged, beta, bounded_beta(partition, beta, wide, volume))
+            if number == volume.rounds or converged.all():
+                break
+            shares = bound_shares(partition, wide)
+            partition = with_cuts(self.sdf, rays, partition, shares, volume.initial_samples, self.training)
+        return opacity_samples(partition, wide, volume.samples, self.training)
+
+
+def straightforward(model: NeilfModel) -> NeilfModel:
+    """A model with the weights of another, whose host is VolSDF and whose light is the paper's, that computes plainly."""
+    config = dataclasses.replace(
+        model.config,
+        volume=dataclasses.replace(model.config.volume, skip_empty=False),
+        shading=dataclasses.replace(model.config.shading, sampler="fibonacci"),
+    )
+    host = PlainHost(config, model.facts.radiance_scale, model.facts.background)
+    plain = NeilfModel(host, config, model.facts)
+    plain.load_state_dict({k: v for k, v in model.state_dict().items() if "empty_space" not in k})
+    plain.brdf, plain.light = PlainBrdf(plain.brdf), PlainLight(plain.light)
+    return plain
