@@ -114,6 +114,13 @@ def _normalisation(matrices: Mapping[str, np.ndarray], count: int, archive: Path
 
 
 def _files(root: Path, folder: Path) -> tuple[Path, ...]:
-    """The images of a folder, in the order of their names."""
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
-    return tuple(inside(root, file) for file in files if not file.name.startswith("."))
+    """The images of a folder, in the order of their names, which must not contradict that of their numbers."""
+    shown = (file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith("."))
+    files = sorted(shown)
+    numbers = [int(file.stem) for file in files if file.stem.isdecimal()]
+    if len(numbers) == len(files) and numbers != sorted(numbers):
+        raise UserError(
+            f"{folder}: by name {files[0].name} comes first, by number {min(numbers)}: whose camera is whose is not certain",
+            "pad the numbers with zeros: 007, 010",
+        )
+    return tuple(inside(root, file) for file in files)

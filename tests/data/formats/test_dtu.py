@@ -110,6 +110,16 @@ def test_bad_archives_are_refused(tmp_path: Path) -> None:
     refused(tmp_path, "not an archive of matrices")
 
 
+def test_numbers_without_zeros_in_front_are_refused(tmp_path: Path) -> None:
+    scan(tmp_path)
+    for i, path in enumerate(sorted((tmp_path / "image").iterdir())):
+        path.rename(path.with_stem(f"{i + 7:02d}"))
+    assert [view.name for view in load_capture(tmp_path).views] == ["07", "08", "09", "10", "11", "12"]
+    for path in sorted((tmp_path / "image").iterdir()):
+        path.rename(path.with_stem(str(int(path.stem))))
+    refused(tmp_path, "10.exr comes first", "pad the numbers")
+
+
 def test_images_and_cameras_have_to_match(tmp_path: Path) -> None:
     scan(tmp_path)
     (tmp_path / "image" / "002.exr").unlink()
