@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import signal
 import subprocess
 import sys
 
@@ -26,6 +27,12 @@ def test_png_files_are_written_after_a_module_with_pycolmap(tmp_path, first):
     program = f"import neilfpp_method.{first}\n{WRITE}"
     done = subprocess.run([sys.executable, "-c", program, tmp_path / "a.png"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_sigterm_ends_a_process_without_a_stack_trace():
+    program = "import os, signal, neilfpp_method.data.colmap_library; os.kill(os.getpid(), signal.SIGTERM)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (-signal.SIGTERM, "")
 
 
 def test_one_module_loads_pycolmap():
