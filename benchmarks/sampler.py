@@ -25,6 +25,8 @@ from neilfpp_method.volume.empty_space import MOST_LIFE, RESOLUTION
 __all__ = ["measurements", "queries_per_ray", "table_host"]
 
 RAYS = 1024
+WHOLE = "whole rays"
+WAYS = {WHOLE: 128, "empty space skipped": 128, "empty space skipped, half the cuts": 64}
 SCALES = (0.03, 0.01, SHARP)  # of the density: a surface that is found, one that settles, one that has
 
 
@@ -49,18 +51,29 @@ def queries_per_ray(host: VolSdfHost, rays: RayBatch) -> float:
 
 
 def measurements() -> Iterator[Measurement]:
-    """Queries per ray by the scale of the density, and the time of rendering without gradients."""
+    """By scale and way: queries, and how far hits lie from those of whole rays that are sampled without random numbers."""
     rays = rays_at_the_table(RAYS).rays
     share_of_grid = RESOLUTION**3 / (MOST_LIFE * preset("paper-ngp").train.rays)
-    with computing_fast():
-        whole, cached = table_host(skip_empty=False), table_host()
+    hosts = {name: with_cuts(table_host(name != WHOLE), cuts) for name, cuts in WAYS.items()}
+    with computing_fast(), torch.no_grad():
         for scale in SCALES:
-            for host in (whole, cached):
-                host.density.above_floor.data.fill_(scale - host.density.beta_floor)
-            cached.may_meet(rays)  # samples the grid
-            exact, fewer = queries_per_ray(whole, rays), queries_per_ray(cached, rays) + share_of_grid
-            yield Measurement(f"sampler/β {scale:g}: whole rays", exact, "queries a ray", "lower", tolerance=0.2)
-            yield Measurement(f"sampler/β {scale:g}: empty space skipped", fewer, "queries a ray", "lower", tolerance=0.2)
-        with torch.no_grad():
-            slow, fast = median_seconds(lambda: whole.render(rays), lambda: cached.render(rays))
-        yield Measurement(f"sampler/β {SHARP:g}: time of whole rays over skipped", slow / fast, "×", "higher", tolerance=0.5)
+            for host in hosts.values():
+                host.density.above_floor.fill_(scale - host.density.beta_floor)
+            truth = hosts[WHOLE].eval().render(rays).position
+            hosts[WHOLE].train()
+            for name, host in hosts.items():
+                host.may_meet(rays)  # samples the grid
+                queries = queries_per_ray(host, rays) + (0 if name == WHOLE else share_of_grid)
+                off = (host.render(rays).position - truth).norm(dim=-1).median().item() / scale
+                yield Measurement(f"sampler/β {scale:g}, {name}", queries, "queries a ray", "lower", tolerance=0.2)
+                yield Measurement(f"sampler/β {scale:g}, {name}: hit off", off, "β, median", "lower", tolerance=1.0)
+        seconds = median_seconds(*(lambda host=host: host.render(rays) for host in hosts.values()))
+        for name, taken in list(zip(WAYS, seconds, strict=True))[1:]:
+            yield Measurement(f"sampler/β {SHARP:g}: time, whole over {name}", seconds[0] / taken, "×", "higher", tolerance=0.5)
+
+
+def with_cuts(host: VolSdfHost, cuts: int) -> VolSdfHost:
+    """The host with so many first and further cuts a ray."""
+    volume = dataclasses.replace(host.config.volume, initial_samples=cuts)
+    host.config = dataclasses.replace(host.config, volume=volume)
+    return host

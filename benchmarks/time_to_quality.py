@@ -1,0 +1,195 @@
+"""What training time buys: the quality of novel views and of the material over seconds, for every preset.
+
+    python -m benchmarks.time_to_quality DATA/tabletop_mix --out docs
+    python -m benchmarks.time_to_quality DATA/tabletop_mix --presets paper-ngp --device cuda --cap 600 --out docs
+
+Each preset trains from scratch. At marks of time (seconds of the process's own CPU time, or on a GPU of the clock), each
+twice the last, training is held, some test views are rendered and measured, and the time that takes does not count. `fast`
+runs to its end; a preset that is stopped by the cap is shown as unfinished, with the step that it reached: its rates have not
+fallen, and its material may not have begun.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import tyro
+from rich.console import Console
+
+from benchmarks.charts import Chart, Line, draw_charts
+from benchmarks.measure import hardware
+from neilfpp_method.config import NeilfConfig
+from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.evaluate.protocols import image_metrics, material_metrics
+from neilfpp_method.evaluate.views import known_test_views, render_test_views
+from neilfpp_method.kernels.process import computing_fast
+from neilfpp_method.presets import preset
+from neilfpp_method.schedule import active_losses, stage_at, stage_steps, weigh
+from neilfpp_method.train.build import build_model, scene_facts
+from neilfpp_method.train.device import pick_device
+from neilfpp_method.train.loop import make_optimizer, seed_step, set_rates
+from neilfpp_method.train.run import Run
+
+__all__ = ["Curve", "Mark", "curve", "table"]
+
+FIGURES = {
+    "volume_psnr": "novel view, R",
+    "pbr_psnr": "novel view, PBR",
+    "base_color_psnr_scaled": "base colour, scaled",
+    "roughness_psnr": "roughness",
+    "metallic_psnr": "metallic",
+}
+
+
+@dataclass
+class Options:
+    """Train presets on captures whose truth is known, and measure them on the way."""
+
+    captures: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders of captures."""
+    presets: tuple[str, ...] = ("fast", "paper-ngp", "paper-mlp")
+    """Which settings."""
+    cap: float = 3600.0
+    """Seconds after which a preset is stopped, `fast` alone excepted."""
+    first: float = 15.0
+    """Seconds to the first mark."""
+    views: int = 2
+    """Test views that are rendered at a mark."""
+    device: str = "auto"
+    """Where to train."""
+    out: Path = Path("runs/benchmarks")
+    """Where the figure and the table go."""
+
+
+@dataclass(frozen=True)
+class Mark:
+    """What was measured after so many seconds of training."""
+
+    seconds: float
+    step: int
+    figures: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The marks of a preset, and the steps that it would take in full."""
+
+    marks: tuple[Mark, ...]
+    steps: int
+
+    @property
+    def finished(self) -> bool:
+        return self.marks[-1].step == self.steps
+
+    def line(self, figure: str) -> Line | None:
+        """A figure over seconds, from when it is there."""
+        known = [(mark.seconds, mark.figures[figure]) for mark in self.marks if figure in mark.figures]
+        return Line(*zip(*known, strict=True)) if known else None
+
+
+def curve(root: Path, config: NeilfConfig, cap: float, first: float, views: int, device: torch.device) -> Curve:
+    """Train a preset until its end or the cap, and measure it at the marks and at the end."""
+    capture = load_capture(root)
+    pixels = PixelDataset(capture, capture.train_views, device=device)
+    facts = scene_facts(capture, pixels, config)
+    seed_step(config.train.seed, step=-1)
+    model = build_model(capture, facts, config).to(device)
+    shown = dataclasses.replace(capture, test=frozenset(view.name for view in capture.test_views[:views]))
+    steps = sum(stage_steps(config.train).values())
+    marks, due, seconds = [], first, 0.0
+    for step, taken in _training(model, pixels, config, device):
+        seconds += taken
+        last = step == steps or seconds >= cap
+        if seconds >= due or last:
+            marks.append(Mark(seconds, step, _measure(Run(root, config, shown, facts, model.eval(), step))))
+            model.train()
+            due *= 2
+        if last:
+            break
+    return Curve(tuple(marks), steps)
+
+
+def _training(
+    model: torch.nn.Module, pixels: PixelDataset, config: NeilfConfig, device: torch.device
+) -> Iterator[tuple[int, float]]:
+    """The steps of all stages as `train.loop` takes them, with nothing kept: how many are done, and the last one's seconds."""
+    clock = _clock(device)
+    optimizer = make_optimizer(model, config.optimizer)
+    for step in range(sum(stage_steps(config.train).values())):
+        began = clock()
+        position = stage_at(step, config.train)
+        if position.step == 0:
+            model.train().freeze_for(position.stage)
+        seed_step(config.train.seed, step)
+        set_rates(optimizer, config.optimizer, position.stage, position.step / position.length)
+        optimizer.zero_grad(set_to_none=True)
+        terms = model(pixels.sample(config.train.rays), position.stage)
+        weigh(terms, active_losses(position.stage, config, model.stages)).loss.backward()
+        optimizer.step()
+        yield step + 1, clock() - began
+
+
+def _clock(device: torch.device) -> Callable[[], float]:
+    """Seconds: of this process's own on a CPU, which others may share; of the clock, with all work done, on a GPU."""
+    if device.type != "cuda":
+        return time.process_time
+
+    def now() -> float:
+        torch.cuda.synchronize(device)
+        return time.perf_counter()
+
+    return now
+
+
+def _measure(run: Run) -> dict[str, float]:
+    rendered = render_test_views(run)
+    pairs = list(zip(rendered, known_test_views(run, rendered).views, strict=True))
+    figures = image_metrics(run, pairs) | material_metrics(run, pairs)
+    return {name: figures[name] for name in FIGURES if name in figures}
+
+
+def table(curves: Mapping[str, Curve]) -> str:
+    """Markdown: a row for each mark."""
+    lines = ["| preset | seconds | step | " + " | ".join(FIGURES.values()) + " |", "|---" * (3 + len(FIGURES)) + "|"]
+    for name, measured in curves.items():
+        for mark in measured.marks:
+            cells = [f"{mark.figures[figure]:.2f}" if figure in mark.figures else "–" for figure in FIGURES]
+            lines.append("| " + " | ".join([name, f"{mark.seconds:.0f}", f"{mark.step} of {measured.steps}", *cells]) + " |")
+    return "\n".join(lines)
+
+
+def charts(capture: Path, curves: Mapping[str, Curve]) -> list[Chart]:
+    """A panel for each figure; unfinished curves are named so."""
+    titled = {name if c.finished else f"{name}, unfinished": c for name, c in curves.items()}
+    lines = {figure: {name: c.line(figure) for name, c in titled.items()} for figure in FIGURES}
+    panels = {figure: {name: line for name, line in found.items() if line} for figure, found in lines.items()}
+    return [Chart(f"{capture.name}: {FIGURES[figure]}", found) for figure, found in panels.items() if found]
+
+
+def main(options: Options) -> None:
+    """Train, print the tables, write them and the figure."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    device = pick_device(options.device)
+    sections, panels = [hardware()], []
+    with computing_fast():
+        for capture in options.captures:
+            curves = {}
+            for name in options.presets:
+                cap = float("inf") if name == "fast" else options.cap
+                curves[name] = curve(capture, preset(name), cap, options.first, options.views, device)
+                Console().print(table({name: curves[name]}), markup=False, highlight=False, soft_wrap=True)
+            sections.append(f"### {capture.name}\n\n{table(curves)}")
+            panels += charts(capture, curves)
+    (options.out / "time_to_quality.md").write_text("\n\n".join(sections) + "\n")
+    title = "What training time buys"
+    draw_charts(options.out / "time_to_quality.png", title, "seconds of training", "PSNR, dB", panels, columns=2)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
