@@ -115,8 +115,11 @@ class LightFitConfig:
     """Rate of log radiance at the start of a fit."""
     smoothness: float = 0.03
     """Weight of the total variation of log radiance, per texel, against the relative error."""
-    sparsity: float = 0.02
-    """Weight of the light that near lamps bring, in units of a typical pixel, against the relative error."""
+    whiteness: float = 0.05
+    """Weight of the tint of all light that reaches the points, against the relative error: images hardly tell the tint of the
+    light from that of the surfaces."""
+    sparsity: float = 0.0005
+    """Weight of the lamps, by the logarithm of their shares of all light, against the relative error."""
     candidates: int = 192
     """Places for lamps that one fit tries."""
     lamps: int = 8

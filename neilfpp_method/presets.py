@@ -85,7 +85,7 @@ def fast() -> NeilfConfig:
             surface=1e-2,
             surface_joint=1e-3,
             mask=0.1,
-            smoothness=1.5e-3,
+            smoothness=0.0,
             lambertian=0.0,
             position_gradient=0.0,
             normal_gradient=0.1,

@@ -1,5 +1,9 @@
 """Light is solved for, not descended to: a map and lamps under which remembered points look as the images show them.
 
+What is known of light in general takes no side in the factor between light and base colour: the total variation of the map
+is of logarithms, lamps pay for their share of all light, and the tint is of ratios. A price per amount of light would make
+the light dimmer and surfaces brighter at every fit, as the base colour follows.
+
 With the transport of these points at hand (`lighting.transport`), a hundred steps on the light cost less than as many steps
 of training. They find lamps that stochastic descent, through few and noisy samples of every texel, spreads into a haze that
 the base colour then makes up for.
@@ -19,7 +23,7 @@ from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.shading.color import apply_response
 from neilfpp_method.structures import Indexable, Material
 
-__all__ = ["Evidence", "Light", "Target", "compare", "fit_light", "total_variation"]
+__all__ = ["Evidence", "Light", "Target", "compare", "fit_light", "tint", "total_variation"]
 
 SMOOTHED = 1e-2
 """Differences of log radiance below this count by their square, so that the total variation has a gradient everywhere."""
@@ -31,6 +35,8 @@ LEAST_GAIN = 0.01
 """Of the relative error. Many points make any difference significant; lamps that explain less than a hundredth are no lamps."""
 FIRST_SHARE = 0.1
 """Of the light that typical points receive, what all lamps that are not yet lit start with together."""
+SMALL_SHARE = 0.02
+"""Of all light: a lamp that brings less pays for what it brings, one that brings much more hardly for more than being there."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,10 @@ class Light:
 
     log_radiance: Float[Tensor, "3 H W"]
     intensity: Float[Tensor, "M 3"]
+
+    def strength(self) -> Float[Tensor, "T 3"]:
+        """Of all sources: radiance of the texels row by row, then intensity of the lamps."""
+        return torch.cat((self.log_radiance.exp().flatten(1).t(), self.intensity))
 
 
 @dataclass(frozen=True)
@@ -73,9 +83,10 @@ def fit_light(
     """The light that explains the points best, the smoothest and with the fewest lamps where they do not say.
 
     Minimises the relative error, robustly; the total variation of the map's log radiance, so that lamps in it may be sharp
-    and what no point sees takes after its surroundings; and the light that near lamps bring, which their squares as unknowns
-    make sparse. Base colour and light share a scale, so a factor per channel on the base colour is free during the fit: the
-    light need not make up for it.
+    and what no point sees takes after its surroundings; Σ ln(1 + share/s) over the lamps' shares of all light, a concave
+    price for which one strong lamp is cheaper than two half as strong; and the tint of all light that reaches the points,
+    which images hardly tell from that of the surfaces. Base colour and light share a scale, so a factor per channel on the
+    base colour is free during the fit: the light need not make up for it.
 
     Args:
         start: where the search starts.
@@ -96,9 +107,9 @@ def fit_light(
     first = FIRST_SHARE / max(1, len(brought))
     root = (start.intensity * brought).clamp_min(first).sqrt().requires_grad_()
     log_gain = torch.zeros(3, device=root.device, requires_grad=True)
-    groups = [{"params": [p], "rate": rate * config.rate} for p, rate in ((log_radiance, 1.0), (root, 0.2), (log_gain, 0.2))]
+    groups = [{"params": [p], "rate": rate * config.rate} for p, rate in ((log_radiance, 1.0), (root, 0.5), (log_gain, 0.2))]
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
-    scale = target.pixel + config.floor * unit
+    reaching = carried.sources[0].mean(0)
 
     def light() -> Light:
         return Light(log_radiance, torch.where(reaches, root.square() / brought.clamp_min(1e-20), 0.0))
@@ -107,10 +118,14 @@ def fit_light(
         for step in range(config.steps):
             for group in optimizer.param_groups:
                 group["lr"] = group["rate"] * LEAST_RATE ** (step / config.steps)
-            error = (_shown(light(), carried, target.material, log_gain.exp(), response) - target.pixel) / scale
+            now = light()
+            error = _relative_error(now, carried, target, log_gain.exp(), response, unit, config)
             loss = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=config.outlier)
             loss = loss + config.smoothness * total_variation(log_radiance)
-            loss = loss + config.sparsity * root.square().sum(0).mean()
+            brings = reaching @ now.strength()
+            share = unit * root.square().mean(-1) / brings.mean()
+            loss = loss + config.sparsity * (share / SMALL_SHARE).log1p().sum()
+            loss = loss + config.whiteness * tint(brings)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -130,9 +145,8 @@ def compare(
     config: LightFitConfig,
 ) -> Evidence:
     """Which of two lights explains the points better that neither was fitted to; without any, nothing speaks for either."""
-    scale = target.pixel + config.floor * unit
     one, other = (
-        ((_shown(light, transport, target.material, 1.0, response) - target.pixel) / scale).abs().clamp_max(1).mean(-1)
+        _relative_error(light, transport, target, 1.0, response, unit, config).abs().clamp_max(1).mean(-1)
         for light, transport in zip(lights, carried, strict=True)
     )
     gain = one - other
@@ -149,10 +163,22 @@ def total_variation(values: Float[Tensor, "C H W"]) -> Float[Tensor, ""]:
     return sum((step.square() + SMOOTHED**2).sqrt().sum() for step in (across, down)) / size
 
 
-def _shown(
-    light: Light, carried: Transport, material: Material, gain: Float[Tensor, " 3"] | float, response: str
+def tint(light: Float[Tensor, " 3"]) -> Float[Tensor, ""]:
+    """How far light is from white: the variance of its logarithm over the channels."""
+    return light.clamp_min(1e-20).log().var(correction=0)
+
+
+def _relative_error(
+    light: Light,
+    carried: Transport,
+    target: Target,
+    gain: Float[Tensor, " 3"] | float,
+    response: str,
+    unit: float,
+    config: LightFitConfig,
 ) -> Float[Tensor, "N 3"]:
-    """What the camera stores of the points, their base colour times `gain`."""
+    """What the camera stores of the points, their base colour times `gain`, against their pixels."""
+    material = target.material
     tinted = Material((material.base_color * gain).clamp(0, 1), material.roughness, material.metallic)
-    strength = torch.cat((light.log_radiance.exp().flatten(1).t(), light.intensity))
-    return apply_response(carried.outgoing(tinted, strength), response)
+    shown = apply_response(carried.outgoing(tinted, light.strength()), response)
+    return (shown - target.pixel) / (target.pixel + config.floor * unit)
