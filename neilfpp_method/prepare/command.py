@@ -150,7 +150,7 @@ def _from_photos(photos: Photos, brackets: Brackets | None, options: Prepare, op
 
     step = begin(work / "model", step)
     if step.result is None:
-        mapped = map_scene(database, copies, step.folder, count, open_bar("placing cameras", count).to)
+        mapped = map_scene(database, copies, step.folder, photos.items, open_bar("placing cameras", count).to)
         step = replace(step, result=step.complete({"sizes": mapped}))
     model = open_model(step.folder / "largest")
     placed = placements(features, model)

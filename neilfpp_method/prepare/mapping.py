@@ -9,6 +9,7 @@ from pathlib import Path
 from neilfpp_method.data.colmap_library import pycolmap
 from neilfpp_method.errors import UserError
 from neilfpp_method.prepare.background import in_background
+from neilfpp_method.prepare.photos import Photo
 from neilfpp_method.prepare.upright import turn_upright
 
 __all__ = ["LEAST_SHARE", "map_scene", "refuse_partial"]
@@ -20,7 +21,9 @@ SHOT_ADVICE = (
 )
 
 
-def map_scene(database: Path, copies: Path, work: Path, count: int, progress: Callable[[int, int], None]) -> list[int]:
+def map_scene(
+    database: Path, copies: Path, work: Path, photos: Sequence[Photo], progress: Callable[[int, int], None]
+) -> list[int]:
     """Place the cameras and the points; the largest model is left, upright, in `work`/largest.
 
     Returns how many images each of the models places, the largest first.
@@ -29,14 +32,14 @@ def map_scene(database: Path, copies: Path, work: Path, count: int, progress: Ca
         database: with verified matches.
         copies: the images' 8-bit copies; they colour the points.
         work: where models go.
-        count: how many images there are.
+        photos: the images.
         progress: called with the images placed, and all.
 
     Raises:
         UserError: no two images could be placed.
         KeyboardInterrupt: asked to stop.
     """
-    models = work / "models"
+    models, count = work / "models", len(photos)
     shutil.rmtree(models, ignore_errors=True)
     models.mkdir(parents=True)
     placed = 0
@@ -61,7 +64,7 @@ def map_scene(database: Path, copies: Path, work: Path, count: int, progress: Ca
     if not found:
         raise UserError(f"no two of the {count} images could be placed in space", SHOT_ADVICE)
     ranked = sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
-    turn_upright(ranked[0])
+    turn_upright(ranked[0], {f"{photo.name}.png": photo.held for photo in photos})
     largest = work / "largest"
     shutil.rmtree(largest, ignore_errors=True)
     largest.mkdir()

@@ -22,7 +22,7 @@ from neilfpp_method.errors import UserError
 __all__ = ["FEWEST", "Photo", "Photos", "Picture", "check_names", "read_photo", "survey", "unreadable"]
 
 FEWEST = 3
-EXIF_FOLDER, MAKE, MODEL, FOCAL, FOCAL_35MM = 0x8769, 0x010F, 0x0110, 0x920A, 0xA405
+EXIF_FOLDER, MAKE, MODEL, ORIENTATION, FOCAL, FOCAL_35MM = 0x8769, 0x010F, 0x0110, 0x0112, 0x920A, 0xA405
 FILM_WIDTH = 36.0
 
 
@@ -31,8 +31,9 @@ class Photo:
     """A photograph that is to become a view.
 
     `exposure` is the light that the picture took in, relative to the others, where EXIF says it. `device` names camera
-    and focal length as far as EXIF does, `focal` is the focal length in units of the image's longer side. `valid` is a
-    validity mask where there is one.
+    and focal length as far as EXIF does, `focal` is the focal length in units of the image's longer side. `held` is EXIF's
+    orientation: pixels stay as the sensor has them, but it tells which way is up. `valid` is a validity mask, where there is
+    one.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Photo:
     exposure: float | None
     device: str
     focal: float | None
+    held: int = 1
     valid: Path | None = None
 
 
@@ -154,6 +156,7 @@ def _photo(root: Path, name: str, path: Path, linear: bool) -> Photo:
         exposure=photo_exposure(path) if linear else None,
         device=device,
         focal=focal_35mm and focal_35mm / FILM_WIDTH,
+        held=int(_number(entries.get(ORIENTATION)) or 1),
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Float64
 
@@ -10,6 +12,12 @@ from neilfpp_method.data.colmap_library import pycolmap
 __all__ = ["turn_upright", "upright_rotation"]
 
 LEVEL = 0.1
+HELD = {
+    3: np.diag([-1.0, -1.0, 1.0]),
+    6: np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    8: np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+}
+"""By EXIF's orientation, where the camera was not held level: from its axes to those of the picture as people look at it."""
 
 
 def upright_rotation(rotations: Float64[np.ndarray, "N 3 3"]) -> Float64[np.ndarray, "3 3"]:
@@ -34,8 +42,15 @@ def upright_rotation(rotations: Float64[np.ndarray, "N 3 3"]) -> Float64[np.ndar
     return np.stack([x, np.cross(z, x), z])
 
 
-def turn_upright(model: pycolmap.Reconstruction) -> None:
-    """Turn a model, in place, so that +z is up; its scale and origin stay."""
-    rotations = np.stack([model.image(i).cam_from_world().rotation.matrix() for i in model.reg_image_ids()])
+def turn_upright(model: pycolmap.Reconstruction, held: Mapping[str, int]) -> None:
+    """Turn a model, in place, so that +z is up; its scale and origin stay.
+
+    Args:
+        model: with placed images.
+        held: EXIF's orientation of each image, by its name in the model: a camera on its side has its x axis upright.
+    """
+    images = [model.image(i) for i in model.reg_image_ids()]
+    turns = [HELD.get(held[image.name], np.eye(3)) for image in images]
+    rotations = np.stack([q @ image.cam_from_world().rotation.matrix() for q, image in zip(turns, images, strict=True)])
     turn = pycolmap.Rotation3d(upright_rotation(rotations))
     model.transform(pycolmap.Sim3d(1.0, turn, np.zeros(3)))

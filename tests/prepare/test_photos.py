@@ -46,6 +46,15 @@ def test_names_cameras_and_focal_lengths(tmp_path):
     assert survey(tmp_path, "linear").linear
 
 
+def test_exif_tells_how_a_camera_was_held(tmp_path):
+    for i, orientation in enumerate((None, 6, 8, 99)):
+        exif = Image.Exif()
+        if orientation:
+            exif[0x0112] = orientation
+        Image.new("RGB", (40, 30)).save(tmp_path / f"{i}.jpg", exif=exif)
+    assert [photo.held for photo in survey(tmp_path, "auto").items] == [1, 6, 8, 99]
+
+
 def test_unreadable_files_are_listed(tmp_path):
     for i in range(3):
         exr(tmp_path / f"{i}.exr")
