@@ -2,42 +2,44 @@
 
     python -m benchmarks.growth --out docs
 
-Each panel has the CPU time of a joint step over one number, the others held at those of a small step of the paper's hash-grid
-setting; views share one number of pixels drawn. A slope of 1 in the logarithms is growth in proportion.
+Each panel has the CPU time of a joint step of `fast` with the free light over one number, the others held, on rays that all
+meet the table of `benchmarks.joint`; the last has that of drawing 4096 pixels from so many views. The written table puts a
+straight line through each, a fixed part and one in proportion, and says how far the figures lie from it.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
 import statistics
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 import tyro
 from rich.console import Console
 
 from benchmarks.charts import Chart, Line, draw_charts
 from benchmarks.joint import fitted_model, rays_at_the_table, step_on
-from benchmarks.measure import hardware
+from benchmarks.measure import clock, device, hardware
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.demo import demo_scene
 from neilfpp_method.kernels.process import computing_fast
+from neilfpp_method.model import NeilfModel
 from neilfpp_method.presets import free_light, preset
 from neilfpp_method.train.loop import seed_step
 
-__all__ = ["Growth", "slope"]
+__all__ = ["Growth", "StraightLine", "straight_line"]
 
 RAYS = (64, 128, 256, 512, 1024)
 SAMPLES = (16, 32, 64, 128, 256)
 DIRECTIONS = (16, 32, 64, 128, 256)
+SMALL = 256  # rays of the panels that are not about rays
 VIEWS = (1, 2, 4, 8, 16)
-STEPS = 3
+STEPS = 5
 DRAWS = 50
 
 
@@ -58,43 +60,55 @@ class Growth:
     seconds: tuple[float, ...]
 
 
-def slope(growth: Growth) -> float:
-    """The slope between the last two points in logarithms: 1 is growth in proportion, 0 none."""
-    (a, b), (s, t) = growth.numbers[-2:], growth.seconds[-2:]
-    return math.log(t / s) / math.log(b / a)
+@dataclass(frozen=True)
+class StraightLine:
+    """seconds = fixed + each · number, and the largest relative distance of a figure from that."""
+
+    fixed: float
+    each: float
+    off: float
 
 
-def cpu_seconds(function: Callable[[], object]) -> float:
-    """The median CPU time of a call, after one that does not count."""
+def straight_line(growth: Growth) -> StraightLine:
+    """The line of least relative squares."""
+    numbers, seconds = np.array(growth.numbers, dtype=float), np.array(growth.seconds)
+    each, fixed = np.polyfit(numbers, seconds, 1, w=1 / seconds)
+    return StraightLine(float(fixed), float(each), float(np.abs((fixed + each * numbers) / seconds - 1).max()))
+
+
+def seconds_of(function: Callable[[], object]) -> float:
+    """The median time of a call, after one that does not count."""
     function()
-    taken = []
+    now, taken = clock(device()), []
     for number in range(STEPS):
         seed_step(0, number)
-        began = time.process_time()
+        began = now()
         function()
-        taken.append(time.process_time() - began)
+        taken.append(now() - began)
     return statistics.median(taken)
 
 
-def step_seconds(config: NeilfConfig, rays: int) -> float:
-    """Of a joint step."""
-    return cpu_seconds(step_on(fitted_model(config), rays_at_the_table(rays)))
+def step_seconds(model: NeilfModel, config: NeilfConfig, rays: int) -> float:
+    """Of a joint step by other settings than the model was made with; they may change no network."""
+    model.config = model.host.config = config
+    return seconds_of(step_on(model, rays_at_the_table(rays)))
 
 
 def measure() -> list[Growth]:
     """Every panel."""
     base = free_light(preset("fast"))
-    replace = dataclasses.replace
-    by_rays = tuple(step_seconds(base, count) for count in RAYS)
-    by_samples = tuple(step_seconds(replace(base, volume=replace(base.volume, samples=n)), 256) for n in SAMPLES)
-    by_directions = tuple(
-        step_seconds(replace(base, shading=replace(base.shading, train_samples=n)), 256) for n in DIRECTIONS
-    )
+    model, replace = fitted_model(base), dataclasses.replace
+    base = model.config
+    by_rays = tuple(step_seconds(model, base, count) for count in RAYS)
+    with_samples = [replace(base, volume=replace(base.volume, samples=n)) for n in SAMPLES]
+    by_samples = tuple(step_seconds(model, config, SMALL) for config in with_samples)
+    with_directions = [replace(base, shading=replace(base.shading, train_samples=n)) for n in DIRECTIONS]
+    by_directions = tuple(step_seconds(model, config, SMALL) for config in with_directions)
     capture = load_capture(demo_scene())
     by_views = []
     for count in VIEWS:
-        pixels = PixelDataset(capture, (capture.train_views * count)[:count])
-        by_views.append(cpu_seconds(lambda pixels=pixels: [pixels.sample(4096) for _ in range(DRAWS)]) / DRAWS)
+        pixels = PixelDataset(capture, capture.train_views[:count], device=device())
+        by_views.append(seconds_of(lambda pixels=pixels: [pixels.sample(4096) for _ in range(DRAWS)]) / DRAWS)
     return [
         Growth("a joint step over rays", RAYS, by_rays),
         Growth("a joint step over samples of a ray", SAMPLES, by_samples),
@@ -104,13 +118,15 @@ def measure() -> list[Growth]:
 
 
 def table(growths: list[Growth]) -> str:
-    """Markdown: milliseconds, and the slope at the end."""
+    """Markdown: milliseconds, and the straight line through them."""
     lines = []
     for growth in growths:
-        lines += ["| " + " | ".join([growth.name, *map(str, growth.numbers), "slope at the end"]) + " |"]
-        lines += ["|---" * (len(growth.numbers) + 2) + "|"]
+        line = straight_line(growth)
+        lines += ["| " + " | ".join([growth.name, *map(str, growth.numbers), "straight line", "off it"]) + " |"]
+        lines += ["|---" * (len(growth.numbers) + 3) + "|"]
         cells = [f"{1e3 * seconds:.3g} ms" for seconds in growth.seconds]
-        lines += ["| " + " | ".join(["CPU time", *cells, f"{slope(growth):.2f}"]) + " |", ""]
+        fitted = f"{1e3 * line.fixed:.3g} ms + {1e3 * line.each:.2g} ms each"
+        lines += ["| " + " | ".join(["CPU time", *cells, fitted, f"{100 * line.off:.0f} %"]) + " |", ""]
     return "\n".join(lines)
 
 

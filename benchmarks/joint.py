@@ -4,8 +4,9 @@
 
 256 rays, all of which meet the object, 128 incident directions each for the paper's networks. The scene is a table with two
 balls; each geometry is fitted to it first, so that rays converge, and traced rays hit, as in a scene that trains. Everything
-runs in one process and takes turns; a figure is the median of the CPU time that the process spends. The plain implementation
-runs twice: as any process starts, and with the settings that the commands make (`kernels.process`).
+runs in one process and takes turns; a figure is the median of the CPU time that the process spends (of the clock on a GPU,
+where there is one). The plain implementation runs twice: as any process starts, and with the settings that the commands make
+(`kernels.process`).
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import statistics
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
 
@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from benchmarks.light_fields import KINDS
-from benchmarks.measure import Measurement
+from benchmarks.measure import Measurement, clock, device
 from benchmarks.shading_samples import Scene, error_curves, scene_of, techniques
 from benchmarks.straightforward import straightforward
 from benchmarks.true_light import read_light
@@ -80,7 +80,7 @@ def fitted_model(config: NeilfConfig) -> NeilfModel:
     facts = SceneFacts("linear", 0.2, 3.0, "constant")
     host = VolSdfHost(config, facts.radiance_scale, facts.background)
     fit_table(host.sdf_field)
-    return NeilfModel(host, config, facts)
+    return NeilfModel(host, config, facts).to(device())
 
 
 def rays_at_the_table(count: int) -> PixelBatch:
@@ -95,7 +95,7 @@ def rays_at_the_table(count: int) -> PixelBatch:
     rows = torch.nonzero(table(origins + depth[:, None] * directions).abs() < 1e-3)[:count, 0]
     flat = torch.zeros(count)
     grey = torch.full((count, 3), 0.2)
-    return PixelBatch(origins[rows], directions[rows], grey, flat + 1.0, flat, flat, flat.long())
+    return PixelBatch(origins[rows], directions[rows], grey, flat + 1.0, flat, flat, flat.long()).to(device())
 
 
 def step_on(model: NeilfModel, batch: PixelBatch) -> Callable[[], None]:
@@ -125,16 +125,17 @@ def cheap_paper() -> NeilfConfig:
     )
 
 
-def cpu_seconds(steps: Mapping[str, Callable[[], None]], fast: Mapping[str, bool]) -> dict[str, float]:
-    """The median CPU time of each step, after one that does not count; they take turns."""
+def seconds_of(steps: Mapping[str, Callable[[], None]], fast: Mapping[str, bool]) -> dict[str, float]:
+    """The median time of each step, after one that does not count; they take turns."""
+    now = clock(device())
     taken: dict[str, list[float]] = {name: [] for name in steps}
     for number in range(REPETITIONS + 1):
         for name, step in steps.items():
             with computing_fast() if fast[name] else nullcontext():
                 seed_step(0, number)
-                began = time.process_time()
+                began = now()
                 step()
-                taken[name].append(time.process_time() - began)
+                taken[name].append(now() - began)
     return {name: statistics.median(seconds[1:]) for name, seconds in taken.items()}
 
 
@@ -143,7 +144,7 @@ def measurements() -> Iterator[Measurement]:
     batch = rays_at_the_table(RAYS)
     with computing_fast():
         cheap, published, fast = (fitted_model(c) for c in (cheap_paper(), preset("paper-mlp"), preset("fast")))
-    plain = straightforward(cheap)
+    plain = straightforward(cheap).to(device())
     steps = {
         "plain": step_on(plain, batch),
         "plain, settings of the process": step_on(plain, batch),
@@ -151,7 +152,7 @@ def measurements() -> Iterator[Measurement]:
         "paper-mlp, made cheap": step_on(cheap, batch),
         "fast": step_on(fast, batch),
     }
-    seconds = cpu_seconds(steps, {name: name != "plain" for name in steps})
+    seconds = seconds_of(steps, {name: name != "plain" for name in steps})
     yield Measurement("joint/plain", seconds["plain"], "s", "lower")
     for name in list(steps)[1:]:
         yield Measurement(f"joint/plain over {name}", seconds["plain"] / seconds[name], "×", "higher", tolerance=0.5)

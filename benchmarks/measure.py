@@ -12,7 +12,7 @@ from typing import Literal
 
 import torch
 
-__all__ = ["Measurement", "hardware", "in_yardsticks", "median_seconds", "yardstick"]
+__all__ = ["Measurement", "clock", "device", "hardware", "in_yardsticks", "median_seconds", "yardstick"]
 
 
 @dataclass(frozen=True)
@@ -43,20 +43,38 @@ class Measurement:
         return self.value < baseline / (1 + self.tolerance)
 
 
+def device() -> torch.device:
+    """Where suites run: on a GPU where there is one. The committed baseline is a CPU's."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def clock(where: torch.device) -> Callable[[], float]:
+    """Seconds: of this process's own on a CPU, which others may share; of the clock, with all work done, on a GPU."""
+    if where.type != "cuda":
+        return time.process_time
+
+    def now() -> float:
+        torch.cuda.synchronize(where)
+        return time.perf_counter()
+
+    return now
+
+
 def median_seconds(*functions: Callable[[], object], repetitions: int = 7) -> list[float]:
     """The median duration of each function, after one call that does not count.
 
     They take turns, so that whatever else the machine does falls on all of them: their ratios are worth more than their
     durations.
     """
+    now = clock(device())
     for function in functions:
         function()
     seconds: list[list[float]] = [[] for _ in functions]
     for _ in range(repetitions):
         for function, taken in zip(functions, seconds, strict=True):
-            started = time.perf_counter()
+            started = now()
             function()
-            taken.append(time.perf_counter() - started)
+            taken.append(now() - started)
     return [statistics.median(taken) for taken in seconds]
 
 
@@ -77,8 +95,8 @@ def _processor() -> str:
 
 def yardstick() -> None:
     """Work that a machine does about as fast as ours: products of matrices and sines, some hundredths of a second."""
-    x = torch.ones(2048, 256)
-    weight = torch.full((256, 256), 1e-3)
+    x = torch.ones(2048, 256, device=device())
+    weight = torch.full((256, 256), 1e-3, device=device())
     for _ in range(16):
         x = torch.sin(x @ weight)
 

@@ -13,7 +13,7 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import cache
 from pathlib import Path
 
-from benchmarks.measure import Measurement, in_yardsticks
+from benchmarks.measure import Measurement, device, in_yardsticks
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
@@ -46,14 +46,14 @@ def config_of(name: str) -> NeilfConfig:
 @cache
 def _pixels() -> PixelDataset:
     capture = load_capture(demo_scene())
-    return PixelDataset(capture, capture.train_views)
+    return PixelDataset(capture, capture.train_views, device=device())
 
 
 def model_of(name: str) -> NeilfModel:
     """The untrained model of a preset."""
     config, pixels = config_of(name), _pixels()
     seed_step(config.train.seed, step=-1)
-    return build_model(pixels.capture, scene_facts(pixels.capture, pixels, config), config)
+    return build_model(pixels.capture, scene_facts(pixels.capture, pixels, config), config).to(device())
 
 
 def step_of(model: NeilfModel, stage: Stage, rays: int = RAYS) -> Callable[[], None]:

@@ -12,8 +12,7 @@ fallen, and its material may not have begun.
 from __future__ import annotations
 
 import dataclasses
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +21,7 @@ import tyro
 from rich.console import Console
 
 from benchmarks.charts import Chart, Line, draw_charts
-from benchmarks.measure import hardware
+from benchmarks.measure import clock, hardware
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
@@ -119,10 +118,10 @@ def _training(
     model: torch.nn.Module, pixels: PixelDataset, config: NeilfConfig, device: torch.device
 ) -> Iterator[tuple[int, float]]:
     """The steps of all stages as `train.loop` takes them, with nothing kept: how many are done, and the last one's seconds."""
-    clock = _clock(device)
+    now = clock(device)
     optimizer = make_optimizer(model, config.optimizer)
     for step in range(sum(stage_steps(config.train).values())):
-        began = clock()
+        began = now()
         position = stage_at(step, config.train)
         if position.step == 0:
             model.train().freeze_for(position.stage)
@@ -132,19 +131,7 @@ def _training(
         terms = model(pixels.sample(config.train.rays), position.stage)
         weigh(terms, active_losses(position.stage, config, model.stages)).loss.backward()
         optimizer.step()
-        yield step + 1, clock() - began
-
-
-def _clock(device: torch.device) -> Callable[[], float]:
-    """Seconds: of this process's own on a CPU, which others may share; of the clock, with all work done, on a GPU."""
-    if device.type != "cuda":
-        return time.process_time
-
-    def now() -> float:
-        torch.cuda.synchronize(device)
-        return time.perf_counter()
-
-    return now
+        yield step + 1, now() - began
 
 
 def _measure(run: Run) -> dict[str, float]:
