@@ -74,7 +74,8 @@ class OutgoingRadianceConfig:
     width: int = 256
     """Units of a hidden layer."""
     scale: float | None = None
-    """Largest radiance that the sigmoid can reach; none: 1 for LDR, 3 for HDR captures, more where the images hold more."""
+    """Largest radiance that the sigmoid can reach; none: 1 for LDR; for HDR twenty times the median of the images, or more
+    where they hold more."""
 
 
 @dataclass(frozen=True)

@@ -12,23 +12,25 @@ from neilfpp_method.config import OutgoingRadianceConfig
 from neilfpp_method.fields.encodings import direction_encoding, position_encoding
 from neilfpp_method.fields.mlp import Mlp
 
-__all__ = ["OutgoingRadianceField"]
+__all__ = ["MID_GREY", "OutgoingRadianceField"]
 
-MID_GREY = 0.2  # linear radiance that the field starts at
+MID_GREY = 0.2
 
 
 class OutgoingRadianceField(nn.Module):
-    """A sigmoid times `scale`, the largest radiance it reaches; starts near mid-grey, or at scale/2 if that is less."""
+    """A sigmoid times `scale`, the largest radiance it reaches; starts near the radiance `start`, at most at scale/2."""
 
-    def __init__(self, config: OutgoingRadianceConfig, feature_width: int, radius: float, scale: float) -> None:
+    def __init__(
+        self, config: OutgoingRadianceConfig, feature_width: int, radius: float, scale: float, start: float = MID_GREY
+    ) -> None:
         super().__init__()
         self.scale = scale
         self.position = position_encoding(config.encoding, config.grid, radius, config.frequencies)
         self.direction = direction_encoding(config.direction_encoding, config.direction_degree)
         inputs = self.position.width + self.direction.width + 3 + feature_width
         self.mlp = Mlp(inputs, 3, config.layers, config.width, "relu", output_scale=0.1)
-        start = min(MID_GREY / scale, 0.5)
-        nn.init.constant_(self.mlp.layers[-1].bias, math.log(start / (1 - start)))
+        share = min(start / scale, 0.5)
+        nn.init.constant_(self.mlp.layers[-1].bias, math.log(share / (1 - share)))
 
     def forward(
         self,

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.fields.background import InvertedSphere
-from neilfpp_method.fields.outgoing_radiance import OutgoingRadianceField
+from neilfpp_method.fields.outgoing_radiance import MID_GREY, OutgoingRadianceField
 from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_tracer, meet, tree_tracer
 from neilfpp_method.schedule import FIXED_GEOMETRY
 from neilfpp_method.shading.frame import safe_normalize
@@ -47,6 +47,7 @@ class MeshHost(nn.Module):
         radiance_scale: the largest radiance that R can reach.
         background: "inverted_sphere", or whatever else for a constant one.
         background_color: linear RGB of a constant background.
+        radiance_start: what R starts near.
     """
 
     stages = FIXED_GEOMETRY
@@ -58,10 +59,11 @@ class MeshHost(nn.Module):
         radiance_scale: float,
         background: str = "constant",
         background_color: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        radiance_start: float = MID_GREY,
     ) -> None:
         super().__init__()
         radius = config.volume.radius
-        self.radiance_field = OutgoingRadianceField(config.radiance, 0, radius, radiance_scale)
+        self.radiance_field = OutgoingRadianceField(config.radiance, 0, radius, radiance_scale, radiance_start)
         self.background = InvertedSphere(config.background, radius, radiance_scale) if background == "inverted_sphere" else None
         self.register_buffer("background_color", torch.tensor(background_color))
         triangles = mesh.vertices[mesh.faces]

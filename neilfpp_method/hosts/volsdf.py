@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from neilfpp_method import losses
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.fields.background import InvertedSphere
-from neilfpp_method.fields.outgoing_radiance import OutgoingRadianceField
+from neilfpp_method.fields.outgoing_radiance import MID_GREY, OutgoingRadianceField
 from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.base import RegularisedHits
 from neilfpp_method.shading.frame import safe_normalize
@@ -49,6 +49,7 @@ class VolSdfHost(nn.Module):
         background: "none", "constant" or "inverted_sphere" (`config.background.kind`, decided).
         background_color: linear RGB of a constant background.
         points: oriented cloud on the surface, scene frame, for L_pcd.
+        radiance_start: what R starts near.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class VolSdfHost(nn.Module):
         background: str,
         background_color: tuple[float, float, float] = (0.0, 0.0, 0.0),
         points: OrientedPoints | None = None,
+        radiance_start: float = MID_GREY,
     ) -> None:
         super().__init__()
         self.config = config
@@ -68,7 +70,9 @@ class VolSdfHost(nn.Module):
         self.register_buffer("point_normal", None if points is None else points.normal, persistent=False)
         radius = config.volume.radius
         self.sdf_field = SdfField(config.sdf, radius)
-        self.radiance_field = OutgoingRadianceField(config.radiance, config.sdf.feature_width, radius, radiance_scale)
+        self.radiance_field = OutgoingRadianceField(
+            config.radiance, config.sdf.feature_width, radius, radiance_scale, radiance_start
+        )
         self.density = LaplaceDensity(config.volume.beta_init, config.volume.beta_floor)
         self.background = (
             InvertedSphere(config.background, radius, radiance_scale) if background == "inverted_sphere" else None

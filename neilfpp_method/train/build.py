@@ -24,10 +24,10 @@ from neilfpp_method.structures import OrientedPoints
 
 __all__ = ["build_model", "scene_facts", "show_known_light"]
 
-# METHOD §5: the sigmoid of R reaches 1 for LDR and 3 for HDR input; a brighter capture needs more room, and the few
-# brightest pixels (a lamp in view) do not set the scale of all others.
+# The sigmoid of R reaches 1 for LDR input. Radiance has no unit: the paper's 3 for HDR is twenty times the median of a well
+# exposed image. Where more is bright R needs more room; the few brightest pixels (a lamp in view) do not decide for all.
 LDR_SCALE = 1.0
-HDR_SCALE = 3.0
+HDR_MEDIANS = 20.0
 BRIGHT_QUANTILE = 0.999
 
 # Of the pixels of every view, one in so many asks whether a mesh is where the cameras look.
@@ -37,16 +37,17 @@ SEEN_EVERY = 67
 def scene_facts(capture: Capture, pixels: PixelDataset, config: NeilfConfig) -> SceneFacts:
     """What the training images decide before training; see `SceneFacts`."""
     response = "linear" if capture.hdr else "srgb"
-    scale = config.radiance.scale
+    scale, median = config.radiance.scale, pixels.median_radiance()
     if scale is None:
-        scale = LDR_SCALE if response == "srgb" else max(HDR_SCALE, pixels.radiance_quantile(BRIGHT_QUANTILE))
+        hdr = max(HDR_MEDIANS * median, pixels.radiance_quantile(BRIGHT_QUANTILE))
+        scale = LDR_SCALE if response == "srgb" else hdr
     kind, color = config.background.kind, config.background.color
     if color is None and kind in ("auto", "constant"):
         border = pixels.border_color()
         color = None if border is None else tuple(border.tolist())
     if kind == "auto":
         kind = "inverted_sphere" if color is None else "constant"
-    return SceneFacts(response, pixels.median_radiance(), scale, kind, color or (0.0, 0.0, 0.0))
+    return SceneFacts(response, median, scale, kind, color or (0.0, 0.0, 0.0))
 
 
 def build_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> NeilfModel:
@@ -71,7 +72,8 @@ def show_known_light(model: NeilfModel) -> None:
 
 
 def _volsdf(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> VolSdfHost:
-    return VolSdfHost(config, facts.radiance_scale, facts.background, facts.background_color, _points(capture, config))
+    scale, start, points = facts.radiance_scale, facts.median_radiance, _points(capture, config)
+    return VolSdfHost(config, scale, facts.background, facts.background_color, points, start)
 
 
 def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
@@ -79,7 +81,8 @@ def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
     mesh = Truth(capture).mesh() if path is None else read_mesh(Path(path), capture.normalisation)
     if mesh is None:
         raise UserError(f"{capture.root}: no inputs/model/mesh.ply for the mesh host", "name a mesh with --mesh PATH")
-    host = MeshHost(mesh, config, facts.radiance_scale, facts.background, facts.background_color)
+    scale, start = facts.radiance_scale, facts.median_radiance
+    host = MeshHost(mesh, config, scale, facts.background, facts.background_color, start)
     _check_seen(host, capture, path or "inputs/model/mesh.ply")
     return host
 

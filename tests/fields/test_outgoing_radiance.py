@@ -16,12 +16,15 @@ def inputs(feature_width: int) -> list[torch.Tensor]:
 
 
 @pytest.mark.parametrize("name", ["paper-mlp", "paper-ngp", "fast"])
-@pytest.mark.parametrize(("scale", "start"), [(1.0, 0.2), (3.0, 0.2), (0.1, 0.05)])
-def test_starts_near_mid_grey_and_below_its_scale(name, scale, start):
+@pytest.mark.parametrize(
+    ("scale", "asked", "start"),
+    [(1.0, 0.2, 0.2), (3.0, 0.2, 0.2), (0.1, 0.2, 0.05), (3e4, 2e3, 2e3), (3e-4, 2e-5, 2e-5)],
+)
+def test_starts_near_what_is_asked_and_below_its_scale(name, scale, asked, start):
     torch.manual_seed(0)
     config = preset(name)
     width = config.sdf.feature_width
-    color = OutgoingRadianceField(config.radiance, width, config.volume.radius, scale)(*inputs(width))
+    color = OutgoingRadianceField(config.radiance, width, config.volume.radius, scale, asked)(*inputs(width))
     assert color.shape == (50, 3)
     assert color.min() > 0
     assert color.max() < scale

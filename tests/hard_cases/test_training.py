@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -19,14 +18,7 @@ from neilfpp_method.train.loop import train
 from tests.data.make_capture import RADIUS, SCALE, make_capture, srgb
 from tests.train.small_runs import small_config, small_training
 
-
-@pytest.fixture(autouse=True)
-def _without_shape_checks():
-    """They cost two thirds of the time of a small step, and a hundred steps have the shapes of the first."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
-
+pytestmark = pytest.mark.usefixtures("without_shape_checks")
 
 # Linear radiance from a unit normal and the unit direction of the ray that sees it, both of the scene frame.
 Look = Callable[[np.ndarray, np.ndarray], np.ndarray]

@@ -1,0 +1,87 @@
+"""Units that nobody tuned for: what a capture calls a length or a radiance of 1 changes neither surface nor material.
+
+Factors are powers of two, which no rounding touches, so two trainings can be compared bit for bit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from neilfpp_method.config import NeilfConfig
+from neilfpp_method.data.images import read_image, write_exr
+from neilfpp_method.presets import preset
+from neilfpp_method.train.loop import Training, train
+from tests.data.make_capture import make_capture
+from tests.train.small_runs import small_config, small_training
+
+pytestmark = pytest.mark.usefixtures("without_shape_checks")
+
+STEPS = 4
+
+
+def settings(light: str) -> NeilfConfig:
+    """Smoothness is off: it is weighed by the gradient of the displayed image, whose exposure is the capture's."""
+    config = small_config(sdf_steps=STEPS, material_steps=STEPS, joint_steps=STEPS)
+    config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, smoothness=0.0))
+    if light == "free":
+        return config
+    solved = preset("fast")
+    fit = dataclasses.replace(solved.light.fit, points=32, candidates=8, every=3, steps=5)
+    return dataclasses.replace(
+        config,
+        light=dataclasses.replace(solved.light, environment_height=4, fit=fit),
+        inter_reflection=dataclasses.replace(solved.inter_reflection, grid_resolution=24),
+    )
+
+
+def trained(folder: Path, light: str, radiance: float = 1.0, length: float = 1.0) -> Training:
+    """A few steps of each stage on the sphere, its images and its world in other units."""
+    root = make_capture(folder / "capture", masks=True, background=0.1)
+    for image in (root / "inputs" / "images").iterdir():
+        write_exr(image, {"RGB": read_image(image).pixels * np.float32(radiance)})
+    path = root / "inputs" / "sfm_scene.json"
+    scene = json.loads(path.read_text())
+    for track in scene["camera_track_map"]["images"].values():
+        w2c = np.reshape(track["camera"]["extrinsic"], (4, 4))
+        w2c[:3, 3] *= length
+        track["camera"]["extrinsic"] = w2c.tolist()
+    box = np.reshape(scene["bbox"]["transform"], (4, 4))
+    box[:3] *= length
+    scene["bbox"]["transform"] = box.tolist()
+    path.write_text(json.dumps(scene))
+    run = small_training(root, folder / "run", settings(light))
+    train(run)
+    assert run.skipped == 0
+    run.model.eval()
+    return run
+
+
+@pytest.fixture(scope="module", params=["free", "auto"])
+def usual(request, without_shape_checks, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Training]:
+    return request.param, trained(tmp_path_factory.mktemp("usual"), request.param)
+
+
+@pytest.mark.parametrize(("radiance", "length"), [(2.0**13, 2.0**-10), (2.0**-13, 2.0**10)])
+def test_other_units_show_the_same_scene(tmp_path, usual, radiance, length):
+    """Surface and material are the same; the light, and what the surface sends, have the unit of the images."""
+    light, reference = usual
+    other = trained(tmp_path, light, radiance, length)
+    # The logarithm of a map's texels is shifted by the unit, and rounded.
+    tolerance = {"rtol": 0.0, "atol": 0.0} if light == "free" else {"rtol": 1e-3, "atol": 1e-4}
+    for field in ("geometry", "brdf"):
+        groups = (run.model.parameter_groups()[field] for run in (reference, other))
+        for p, q in zip(*groups, strict=True):
+            torch.testing.assert_close(q, p, **tolerance)
+
+    x, wi = torch.tensor([[0.0, 0.0, 0.8]]), torch.tensor([[[0.0, 0.6, 0.8], [1.0, 0.0, 0.0]]])
+    rays = reference.pixels.view(0).rays
+    with torch.no_grad():
+        for shown in (lambda model: model.light.radiance(x, wi), lambda model: model.host.render(rays).color):
+            expected = radiance * shown(reference.model)
+            torch.testing.assert_close(shown(other.model), expected, rtol=1e-3, atol=1e-4 * float(expected.mean()))
