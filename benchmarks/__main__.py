@@ -75,7 +75,8 @@ def main(options: Options, console: Console) -> int:
             console.print(f"{measurement.name}: {measurement.value:.3g} {measurement.unit}", markup=False, highlight=False)
             measured.append(measurement)
     if options.save:
-        write_json(BASELINE, merged(measured, old, hardware()))
+        now = read_json(BASELINE) if BASELINE.exists() else {}  # others may have saved meanwhile
+        write_json(BASELINE, merged(measured, now, hardware()))
     worse = compare(measured, known) if options.compare else []
     if options.compare:
         console.print(_table(measured, known, worse))

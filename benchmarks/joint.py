@@ -69,8 +69,8 @@ def fit_table(field: SdfField) -> None:
         optimizer.step()
 
 
-def fitted_model(config: NeilfConfig) -> NeilfModel:
-    """A model whose surface is the table, sharp."""
+def fitted_model(config: NeilfConfig, like: VolSdfHost | None = None) -> NeilfModel:
+    """A model whose surface is the table, sharp; fitted, or that of another host with the same networks."""
     config = dataclasses.replace(
         config,
         loss=dataclasses.replace(config.loss, point_cloud=0.0),
@@ -79,7 +79,10 @@ def fitted_model(config: NeilfConfig) -> NeilfModel:
     torch.manual_seed(0)
     facts = SceneFacts("linear", 0.2, 3.0, "constant")
     host = VolSdfHost(config, facts.radiance_scale, facts.background)
-    fit_table(host.sdf_field)
+    if like is None:
+        fit_table(host.sdf_field)
+    else:
+        host.sdf_field.load_state_dict(like.sdf_field.state_dict())
     return NeilfModel(host, config, facts).to(device())
 
 
@@ -143,7 +146,8 @@ def measurements() -> Iterator[Measurement]:
     """Ratios of whole steps, and the error of the integral over directions that are shared."""
     batch = rays_at_the_table(RAYS)
     with computing_fast():
-        cheap, published, fast = (fitted_model(c) for c in (cheap_paper(), preset("paper-mlp"), preset("fast")))
+        cheap, fast = fitted_model(cheap_paper()), fitted_model(preset("fast"))
+        published = fitted_model(preset("paper-mlp"), like=cheap.host)
     plain = straightforward(cheap).to(device())
     steps = {
         "plain": step_on(plain, batch),
