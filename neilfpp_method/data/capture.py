@@ -173,9 +173,11 @@ def _check_views(views: tuple[View, ...]) -> bool:
         hdr.setdefault(headers[view.image].hdr, view)
         for path, header in headers.items():
             if (header.width, header.height) != size:
+                turned = (header.height, header.width) == size
+                remedy = "turn the pixels as the image's EXIF says" if turned else "resize the image, or scale its camera"
                 raise UserError(
                     f"{path}: {header.width}×{header.height} pixels where the camera has {size[0]}×{size[1]}",
-                    "resize the image, or scale the camera with it",
+                    remedy,
                 )
     if len(hdr) > 1:
         raise UserError(f"{hdr[True].image} is HDR and {hdr[False].image} is LDR", "use images of one kind")

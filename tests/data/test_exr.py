@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,16 @@ def test_layers_that_could_all_be_meant_are_refused(tmp_path: Path) -> None:
     path = written(tmp_path / "a.exr", {**DIFFUSE, **planes("View.GlossCol.", RGB)})
     for read in (image_header, read_image):
         with pytest.raises(UserError, match=r"a\.exr: no RGB or single channel among View\.DiffCol\.B, .*GlossCol"):
+            read(path)
+
+
+def test_the_size_of_every_part_is_bounded(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.exr", planes("", RGB), {"Z": OTHER[..., 0].copy()})
+    data = path.read_bytes()
+    at = data.rindex(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
+    path.write_bytes(data[:at] + struct.pack("<4i", 0, 0, 199_999, 199_999) + data[at + 16 :])
+    for read in (image_header, read_image):
+        with pytest.raises(UserError, match=r"a\.exr: the header says 200000×200000"):
             read(path)
 
 

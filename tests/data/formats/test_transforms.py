@@ -221,6 +221,11 @@ def test_bad_entries_are_refused(tmp_path: Path, change: Callable[[dict], object
     refused(edit(scene(tmp_path / "capture"), change), *words)
 
 
+def test_an_image_on_its_side(tmp_path: Path) -> None:
+    """Some programs turn a picture as its EXIF says before they look for its camera, and leave the file as it is."""
+    refused(edit(scene(tmp_path), lambda c: c.update(w=HEIGHT, h=WIDTH)), "18×24; turn the pixels as the image's EXIF says")
+
+
 def test_what_is_no_json(tmp_path: Path) -> None:
     scene(tmp_path)
     for text in ("", "{", "[" * 100_000, "\x00"):
