@@ -121,7 +121,7 @@ class LightFitConfig:
     light from that of the surfaces."""
     sparsity: float = 0.0005
     """Weight of the lamps, by the logarithm of their shares of all light, against the relative error."""
-    candidates: int = 192
+    candidates: int = 256
     """Places for lamps that one fit tries."""
     lamps: int = 8
     """Most lamps."""

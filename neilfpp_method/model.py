@@ -298,7 +298,7 @@ class NeilfModel(nn.Module):
             return shading
         # Lamps are small and few: each is asked by itself, and no direction that another sampler draws meets one.
         rays = self.lamps.rays_from(position)
-        radiance = self.lamps.radiance().expand_as(rays.wi)
+        radiance = self.lamps.arriving(rays)
         if self.config.inter_reflection.mode == "hard":
             radiance = radiance * (self._scene_light(position, rays.wi).distance >= rays.distance)[..., None]
         lit = shade(material, normal, wo, rays.samples(), radiance, self.lobe, settings.specular)

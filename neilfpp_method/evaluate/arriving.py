@@ -63,7 +63,7 @@ def arriving_light(
         radiance, patch = torch.where(scene.hit[..., None], scene.radiance, radiance), patch + PATCHES * scene.hit
     if lamps is not None and lamps.lit:
         rays = lamps.rays_from(position)
-        shining = lamps.radiance().expand_as(rays.wi)
+        shining = lamps.arriving(rays)
         if hard:
             shining = shining * (_scene(model, position, rays.wi).distance >= rays.distance)[..., None]
         number = 2 * PATCHES + torch.arange(lamps.lit, device=patch.device)

@@ -87,10 +87,11 @@ def _lamps(run: Run, lamps: Lamps) -> list[dict[str, Any]]:
     frame = run.capture.normalisation
     lit = slice(lamps.lit)
     positions = frame.to_world(lamps.position[lit].double()).tolist()
+    axes = [axis if any(axis) else None for axis in lamps.axis[lit].tolist()]
     intensities = (lamps.intensity[lit].double() * frame.scale**2).tolist()
     return [
-        {"position": position, "radius": lamps.radius * frame.scale, "intensity": intensity, "radiance": radiance}
-        for position, intensity, radiance in zip(positions, intensities, lamps.radiance().tolist(), strict=True)
+        {"position": position, "axis": axis, "radius": lamps.radius * frame.scale, "intensity": intensity, "radiance": radiance}
+        for position, axis, intensity, radiance in zip(positions, axes, intensities, lamps.radiance().tolist(), strict=True)
     ]
 
 

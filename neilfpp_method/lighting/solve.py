@@ -65,7 +65,7 @@ def solve_light(
     places = propose(lamps, seen.position, config.fit.candidates)
     near = from_lamps(places, lamps.radius, seen, material.roughness, lobe, scene)
     both = texels.beside(near)
-    intensity = dark.new_zeros(len(places), 3)
+    intensity = dark.new_zeros(len(places.position), 3)
     intensity[: lamps.lit] = lamps.intensity[: lamps.lit]
     start = Light(sought, intensity)
     if config.kind != "auto":
@@ -84,5 +84,5 @@ def solve_light(
             return evidence
     sought.copy_(found.log_radiance)
     lit = merge(places, found.intensity, near.sources[0].mean(0), len(lamps.position))
-    lamps.place(lit.position, lit.intensity)
+    lamps.place(lit.places.position, lit.intensity, lit.places.axis)
     return evidence

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.fields.lamps import rays_towards
+from neilfpp_method.fields.lamps import LampPlaces, rays_towards
 from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.shading.brdf import Lobe, diffuse_reflectance, normal_reflectance, specular_terms
 from neilfpp_method.shading.frame import dot
@@ -105,7 +105,7 @@ def from_texels(
 
 @torch.no_grad()
 def from_lamps(
-    position: Float[Tensor, "M 3"],
+    lamps: LampPlaces,
     radius: float,
     seen: Observed,
     roughness: Float[Tensor, "N 1"],
@@ -114,9 +114,9 @@ def from_lamps(
 ) -> Transport:
     """From small lamps, per unit of intensity: the direction to their middle is traced. Arguments as of `from_texels`."""
     sources = []
-    for part, rough in _chunks(seen, roughness, len(position)):
-        rays = rays_towards(part.position, position, radius)
-        weight = dot(rays.wi, part.normal).clamp_min(0) / rays.distance.square()
+    for part, rough in _chunks(seen, roughness, len(lamps.position)):
+        rays = rays_towards(part.position, lamps.position, lamps.axis, radius)
+        weight = rays.emission * dot(rays.wi, part.normal).clamp_min(0) / rays.distance.square()
         if scene is not None:
             weight = weight * (scene(part.position, rays.wi).distance >= rays.distance)
         sources.append(_kernel(part, rough, rays.wi, weight, lobe))

@@ -25,6 +25,7 @@ from tests.scenes import tiny_config
 RADIUS = 0.6
 POSITION = torch.tensor([[0.9, 0.0, 0.3], [-0.2, 0.8, 0.4]])
 INTENSITY = torch.tensor([[0.5, 0.25, 0.125], [0.1, 0.2, 0.4]])
+AXIS = torch.tensor([[0.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 class Ball(torch.nn.Module):
@@ -56,7 +57,7 @@ def make_run(folder: Path, kind: str, step: int = 12, radius: float = RADIUS) ->
     if kind != "free":
         model.light.show(torch.rand(3, 9, 18) + 0.1)
     if kind == "distant_near":
-        model.lamps.place(POSITION, INTENSITY)
+        model.lamps.place(POSITION, INTENSITY, AXIS)
     return Run(folder, config, load_capture(make_capture(folder / "capture")), model.facts, model, step)
 
 
@@ -79,6 +80,7 @@ def test_lamps_light_the_world_as_they_light_the_scene(tmp_path):
     assert export_light(run, tmp_path / "light").lamps == 2
     described = json.loads((tmp_path / "light" / "lamps.json").read_text())
     assert described["format"] == 1
+    assert [lamp["axis"] for lamp in described["lamps"]] == [None, [0.0, -1.0, 0.0]]
     at = np.array([0.1, -0.2, 0.6])  # a point of the scene, which is CENTRE + SCALE · at in the world
     for lamp, position, intensity in zip(described["lamps"], POSITION.numpy(), INTENSITY.numpy(), strict=True):
         np.testing.assert_allclose(lamp["position"], CENTRE + SCALE * position, atol=1e-6)

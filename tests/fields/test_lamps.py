@@ -33,7 +33,7 @@ def test_a_lambertian_surface_shows_cosine_and_inverse_square():
     x, up = torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]])
     rays = light.rays_from(x)
     material = Material(torch.tensor([[0.5, 0.5, 0.5]]), torch.ones(1, 1), torch.zeros(1, 1))
-    radiance = light.radiance().expand_as(rays.wi)
+    radiance = light.arriving(rays)
     color = shade(material, up, up, rays.samples(), radiance, GGX, specular=False).color[0]
     expected = 0.5 / math.pi * (0.8 * torch.tensor([0.3, 0.6, 0.9]) + 0.2)
     torch.testing.assert_close(color, expected)
@@ -48,6 +48,19 @@ def test_the_light_that_is_seen_brings_the_same_irradiance_as_the_rays():
     seen = light.seen(torch.zeros(1, 3), wi, torch.full((1, 2_000_000), math.inf))
     irradiance = 2 * math.pi * (seen * wi[..., 2:]).mean(1)[0]
     torch.testing.assert_close(irradiance, 0.8 * torch.tensor([0.3, 0.6, 0.9]) + 0.2, rtol=0.05, atol=0.0)
+
+
+def test_a_lamp_with_an_axis_sends_by_the_cosine_and_nothing_backwards():
+    """Both ways of asking, at 0°, 60° and 120° from the axis of a lamp at the origin."""
+    light = Lamps(1, radius=0.05)
+    light.place(torch.zeros(1, 3), torch.full((1, 3), 0.6), torch.tensor([[0.0, 0.0, 1.0]]))
+    angle = torch.tensor([0.0, math.pi / 3, 2 * math.pi / 3])
+    x = 2 * torch.stack((angle.sin(), torch.zeros(3), angle.cos()), -1)
+    full = 0.6 / (math.pi * 0.05**2)
+    expected = full * torch.tensor([1.0, 0.5, 0.0])[:, None].expand(3, 3)
+    torch.testing.assert_close(light.arriving(light.rays_from(x))[:, 0], expected, atol=1e-4, rtol=1e-5)
+    infinite = torch.full((3, 1), math.inf)
+    torch.testing.assert_close(light.seen(x, -x[:, None] / 2, infinite)[:, 0], expected, atol=1e-4, rtol=1e-5)
 
 
 def test_what_stands_before_a_lamp_hides_it():
@@ -67,7 +80,10 @@ def test_a_point_inside_a_lamp_gets_finite_light():
 
 
 def test_a_checkpoint_knows_how_many_are_lit():
+    before = lamps()
+    before.axis[0] = torch.tensor([0.0, 0.0, -1.0])
     again = Lamps(3, radius=0.05)
-    again.load_state_dict(lamps().state_dict())
+    again.load_state_dict(before.state_dict())
     assert again.lit == 2
+    assert torch.equal(again.axis, before.axis)
     assert torch.equal(again.radiance(), lamps().radiance())

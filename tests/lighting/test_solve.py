@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.config import IncidentLightConfig, LightFitConfig
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.fields.lamps import Lamps
+from neilfpp_method.fields.lamps import LampPlaces, Lamps
 from neilfpp_method.lighting.candidates import merge, propose
 from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.lighting.solve import solve_light
@@ -22,6 +22,10 @@ from tests.lighting.surfaces import material
 
 CONFIG = IncidentLightConfig(kind="auto", environment_height=12, fit=LightFitConfig(points=800, steps=150))
 LAMP = torch.tensor([[0.3, -0.2, 0.5]])
+BULB = LampPlaces(LAMP, torch.zeros(1, 3))
+"""Sends alike in all directions."""
+PANEL = LampPlaces(LAMP, normalize(torch.tensor([[-0.7, 0.3, -0.6]]), dim=-1))
+"""Sends most to the left, and nothing to the right of it."""
 
 
 def table(count: int) -> Observed:
@@ -37,13 +41,13 @@ def table(count: int) -> Observed:
     return Observed(position, normal, wo, torch.zeros(count, 3))
 
 
-def photographed(lamp: bool) -> tuple[Observed, Material]:
+def photographed(lamp: LampPlaces | None) -> tuple[Observed, Material]:
     """The table under an even sky, with or without a lamp above it that brings about as much light."""
     seen, of = table(800), material(800)
     sky = EnvironmentLight(12, 0.5)
     image = from_texels(sky, seen, of.roughness, GGX, None).outgoing(of, sky.log_radiance.exp().flatten(1).t())
-    if lamp:
-        carried = from_lamps(LAMP, 0.06, seen, of.roughness, GGX, None)
+    if lamp is not None:
+        carried = from_lamps(lamp, 0.06, seen, of.roughness, GGX, None)
         image = image + carried.outgoing(of, torch.tensor([[0.9, 0.7, 0.4]]))
     return dataclasses.replace(seen, pixel=image), of
 
@@ -58,7 +62,7 @@ def solved(seen: Observed, of: Material, rounds: int) -> tuple[Lamps, object]:
 
 
 def test_a_lamp_is_found_where_it_is():
-    lamps, evidence = solved(*photographed(lamp=True), rounds=6)
+    lamps, evidence = solved(*photographed(BULB), rounds=6)
     assert evidence.significant
     assert lamps.lit >= 1
     assert (lamps.position[0] - LAMP[0]).norm() < 0.12  # its width
@@ -69,8 +73,15 @@ def test_a_lamp_is_found_where_it_is():
     assert lamps.intensity[beside].sum() > 0.9 * lamps.intensity.sum()
 
 
+def test_a_panel_is_found_where_it_is_and_which_way_it_shines():
+    lamps, evidence = solved(*photographed(PANEL), rounds=6)
+    assert evidence.significant
+    assert (lamps.position[0] - LAMP[0]).norm() < 0.12
+    assert (lamps.axis[0] * PANEL.axis[0]).sum() > math.cos(math.radians(30))
+
+
 def test_under_a_sky_alone_no_lamp_is_lit():
-    lamps, evidence = solved(*photographed(lamp=False), rounds=2)
+    lamps, evidence = solved(*photographed(None), rounds=2)
     assert not evidence.significant
     assert lamps.lit == 0
 
@@ -81,24 +92,44 @@ def test_proposals_keep_what_is_lit_and_stay_clear_of_surfaces():
     lamps.place(LAMP, torch.ones(1, 3))
     surface = table(400).position
     places = propose(lamps, surface, 100)
-    assert places.shape == (100, 3)
-    assert torch.equal(places[:1], LAMP)
-    assert torch.cdist(places[1:], surface).min() > 3 * 0.06
-    assert ((places - LAMP).norm(dim=-1) < 0.2).sum() >= 5
+    assert places.position.shape == places.axis.shape == (100, 3)
+    assert torch.equal(places.position[:1], LAMP)
+    assert torch.cdist(places.position[1:], surface).min() > 3 * 0.06
+    assert ((places.position - LAMP).norm(dim=-1) < 0.2).sum() >= 5
+
+
+def test_proposals_are_bulbs_and_panels_turned_to_the_scene():
+    torch.manual_seed(0)
+    places = propose(Lamps(4, 0.06), table(400).position, 200)
+    length = places.axis.norm(dim=-1)
+    bulb = length == 0
+    assert 0.2 < bulb.float().mean() < 0.5
+    torch.testing.assert_close(length[~bulb], torch.ones(int((~bulb).sum())))
+    towards = (normalize(-places.position, dim=-1) * places.axis).sum(-1)[~bulb]
+    assert (towards > 0).float().mean() > 0.75
 
 
 def test_neighbours_become_one_lamp_of_their_joint_power():
     position = torch.tensor([[0.0, 0.0, 0.5], [0.06, 0.0, 0.5], [0.8, 0.0, 0.5], [-0.8, 0.0, 0.5]])
     intensity = torch.tensor([[3.0, 3.0, 3.0], [1.0, 1.0, 1.0], [2.0, 0.0, 0.0], [0.01, 0.01, 0.01]])
-    found = merge(position, intensity, torch.ones(4), most=4)
-    torch.testing.assert_close(found.position, torch.tensor([[0.015, 0.0, 0.5], [0.8, 0.0, 0.5]]))
+    axis = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    places = LampPlaces(position, axis)
+    found = merge(places, intensity, torch.ones(4), most=4)
+    torch.testing.assert_close(found.places.axis, axis[[0, 2]])
+    torch.testing.assert_close(found.places.position, torch.tensor([[0.015, 0.0, 0.5], [0.8, 0.0, 0.5]]))
     torch.testing.assert_close(found.intensity, torch.tensor([[4.0, 4.0, 4.0], [2.0, 0.0, 0.0]]))
-    assert len(merge(position, intensity, torch.ones(4), most=1).position) == 1
-    assert len(merge(position, torch.zeros(4, 3), torch.ones(4), most=4).position) == 0
+    assert len(merge(places, intensity, torch.ones(4), most=1).intensity) == 1
+    assert len(merge(places, torch.zeros(4, 3), torch.ones(4), most=4).intensity) == 0
+
+
+def test_lamps_back_to_back_are_a_bulb():
+    axis = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
+    found = merge(LampPlaces(LAMP.expand(2, 3), axis), torch.ones(2, 3), torch.ones(2), most=4)
+    torch.testing.assert_close(found.places.axis, torch.zeros(1, 3))
 
 
 def test_before_a_known_map_lamps_are_found_and_the_map_stays():
-    seen, of = photographed(lamp=True)
+    seen, of = photographed(BULB)
     known = dataclasses.replace(CONFIG, map="sky.exr")
     environment, lamps = EnvironmentLight(4, 1.0), Lamps(4, 0.06)
     environment.show(torch.full((3, 48, 70), 0.5))  # finer than the fit needs it
@@ -116,7 +147,7 @@ def test_before_a_known_map_lamps_are_found_and_the_map_stays():
 
 
 def test_under_a_known_sky_alone_no_lamp_is_lit():
-    seen, of = photographed(lamp=False)
+    seen, of = photographed(None)
     environment, lamps = EnvironmentLight(12, 0.5), Lamps(4, 0.06)
     torch.manual_seed(0)
     known = dataclasses.replace(CONFIG, map="sky.exr")
@@ -128,7 +159,7 @@ def test_under_a_known_sky_alone_no_lamp_is_lit():
 @pytest.mark.parametrize("count", [1, 3, 5])
 def test_hardly_any_points_speak_for_no_lamp(count):
     """Of a few points none or one is kept back: evidence that JSON can hold, and nothing that is not finite."""
-    seen, of = photographed(lamp=False)
+    seen, of = photographed(None)
     few = torch.arange(count)
     lamps, evidence = solved(seen[few], of[few], rounds=1)
     assert evidence.points == count // 5
