@@ -1,8 +1,10 @@
-"""Scenes that strain the method: a hundred steps of each stage end finite, and none is skipped."""
+"""Scenes that strain the method: a hundred steps of each stage (a dozen for captures that are merely odd) end finite, and none
+is skipped."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,8 +17,8 @@ from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.errors import UserError
 from neilfpp_method.train.loop import train
-from tests.data.make_capture import RADIUS, SCALE, make_capture, srgb
-from tests.train.small_runs import small_config, small_training
+from tests.data.make_capture import CENTRE, RADIUS, SCALE, make_capture, srgb
+from tests.train.small_runs import small_config, small_training, solved_light
 
 pytestmark = pytest.mark.usefixtures("without_shape_checks")
 
@@ -46,23 +48,25 @@ def repaint(root: Path, look: Look) -> Path:
     return root
 
 
-def trains(root: Path, out: Path, may_rest: frozenset[str] = frozenset()) -> None:
-    """Train a hundred steps a stage, and shade nearly every ray that the object might stop.
+def trains(root: Path, out: Path, may_rest: frozenset[str] = frozenset(), steps: int = 100, solved: bool = False) -> None:
+    """Train so many steps a stage, and shade nearly every ray that the object might stop.
 
-    Every field must move, but those that `may_rest`.
+    Every field must move, but those that `may_rest`. The light is free, or `solved` for.
     """
-    config = small_config(sdf_steps=100, material_steps=100, joint_steps=100, checkpoint_every=1000, rays=16)
+    config = small_config(sdf_steps=steps, material_steps=steps, joint_steps=steps, checkpoint_every=1000, rays=16)
+    config = solved_light(config) if solved else config
     config = dataclasses.replace(config, shading=dataclasses.replace(config.shading, hit_share=0.01))
     training = small_training(root, out, config)
     groups = training.model.parameter_groups()
     before = {field: [p.detach().clone() for p in parameters] for field, parameters in groups.items()}
     train(training)
     assert training.skipped == 0, training.reporter.said
-    assert len(training.reporter.losses) == 300
+    assert len(training.reporter.losses) == 3 * steps
     for field, parameters in groups.items():
         assert all(p.isfinite().all() for p in parameters), field
         moved = not all(map(torch.equal, before[field], parameters))
         assert moved or field in may_rest, f"{field} did not train"
+    assert all(b.isfinite().all() for b in training.model.buffers())
 
 
 def environment(direction: np.ndarray) -> np.ndarray:
@@ -109,3 +113,59 @@ def test_a_scene_without_an_object(tmp_path):
     repaint(root, lambda n, d: np.full_like(n, 0.3))
     # Once nothing is left to hit, there is nothing to shade.
     trains(root, tmp_path / "run", may_rest=frozenset({"brdf", "light"}))
+
+
+# ------------------------------------------------------------------------------ captures that no setting was chosen for
+
+# A map that is solved for is no parameter, so nothing of the light trains by steps.
+odd = {"steps": 12, "solved": True, "may_rest": frozenset({"light"})}
+
+
+def test_a_mirror_under_a_light_that_is_solved_for(tmp_path):
+    def mirror(normal: np.ndarray, seen_along: np.ndarray) -> np.ndarray:
+        return environment(seen_along - 2.0 * (seen_along * normal).sum(-1, keepdims=True) * normal)
+
+    trains(repaint(make_capture(tmp_path / "mirror", masks=True), mirror), tmp_path / "run", **odd)
+
+
+def test_one_view_to_train_on(tmp_path):
+    root = make_capture(tmp_path / "one", views=2)
+    assert len(load_capture(root).train_views) == 1
+    trains(root, tmp_path / "run", **odd)
+
+
+def test_masks_that_call_everything_the_object(tmp_path):
+    root = make_capture(tmp_path / "all", masks=True)
+    for mask in (root / "inputs" / "masks").iterdir():
+        write_png(mask, np.full((18, 24), 255, np.uint8))
+    trains(root, tmp_path / "run", **odd)
+
+
+def test_views_of_several_sizes(tmp_path):
+    root, larger = make_capture(tmp_path / "capture"), make_capture(tmp_path / "larger", size=(37, 29))
+    scenes = [json.loads((folder / "inputs" / "sfm_scene.json").read_text()) for folder in (root, larger)]
+    tracks = [scene["camera_track_map"]["images"] for scene in scenes]
+    for k in (1, 3):
+        tracks[0][str(k)] = tracks[1][str(k)]
+        for name in (f"images/{k:03d}.exr", f"depth_maps/{k:03d}.exr", f"normal_maps/{k:03d}.exr"):
+            (root / "inputs" / name).write_bytes((larger / "inputs" / name).read_bytes())
+    (root / "inputs" / "sfm_scene.json").write_text(json.dumps(scenes[0]))
+    assert {view.camera.width for view in load_capture(root).views} == {24, 37}
+    trains(root, tmp_path / "run", **odd)
+
+
+@pytest.mark.parametrize("solved", [False, True])
+def test_cameras_inside_the_object(tmp_path, solved):
+    """Whatever way they look there is a wall; of its outside, which is what is shaded, they see nothing."""
+    root = make_capture(tmp_path / "inside", background=0.4)
+    path = root / "inputs" / "sfm_scene.json"
+    scene = json.loads(path.read_text())
+    for k, track in scene["camera_track_map"]["images"].items():
+        w2c = np.reshape(track["camera"]["extrinsic"], (4, 4))
+        eye = CENTRE - 0.2 * RADIUS * w2c[2, :3]
+        w2c[:3, 3] = -w2c[:3, :3] @ eye
+        track["camera"]["extrinsic"] = w2c.tolist()
+        image = root / "inputs" / "images" / f"{int(k):03d}.exr"
+        write_exr(image, {"RGB": np.full((18, 24, 3), 0.4, np.float32)})
+    path.write_text(json.dumps(scene))
+    trains(root, tmp_path / "run", may_rest=frozenset({"brdf", "light"}), steps=12, solved=solved)

@@ -15,10 +15,9 @@ import torch
 
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.images import read_image, write_exr
-from neilfpp_method.presets import preset
 from neilfpp_method.train.loop import Training, train
 from tests.data.make_capture import make_capture
-from tests.train.small_runs import small_config, small_training
+from tests.train.small_runs import small_config, small_training, solved_light
 
 pytestmark = pytest.mark.usefixtures("without_shape_checks")
 
@@ -29,15 +28,7 @@ def settings(light: str) -> NeilfConfig:
     """Smoothness is off: it is weighed by the gradient of the displayed image, whose exposure is the capture's."""
     config = small_config(sdf_steps=STEPS, material_steps=STEPS, joint_steps=STEPS)
     config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, smoothness=0.0))
-    if light == "free":
-        return config
-    solved = preset("fast")
-    fit = dataclasses.replace(solved.light.fit, points=32, candidates=8, every=3, steps=5)
-    return dataclasses.replace(
-        config,
-        light=dataclasses.replace(solved.light, environment_height=4, fit=fit),
-        inter_reflection=dataclasses.replace(solved.inter_reflection, grid_resolution=24),
-    )
+    return config if light == "free" else solved_light(config)
 
 
 def trained(folder: Path, light: str, radiance: float = 1.0, length: float = 1.0) -> Training:

@@ -12,6 +12,7 @@ from rich.console import Console
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.presets import preset
 from neilfpp_method.train.build import build_model, scene_facts
 from neilfpp_method.train.loop import Training, seed_step
 from neilfpp_method.train.progress import Reporter
@@ -25,6 +26,17 @@ def small_config(**train) -> NeilfConfig:
         config,
         shading=dataclasses.replace(config.shading, hit_share=0.2),
         train=dataclasses.replace(config.train, **train),
+    )
+
+
+def solved_light(config: NeilfConfig) -> NeilfConfig:
+    """The settings with the light of `fast`: a small map and lamps, fitted every third step, and traced visibility."""
+    fast = preset("fast")
+    fit = dataclasses.replace(fast.light.fit, points=32, candidates=8, every=3, steps=5)
+    return dataclasses.replace(
+        config,
+        light=dataclasses.replace(fast.light, environment_height=4, fit=fit),
+        inter_reflection=dataclasses.replace(fast.inter_reflection, grid_resolution=24),
     )
 
 
