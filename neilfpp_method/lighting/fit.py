@@ -109,6 +109,9 @@ def fit_light(
     log_gain = torch.zeros(3, device=root.device, requires_grad=True)
     groups = [{"params": [p], "rate": rate * config.rate} for p, rate in ((log_radiance, 1.0), (root, 0.5), (log_gain, 0.2))]
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
+    # What a wall or the ground hides from all points has no part in how they look: half of the texels over a table.
+    felt = torch.nonzero(carried.sources.amax((0, 1)))[:, 0]
+    carried = carried.of(felt)
     reaching = carried.sources[0].mean(0)
 
     def light() -> Light:
@@ -118,11 +121,11 @@ def fit_light(
         for step in range(config.steps):
             for group in optimizer.param_groups:
                 group["lr"] = group["rate"] * LEAST_RATE ** (step / config.steps)
-            now = light()
-            error = _relative_error(now, carried, target, log_gain.exp(), response, unit, config)
+            strength = light().strength()[felt]
+            error = _relative_error(strength, carried, target, log_gain.exp(), response, unit, config)
             loss = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=config.outlier)
             loss = loss + config.smoothness * total_variation(log_radiance)
-            brings = reaching @ now.strength()
+            brings = reaching @ strength
             share = unit * root.square().mean(-1) / brings.mean()
             loss = loss + config.sparsity * (share / SMALL_SHARE).log1p().sum()
             loss = loss + config.whiteness * tint(brings)
@@ -146,7 +149,7 @@ def compare(
 ) -> Evidence:
     """Which of two lights explains the points better that neither was fitted to; without any, nothing speaks for either."""
     one, other = (
-        _relative_error(light, transport, target, 1.0, response, unit, config).abs().clamp_max(1).mean(-1)
+        _relative_error(light.strength(), transport, target, 1.0, response, unit, config).abs().clamp_max(1).mean(-1)
         for light, transport in zip(lights, carried, strict=True)
     )
     gain = one - other
@@ -169,7 +172,7 @@ def tint(light: Float[Tensor, " 3"]) -> Float[Tensor, ""]:
 
 
 def _relative_error(
-    light: Light,
+    strength: Float[Tensor, "T 3"],
     carried: Transport,
     target: Target,
     gain: Float[Tensor, " 3"] | float,
@@ -180,5 +183,5 @@ def _relative_error(
     """What the camera stores of the points, their base colour times `gain`, against their pixels."""
     material = target.material
     tinted = Material((material.base_color * gain).clamp(0, 1), material.roughness, material.metallic)
-    shown = apply_response(carried.outgoing(tinted, light.strength()), response)
+    shown = apply_response(carried.outgoing(tinted, strength), response)
     return (shown - target.pixel) / (target.pixel + config.floor * unit)

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from neilfpp_method.fields.environment import EnvironmentLight
@@ -48,6 +48,10 @@ class Transport:
     def __getitem__(self, points: Tensor | slice) -> Transport:
         """The same for some of the points."""
         return Transport(self.sources[:, points], self.scene[:, points])
+
+    def of(self, sources: Int[Tensor, " U"]) -> Transport:
+        """From some of the sources."""
+        return Transport(self.sources[..., sources], self.scene)
 
     def beside(self, other: Transport) -> Transport:
         """Both sets of sources."""
