@@ -119,7 +119,7 @@ class LightFitConfig:
     whiteness: float = 0.05
     """Weight of the tint of all light that reaches the points, against the relative error: images hardly tell the tint of the
     light from that of the surfaces."""
-    sparsity: float = 0.0005
+    sparsity: float = 0.001
     """Weight of the lamps, by the logarithm of their shares of all light, against the relative error."""
     candidates: int = 256
     """Places for lamps that one fit tries."""
@@ -288,6 +288,8 @@ class LossConfig:
     point_cloud: float = 0.0
     inter_reflection: float = 0.1
     smoothness: float = 5e-4
+    metallic_smoothness: float = 1.0
+    """Metallic in L_smth against roughness. Small patches of metal cost more than they show: with 1 they end half way."""
     lambertian: float = 5e-4
     mask: float = 0.0
     """Opacity against the object mask, where the capture has masks or shows exactly its background."""

@@ -216,7 +216,7 @@ class NeilfModel(nn.Module):
             sample = self.brdf.with_gradients(position)
             material = sample.material
             terms["smoothness"] = losses.smoothness(
-                sample.roughness_gradient, sample.metallic_gradient, image_gradient
+                sample.roughness_gradient, sample.metallic_gradient, image_gradient, self.config.loss.metallic_smoothness
             )
         else:
             material = self.brdf(position)

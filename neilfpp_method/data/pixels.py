@@ -24,6 +24,7 @@ __all__ = ["PixelDataset", "pixel_colors"]
 BORDER_TOLERANCE = 0.02
 BORDER_SHARE = 0.5
 DARK = 1e-3
+MIDDLE_GREY = 0.18
 REPAIR = "repair the images, or mark the pixels in a validity mask"
 
 
@@ -60,7 +61,7 @@ class PixelDataset:
         cameras = [capture.normalisation.camera(view.camera) for view in views]
         self._rays = CameraRays(cameras, device)
         loaded = _load(self.views, capture.hdr, on_view)
-        self._color, self._mask, self._mask_known, self._gradient, valid = (tensor.to(device) for tensor in loaded)
+        self._color, self._mask, self._mask_known, valid = (tensor.to(device) for tensor in loaded)
         valid &= torch.cat([self._rays.shown(i) for i in range(len(views))])
         if not valid.any():
             raise UserError(f"{capture.root}: no pixel is valid", "check the validity masks: white is valid")
@@ -70,6 +71,7 @@ class PixelDataset:
         self._starts = tuple(itertools.accumulate(sizes, initial=0))
         if not self._mask_known.any():
             self._mask_from_background()
+        self._gradient = self._image_gradients()
         self._first = torch.tensor(self._starts[:-1], device=device)
 
     def __len__(self) -> int:
@@ -117,6 +119,17 @@ class PixelDataset:
         if (border == color).all(dim=-1).float().mean() >= BORDER_SHARE and not background.all():
             self._mask, self._mask_known = ~background, background
 
+    def _image_gradients(self) -> Float32[Tensor, " P"]:
+        """How much the images change per pixel as they look: linear ones with the median of the object at middle grey."""
+        lit = self._lit() if self.capture.hdr else ()
+        exposure = MIDDLE_GREY / float(lit.median()) if len(lit) else 1.0
+        gradients = []
+        for view, (start, end) in zip(self.views, itertools.pairwise(self._starts), strict=True):
+            color = self._color[start:end].view(view.camera.height, view.camera.width, 3)
+            seen = tone_map(exposure * color) if self.capture.hdr else color
+            gradients.append(_gradient(luminance(seen)).reshape(-1))
+        return torch.cat(gradients)
+
     # ------------------------------------------------------------------------------------------------------- statistics
 
     def median_radiance(self) -> float:
@@ -125,11 +138,15 @@ class PixelDataset:
         Raises:
             UserError: there is no such pixel.
         """
-        seen = luminance(self._linear(self._color[self._mask & self._valid]))
-        lit = seen[seen > DARK * seen.mean()]
+        lit = self._lit()
         if not len(lit):
             raise UserError(f"{self.capture.root}: all pixels of the object are black", "check images and masks")
         return float(lit.median())
+
+    def _lit(self) -> Float[Tensor, " L"]:
+        """The luminance, linear, of the pixels of the object that are not black."""
+        seen = luminance(self._linear(self._color[self._mask & self._valid]))
+        return seen[seen > DARK * seen.mean()]
 
     def radiance_quantile(self, share: float) -> float:
         """The linear value that `share` of the values of all valid object pixels and channels do not exceed."""
@@ -170,7 +187,6 @@ class LoadedPixels(NamedTuple):
     color: Float32[Tensor, "P 3"]
     mask: Bool[Tensor, " P"]
     mask_known: Bool[Tensor, " P"]
-    image_gradient: Float32[Tensor, " P"]
     valid: Bool[Tensor, " P"]
 
 
@@ -178,7 +194,7 @@ def _load(views: Sequence[View], hdr: bool, on_view: Callable[[str], None] | Non
     total = sum(view.camera.width * view.camera.height for view in views)
     mask, known = torch.ones(total, dtype=torch.bool), torch.zeros(total, dtype=torch.bool)
     valid = torch.ones(total, dtype=torch.bool)
-    pixels = LoadedPixels(torch.empty(total, 3), mask, known, torch.empty(total), valid)
+    pixels = LoadedPixels(torch.empty(total, 3), mask, known, valid)
     broken: list[tuple[View, int]] = []
     start = 0
     for view in views:
@@ -196,7 +212,6 @@ def _load(views: Sequence[View], hdr: bool, on_view: Callable[[str], None] | Non
         pixels.color[rows] = color.reshape(-1, 3)
         if (object_mask := _mask(view, image)) is not None:
             mask[rows], known[rows] = object_mask.reshape(-1), True
-        pixels.image_gradient[rows] = _gradient(luminance(tone_map(color) if hdr else color)).reshape(-1)
         if on_view:
             on_view(view.name)
     if broken:

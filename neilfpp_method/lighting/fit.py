@@ -32,7 +32,9 @@ LEAST_RATE = 0.05
 LEAST_REACH = 0.05
 """A lamp that brings less than this share of the mean, were all alike, is not sought: behind a wall anything fits."""
 LEAST_GAIN = 0.01
-"""Of the relative error. Many points make any difference significant; lamps that explain less than a hundredth are no lamps."""
+"""Of the relative error: lamps that explain less than a hundredth are no lamps."""
+FEWEST = 20
+"""Points kept back that say something."""
 FIRST_SHARE = 0.1
 """Of the light that typical points receive, what all lamps that are not yet lit start with together."""
 SMALL_SHARE = 0.02
@@ -72,9 +74,13 @@ class Evidence:
     points: int
 
     @property
-    def significant(self) -> bool:
-        """Whether chance would bring it about less than once in forty times, and it is worth a more complicated light."""
-        return self.gain > max(2 * self.deviation, LEAST_GAIN)
+    def worthwhile(self) -> bool:
+        """Whether the more complicated light may well be worth it: unless chance would hardly hide so little a gain.
+
+        In doubt lamps stay. Early on few points tell little, and surfaces that learn under a light without lamps learn
+        their light as colour, after which nothing speaks for lamps; ones that nothing bears out go when more is known.
+        """
+        return self.points >= FEWEST and self.gain + 2 * self.deviation > LEAST_GAIN
 
 
 def fit_light(

@@ -42,7 +42,7 @@ def solve_light(
         lobe, scene: as of `from_texels`.
         response, unit: as of `fit_light`.
         config: with "auto" the lamps must earn their place: the fit is done with and without, and they stay where they
-            lower the error at points kept back from both by more than chance would.
+            may well lower the error at points kept back from both (`Evidence.worthwhile`).
 
     Returns:
         What spoke for lamps, or against them; none where the settings had decided.
@@ -78,7 +78,7 @@ def solve_light(
         found = fit_light(start, both[fitted], target[fitted], response, unit, config.fit)
         carried = (texels[kept_back], both[kept_back])
         evidence = compare((plain, found), carried, target[kept_back], response, unit, config.fit)
-        if not evidence.significant:
+        if not evidence.worthwhile:
             sought.copy_(plain.log_radiance)
             lamps.place(dark, dark)
             return evidence

@@ -5,7 +5,6 @@ Factors are powers of two, which no rounding touches, so two trainings can be co
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 
@@ -25,9 +24,7 @@ STEPS = 4
 
 
 def settings(light: str) -> NeilfConfig:
-    """Smoothness is off: it is weighed by the gradient of the displayed image, whose exposure is the capture's."""
     config = small_config(sdf_steps=STEPS, material_steps=STEPS, joint_steps=STEPS)
-    config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, smoothness=0.0))
     return config if light == "free" else solved_light(config)
 
 

@@ -63,7 +63,7 @@ def solved(seen: Observed, of: Material, rounds: int) -> tuple[Lamps, object]:
 
 def test_a_lamp_is_found_where_it_is():
     lamps, evidence = solved(*photographed(BULB), rounds=6)
-    assert evidence.significant
+    assert evidence.worthwhile
     assert lamps.lit >= 1
     assert (lamps.position[0] - LAMP[0]).norm() < 0.12  # its width
     red, _, blue = lamps.intensity[0].tolist()
@@ -75,14 +75,14 @@ def test_a_lamp_is_found_where_it_is():
 
 def test_a_panel_is_found_where_it_is_and_which_way_it_shines():
     lamps, evidence = solved(*photographed(PANEL), rounds=6)
-    assert evidence.significant
+    assert evidence.worthwhile
     assert (lamps.position[0] - LAMP[0]).norm() < 0.12
     assert (lamps.axis[0] * PANEL.axis[0]).sum() > math.cos(math.radians(30))
 
 
 def test_under_a_sky_alone_no_lamp_is_lit():
     lamps, evidence = solved(*photographed(None), rounds=2)
-    assert not evidence.significant
+    assert not evidence.worthwhile
     assert lamps.lit == 0
 
 
@@ -138,7 +138,7 @@ def test_before_a_known_map_lamps_are_found_and_the_map_stays():
     for _ in range(6):
         evidence = solve_light(environment, lamps, seen, of, GGX, None, "linear", seen.pixel.median().item(), known)
     assert torch.equal(environment.log_radiance, before)
-    assert evidence.significant
+    assert evidence.worthwhile
     assert evidence.points == 160
     assert (lamps.position[0] - LAMP[0]).norm() < 0.12
     beside = (lamps.position - LAMP).norm(dim=-1) < 0.3
@@ -152,7 +152,7 @@ def test_under_a_known_sky_alone_no_lamp_is_lit():
     torch.manual_seed(0)
     known = dataclasses.replace(CONFIG, map="sky.exr")
     evidence = solve_light(environment, lamps, seen, of, GGX, None, "linear", seen.pixel.median().item(), known)
-    assert not evidence.significant
+    assert not evidence.worthwhile
     assert lamps.lit == 0
 
 
