@@ -35,6 +35,9 @@ LEAST_GAIN = 0.01
 """Of the relative error: lamps that explain less than a hundredth are no lamps."""
 FEWEST = 20
 """Points kept back that say something."""
+LEAST_SIGHT = 0.05
+"""Share of the points that see a texel which the images may set. A few can ask anything of what only they see, and would make
+suns of it for the sake of one pixel; it takes after its surroundings."""
 FIRST_SHARE = 0.1
 """Of the light that typical points receive, what all lamps that are not yet lit start with together."""
 SMALL_SHARE = 0.02
@@ -119,6 +122,8 @@ def fit_light(
     felt = torch.nonzero(carried.sources.amax((0, 1)))[:, 0]
     carried = carried.of(felt)
     reaching = carried.sources[0].mean(0)
+    told = ((carried.sources[0] > 0).float().mean(0) > LEAST_SIGHT) | (felt >= texels)
+    told = told[:, None]
 
     def light() -> Light:
         return Light(log_radiance, torch.where(reaches, root.square() / brought.clamp_min(1e-20), 0.0))
@@ -128,6 +133,7 @@ def fit_light(
             for group in optimizer.param_groups:
                 group["lr"] = group["rate"] * LEAST_RATE ** (step / config.steps)
             strength = light().strength()[felt]
+            strength = torch.where(told, strength, strength.detach())
             error = _relative_error(strength, carried, target, log_gain.exp(), response, unit, config)
             loss = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=config.outlier)
             loss = loss + config.smoothness * total_variation(log_radiance)
