@@ -1,0 +1,124 @@
+"""What bounds the light: solved for under the true material, with the scene's own radiance from a run.
+
+    python -m benchmarks.true_material RUN [RUN …]
+
+A run with a given mesh on a capture whose test views have true materials: points of these views, their true base colour,
+roughness and metallic, and their pixels are what the light is fitted to, from nothing, as often as `--fits` says. The error of
+the light is that of `neilfpp eval`, beside what the run itself came to.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import tyro
+from rich.console import Console
+from torch import Tensor
+
+from neilfpp_method.data.truth import Truth
+from neilfpp_method.data.views import camera_rays
+from neilfpp_method.errors import UserError
+from neilfpp_method.evaluate.protocols import light_metrics
+from neilfpp_method.evaluate.views import known_test_views, render_test_views
+from neilfpp_method.fields.environment import EnvironmentLight
+from neilfpp_method.lighting.memory import Observed
+from neilfpp_method.lighting.solve import solve_light
+from neilfpp_method.structures import Material
+from neilfpp_method.train.run import Run, load_run
+
+MAPS = ("base_color", "roughness", "metallic")
+
+
+@dataclass
+class Options:
+    """Solve for the light of runs under the true material."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folders; geometry given, a map for a light."""
+    fits: int = 12
+    """Fits, each to points of its own."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """Surface points of the test views, and what they truly are made of."""
+
+    seen: Observed
+    material: Material
+
+
+@torch.no_grad()
+def known_points(run: Run) -> Known:
+    """All pixels of the test views that the host hits and the truth knows.
+
+    Raises:
+        UserError: the capture has no true materials.
+    """
+    rendered = render_test_views(dataclasses.replace(run, step=0))  # without material: the host's maps are enough
+    parts = []
+    for known in known_test_views(run, rendered).views:
+        if known.material is None:
+            raise UserError(f"{run.capture.root}: no true materials", "take a capture with ground truth")
+        rays = camera_rays(run.capture.normalisation.camera(known.view.camera))
+        hits = run.model.host.render(rays)
+        rows = torch.nonzero(hits.is_hit(run.config.shading.hit_share) & torch.from_numpy(known.mask.reshape(-1)))[:, 0]
+        truth = [torch.from_numpy(known.material[name]).reshape(len(rays), -1)[rows] for name in MAPS]
+        image = torch.from_numpy(known.image).reshape(-1, 3)[rows]
+        parts.append([hits.position[rows], hits.normal[rows], -rays.directions[rows], image, *truth])
+    columns: list[Tensor] = [torch.cat(column).float() for column in zip(*parts, strict=True)]
+    return Known(Observed(*columns[:4]), Material(*columns[4:]))
+
+
+@torch.no_grad()
+def solve_under_truth(run: Run, known: Known, fits: int) -> None:
+    """Forget the light of the run, and set it anew."""
+    model, settings = run.model, run.config.light
+    model.light.log_radiance.fill_(math.log(model.facts.median_radiance / 0.3))
+    if model.lamps is not None:
+        model.lamps.lit = 0
+    lobe = model.lobe if run.config.shading.specular else None
+    for _ in range(fits):
+        rows = torch.randperm(len(known.seen.position))[: settings.fit.points]
+        seen, material = known.seen[rows], known.material[rows]
+        scene, response, unit = model._scene_light, model.facts.response, model.units.physical
+        solve_light(model.light, model.lamps, seen, material, lobe, scene, response, unit, settings)
+
+
+def line(run: Run, title: str) -> str:
+    """The light errors of a run, and its lamps."""
+    truth = Truth(run.capture)
+    field = truth.light_field()
+    if field is None:
+        raise UserError(f"{run.capture.root}: no true light", "take a capture with light/light_field_gt.npz")
+    figures = light_metrics(run, field, truth.mesh())
+    text = f"{title:>22}: " + ", ".join(f"{name.removeprefix('incident_light_')} {x:.3f}" for name, x in figures.items())
+    lamps = run.model.lamps
+    for k in range(0 if lamps is None else lamps.lit):
+        place = run.capture.normalisation.to_world(lamps.position[k]).tolist()
+        text += "\n" + 24 * " " + "lamp at " + ", ".join(f"{x:.2f}" for x in place)
+        text += "; axis " + ", ".join(f"{x:.2f}" for x in lamps.axis[k].tolist())
+        text += "; intensity " + ", ".join(f"{x:.2f}" for x in lamps.intensity[k].tolist())
+    return text
+
+
+def main(options: Options) -> None:
+    """Print the light of each run, learned and under the true material."""
+    console = Console()
+    for path in options.runs:
+        run = load_run(path)
+        if not isinstance(run.model.light, EnvironmentLight):
+            raise UserError(f"{path}: its light is no environment map", "take a run with --config.light.kind auto or distant")
+        run.model.eval()
+        console.print(str(path), highlight=False)
+        console.print(line(run, "as trained"), highlight=False)
+        torch.manual_seed(run.config.train.seed)
+        solve_under_truth(run, known_points(run), options.fits)
+        console.print(line(run, "under true material"), highlight=False)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
