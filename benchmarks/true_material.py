@@ -85,7 +85,7 @@ def solve_under_truth(run: Run, known: Known, fits: int) -> None:
         rows = torch.randperm(len(known.seen.position))[: settings.fit.points]
         seen, material = known.seen[rows], known.material[rows]
         scene, response, unit = model._scene_light, model.facts.response, model.units.physical
-        solve_light(model.light, model.lamps, seen, material, lobe, scene, response, unit, settings)
+        solve_light(model.light, model.lamps, seen, material, lobe, scene, response, unit, settings, first=False)
 
 
 def line(run: Run, title: str) -> str:

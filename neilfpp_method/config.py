@@ -288,8 +288,6 @@ class LossConfig:
     point_cloud: float = 0.0
     inter_reflection: float = 0.1
     smoothness: float = 5e-4
-    metallic_smoothness: float = 1.0
-    """Metallic in L_smth against roughness. Small patches of metal cost more than they show: with 1 they end half way."""
     lambertian: float = 5e-4
     mask: float = 0.0
     """Opacity against the object mask, where the capture has masks or shows exactly its background."""

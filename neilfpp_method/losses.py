@@ -84,11 +84,9 @@ def smoothness(
     roughness_gradient: Float[Tensor, "N 3"],
     metallic_gradient: Float[Tensor, "N 3"],
     image_gradient: Float[Tensor, " N"],
-    metallic_share: float = 1.0,
 ) -> LossTerm:
-    """L_smth = (‖∇r‖ + k ‖∇m‖) exp(−‖∇I‖): roughness and metallic change where the image does; k is 1 in the paper."""
-    changes = _safe_norm(roughness_gradient) + metallic_share * _safe_norm(metallic_gradient)
-    return LossTerm(changes * torch.exp(-image_gradient))
+    """L_smth = (‖∇r‖ + ‖∇m‖) exp(−‖∇I‖): roughness and metallic change where the image does."""
+    return LossTerm((_safe_norm(roughness_gradient) + _safe_norm(metallic_gradient)) * torch.exp(-image_gradient))
 
 
 def lambertian(material: Material) -> LossTerm:

@@ -216,7 +216,7 @@ class NeilfModel(nn.Module):
             sample = self.brdf.with_gradients(position)
             material = sample.material
             terms["smoothness"] = losses.smoothness(
-                sample.roughness_gradient, sample.metallic_gradient, image_gradient, self.config.loss.metallic_smoothness
+                sample.roughness_gradient, sample.metallic_gradient, image_gradient
             )
         else:
             material = self.brdf(position)
@@ -237,14 +237,14 @@ class NeilfModel(nn.Module):
         self.memory.remember(seen)
         if not self.memory.due:
             return
-        seen = self.memory.recall()
+        first, seen = self.memory.age is None, self.memory.recall()
         with torch.no_grad():
             material = self.brdf(seen.position)
         lobe = self.lobe if self.config.shading.specular else None
         scene = None if self.config.inter_reflection.mode == "off" else self._scene_light
         response, unit = self.facts.response, self.units.physical
         self.evidence = solve_light(
-            self.light, self.lamps, seen, material, lobe, scene, response, unit, self.config.light
+            self.light, self.lamps, seen, material, lobe, scene, response, unit, self.config.light, first
         )
 
     # ------------------------------------------------------------------------------------------------------- the parts

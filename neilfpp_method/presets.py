@@ -85,8 +85,7 @@ def fast() -> NeilfConfig:
             surface=1e-2,
             surface_joint=1e-3,
             mask=0.1,
-            smoothness=7e-4,
-            metallic_smoothness=0.0,
+            smoothness=0.0,
             lambertian=0.0,
             position_gradient=0.0,
             normal_gradient=0.1,
@@ -125,7 +124,8 @@ def free_light(config: NeilfConfig) -> NeilfConfig:
 
 
 def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
-    """A preset for geometry that is given as a mesh: one stage in which R, B and L move together.
+    """A preset for geometry that is given as a mesh: R alone for a while, as the light is chosen by what surfaces send each
+    other, then one stage in which R, B and L move together.
 
     R has no feature of G that knows the place, so it encodes positions as G would; 8×128 is the paper's surface light
     field. A surface without thickness needs no distance to leave it, and what leaves it is known well enough to learn
@@ -146,5 +146,10 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
         ),
         inter_reflection=replace(config.inter_reflection, radiance_gradient=0.7, offset=2e-3),
         loss=replace(config.loss, lambertian=10.0 * config.loss.lambertian),
-        train=replace(train, sdf_steps=0, material_steps=3 * (train.material_steps + train.joint_steps), joint_steps=0),
+        train=replace(
+            train,
+            sdf_steps=train.sdf_steps // 10,
+            material_steps=3 * (train.material_steps + train.joint_steps),
+            joint_steps=0,
+        ),
     )

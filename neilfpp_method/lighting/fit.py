@@ -23,7 +23,7 @@ from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.shading.color import apply_response
 from neilfpp_method.structures import Indexable, Material
 
-__all__ = ["Evidence", "Light", "Target", "compare", "fit_light", "tint", "total_variation"]
+__all__ = ["Evidence", "Light", "Target", "compare", "evidence", "fit_light", "tint", "total_variation"]
 
 SMOOTHED = 1e-2
 """Differences of log radiance below this count by their square, so that the total variation has a gradient everywhere."""
@@ -76,14 +76,24 @@ class Evidence:
     deviation: float
     points: int
 
-    @property
-    def worthwhile(self) -> bool:
-        """Whether the more complicated light may well be worth it: unless chance would hardly hide so little a gain.
+    def favours(self, chosen: bool) -> bool:
+        """Whether to take the more complicated light; `chosen`: it is what surfaces have learned under so far.
 
-        In doubt lamps stay. Early on few points tell little, and surfaces that learn under a light without lamps learn
-        their light as colour, after which nothing speaks for lamps; ones that nothing bears out go when more is known.
+        To be chosen it must gain more than chance brings about once in forty times, and enough to be worth it; to stay, it
+        may well do so.
         """
-        return self.points >= FEWEST and self.gain + 2 * self.deviation > LEAST_GAIN
+        if self.points < FEWEST:
+            return False
+        if chosen:
+            return self.gain + 2 * self.deviation > LEAST_GAIN
+        return self.gain > max(2 * self.deviation, LEAST_GAIN)
+
+
+def evidence(gain: Float[Tensor, " N"]) -> Evidence:
+    """What the gains of points add up to; without any, nothing speaks for either light."""
+    if not len(gain):
+        return Evidence(0.0, 0.0, 0)
+    return Evidence(gain.mean().item(), (gain.std(correction=0) / len(gain) ** 0.5).item(), len(gain))
 
 
 def fit_light(
@@ -158,16 +168,13 @@ def compare(
     response: str,
     unit: float,
     config: LightFitConfig,
-) -> Evidence:
-    """Which of two lights explains the points better that neither was fitted to; without any, nothing speaks for either."""
+) -> Float[Tensor, " N"]:
+    """How much lower the relative error of the second of two lights is, at points that neither was fitted to."""
     one, other = (
         _relative_error(light.strength(), transport, target, 1.0, response, unit, config).abs().clamp_max(1).mean(-1)
         for light, transport in zip(lights, carried, strict=True)
     )
-    gain = one - other
-    if not len(gain):
-        return Evidence(0.0, 0.0, 0)
-    return Evidence(gain.mean().item(), (gain.std(correction=0) / len(gain) ** 0.5).item(), len(gain))
+    return one - other
 
 
 def total_variation(values: Float[Tensor, "C H W"]) -> Float[Tensor, ""]:

@@ -13,6 +13,9 @@ from neilfpp_method.structures import Indexable
 
 __all__ = ["Observed", "SurfaceMemory"]
 
+PATIENCE = 4
+"""Steps that the first fit waits for more points."""
+
 
 @dataclass(frozen=True)
 class Observed(Indexable):
@@ -25,7 +28,8 @@ class Observed(Indexable):
 
 
 class SurfaceMemory(nn.Module):
-    """The newest points of all images, and when to fit to them next. It is part of a checkpoint.
+    """The newest points of all images, and when to fit to them next: for the first time when the memory is full, or after a few
+    steps, as surfaces start to learn under a light that nobody has fitted. It is part of a checkpoint.
 
     Args:
         capacity: how many points are kept.
@@ -38,18 +42,22 @@ class SurfaceMemory(nn.Module):
         self.register_buffer("points", torch.zeros(capacity, 12))
         self.filled = 0
         self.next = 0
+        self.waited = 0
         self.age: int | None = None
 
     @property
     def due(self) -> bool:
-        """Whether it is time to fit: at the first step that saw anything, and `every` steps after each fit."""
-        return self.filled > 0 and (self.age is None or self.age >= self.every)
+        """Whether it is time to fit: `every` steps after each fit, and soon for the first time."""
+        if self.age is not None:
+            return self.age >= self.every
+        return self.filled == len(self.points) or (self.filled > 0 and self.waited >= PATIENCE)
 
     @torch.no_grad()
     def remember(self, seen: Observed) -> None:
-        """Keep some rows, in the place of the oldest; of the first step all of them."""
+        """Keep some rows, in the place of the oldest; before the first fit all of them."""
         capacity = len(self.points)
-        share = capacity if self.filled == 0 else math.ceil(capacity / self.every)
+        self.waited += self.age is None
+        share = capacity if self.age is None else math.ceil(capacity / self.every)
         kept = torch.cat((seen.position, seen.normal, seen.wo, seen.pixel), -1)[:share].to(self.points.dtype)
         slots = torch.arange(self.next, self.next + len(kept), device=kept.device) % capacity
         self.points[slots] = kept
@@ -65,8 +73,8 @@ class SurfaceMemory(nn.Module):
 
     def get_extra_state(self) -> dict[str, int | None]:
         """Where the memory stands, for checkpoints."""
-        return {"filled": self.filled, "next": self.next, "age": self.age}
+        return {"filled": self.filled, "next": self.next, "age": self.age, "waited": self.waited}
 
     def set_extra_state(self, state: dict[str, int | None]) -> None:
         """The inverse of `get_extra_state`."""
-        self.filled, self.next, self.age = state["filled"], state["next"], state["age"]
+        self.filled, self.next, self.age, self.waited = (state[key] for key in ("filled", "next", "age", "waited"))

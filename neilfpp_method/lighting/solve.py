@@ -8,7 +8,7 @@ from neilfpp_method.config import IncidentLightConfig
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.lighting.candidates import merge, propose
-from neilfpp_method.lighting.fit import Evidence, Light, Target, compare, fit_light
+from neilfpp_method.lighting.fit import Evidence, Light, Target, compare, evidence, fit_light
 from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.lighting.transport import SceneTracer, from_lamps, from_texels
 from neilfpp_method.shading.brdf import Lobe
@@ -16,8 +16,8 @@ from neilfpp_method.structures import Material
 
 __all__ = ["solve_light"]
 
-KEPT_BACK = 5
-"""One point in so many is not fitted to, and decides between two lights."""
+FOLDS = 5
+"""One part in so many of the points is not fitted to, and decides between two lights; the first time each part in turn."""
 KNOWN_ROWS = 32
 """Rows of a known map as the fit of the lamps before it sees it: that fit traces every texel from every point."""
 
@@ -33,6 +33,7 @@ def solve_light(
     response: str,
     unit: float,
     config: IncidentLightConfig,
+    first: bool,
 ) -> Evidence | None:
     """Set the map, and the lamps where there may be any, to what explains the points. A map that is known stays.
 
@@ -42,7 +43,8 @@ def solve_light(
         lobe, scene: as of `from_texels`.
         response, unit: as of `fit_light`.
         config: with "auto" the lamps must earn their place: the fit is done with and without, and they stay where they
-            may well lower the error at points kept back from both (`Evidence.worthwhile`).
+            lower the error at points kept back from both (`Evidence.favours`).
+        first: nothing has been decided yet.
 
     Returns:
         What spoke for lamps, or against them; none where the settings had decided.
@@ -69,20 +71,23 @@ def solve_light(
     intensity[: lamps.lit] = lamps.intensity[: lamps.lit]
     start = Light(sought, intensity)
     if config.kind != "auto":
-        found, evidence = fit_light(start, both, target, response, unit, config.fit), None
+        found, spoken = fit_light(start, both, target, response, unit, config.fit), None
     else:
-        kept_back = torch.zeros(len(seen), dtype=torch.bool, device=seen.position.device)
-        kept_back[torch.randperm(len(seen), device=kept_back.device)[: len(seen) // KEPT_BACK]] = True
-        fitted = ~kept_back
-        plain = fit_light(plain_start, texels[fitted], target[fitted], response, unit, config.fit)
-        found = fit_light(start, both[fitted], target[fitted], response, unit, config.fit)
-        carried = (texels[kept_back], both[kept_back])
-        evidence = compare((plain, found), carried, target[kept_back], response, unit, config.fit)
-        if not evidence.worthwhile:
+        # Before anything is known a wrong choice would last: what surfaces then learn speaks for the light they learn it under.
+        fold = torch.randperm(len(seen), device=seen.position.device) % FOLDS
+        gains = []
+        for number in range(FOLDS if first else 1):
+            kept_back, fitted = fold == number, fold != number
+            plain = fit_light(plain_start, texels[fitted], target[fitted], response, unit, config.fit)
+            found = fit_light(start, both[fitted], target[fitted], response, unit, config.fit)
+            carried = (texels[kept_back], both[kept_back])
+            gains.append(compare((plain, found), carried, target[kept_back], response, unit, config.fit))
+        spoken = evidence(torch.cat(gains))
+        if not spoken.favours(chosen=lamps.lit > 0):
             sought.copy_(plain.log_radiance)
             lamps.place(dark, dark)
-            return evidence
+            return spoken
     sought.copy_(found.log_radiance)
     lit = merge(places, found.intensity, near.sources[0].mean(0), len(lamps.position))
     lamps.place(lit.places.position, lit.intensity, lit.places.axis)
-    return evidence
+    return spoken

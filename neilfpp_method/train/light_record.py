@@ -28,7 +28,6 @@ class LightFit:
         gain: how much lower the mean relative error is with lamps, at points that were kept back from the fit.
         deviation: the standard error of that mean.
         points: how many were kept back.
-        worthwhile: whether the lamps were taken for it.
         lamps: how many are lit since.
     """
 
@@ -36,7 +35,6 @@ class LightFit:
     gain: float
     deviation: float
     points: int
-    worthwhile: bool
     lamps: int
 
 
@@ -45,7 +43,7 @@ def note_fit(fits: list[LightFit], model: NeilfModel, step: int) -> None:
     found, model.evidence = model.evidence, None
     if found is not None:
         lamps = model.lamps.lit if model.lamps is not None else 0
-        fits.append(LightFit(step, found.gain, found.deviation, found.points, found.worthwhile, lamps))
+        fits.append(LightFit(step, found.gain, found.deviation, found.points, lamps))
 
 
 def write_fits(run: Path, fits: Sequence[LightFit]) -> None:
@@ -83,6 +81,6 @@ def in_words(config: IncidentLightConfig, fits: Sequence[LightFit]) -> str:
     last = fits[-1]
     change = f"error {-100 * last.gain:+.1f} ± {100 * last.deviation:.1f} % at {last.points} points kept back"
     change = change.replace("-", "\N{MINUS SIGN}")
-    if last.worthwhile and last.lamps:
+    if last.lamps:
         return f"{sky} and {last.lamps} lamp{'s' if last.lamps > 1 else ''} before it ({change})"
     return f"{sky}; lamps were not needed ({change})"

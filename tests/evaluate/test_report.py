@@ -236,7 +236,7 @@ def test_the_report_says_what_spoke_for_lamps(root: Path, tmp_path: Path):
     run = make_run(root)
     light = replace(run.config.light, kind="auto")
     run = replace(run, path=tmp_path, config=replace(run.config, light=light))
-    write_fits(tmp_path, [LightFit(5, 0.02, 0.004, 204, True, 3), LightFit(run.step, -0.001, 0.003, 204, False, 0)])
+    write_fits(tmp_path, [LightFit(5, 0.02, 0.004, 204, 3), LightFit(run.step, -0.001, 0.003, 204, 0)])
     text = Page(write_report(run, tmp_path, {}, {}).read_text()).text
     assert "an environment map and 3 lamps before it (error −2.0 ± 0.4 % at 204 points kept back)" in text
 

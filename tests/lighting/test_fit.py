@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.config import LightFitConfig
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.lighting.fit import Light, Target, fit_light, total_variation
+from neilfpp_method.lighting.fit import Evidence, Light, Target, fit_light, total_variation
 from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.lighting.transport import Transport, from_texels
 from neilfpp_method.shading.brdf import GGX
@@ -116,6 +116,22 @@ def test_what_a_few_points_see_alone_is_no_sun():
     image[:12] *= 5
     fit(found, carried, of, image, 1.0, steps=100)
     assert found.log_radiance.exp().max() < 4.0
+
+
+@pytest.mark.parametrize(
+    ("gain", "deviation", "points", "new", "chosen"),
+    [
+        (0.05, 0.01, 200, True, True),
+        (0.015, 0.01, 200, False, True),  # may be chance: it stays, but is not taken
+        (0.005, 0.001, 200, False, False),  # certain, and worth nothing
+        (-0.02, 0.02, 200, False, True),
+        (-0.02, 0.01, 200, False, False),
+        (0.05, 0.01, 5, False, False),  # hardly any points
+    ],
+)
+def test_what_is_chosen_stays_in_doubt_and_nothing_is_chosen_in_doubt(gain, deviation, points, new, chosen):
+    spoken = Evidence(gain, deviation, points)
+    assert (spoken.favours(chosen=False), spoken.favours(chosen=True)) == (new, chosen)
 
 
 def test_total_variation_counts_every_step_once_and_closes_the_map():

@@ -8,7 +8,21 @@ from neilfpp_method.lighting.memory import SurfaceMemory
 from tests.lighting.surfaces import points
 
 
-def test_memory_is_due_at_once_then_every_so_often_and_keeps_the_newest():
+def test_the_first_fit_waits_for_a_full_memory_or_a_few_steps():
+    memory = SurfaceMemory(20, every=100)
+    memory.remember(points(12))
+    assert not memory.due
+    memory.remember(points(12, seed=1))
+    assert memory.due
+    few = SurfaceMemory(20, every=100)
+    for step in range(4):
+        assert not few.due, step
+        few.remember(points(1, seed=step))
+    assert few.due
+    assert len(few.recall()) == 4
+
+
+def test_memory_is_due_once_full_then_every_so_often_and_keeps_the_newest():
     memory = SurfaceMemory(20, every=4)
     assert not memory.due
     memory.remember(points(50))
@@ -30,6 +44,6 @@ def test_memory_survives_a_checkpoint():
     memory.recall()
     memory.remember(points(12, seed=5))
     again.load_state_dict(memory.state_dict())
-    assert (again.filled, again.next, again.age) == (memory.filled, memory.next, memory.age)
+    assert again.get_extra_state() == memory.get_extra_state()
     for one, other in zip(vars(memory.recall()).values(), vars(again.recall()).values(), strict=True):
         assert torch.equal(one, other)

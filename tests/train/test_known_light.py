@@ -123,7 +123,7 @@ def test_a_map_that_cannot_be_is_refused_and_leaves_nothing(capture, tmp_path, c
 
 # --------------------------------------------------------------------------------------------------------------- record
 
-FITS = [LightFit(0, 0.021, 0.004, 204, True, 3), LightFit(100, -0.001, 0.003, 204, False, 0)]
+FITS = [LightFit(0, 0.021, 0.004, 204, 3), LightFit(100, -0.001, 0.003, 204, 0)]
 
 
 def test_the_record_says_why():
