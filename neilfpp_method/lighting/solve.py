@@ -38,7 +38,7 @@ def solve_light(
     """Set the map, and the lamps where there may be any, to what explains the points. A map that is known stays.
 
     Args:
-        environment, lamps: what is set; the search starts from the map, and near the lamps.
+        environment, lamps: what is set; the search starts from what they are.
         seen, material: surface points, and what they are made of.
         lobe, scene: as of `from_texels`.
         response, unit: as of `fit_light`.
@@ -67,8 +67,9 @@ def solve_light(
     places = propose(lamps, seen.position, config.fit.candidates)
     near = from_lamps(places, lamps.radius, seen, material.roughness, lobe, scene)
     both = texels.beside(near)
-    # All start alike: fits that begin with the lamps of the last one keep its pieces of lamps, beside the better places.
-    start = Light(sought, dark.new_zeros(len(places.position), 3))
+    intensity = dark.new_zeros(len(places.position), 3)
+    intensity[: lamps.lit] = lamps.intensity[: lamps.lit]
+    start = Light(sought, intensity)
     if config.kind != "auto":
         found, spoken = fit_light(start, both, target, response, unit, config.fit), None
     else:
