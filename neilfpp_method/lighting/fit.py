@@ -116,8 +116,10 @@ def fit_light(
         config: weights, rates and number of steps.
 
     Returns:
-        `start` where the search leads to what is not finite.
+        `start` where the search leads to what is not finite, or there is no point.
     """
+    if not len(target.pixel):
+        return start
     texels = start.log_radiance[0].numel()
     log_radiance = start.log_radiance.clone().requires_grad_()
     # In units of what a lamp brings to a white surface in the mean over the points: its unknowns are then of one size.
