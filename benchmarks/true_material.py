@@ -113,11 +113,11 @@ def main(options: Options) -> None:
         if not isinstance(run.model.light, EnvironmentLight):
             raise UserError(f"{path}: its light is no environment map", "take a run with --config.light.kind auto or distant")
         run.model.eval()
-        console.print(str(path), highlight=False)
-        console.print(line(run, "as trained"), highlight=False)
+        console.print(str(path), highlight=False, soft_wrap=True)
+        console.print(line(run, "as trained"), highlight=False, soft_wrap=True)
         torch.manual_seed(run.config.train.seed)
         solve_under_truth(run, known_points(run), options.fits)
-        console.print(line(run, "under true material"), highlight=False)
+        console.print(line(run, "under true material"), highlight=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

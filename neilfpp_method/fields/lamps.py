@@ -89,7 +89,7 @@ class Lamps(nn.Module):
         """Radiance of the lamps that directions meet nearer than a distance; where they overlap, all of them."""
         total = torch.zeros_like(wi)
         towards = self.position[: self.lit] - x[:, None]
-        for offset, axis, radiance in zip(towards.unbind(1), self.axis, self.radiance(), strict=False):
+        for offset, axis, radiance in zip(towards.unbind(1), self.axis[: self.lit], self.radiance(), strict=True):
             along = dot(wi, offset)
             miss = offset.square().sum(-1)[:, None] - along.square()
             met = (along > 0) & (miss < self.radius**2) & (along < before)

@@ -64,7 +64,9 @@ def solved(seen: Observed, of: Material, rounds: int) -> tuple[Lamps, object]:
 def test_a_lamp_is_found_where_it_is():
     lamps, _ = solved(*photographed(BULB), rounds=6)
     assert lamps.lit
-    assert (lamps.position[0] - LAMP[0]).norm() < 0.2  # within which lamps are one
+    # It may come in pieces; their middle, by power, is within its width of it.
+    power = lamps.intensity.sum(-1, keepdim=True)
+    assert ((power * lamps.position).sum(0) / power.sum() - LAMP[0]).norm() < 0.12
     red, _, blue = lamps.intensity[0].tolist()
     assert red / blue == pytest.approx(0.9 / 0.4, rel=0.3)
     # What is left of it may stay beside it; nothing is elsewhere.
@@ -139,7 +141,7 @@ def test_before_a_known_map_lamps_are_found_and_the_map_stays():
     assert torch.equal(environment.log_radiance, before)
     assert lamps.lit
     assert evidence.points == 160
-    assert (lamps.position[0] - LAMP[0]).norm() < 0.2
+    assert (lamps.position[0] - LAMP[0]).norm() < 0.12
     beside = (lamps.position - LAMP).norm(dim=-1) < 0.3
     # The sky is no unknown that could take a share of it.
     assert lamps.intensity[beside].sum().item() == pytest.approx(0.9 + 0.7 + 0.4, rel=0.15)
