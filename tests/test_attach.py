@@ -104,7 +104,7 @@ def test_before_there_is_a_material_the_host_is_not_asked():
 def test_steps_fall_into_the_stages_of_the_settings():
     neilf = attach_neilf(Ball(), steps(sdf=2, material=3, joint=1))
     names = [set(neilf.losses(pixels(), step).terms) for step in (1, 2, 4, 5, 99)]
-    material = {"physical", "inter_reflection", "smoothness"}
+    material = {"physical", "inter_reflection"}
     assert [n - {"lambertian"} for n in names] == [set(), material, material, material | {"volume"}, material | {"volume"}]
     assert set(neilf.losses(pixels(), Stage.JOINT).terms) == names[3]
 

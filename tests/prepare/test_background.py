@@ -6,6 +6,8 @@ import ast
 import signal
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -28,6 +30,16 @@ def test_a_failure_is_raised_where_it_was_called():
         in_background(fail)
 
 
+@contextmanager
+def heard(number: signal.Signals) -> Iterator[None]:
+    """A shell starts its background jobs deaf to Ctrl-C, and these tests may be one."""
+    before = signal.signal(number, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stop_reaches_the_call_and_waits_for_its_end(number):
     ended = []
@@ -40,7 +52,7 @@ def test_a_stop_reaches_the_call_and_waits_for_its_end(number):
 
     threading.Timer(0.3, signal.pthread_kill, (threading.main_thread().ident, number)).start()
     before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(KeyboardInterrupt), sigterm_as_ctrl_c():
+    with heard(signal.SIGINT), pytest.raises(KeyboardInterrupt), sigterm_as_ctrl_c():
         in_background(work)
     assert ended
     assert signal.getsignal(signal.SIGTERM) == before
