@@ -1,9 +1,5 @@
 """Light is solved for, not descended to: a map and lamps under which remembered points look as the images show them.
 
-What is known of light in general takes no side in the factor between light and base colour: the total variation of the map
-is of logarithms, lamps pay for their share of all light, and the tint is of ratios. A price per amount of light would make
-the light dimmer and surfaces brighter at every fit, as the base colour follows.
-
 With the transport of these points at hand (`lighting.transport`), a hundred steps on the light cost less than as many steps
 of training. They find lamps that stochastic descent, through few and noisy samples of every texel, spreads into a haze that
 the base colour then makes up for.
@@ -16,17 +12,13 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional
 
 from neilfpp_method.config import LightFitConfig
+from neilfpp_method.lighting.objective import Target, misfit, price, relative_error, total_variation
 from neilfpp_method.lighting.transport import Transport
-from neilfpp_method.shading.color import apply_response
-from neilfpp_method.structures import Indexable, Material
 
-__all__ = ["Evidence", "Light", "Target", "compare", "evidence", "fit_light", "tint", "total_variation"]
+__all__ = ["Evidence", "Light", "compare", "evidence", "fit_light"]
 
-SMOOTHED = 1e-2
-"""Differences of log radiance below this count by their square, so that the total variation has a gradient everywhere."""
 LEAST_RATE = 0.05
 """The last step's rate over the first's."""
 LEAST_REACH = 0.05
@@ -40,8 +32,6 @@ LEAST_SIGHT = 0.05
 suns of it for the sake of one pixel; it takes after its surroundings."""
 FIRST_SHARE = 0.1
 """Of the light that typical points receive, what all lamps that are not yet lit start with together."""
-SMALL_SHARE = 0.02
-"""Of all light: a lamp that brings less pays for what it brings, one that brings much more hardly for more than being there."""
 
 
 @dataclass(frozen=True)
@@ -54,17 +44,6 @@ class Light:
     def strength(self) -> Float[Tensor, "T 3"]:
         """Of all sources: radiance of the texels row by row, then intensity of the lamps."""
         return torch.cat((self.log_radiance.exp().flatten(1).t(), self.intensity))
-
-
-@dataclass(frozen=True)
-class Target(Indexable):
-    """What points look like: their material, constants, and their pixels in the response of the capture."""
-
-    material: Material
-    pixel: Float[Tensor, "N 3"]
-
-    def __getitem__(self, rows: Tensor | slice) -> Target:
-        return Target(self.material[rows], self.pixel[rows])
 
 
 @dataclass(frozen=True)
@@ -102,9 +81,8 @@ def fit_light(
     """The light that explains the points best, the smoothest and with the fewest lamps where they do not say.
 
     Minimises the relative error, robustly; the total variation of the map's log radiance, so that lamps in it may be sharp
-    and what no point sees takes after its surroundings; Σ ln(1 + share/s) over the lamps' shares of all light, a concave
-    price for which one strong lamp is cheaper than two half as strong; and the tint of all light that reaches the points,
-    which images hardly tell from that of the surfaces. Base colour and light share a scale, so a factor per channel on the
+    and what no point sees takes after its surroundings; and the price of lamps and of tint, which images hardly tell from that
+    of the surfaces (`objective`). Base colour and light share a scale, so a factor per channel on the
     base colour is free during the fit: the light need not make up for it.
 
     Args:
@@ -146,13 +124,9 @@ def fit_light(
                 group["lr"] = group["rate"] * LEAST_RATE ** (step / config.steps)
             strength = light().strength()[felt]
             strength = torch.where(told, strength, strength.detach())
-            error = _relative_error(strength, carried, target, log_gain.exp(), response, unit, config)
-            loss = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=config.outlier)
+            loss = misfit(strength, carried, target, log_gain.exp(), response, unit, config)
             loss = loss + config.smoothness * total_variation(log_radiance)
-            brings = reaching @ strength
-            share = unit * root.square().mean(-1) / brings.mean()
-            loss = loss + config.sparsity * (share / SMALL_SHARE).log1p().sum()
-            loss = loss + config.whiteness * tint(brings)
+            loss = loss + price(unit * root.square().mean(-1), reaching @ strength, config)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -173,36 +147,7 @@ def compare(
 ) -> Float[Tensor, " N"]:
     """How much lower the relative error of the second of two lights is, at points that neither was fitted to."""
     one, other = (
-        _relative_error(light.strength(), transport, target, 1.0, response, unit, config).abs().clamp_max(1).mean(-1)
+        relative_error(light.strength(), transport, target, 1.0, response, unit, config).abs().clamp_max(1).mean(-1)
         for light, transport in zip(lights, carried, strict=True)
     )
     return one - other
-
-
-def total_variation(values: Float[Tensor, "C H W"]) -> Float[Tensor, ""]:
-    """Σ |difference of neighbours| per texel, of a map that is closed in azimuth."""
-    across = torch.cat((values, values[..., :1]), -1).diff(dim=-1)
-    down = values.diff(dim=1)
-    size = max(1, values[0].numel())
-    return sum((step.square() + SMOOTHED**2).sqrt().sum() for step in (across, down)) / size
-
-
-def tint(light: Float[Tensor, " 3"]) -> Float[Tensor, ""]:
-    """How far light is from white: the variance of its logarithm over the channels."""
-    return light.clamp_min(1e-20).log().var(correction=0)
-
-
-def _relative_error(
-    strength: Float[Tensor, "T 3"],
-    carried: Transport,
-    target: Target,
-    gain: Float[Tensor, " 3"] | float,
-    response: str,
-    unit: float,
-    config: LightFitConfig,
-) -> Float[Tensor, "N 3"]:
-    """What the camera stores of the points, their base colour times `gain`, against their pixels."""
-    material = target.material
-    tinted = Material((material.base_color * gain).clamp(0, 1), material.roughness, material.metallic)
-    shown = apply_response(carried.outgoing(tinted, strength), response)
-    return (shown - target.pixel) / (target.pixel + config.floor * unit)

@@ -8,8 +8,10 @@ from neilfpp_method.config import IncidentLightConfig
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.lighting.candidates import merge, propose
-from neilfpp_method.lighting.fit import Evidence, Light, Target, compare, evidence, fit_light
+from neilfpp_method.lighting.fit import Evidence, Light, compare, evidence, fit_light
 from neilfpp_method.lighting.memory import Observed
+from neilfpp_method.lighting.objective import Target
+from neilfpp_method.lighting.settle import settle_lamps
 from neilfpp_method.lighting.transport import SceneTracer, from_lamps, from_texels
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import Material
@@ -89,5 +91,7 @@ def solve_light(
             return spoken
     sought.copy_(found.log_radiance)
     lit = merge(places, found.intensity, near.sources[0].mean(0), len(lamps.position))
+    beside = texels.lit(sought.exp().flatten(1).t())
+    lit = settle_lamps(lit, lamps.radius, beside, seen, target, lobe, scene, response, unit, config.fit)
     lamps.place(lit.places.position, lit.intensity, lit.places.axis)
     return spoken

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from neilfpp_method.fields.environment import EnvironmentLight
@@ -25,7 +25,7 @@ from neilfpp_method.shading.brdf import Lobe, diffuse_reflectance, normal_reflec
 from neilfpp_method.shading.frame import dot
 from neilfpp_method.structures import Material, SceneLight
 
-__all__ = ["SceneTracer", "Transport", "from_lamps", "from_texels"]
+__all__ = ["SceneTracer", "Transport", "from_lamps", "from_texels", "in_sight", "lamp_kernel"]
 
 SceneTracer = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N S 3"]], SceneLight]
 """What the scene sends to points from directions."""
@@ -119,13 +119,35 @@ def from_lamps(
     """From small lamps, per unit of intensity: the direction to their middle is traced. Arguments as of `from_texels`."""
     sources = []
     for part, rough in _chunks(seen, roughness, len(lamps.position)):
-        rays = rays_towards(part.position, lamps.position, lamps.axis, radius)
-        weight = rays.emission * dot(rays.wi, part.normal).clamp_min(0) / rays.distance.square()
-        if scene is not None:
-            weight = weight * (scene(part.position, rays.wi).distance >= rays.distance)
-        sources.append(_kernel(part, rough, rays.wi, weight, lobe))
+        sight = in_sight(lamps, radius, part.position, scene)
+        sources.append(lamp_kernel(lamps, radius, sight, part, rough, lobe))
     kernel = torch.cat(sources, 1)
     return Transport(kernel, kernel.new_zeros(*kernel.shape[:2], 3))
+
+
+@torch.no_grad()
+def in_sight(
+    lamps: LampPlaces, radius: float, x: Float[Tensor, "N 3"], scene: SceneTracer | None
+) -> Bool[Tensor, "N M"]:
+    """Whether the middle of a lamp is to be seen from a point."""
+    rays = rays_towards(x, lamps.position, lamps.axis, radius)
+    if scene is None:
+        return torch.ones_like(rays.distance, dtype=torch.bool)
+    return scene(x, rays.wi).distance >= rays.distance
+
+
+def lamp_kernel(
+    lamps: LampPlaces,
+    radius: float,
+    sight: Bool[Tensor, "N M"],
+    seen: Observed,
+    roughness: Float[Tensor, "N 1"],
+    lobe: Lobe | None,
+) -> Float[Tensor, "K N M"]:
+    """`sources` of a transport from lamps; differentiable in where they are and which way they send, up to `sight`."""
+    rays = rays_towards(seen.position, lamps.position, lamps.axis, radius)
+    weight = sight * rays.emission * dot(rays.wi, seen.normal).clamp_min(0) / rays.distance.square()
+    return _kernel(seen, roughness, rays.wi, weight, lobe)
 
 
 def _kernel(
