@@ -18,8 +18,9 @@ demo-short: $(VENV)/.installed
 	$(RUN)/neilfpp demo --short --out build/demo-short
 
 # The tensors of the tests are small: a second thread costs more than it brings, many times more on a busy machine.
+# Two processes instead, each with whole modules, so that what a module prepares is prepared once.
 test: $(VENV)/.installed
-	OMP_NUM_THREADS=1 $(RUN)/python -m pytest -m "not slow"
+	OMP_NUM_THREADS=1 $(RUN)/python -m pytest -m "not slow" -n 2 --dist loadscope
 
 test-slow: $(VENV)/.installed
 	OMP_NUM_THREADS=1 $(RUN)/python -m pytest -m slow
