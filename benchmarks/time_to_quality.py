@@ -126,10 +126,10 @@ def _training(
         if position.step == 0:
             model.train().freeze_for(position.stage)
         seed_step(config.train.seed, step)
-        set_rates(optimizer, config.optimizer, position.stage, position.step / position.length)
+        set_rates(optimizer, config.optimizer, position.stage, position.share)
         optimizer.zero_grad(set_to_none=True)
         terms = model(pixels.sample(config.train.rays), position.stage)
-        weigh(terms, active_losses(position.stage, config, model.stages)).loss.backward()
+        weigh(terms, active_losses(position.stage, config, model.stages, position.share)).loss.backward()
         optimizer.step()
         yield step + 1, now() - began
 

@@ -26,7 +26,7 @@ from neilfpp_method.hosts.base import HasParameterGroups, Host, LightsItself
 from neilfpp_method.hosts.outputs import check_tensors, host_name
 from neilfpp_method.model import NeilfModel, SceneFacts
 from neilfpp_method.presets import free_light, preset
-from neilfpp_method.schedule import Stage, Total, active_losses, stage_at, weigh
+from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, stage_at, weigh
 from neilfpp_method.structures import Material, PixelBatch, RayBatch, Shading, SurfaceHits
 
 __all__ = ["AttachedNeilf", "CallableHost", "attach_neilf", "missing_capabilities", "pixel_batch"]
@@ -112,12 +112,12 @@ class AttachedNeilf(nn.Module):
         place, own = batch.origins.device, next(self.model.brdf.parameters()).device
         if place != own:
             raise UserError(f"rays on {place}, material and light on {own}", "move one of them: neilf.to(device)")
-        stage = step if isinstance(step, Stage) else stage_at(step, self.model.config.train).stage
-        terms = self.model(batch, stage)
+        position = StagePosition(step, 0, 1) if isinstance(step, Stage) else stage_at(step, self.model.config.train)
+        terms = self.model(batch, position.stage)
         if not terms:
             # A loop without a loss of its own may still call backward.
             return Total(torch.zeros((), device=place, requires_grad=True), {})
-        return weigh(terms, active_losses(stage, self.model.config, self.model.stages))
+        return weigh(terms, active_losses(position.stage, self.model.config, self.model.stages, position.share))
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
         """The parameters by field, for a learning rate each (`config.optimizer`)."""

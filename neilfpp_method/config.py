@@ -282,6 +282,9 @@ class LossConfig:
     physical: float = 1.0
     eikonal: float = 0.1
     hessian: float = 1e-3
+    hessian_growth: float = 1.0
+    """Weight of L_Hess at the end of SDF init over that at its start: early, shapes must be free to fold; late, ripples are
+    noise."""
     hessian_joint: float = 1e-4
     surface: float = 1e-3
     surface_joint: float = 1e-4

@@ -12,7 +12,7 @@ moves with the material; where the host belongs to another trainer, that one see
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 from jaxtyping import Float
@@ -55,10 +55,12 @@ MATERIAL_LOSSES = {name: name for name in ("physical", "inter_reflection", "smoo
 
 @dataclass(frozen=True)
 class StagePlan:
-    """One row of the table: for each loss that counts the setting that weighs it, and the fields that move."""
+    """One row of the table: for each loss that counts the setting that weighs it, and the fields that move; for each loss whose
+    weight grows in the course of the stage the setting that says by how much."""
 
     weights: Mapping[str, str]
     moves: frozenset[str]
+    grows: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def moves_host(self) -> bool:
@@ -82,6 +84,7 @@ STAGES: StageTable = {
             "point_cloud": "point_cloud",
         },
         moves=GEOMETRY,
+        grows={"hessian": "hessian_growth"},
     ),
     Stage.MATERIAL_INIT: StagePlan(weights=MATERIAL_LOSSES, moves=MATERIAL),
     Stage.JOINT: StagePlan(
@@ -131,6 +134,11 @@ class StagePosition:
     step: int
     length: int
 
+    @property
+    def share(self) -> float:
+        """Of the stage, what is over."""
+        return self.step / self.length
+
 
 def stage_at(step: int, config: TrainConfig) -> StagePosition:
     """The stage of a global step (from 0); the last stage that has steps, one past its end, when training is over."""
@@ -144,12 +152,16 @@ def stage_at(step: int, config: TrainConfig) -> StagePosition:
     return StagePosition(stage, length, length)
 
 
-def active_losses(stage: Stage, config: NeilfConfig, stages: StageTable = STAGES) -> Mapping[str, float]:
-    """The losses that count in a stage, with their weights.
+def active_losses(
+    stage: Stage, config: NeilfConfig, stages: StageTable = STAGES, share: float = 0.0
+) -> Mapping[str, float]:
+    """The losses that count in a stage, with their weights when `share` of it is over.
 
     One of weight 0, or whose effect is switched off, is absent: nothing computes it.
     """
-    weights = {loss: getattr(config.loss, setting) for loss, setting in stages[stage].weights.items()}
+    plan = stages[stage]
+    weights = {loss: getattr(config.loss, setting) for loss, setting in plan.weights.items()}
+    weights |= {loss: weights[loss] * getattr(config.loss, setting) ** share for loss, setting in plan.grows.items()}
     if config.inter_reflection.mode != "soft":
         weights.pop("inter_reflection", None)
     if not config.shading.specular:

@@ -34,6 +34,17 @@ def test_the_joint_stage_lowers_hessian_and_surface():
     assert (first["surface"], last["surface"]) == (1e-3, 1e-4)
 
 
+def test_the_weight_of_the_hessian_grows_in_sdf_init_alone():
+    config = preset("fast")
+    weights = [active_losses(Stage.SDF_INIT, config, share=share) for share in (0.0, 0.5, 1.0)]
+    growth = config.loss.hessian_growth
+    assert growth > 1
+    assert weights[1]["hessian"] == pytest.approx(weights[0]["hessian"] * growth**0.5)
+    assert weights[2]["hessian"] == pytest.approx(weights[0]["hessian"] * growth)
+    assert [w["eikonal"] for w in weights] == [config.loss.eikonal] * 3
+    assert active_losses(Stage.JOINT, config, share=1.0)["hessian"] == config.loss.hessian_joint
+
+
 def test_an_effect_that_is_off_has_no_loss():
     config = preset("fast")
     off = dataclasses.replace(config, inter_reflection=dataclasses.replace(config.inter_reflection, mode="off"))

@@ -166,7 +166,11 @@ class NeilfMethod(Model):
             return {"rgb": (outputs["rgb"] - batch["image"].to(self.device)).abs().mean()}
         pixels = pixel_batch(outputs["origins"], outputs["directions"], batch)
         terms = self.neilf.losses(pixels, self.stage)
-        weights = {**active_losses(self.stage, self.neilf.config, self.neilf.stages), OWN_LOSSES: self.config.host_losses}
+        share = stage_at(self.step, self.config.neilf.train).share
+        weights = {
+            **active_losses(self.stage, self.neilf.config, self.neilf.stages, share),
+            OWN_LOSSES: self.config.host_losses,
+        }
         if metrics_dict is not None:
             # Known only now, and logged after this: the terms before their weights.
             metrics_dict |= weigh(terms, weights).terms | self._light_found()

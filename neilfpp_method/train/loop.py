@@ -75,7 +75,6 @@ def _train_stage(
     """The rest of a stage. Returns the number of the step that follows it."""
     settings = run.config.train
     stage = position.stage
-    weights = active_losses(stage, run.config, model.stages)
     model.freeze_for(stage)
     # Set up anew in each stage: data-parallel wrappers fix the set of moving parameters when they are made.
     wrapped = run.fabric.setup_module(model, move_to_device=False)
@@ -84,11 +83,13 @@ def _train_stage(
     before = run.seconds.get(stage.value, 0.0)
     for number in range(position.step, position.length):
         seed_step(settings.seed, step, run.fabric.global_rank)
-        set_rates(optimizer, run.config.optimizer, stage, number / position.length)
+        share = number / position.length
+        set_rates(optimizer, run.config.optimizer, stage, share)
         batch = run.pixels.sample(settings.rays)
         terms = wrapped(batch, stage)
         note_fit(run.fits, model, step)
-        stop = _update(run, model, optimizer, terms, weigh(terms, weights), step)
+        total = weigh(terms, active_losses(stage, run.config, model.stages, share))
+        stop = _update(run, model, optimizer, terms, total, step)
         step += 1
         run.seconds[stage.value] = before + time.perf_counter() - started
         if number + 1 == position.length:
