@@ -63,12 +63,32 @@ class Transport:
 
     def outgoing(self, material: Material, strength: Float[Tensor, "T 3"]) -> Float[Tensor, "N 3"]:
         """L_o under sources of this strength; `material` brings the colours, its roughness is in the matrices."""
-        diffuse, *reflected = self.sources @ strength + self.scene
+        diffuse, *reflected = _SumOverSources.apply(self.sources, strength) + self.scene
         color = diffuse_reflectance(material, bool(reflected)) * diffuse
         if reflected:
             facing, grazing = reflected
             color = color + normal_reflectance(material) * facing + grazing
         return color
+
+
+class _SumOverSources(torch.autograd.Function):
+    """sources @ strength: K N T, T 3 → K N 3.
+
+    Autograd's own slope in the strength reads the sources across their order in memory, which takes 13 ms where reading them
+    along it takes 5; a fit does little else.
+    """
+
+    @staticmethod
+    def forward(ctx, sources: Tensor, strength: Tensor) -> Tensor:
+        ctx.save_for_backward(sources, strength)
+        return sources @ strength
+
+    @staticmethod
+    def backward(ctx, slope: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        sources, strength = ctx.saved_tensors
+        of_sources = slope @ strength.t() if ctx.needs_input_grad[0] else None
+        of_strength = (slope.flatten(0, 1).t() @ sources.flatten(0, 1)).t() if ctx.needs_input_grad[1] else None
+        return of_sources, of_strength
 
 
 @torch.no_grad()

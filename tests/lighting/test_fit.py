@@ -54,6 +54,14 @@ def test_transport_agrees_with_the_estimator_under_a_map_and_a_wall():
     torch.testing.assert_close(carried, expected, rtol=0.06, atol=0.02)
 
 
+def test_transport_knows_its_slopes_in_sources_and_strength():
+    torch.manual_seed(0)
+    of = Material(*(value.double() for value in (torch.rand(4, 3), torch.rand(4, 1), torch.rand(4, 1))))
+    sources, scene, strength = (torch.rand(*shape, dtype=torch.float64) for shape in ((3, 4, 5), (3, 4, 3), (5, 3)))
+    unknowns = (sources.requires_grad_(), strength.requires_grad_())
+    torch.autograd.gradcheck(lambda a, b: Transport(a, scene).outgoing(of, b), unknowns)
+
+
 def lamp(height: int) -> EnvironmentLight:
     """A dim sky with one lamp of 40 at row 8, column 20 of a map of 24 rows, and its neighbours at 5."""
     environment = EnvironmentLight(height, 0.3)
