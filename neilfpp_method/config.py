@@ -119,6 +119,9 @@ class LightFitConfig:
     whiteness: float = 0.05
     """Weight of the tint of all light that reaches the points, against the relative error: images hardly tell the tint of the
     light from that of the surfaces."""
+    evenness: float = 0.3
+    """Weight of the mean difference of log base colour between neighbouring points, against the relative error. The base colour
+    of every point is free while light is fitted; 0: it is what surfaces have learned, up to a factor per channel."""
     sparsity: float = 0.001
     """Weight of the lamps, by the logarithm of their shares of all light, against the relative error."""
     candidates: int = 256

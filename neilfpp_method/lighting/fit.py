@@ -13,14 +13,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.config import LightFitConfig
-from neilfpp_method.lighting.objective import Target, misfit, price, relative_error, total_variation
+from neilfpp_method.lighting.descent import Unknown, descend
+from neilfpp_method.lighting.objective import Objective, Target, total_variation
 from neilfpp_method.lighting.transport import Transport
 
 __all__ = ["Evidence", "Light", "compare", "evidence", "fit_light"]
 
-LEAST_RATE = 0.05
-"""The last step's rate over the first's."""
+ROOT_RATE, GAIN_RATE = 0.5, 0.1
+"""Rates of the roots of what lamps bring, and of the logarithms of the factors on base colour, over that of log radiance."""
 LEAST_REACH = 0.05
 """A lamp that brings less than this share of the mean, were all alike, is not sought: behind a wall anything fits."""
 LEAST_GAIN = 0.01
@@ -75,29 +75,25 @@ def evidence(gain: Float[Tensor, " N"]) -> Evidence:
     return Evidence(gain.mean().item(), (gain.std(correction=0) / len(gain) ** 0.5).item(), len(gain))
 
 
-def fit_light(
-    start: Light, carried: Transport, target: Target, response: str, unit: float, config: LightFitConfig
-) -> Light:
+def fit_light(start: Light, carried: Transport, target: Target, objective: Objective) -> Light:
     """The light that explains the points best, the smoothest and with the fewest lamps where they do not say.
 
     Minimises the relative error, robustly; the total variation of the map's log radiance, so that lamps in it may be sharp
-    and what no point sees takes after its surroundings; and the price of lamps and of tint, which images hardly tell from that
-    of the surfaces (`objective`). Base colour and light share a scale, so a factor per channel on the
-    base colour is free during the fit: the light need not make up for it.
+    and what no point sees takes after its surroundings; the unevenness of base colour, which is free during the fit
+    (`descent`); and the price of lamps and of tint, which images hardly tell from that of the surfaces (`objective`).
 
     Args:
         start: where the search starts.
         carried: from the texels of the map, row by row, and then from the lamps.
         target: what the points look like.
-        response: of the capture, "linear" or "srgb".
-        unit: a pixel of typical brightness; errors are relative to the pixel and a share of this.
-        config: weights, rates and number of steps.
+        objective: what is minimised; its settings have rates and the number of steps, too.
 
     Returns:
         `start` where the search leads to what is not finite, or there is no point.
     """
     if not len(target.pixel):
         return start
+    config, unit = objective.config, objective.unit
     texels = start.log_radiance[0].numel()
     log_radiance = start.log_radiance.clone().requires_grad_()
     # In units of what a lamp brings to a white surface in the mean over the points: its unknowns are then of one size.
@@ -105,9 +101,6 @@ def fit_light(
     reaches = brought > LEAST_REACH * brought.mean()
     first = FIRST_SHARE / max(1, len(brought))
     root = (start.intensity * brought).clamp_min(first).sqrt().requires_grad_()
-    log_gain = torch.zeros(3, device=root.device, requires_grad=True)
-    groups = [{"params": [p], "rate": rate * config.rate} for p, rate in ((log_radiance, 1.0), (root, 0.5), (log_gain, 0.2))]
-    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
     # What a wall or the ground hides from all points has no part in how they look: half of the texels over a table.
     felt = torch.nonzero(carried.sources.amax((0, 1)))[:, 0]
     carried = carried.of(felt)
@@ -118,18 +111,15 @@ def fit_light(
     def light() -> Light:
         return Light(log_radiance, torch.where(reaches, root.square() / brought.clamp_min(1e-20), 0.0))
 
-    with torch.enable_grad():
-        for step in range(config.steps):
-            for group in optimizer.param_groups:
-                group["lr"] = group["rate"] * LEAST_RATE ** (step / config.steps)
-            strength = light().strength()[felt]
-            strength = torch.where(told, strength, strength.detach())
-            loss = misfit(strength, carried, target, log_gain.exp(), response, unit, config)
-            loss = loss + config.smoothness * total_variation(log_radiance)
-            loss = loss + price(unit * root.square().mean(-1), reaching @ strength, config)
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
+    def loss_of(gain: Float[Tensor, "#N 3"]) -> Float[Tensor, ""]:
+        strength = light().strength()[felt]
+        strength = torch.where(told, strength, strength.detach())
+        loss = objective.misfit(strength, carried, target, gain)
+        loss = loss + config.smoothness * total_variation(log_radiance)
+        return loss + objective.price(unit * root.square().mean(-1), reaching @ strength)
+
+    unknowns = (Unknown(log_radiance, config.rate), Unknown(root, ROOT_RATE * config.rate))
+    descend(unknowns, GAIN_RATE * config.rate, config.steps, target, objective, loss_of)
     found = light()
     found = Light(found.log_radiance.detach(), found.intensity.detach())
     finite = found.log_radiance.isfinite().all() and found.intensity.isfinite().all()
@@ -138,16 +128,11 @@ def fit_light(
 
 @torch.no_grad()
 def compare(
-    lights: tuple[Light, Light],
-    carried: tuple[Transport, Transport],
-    target: Target,
-    response: str,
-    unit: float,
-    config: LightFitConfig,
+    lights: tuple[Light, Light], carried: tuple[Transport, Transport], target: Target, objective: Objective
 ) -> Float[Tensor, " N"]:
     """How much lower the relative error of the second of two lights is, at points that neither was fitted to."""
     one, other = (
-        relative_error(light.strength(), transport, target, 1.0, response, unit, config).abs().clamp_max(1).mean(-1)
+        objective.relative_error(light.strength(), transport, target, 1.0).abs().clamp_max(1).mean(-1)
         for light, transport in zip(lights, carried, strict=True)
     )
     return one - other

@@ -1,8 +1,8 @@
-"""What speaks against a light: points that look otherwise than their pixels, and what is known of light in general.
+"""What speaks against a light: points that look otherwise than their pixels, and what light and surfaces mostly are.
 
-What is known in general takes no side in the factor between light and base colour: the total variation of the map is of
-logarithms, lamps pay for their share of all light, and the tint is of ratios. A price per amount of light would make the light
-dimmer and surfaces brighter at every fit, as the base colour follows.
+What they mostly are takes no side in the factor between light and base colour: the total variation of the map is of
+logarithms, and so is the unevenness of base colour; lamps pay for their share of all light, and the tint is of ratios. A price
+per amount of light would make the light dimmer and surfaces brighter at every fit, as the base colour follows.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -19,62 +19,68 @@ from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.shading.color import apply_response
 from neilfpp_method.structures import Indexable, Material
 
-__all__ = ["Target", "misfit", "price", "relative_error", "tint", "total_variation"]
+__all__ = ["Objective", "Target", "nearest_points", "tint", "total_variation", "unevenness"]
 
 SMOOTHED = 1e-2
-"""Differences of log radiance below this count by their square, so that the total variation has a gradient everywhere."""
+"""Differences of logarithms below this count by their square, so that they have a gradient everywhere."""
 SMALL_SHARE = 0.02
 """Of all light: a lamp that brings less pays for what it brings, one that brings much more hardly for more than being there."""
+NEIGHBOURS = 4
+"""Points whose base colour a point is compared with."""
+DARKEST = 0.02
+"""Base colours below this count as this where their logarithms are compared."""
 
 
 @dataclass(frozen=True)
 class Target(Indexable):
     """What points look like: their material, constants, and their pixels in the response of the capture."""
 
+    position: Float[Tensor, "N 3"]
     material: Material
     pixel: Float[Tensor, "N 3"]
 
     def __getitem__(self, rows: Tensor | slice) -> Target:
-        return Target(self.material[rows], self.pixel[rows])
+        return Target(self.position[rows], self.material[rows], self.pixel[rows])
 
 
-def relative_error(
-    strength: Float[Tensor, "T 3"],
-    carried: Transport,
-    target: Target,
-    gain: Float[Tensor, " 3"] | float,
-    response: str,
-    unit: float,
-    config: LightFitConfig,
-) -> Float[Tensor, "N 3"]:
-    """What the camera stores of the points, their base colour times `gain`, against their pixels."""
-    material = target.material
-    tinted = Material((material.base_color * gain).clamp(0, 1), material.roughness, material.metallic)
-    shown = apply_response(carried.outgoing(tinted, strength), response)
-    return (shown - target.pixel) / (target.pixel + config.floor * unit)
+@dataclass(frozen=True)
+class Objective:
+    """What a light is to minimise.
 
-
-def misfit(
-    strength: Float[Tensor, "T 3"],
-    carried: Transport,
-    target: Target,
-    gain: Float[Tensor, " 3"],
-    response: str,
-    unit: float,
-    config: LightFitConfig,
-) -> Float[Tensor, ""]:
-    """The relative error in the mean: by its square where it is small, by its size where it is large."""
-    error = relative_error(strength, carried, target, gain, response, unit, config)
-    return functional.smooth_l1_loss(error, torch.zeros_like(error), beta=config.outlier)
-
-
-def price(brought: Float[Tensor, " M"], all_light: Float[Tensor, " 3"], config: LightFitConfig) -> Float[Tensor, ""]:
-    """Of lamps, by the light that each brings to the points, and of the tint of all light that reaches them.
-
-    Σ ln(1 + share/s) over the lamps' shares of all light is concave: one strong lamp is cheaper than two half as strong.
+    Attributes:
+        response: of the capture, "linear" or "srgb".
+        unit: a pixel of typical brightness; errors are relative to the pixel and a share of this.
+        config: the weights.
     """
-    share = brought / all_light.mean()
-    return config.sparsity * (share / SMALL_SHARE).log1p().sum() + config.whiteness * tint(all_light)
+
+    response: str
+    unit: float
+    config: LightFitConfig
+
+    def relative_error(
+        self, strength: Float[Tensor, "T 3"], carried: Transport, target: Target, gain: Float[Tensor, "#N 3"] | float
+    ) -> Float[Tensor, "N 3"]:
+        """What the camera stores of the points, their base colour times `gain`, against their pixels."""
+        material = target.material
+        tinted = Material((material.base_color * gain).clamp(0, 1), material.roughness, material.metallic)
+        shown = apply_response(carried.outgoing(tinted, strength), self.response)
+        return (shown - target.pixel) / (target.pixel + self.config.floor * self.unit)
+
+    def misfit(
+        self, strength: Float[Tensor, "T 3"], carried: Transport, target: Target, gain: Float[Tensor, "#N 3"]
+    ) -> Float[Tensor, ""]:
+        """The relative error in the mean: by its square where it is small, by its size where it is large."""
+        error = self.relative_error(strength, carried, target, gain)
+        return functional.smooth_l1_loss(error, torch.zeros_like(error), beta=self.config.outlier)
+
+    def price(self, brought: Float[Tensor, " M"], all_light: Float[Tensor, " 3"]) -> Float[Tensor, ""]:
+        """Of lamps, by the light that each brings to the points, and of the tint of all light that reaches them.
+
+        Σ ln(1 + share/s) over the lamps' shares of all light is concave: one strong lamp is cheaper than two half as strong.
+        """
+        share = brought / all_light.mean()
+        lamps = self.config.sparsity * (share / SMALL_SHARE).log1p().sum()
+        return lamps + self.config.whiteness * tint(all_light)
 
 
 def total_variation(values: Float[Tensor, "C H W"]) -> Float[Tensor, ""]:
@@ -83,6 +89,19 @@ def total_variation(values: Float[Tensor, "C H W"]) -> Float[Tensor, ""]:
     down = values.diff(dim=1)
     size = max(1, values[0].numel())
     return sum((step.square() + SMOOTHED**2).sqrt().sum() for step in (across, down)) / size
+
+
+def nearest_points(position: Float[Tensor, "N 3"]) -> Int[Tensor, "N K"]:
+    """The nearest other points of each; K is `NEIGHBOURS`, less where there are fewer."""
+    apart = torch.cdist(position, position).fill_diagonal_(torch.inf)
+    return apart.topk(min(NEIGHBOURS, len(position) - 1), largest=False).indices
+
+
+def unevenness(base_color: Float[Tensor, "N 3"], nearest: Int[Tensor, "N K"]) -> Float[Tensor, ""]:
+    """Mean |difference of log base colour| between neighbours: an edge costs what it is, in however many steps it comes."""
+    logarithm = base_color.clamp_min(DARKEST).log()
+    apart = logarithm[:, None] - logarithm[nearest]
+    return (apart.square() + SMOOTHED**2).sqrt().sum() / max(1, apart.numel())
 
 
 def tint(light: Float[Tensor, " 3"]) -> Float[Tensor, ""]:

@@ -12,14 +12,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from neilfpp_method.config import LightFitConfig
 from neilfpp_method.fields.lamps import LampPlaces
 from neilfpp_method.lighting.candidates import FoundLamps
+from neilfpp_method.lighting.descent import Unknown, descend
 from neilfpp_method.lighting.memory import Observed
-from neilfpp_method.lighting.objective import Target, misfit, price
+from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.transport import SceneTracer, Transport, in_sight, lamp_kernel
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.shading.frame import safe_normalize
@@ -31,8 +31,8 @@ RATE = 0.02
 """Scene units per step, at the start."""
 QUICKER = 3.0
 """Rate of axes and of logarithms of intensity over that of places."""
-LEAST_RATE = 0.05
-"""The last step's rate over the first's."""
+GAIN_RATE = 0.1
+"""Of the logarithms of the factors on base colour."""
 FAINTEST = 1e-3
 """Of the strongest: a channel that is darker starts here, where its logarithm has a slope."""
 
@@ -52,13 +52,12 @@ def settle_lamps(
     target: Target,
     lobe: Lobe | None,
     scene: SceneTracer | None,
-    response: str,
-    unit: float,
-    config: LightFitConfig,
+    objective: Objective,
 ) -> FoundLamps:
     """Where the lamps are, which way they send and how strong they are, once all of it may change; no more than it takes.
 
-    From the weakest to the strongest a lamp goes where the others, its power with its neighbour, do as well without it.
+    A lamp that sends one way becomes a bulb where that explains the points better: a panel elsewhere looks much like it. Then,
+    from the weakest to the strongest, a lamp goes where the others, its power with its neighbour, do as well without it.
 
     Args:
         found: lamps to start from, the strongest first.
@@ -66,23 +65,28 @@ def settle_lamps(
         beside: all other light, with no sources of its own.
         seen, target: the points, and what they look like.
         lobe, scene: as of `from_texels`.
-        response, unit, config: as of `fit_light`.
+        objective: what is minimised.
     """
     if not len(found.intensity) or not len(seen):
         return found
 
-    def loss_of(lamps: FoundLamps, sight: Bool[Tensor, "N M"], gain: Float[Tensor, " 3"]) -> Float[Tensor, ""]:
+    def loss_of(lamps: FoundLamps, sight: Bool[Tensor, "N M"], gain: Float[Tensor, "#N 3"]) -> Float[Tensor, ""]:
         kernel = lamp_kernel(lamps.places, radius, sight, seen, target.material.roughness, lobe)
         brought = kernel[0].mean(0)[:, None] * lamps.intensity
         all_light = brought.sum(0) + beside.scene[0].mean(0)
-        misses = misfit(lamps.intensity, Transport(kernel, beside.scene), target, gain, response, unit, config)
-        return misses + price(brought.mean(-1), all_light, config)
+        misfit = objective.misfit(lamps.intensity, Transport(kernel, beside.scene), target, gain)
+        return misfit + objective.price(brought.mean(-1), all_light)
 
     def settle(lamps: FoundLamps) -> _Settled:
         # A shadow's edge has no derivative here: what is hidden at the start stays so, and the next fit looks again.
-        return _descend(lamps, loss_of, in_sight(lamps.places, radius, seen.position, scene))
+        sight = in_sight(lamps.places, radius, seen.position, scene)
+        return _descend(lamps, target, objective, lambda moved, gain: loss_of(moved, sight, gain))
 
     best = settle(found)
+    for number in torch.nonzero(found.places.axis.any(-1))[:, 0]:
+        bulb = settle(_as_bulb(best.lamps, number))
+        if bulb.loss < best.loss:
+            best = bulb
     for number in reversed(range(len(found.intensity))):
         if len(best.lamps.intensity) == 1:
             break
@@ -90,6 +94,12 @@ def settle_lamps(
         if without.loss < best.loss:
             best = without
     return best.lamps
+
+
+def _as_bulb(lamps: FoundLamps, number: Int[Tensor, ""]) -> FoundLamps:
+    """All lamps as they are, but one that sends alike in all directions."""
+    axis = lamps.places.axis.index_fill(0, number, 0.0)
+    return FoundLamps(LampPlaces(lamps.places.position, axis), lamps.intensity)
 
 
 def _without(lamps: FoundLamps, number: int) -> FoundLamps:
@@ -102,28 +112,23 @@ def _without(lamps: FoundLamps, number: int) -> FoundLamps:
 
 
 def _descend(
-    start: FoundLamps, loss_of: Callable[[FoundLamps, Tensor, Tensor], Tensor], sight: Bool[Tensor, "N M"]
+    start: FoundLamps,
+    target: Target,
+    objective: Objective,
+    loss_of: Callable[[FoundLamps, Float[Tensor, "#N 3"]], Float[Tensor, ""]],
 ) -> _Settled:
-    """To the nearest minimum of a loss over place, axis, intensity, and a factor per channel that is free as in `fit_light`.
-    Where that leads to what is not finite: the start."""
+    """To the nearest minimum of a loss over place, axis and intensity. Where that leads to what is not finite: the start."""
     bare = start.places.axis.square().sum(-1, keepdim=True) == 0
     position = start.places.position.clone().requires_grad_()
     axis = start.places.axis.clone().requires_grad_()
     log_intensity = start.intensity.clamp_min(FAINTEST * start.intensity.max()).log().requires_grad_()
-    log_gain = torch.zeros_like(start.intensity[0], requires_grad=True)
-    rates = ((position, 1.0), (axis, QUICKER), (log_intensity, QUICKER), (log_gain, 1.0))
-    optimizer = torch.optim.Adam([{"params": [p], "rate": RATE * rate} for p, rate in rates], betas=(0.9, 0.99))
 
     def lamps() -> FoundLamps:
         return FoundLamps(LampPlaces(position, safe_normalize(axis).masked_fill(bare, 0.0)), log_intensity.exp())
 
-    with torch.enable_grad():
-        for step in range(STEPS):
-            for group in optimizer.param_groups:
-                group["lr"] = group["rate"] * LEAST_RATE ** (step / STEPS)
-            optimizer.zero_grad()
-            loss_of(lamps(), sight, log_gain.exp()).backward()
-            optimizer.step()
+    unknowns = (Unknown(position, RATE), Unknown(axis, QUICKER * RATE), Unknown(log_intensity, QUICKER * RATE))
+    loss = descend(unknowns, GAIN_RATE, STEPS, target, objective, lambda gain: loss_of(lamps(), gain)).item()
     settled = lamps()
-    loss = loss_of(settled, sight, log_gain.exp()).item()
-    return _Settled(settled, loss) if math.isfinite(loss) else _Settled(start, math.inf)
+    settled = FoundLamps(settled.places.detach(), settled.intensity.detach())
+    finite = math.isfinite(loss) and all(v.isfinite().all() for v in (settled.places.position, settled.intensity))
+    return _Settled(settled, loss) if finite else _Settled(start, math.inf)

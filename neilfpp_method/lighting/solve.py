@@ -10,7 +10,7 @@ from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.lighting.candidates import merge, propose
 from neilfpp_method.lighting.fit import Evidence, Light, compare, evidence, fit_light
 from neilfpp_method.lighting.memory import Observed
-from neilfpp_method.lighting.objective import Target
+from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.settle import settle_lamps
 from neilfpp_method.lighting.transport import SceneTracer, from_lamps, from_texels
 from neilfpp_method.shading.brdf import Lobe
@@ -43,7 +43,7 @@ def solve_light(
         environment, lamps: what is set; the search starts from what they are.
         seen, material: surface points, and what they are made of.
         lobe, scene: as of `from_texels`.
-        response, unit: as of `fit_light`.
+        response, unit: as of `Objective`.
         config: with "auto" the lamps must earn their place: the fit is done with and without, and they stay where they
             lower the error at points kept back from both (`Evidence.favours`).
         first: nothing has been decided yet.
@@ -51,7 +51,8 @@ def solve_light(
     Returns:
         What spoke for lamps, or against them; none where the settings had decided.
     """
-    target = Target(material, seen.pixel)
+    target = Target(seen.position, material, seen.pixel)
+    objective = Objective(response, unit, config.fit)
     dark = environment.log_radiance.new_zeros(0, 3)
     if config.map is None:
         sought = environment.log_radiance
@@ -63,7 +64,7 @@ def solve_light(
         texels = texels.lit(known.log_radiance.exp().flatten(1).t())
     plain_start = Light(sought, dark)
     if lamps is None:
-        sought.copy_(fit_light(plain_start, texels, target, response, unit, config.fit).log_radiance)
+        sought.copy_(fit_light(plain_start, texels, target, objective).log_radiance)
         return None
 
     places = propose(lamps, seen.position, config.fit.candidates)
@@ -73,17 +74,17 @@ def solve_light(
     intensity[: lamps.lit] = lamps.intensity[: lamps.lit]
     start = Light(sought, intensity)
     if config.kind != "auto":
-        found, spoken = fit_light(start, both, target, response, unit, config.fit), None
+        found, spoken = fit_light(start, both, target, objective), None
     else:
         # Before anything is known a wrong choice would last: what surfaces then learn speaks for the light they learn it under.
         fold = torch.randperm(len(seen), device=seen.position.device) % FOLDS
         gains = []
         for number in range(FOLDS if first else 1):
             kept_back, fitted = fold == number, fold != number
-            plain = fit_light(plain_start, texels[fitted], target[fitted], response, unit, config.fit)
-            found = fit_light(start, both[fitted], target[fitted], response, unit, config.fit)
+            plain = fit_light(plain_start, texels[fitted], target[fitted], objective)
+            found = fit_light(start, both[fitted], target[fitted], objective)
             carried = (texels[kept_back], both[kept_back])
-            gains.append(compare((plain, found), carried, target[kept_back], response, unit, config.fit))
+            gains.append(compare((plain, found), carried, target[kept_back], objective))
         spoken = evidence(torch.cat(gains))
         if not spoken.favours(chosen=lamps.lit > 0):
             sought.copy_(plain.log_radiance)
@@ -92,6 +93,6 @@ def solve_light(
     sought.copy_(found.log_radiance)
     lit = merge(places, found.intensity, near.sources[0].mean(0), len(lamps.position))
     beside = texels.lit(sought.exp().flatten(1).t())
-    lit = settle_lamps(lit, lamps.radius, beside, seen, target, lobe, scene, response, unit, config.fit)
+    lit = settle_lamps(lit, lamps.radius, beside, seen, target, lobe, scene, objective)
     lamps.place(lit.places.position, lit.intensity, lit.places.axis)
     return spoken

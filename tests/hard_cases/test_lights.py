@@ -13,7 +13,7 @@ from neilfpp_method.fields.factorised_light import FactorisedLightField
 from neilfpp_method.fields.lamps import LampPlaces, Lamps
 from neilfpp_method.lighting.fit import Light, fit_light
 from neilfpp_method.lighting.memory import Observed
-from neilfpp_method.lighting.objective import Target
+from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.transport import from_lamps, from_texels, in_sight, lamp_kernel
 from neilfpp_method.shading.brdf import GGX, SPHERICAL_GAUSSIAN
 from neilfpp_method.structures import Material
@@ -100,7 +100,7 @@ def test_a_fit_to_what_cannot_be(pixel, base_color, metallic):
     sky = EnvironmentLight(4, 1.0)
     carried = from_texels(sky, seen, rough, GGX, None).beside(from_lamps(LAMPS, RADIUS, seen, rough, GGX, None))
     start = Light(sky.log_radiance, torch.zeros(3, 3))
-    target = Target(material, torch.full((count, 3), pixel))
-    found = fit_light(start, carried, target, "linear", max(pixel, 1.0), LightFitConfig(steps=50))
+    target = Target(seen.position, material, torch.full((count, 3), pixel))
+    found = fit_light(start, carried, target, Objective("linear", max(pixel, 1.0), LightFitConfig(steps=50)))
     assert_bounded(found.log_radiance, found.intensity, bound=1e12)
     assert found.intensity.min() >= 0

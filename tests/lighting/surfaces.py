@@ -25,8 +25,16 @@ def points(count: int, seed: int = 0) -> Observed:
 
 
 def material(count: int, seed: int = 1) -> Material:
+    """Every point is made of something else."""
     generator = torch.Generator().manual_seed(seed)
     base_color = 0.2 + 0.6 * torch.rand(count, 3, generator=generator)
     roughness = 0.3 + 0.5 * torch.rand(count, 1, generator=generator)
     metallic = torch.rand(count, 1, generator=generator).round()
     return Material(base_color, roughness, metallic)
+
+
+def patches(position: torch.Tensor) -> Material:
+    """Roughness and metallic as of `material`, and a base colour for each octant about the middle of the points."""
+    speckled = material(len(position))
+    octant = ((position > position.mean(0)) * torch.tensor([1, 2, 4])).sum(-1)
+    return Material(speckled.base_color[octant], speckled.roughness, speckled.metallic)

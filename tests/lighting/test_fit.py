@@ -12,19 +12,29 @@ from neilfpp_method.config import LightFitConfig
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.fit import Evidence, Light, fit_light
 from neilfpp_method.lighting.memory import Observed
-from neilfpp_method.lighting.objective import Target, total_variation
+from neilfpp_method.lighting.objective import Objective, Target, nearest_points, total_variation, unevenness
 from neilfpp_method.lighting.transport import Transport, from_texels
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.shading.rendering_equation import shade
 from neilfpp_method.shading.sampling import sample_directions
 from neilfpp_method.structures import Material
-from tests.lighting.surfaces import half_room, material, points
+from tests.lighting.surfaces import half_room, material, patches, points
 
 
-def fit(environment: EnvironmentLight, carried: Transport, of: Material, image: torch.Tensor, unit: float, steps: int) -> None:
+def fit(
+    environment: EnvironmentLight,
+    carried: Transport,
+    seen: Observed,
+    of: Material,
+    image: torch.Tensor,
+    unit: float,
+    steps: int,
+    evenness: float = LightFitConfig().evenness,
+) -> None:
     """Set a map by a fit without lamps."""
     start = Light(environment.log_radiance, torch.zeros(0, 3))
-    found = fit_light(start, carried, Target(of, image), "linear", unit, LightFitConfig(steps=steps))
+    objective = Objective("linear", unit, LightFitConfig(steps=steps, evenness=evenness))
+    found = fit_light(start, carried, Target(seen.position, of, image), objective)
     environment.log_radiance.copy_(found.log_radiance)
 
 
@@ -71,10 +81,17 @@ def lamp(height: int) -> EnvironmentLight:
 
 
 @pytest.mark.parametrize("tint", [1.0, 0.6])
-def test_a_lamp_is_found_where_it_is_and_as_bright_beside_the_sky_as_it_is(tint):
-    """All the same where the base colour is wrong by one factor, which light and base colour share."""
+@pytest.mark.parametrize(
+    ("made_of", "evenness", "steps"),
+    [("speckles", 0.0, [200]), ("patches", 0.3, 4 * [100]), ("speckles", 0.3, 4 * [100])],
+    ids=["known", "even", "uneven"],
+)
+def test_a_lamp_is_found_where_it_is_and_as_bright_beside_the_sky_as_it_is(tint, made_of, evenness, steps):
+    """All the same where the base colour is wrong by one factor, which light and base colour share; and, as fits follow
+    each other, where every point has a colour of its own."""
     torch.manual_seed(0)
-    seen, of = points(600), material(600)
+    seen = points(600)
+    of = material(600) if made_of == "speckles" else patches(seen.position)
     true = lamp(24)
     radiance = true.log_radiance.exp().flatten(1).t()
     image = from_texels(true, seen, of.roughness, GGX, None).outgoing(of, radiance)
@@ -82,7 +99,8 @@ def test_a_lamp_is_found_where_it_is_and_as_bright_beside_the_sky_as_it_is(tint)
     found = EnvironmentLight(24, 1.0)
     carried = from_texels(found, seen, of.roughness, GGX, None)
     guess = Material(of.base_color * tint, of.roughness, of.metallic)
-    fit(found, carried, guess, image, image.median().item(), steps=200)
+    for number in steps:
+        fit(found, carried, seen, guess, image, image.median().item(), number, evenness)
 
     green = found.log_radiance[1]
     row, column = divmod(int(green.argmax()), 48)
@@ -105,7 +123,7 @@ def test_where_no_point_looks_the_map_takes_after_its_surroundings():
     image = from_texels(true, seen, of.roughness, GGX, None).outgoing(of, torch.full((512, 3), 2.0))
     found = EnvironmentLight(16, 0.5)
     carried = from_texels(found, seen, of.roughness, GGX, None)
-    fit(found, carried, of, image, 1.0, steps=300)
+    fit(found, carried, seen, of, image, 1.0, steps=300)
     assert found.log_radiance[:, -2:].exp().mean().item() == pytest.approx(2.0, rel=0.35)
 
 
@@ -123,7 +141,7 @@ def test_what_a_few_points_see_alone_is_no_sun():
     carried = from_texels(found, seen, of.roughness, GGX, None)
     image = carried.outgoing(of, torch.full((2048, 3), 2.0))
     image[:12] *= 5
-    fit(found, carried, of, image, 1.0, steps=100)
+    fit(found, carried, seen, of, image, 1.0, steps=100)
     assert found.log_radiance.exp().max() < 4.0
 
 
@@ -143,6 +161,17 @@ def test_what_is_chosen_stays_in_doubt_and_nothing_is_chosen_in_doubt(gain, devi
     assert (spoken.favours(chosen=False), spoken.favours(chosen=True)) == (new, chosen)
 
 
+def test_a_base_colour_is_as_uneven_as_its_steps_are_high():
+    """Points along a line, whose neighbours are the two on either side: one step of ln 2 is crossed by 6 of 40 pairs."""
+    position = torch.arange(10.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    nearest = nearest_points(position)
+    assert sorted(nearest[5].tolist()) == [3, 4, 6, 7]
+    step = torch.where(position[:, :1] < 4.5, 0.3, 0.6).expand(-1, 3)
+    assert unevenness(step, nearest).item() == pytest.approx(math.log(2) * 6 / 40, abs=0.01)
+    assert unevenness(0.5 * step, nearest).item() == pytest.approx(unevenness(step, nearest).item(), rel=1e-5)
+    assert unevenness(step[:1], nearest_points(position[:1])) == 0
+
+
 def test_total_variation_counts_every_step_once_and_closes_the_map():
     """One column of 1 in a map of 0: it steps up and down in each of its four rows, of 32 texels."""
     values = torch.zeros(1, 4, 8)
@@ -156,5 +185,5 @@ def test_a_map_without_a_finite_answer_stays_as_it_was():
     before = environment.log_radiance.clone()
     carried = from_texels(environment, seen, of.roughness, GGX, None)
     broken = torch.full((8, 3), math.inf)
-    fit(environment, carried, of, broken, 1.0, steps=3)
+    fit(environment, carried, seen, of, broken, 1.0, steps=3)
     assert torch.equal(environment.log_radiance, before)
