@@ -77,6 +77,8 @@ def known_points(run: Run) -> Known:
 def solve_under_truth(run: Run, known: Known, fits: int) -> None:
     """Forget the light of the run, and set it anew."""
     model, settings = run.model, run.config.light
+    # The base colour is no unknown here.
+    settings = dataclasses.replace(settings, fit=dataclasses.replace(settings.fit, evenness=0.0))
     model.light.log_radiance.fill_(math.log(model.facts.median_radiance / 0.3))
     if model.lamps is not None:
         model.lamps.lit = 0
