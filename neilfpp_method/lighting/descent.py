@@ -1,4 +1,4 @@
-"""How light is descended to: with the base colour of the points unknown beside it.
+"""How a fit moves: with the base colour of the points unknown beside the light.
 
 What surfaces have learned so far they have learned under the light so far: a lamp in the wrong place leaves its glow in their
 base colour, which then holds it there. So a fit takes from them what the base colour is in the mean, and asks of each point

@@ -130,5 +130,6 @@ def _descend(
     loss = descend(unknowns, GAIN_RATE, STEPS, target, objective, lambda gain: loss_of(lamps(), gain)).item()
     settled = lamps()
     settled = FoundLamps(settled.places.detach(), settled.intensity.detach())
-    finite = math.isfinite(loss) and all(v.isfinite().all() for v in (settled.places.position, settled.intensity))
+    values = torch.cat((settled.places.position, settled.places.axis, settled.intensity))
+    finite = math.isfinite(loss) and values.isfinite().all()
     return _Settled(settled, loss) if finite else _Settled(start, math.inf)
