@@ -88,7 +88,7 @@ def total_variation(values: Float[Tensor, "C H W"]) -> Float[Tensor, ""]:
     across = torch.cat((values, values[..., :1]), -1).diff(dim=-1)
     down = values.diff(dim=1)
     size = max(1, values[0].numel())
-    return sum((step.square() + SMOOTHED**2).sqrt().sum() for step in (across, down)) / size
+    return sum(_size(step).sum() for step in (across, down)) / size
 
 
 def nearest_points(position: Float[Tensor, "N 3"]) -> Int[Tensor, "N K"]:
@@ -101,7 +101,11 @@ def unevenness(base_color: Float[Tensor, "N 3"], nearest: Int[Tensor, "N K"]) ->
     """Mean |difference of log base colour| between neighbours: an edge costs what it is, in however many steps it comes."""
     logarithm = base_color.clamp_min(DARKEST).log()
     apart = logarithm[:, None] - logarithm[nearest]
-    return (apart.square() + SMOOTHED**2).sqrt().sum() / max(1, apart.numel())
+    return _size(apart).sum() / max(1, apart.numel())
+
+
+def _size(difference: Float[Tensor, ...]) -> Float[Tensor, ...]:
+    return (difference.square() + SMOOTHED**2).sqrt()
 
 
 def tint(light: Float[Tensor, " 3"]) -> Float[Tensor, ""]:

@@ -74,8 +74,8 @@ class Transport:
 class _SumOverSources(torch.autograd.Function):
     """sources @ strength: K N T, T 3 → K N 3.
 
-    Autograd's own slope in the strength reads the sources across their order in memory, which takes 13 ms where reading them
-    along it takes 5; a fit does little else.
+    Autograd's own slope in the strength reads the sources across their order in memory, which takes longer than along it; a fit
+    does little else.
     """
 
     @staticmethod

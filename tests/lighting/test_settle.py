@@ -18,7 +18,7 @@ from neilfpp_method.lighting.settle import settle_lamps
 from neilfpp_method.lighting.transport import Transport, from_lamps, in_sight, lamp_kernel
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.structures import Material
-from tests.lighting.surfaces import half_room, patches, points
+from tests.lighting.surfaces import half_room, material, patches, points
 
 RADIUS = 0.06
 EVENNESS = LightFitConfig().evenness
@@ -27,15 +27,14 @@ TRUE = FoundLamps(
     LampPlaces(torch.tensor([[0.5, -0.3, 0.6], [-0.6, 0.4, 0.5]]), torch.tensor([[0.0, 0.0, 0.0], [0.6, 0.0, -0.8]])),
     torch.tensor([[1.0, 0.8, 0.5], [0.4, 0.5, 0.7]]),
 )
-
 WHITE = Material(torch.ones(600, 3), torch.ones(600, 1), torch.zeros(600, 1))
 
 
-def photographed(lamps: FoundLamps) -> tuple[Observed, Material, Transport]:
+def photographed(lamps: FoundLamps, speckled: bool) -> tuple[Observed, Material, Transport]:
     """Points under lamps and even light from everywhere."""
     seen = points(600)
     seen = dataclasses.replace(seen, position=4 * seen.position)
-    of = patches(seen.position)
+    of = material(600) if speckled else patches(seen.position)
     even = torch.full((600, 3), 0.3)
     beside = Transport(torch.zeros(3, 600, 0), torch.stack((even, even, 0.1 * even)))
     carried = from_lamps(lamps.places, RADIUS, seen, of.roughness, GGX, None)
@@ -44,7 +43,7 @@ def photographed(lamps: FoundLamps) -> tuple[Observed, Material, Transport]:
 
 
 def settled(start: FoundLamps, true: FoundLamps, evenness: float) -> FoundLamps:
-    seen, of, beside = photographed(true)
+    seen, of, beside = photographed(true, speckled=evenness == 0)
     objective = Objective("linear", seen.pixel.median().item(), LightFitConfig(evenness=evenness))
     return settle_lamps(start, RADIUS, beside, seen, Target(seen.position, of, seen.pixel), GGX, None, objective)
 
@@ -127,7 +126,7 @@ def test_a_lamp_is_not_held_by_base_colours_that_were_learned_under_it_elsewhere
 
 @pytest.mark.parametrize("broken", ["no points", "no lamps", "a pixel that is no number"])
 def test_where_there_is_nothing_to_go_by_lamps_stay(broken):
-    seen, of, beside = photographed(TRUE)
+    seen, of, beside = photographed(TRUE, speckled=True)
     start = TRUE
     if broken == "no points":
         seen, of, beside = seen[:0], of[:0], beside[torch.arange(0)]
