@@ -93,7 +93,7 @@ def settle_lamps(
         without = settle(_without(best.lamps, number))
         if without.loss < best.loss:
             best = without
-    return best.lamps
+    return settle(best.lamps).lamps
 
 
 def _as_bulb(lamps: FoundLamps, number: Int[Tensor, ""]) -> FoundLamps:

@@ -94,5 +94,9 @@ def solve_light(
     lit = merge(places, found.intensity, near.sources[0].mean(0), len(lamps.position))
     beside = texels.lit(sought.exp().flatten(1).t())
     lit = settle_lamps(lit, lamps.radius, beside, seen, target, lobe, scene, objective)
-    lamps.place(lit.places.position, lit.intensity, lit.places.axis)
+    # The map was found beside lamps in pieces; what it had to make up for, or left to them, is theirs or its own now.
+    near = from_lamps(lit.places, lamps.radius, seen, material.roughness, lobe, scene)
+    found = fit_light(Light(sought, lit.intensity), texels.beside(near), target, objective)
+    sought.copy_(found.log_radiance)
+    lamps.place(lit.places.position, found.intensity, lit.places.axis)
     return spoken

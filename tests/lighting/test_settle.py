@@ -70,19 +70,21 @@ def test_a_wall_hides_a_lamp():
     assert in_sight(lamps, RADIUS, x, half_room).tolist() == [[True, False, True]]
 
 
-@pytest.mark.parametrize(("evenness", "as_strong"), [(0.0, 0.03), (EVENNESS, 0.05)])
-def test_a_lamp_in_pieces_becomes_one_where_it_is(evenness, as_strong):
+@pytest.mark.parametrize(("evenness", "as_tinted"), [(0.0, 0.03), (EVENNESS, 0.06)])
+def test_a_lamp_in_pieces_becomes_one_where_it_is(evenness, as_tinted):
+    """Where base colour is not known, light near white is likelier: a little of the lamp's tint goes to the surfaces."""
     true = FoundLamps(TRUE.places[:1], TRUE.intensity[:1])
     offsets = torch.tensor([[0.12, 0.0, 0.05], [-0.1, 0.15, 0.0], [0.0, -0.2, -0.15], [0.3, 0.3, 0.3]])
     pieces = FoundLamps(LampPlaces(true.places.position + offsets, torch.zeros(4, 3)), 0.4 * true.intensity.expand(4, 3))
     found = settled(pieces, true, evenness)
     assert len(found.intensity) == 1
     torch.testing.assert_close(found.places.position, true.places.position, rtol=0, atol=0.01)
-    torch.testing.assert_close(found.intensity, true.intensity, rtol=as_strong, atol=0)
+    torch.testing.assert_close(found.intensity.sum(), true.intensity.sum(), rtol=0.03, atol=0)
+    torch.testing.assert_close(found.intensity, true.intensity, rtol=as_tinted, atol=0)
 
 
-@pytest.mark.parametrize(("evenness", "as_turned", "as_strong"), [(0.0, 0.1, 0.1), (EVENNESS, 0.2, 0.15)])
-def test_two_lamps_stay_two_and_come_to_where_they_are(evenness, as_turned, as_strong):
+@pytest.mark.parametrize("evenness", [0.0, EVENNESS])
+def test_two_lamps_stay_two_and_come_to_where_they_are(evenness):
     torch.manual_seed(0)
     start = FoundLamps(
         LampPlaces(
@@ -93,8 +95,8 @@ def test_two_lamps_stay_two_and_come_to_where_they_are(evenness, as_turned, as_s
     )
     found = settled(start, TRUE, evenness)
     torch.testing.assert_close(found.places.position, TRUE.places.position, rtol=0, atol=0.02)
-    torch.testing.assert_close(found.places.axis, TRUE.places.axis, rtol=0, atol=as_turned)
-    torch.testing.assert_close(found.intensity, TRUE.intensity, rtol=as_strong, atol=0)
+    torch.testing.assert_close(found.places.axis, TRUE.places.axis, rtol=0, atol=0.1)
+    torch.testing.assert_close(found.intensity, TRUE.intensity, rtol=0.1, atol=0)
 
 
 @pytest.mark.parametrize(("evenness", "within"), [(EVENNESS, 0.07), (0.0, math.inf)])

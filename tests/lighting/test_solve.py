@@ -67,12 +67,12 @@ def solved(seen: Observed, of: Material, rounds: int, config: IncidentLightConfi
 @pytest.mark.parametrize("true", [BULB, PANEL], ids=["bulb", "panel"])
 @pytest.mark.parametrize("known", [True, False])
 def test_a_lamp_is_found_where_it_is_as_strong_and_which_way_it_shines(true, known):
-    """Where base colour is unknown, light near white is likelier: some of the lamp's colour goes to the surfaces."""
+    """Base colours that are known may be as uneven as they like; those that are not are even but for edges."""
     lamps, _ = solved(*photographed(true, speckled=known), rounds=3, config=KNOWN if known else CONFIG)
     assert lamps.lit
     strongest = int(lamps.intensity.sum(-1).argmax())
     assert (lamps.position[strongest] - LAMP[0]).norm() < 0.03
-    assert lamps.intensity[strongest].tolist() == pytest.approx([0.9, 0.7, 0.4], rel=0.1 if known else 0.3)
+    assert lamps.intensity[strongest].tolist() == pytest.approx([0.9, 0.7, 0.4], rel=0.1)
     assert lamps.intensity[strongest].sum() > 0.9 * lamps.intensity.sum(), "nothing is elsewhere"
     torch.testing.assert_close(lamps.axis[strongest], true.axis[0], rtol=0, atol=math.radians(10))
 
