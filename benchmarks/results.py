@@ -71,6 +71,8 @@ class Options:
     compare: Literal["preset", "paper", "ladder"] = "paper"
     """preset: nothing else. paper: the free light field with and without L_ref. ladder: every light with every
     inter-reflection that goes with it."""
+    material_steps: int | None = None
+    """Steps of the stage material init; none: the preset's."""
     device: str = "auto"
     """Where to train."""
 
@@ -170,6 +172,8 @@ def main(options: Options) -> None:
     """Train, measure, and write `tables.md`."""
     config = preset(options.preset)
     config = fixed_geometry(config) if options.host == "mesh" else config
+    if options.material_steps is not None:
+        config = dataclasses.replace(config, train=dataclasses.replace(config.train, material_steps=options.material_steps))
     sections = []
     for capture in options.captures:
         rows: dict[str, dict[str, float]] = {}
