@@ -99,6 +99,15 @@ def test_two_lamps_stay_two_and_come_to_where_they_are(evenness):
     torch.testing.assert_close(found.intensity, TRUE.intensity, rtol=0.1, atol=0)
 
 
+@pytest.mark.parametrize("number", [0, 1], ids=["bulb", "panel"])
+def test_what_was_taken_for_a_panel_becomes_a_bulb_where_it_is_one(number):
+    row = slice(number, number + 1)
+    true = FoundLamps(TRUE.places[row], TRUE.intensity[row])
+    turned = LampPlaces(true.places.position + 0.05, torch.tensor([[0.6, 0.0, -0.8]]))
+    found = settled(FoundLamps(turned, true.intensity), true, EVENNESS)
+    assert found.places.axis.any() == true.places.axis.any()
+
+
 @pytest.mark.parametrize(("evenness", "within"), [(EVENNESS, 0.07), (0.0, math.inf)])
 def test_a_lamp_is_not_held_by_base_colours_that_were_learned_under_it_elsewhere(evenness, within):
     """Nothing speaks against the lamp in the wrong place but that the surfaces then have its glow painted on them."""
