@@ -335,6 +335,8 @@ class TrainConfig:
     """Steps of the joint stage; 0 is the paper's separate pipeline ("Sep.")."""
     rays: int = 4096
     """Rays per step and process."""
+    fresh: float = 1.0
+    """Share of the rays of a step that are rendered while the surface stands still; the other points are those of earlier steps."""
     seed: int = 0
     """Every random number of step k follows from seed and k alone."""
     checkpoint_every: int = 500

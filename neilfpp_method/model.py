@@ -28,6 +28,7 @@ from neilfpp_method.inter_reflection import scene_light, trace_light
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.memory import Observed, SurfaceMemory
 from neilfpp_method.lighting.solve import solve_light
+from neilfpp_method.replay import Replay, SurfacePixels
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, active_losses
 from neilfpp_method.shading.brdf import LOBES
 from neilfpp_method.shading.color import apply_response
@@ -134,6 +135,10 @@ class NeilfModel(nn.Module):
         self.lamps: Lamps | None = None
         self.memory: SurfaceMemory | None = None
         self.evidence: Evidence | None = None
+        # The surface of a borrowed host moves as its own trainer likes.
+        stands_still = not borrowed and not self.stages[Stage.MATERIAL_INIT].moves_host
+        train = config.train
+        self.replay = Replay(train.fresh, train.rays) if train.fresh < 1 and stands_still else None
         if config.light.kind != "free":
             if config.inter_reflection.mode == "soft":
                 raise UserError(
@@ -161,7 +166,10 @@ class NeilfModel(nn.Module):
         if not names:
             return {}
 
-        # 1. The host renders colour, hit position and normal. Without a geometry stage they are constants.
+        # 1. The host renders colour, hit position and normal. Without a geometry stage they are constants, and some are known.
+        replay = self.replay if self.training and not plan.moves_host else None
+        if replay is not None:
+            batch = batch[: math.ceil(replay.share * len(batch))]
         with torch.set_grad_enabled(torch.is_grad_enabled() and plan.moves_host):
             hits, terms = self._render_host(batch, names)
         if "volume" in names:
@@ -171,22 +179,23 @@ class NeilfModel(nn.Module):
 
         # 2. Rays that meet one surface, on the object, are shaded; a scaled gradient goes back to where they met it.
         rows = torch.nonzero((hits.is_hit(self.config.shading.hit_share)) & (batch.mask > 0.5))[:, 0]
-        pixels, position, normal = batch[rows], *self._surface_points(hits, rows)
+        found = self._surface_pixels(hits[rows], batch[rows])
+        seen = found if replay is None else replay.beside_earlier(found)
 
         # 3. The BRDF field says what the surface is made of.
-        material = self._material_and_priors(position, pixels.image_gradient, names, terms)
+        material = self._material_and_priors(seen, names, terms)
 
         # 4. The light says what arrives; an environment map is solved for from what has been seen, now and then.
         if self.memory is not None and self.training:
-            self._keep_fitting(Observed(position, normal, -pixels.directions, pixels.color).detach())
+            self._keep_fitting(found.detach())
 
         # 5. The rendering equation says what leaves.
-        shading = self.shade(position, normal, -pixels.directions, material, self.config.shading.train_samples)
-        terms["physical"] = losses.photometric(shading.color, pixels.color, self.facts.response, self.units.physical)
+        shading = self.shade(seen.position, seen.normal, seen.wo, material, self.config.shading.train_samples)
+        terms["physical"] = losses.photometric(shading.color, seen.pixel, self.facts.response, self.units.physical)
 
         # 6. What arrives from another surface is what that surface sends.
         if "inter_reflection" in names:
-            terms["inter_reflection"] = self._inter_reflection(position, normal)
+            terms["inter_reflection"] = self._inter_reflection(seen.position, seen.normal)
         return terms
 
     def _render_host(self, batch: PixelBatch, names: Mapping[str, float]) -> tuple[SurfaceHits, dict[str, LossTerm]]:
@@ -198,28 +207,27 @@ class NeilfModel(nn.Module):
         self.check_outputs(batch.rays, hits, color_moves="volume" in names and torch.is_grad_enabled())
         return hits, terms
 
-    def _surface_points(self, hits: SurfaceHits, rows: Tensor) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
+    def _surface_pixels(self, hits: SurfaceHits, pixels: PixelBatch) -> SurfacePixels:
         settings = self.config.loss
-        return (
-            losses.scale_gradient(hits.position[rows], settings.position_gradient),
-            losses.scale_gradient(hits.normal[rows], settings.normal_gradient),
+        return SurfacePixels(
+            position=losses.scale_gradient(hits.position, settings.position_gradient),
+            normal=losses.scale_gradient(hits.normal, settings.normal_gradient),
+            wo=-pixels.directions,
+            pixel=pixels.color,
+            image_gradient=pixels.image_gradient,
         )
 
     def _material_and_priors(
-        self,
-        position: Float[Tensor, "P 3"],
-        image_gradient: Float[Tensor, " P"],
-        names: Mapping[str, float],
-        terms: dict[str, LossTerm],
+        self, seen: SurfacePixels, names: Mapping[str, float], terms: dict[str, LossTerm]
     ) -> Material:
         if "smoothness" in names:
-            sample = self.brdf.with_gradients(position)
+            sample = self.brdf.with_gradients(seen.position)
             material = sample.material
             terms["smoothness"] = losses.smoothness(
-                sample.roughness_gradient, sample.metallic_gradient, image_gradient
+                sample.roughness_gradient, sample.metallic_gradient, seen.image_gradient
             )
         else:
-            material = self.brdf(position)
+            material = self.brdf(seen.position)
         if "lambertian" in names:
             terms["lambertian"] = losses.lambertian(material)
         return material

@@ -93,7 +93,7 @@ def fast() -> NeilfConfig:
             hessian_method="finite_difference",
         ),
         optimizer=OptimizerConfig(geometry=2e-2, radiance=5e-3, brdf=5e-3, light=3e-2, background=5e-3, beta=1e-3),
-        train=TrainConfig(sdf_steps=2_000, material_steps=800, joint_steps=200, rays=512),
+        train=TrainConfig(sdf_steps=2_000, material_steps=800, joint_steps=200, rays=512, fresh=0.25),
     )
 
 

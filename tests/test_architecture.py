@@ -20,10 +20,10 @@ SOURCES = {
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "structures"),
     ("config", "config_json"),
-    ("shading", "volume", "kernels", "schedule", "presets"),
+    ("shading", "volume", "kernels", "schedule", "presets", "ring"),
     ("fields", "data", "losses"),
     ("hosts.base", "lighting"),
-    ("hosts", "inter_reflection"),
+    ("hosts", "inter_reflection", "replay"),
     ("model",),
     ("attach", "train"),
     ("export",),

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from neilfpp_method.ring import Ring
 from neilfpp_method.structures import Indexable
 
 __all__ = ["Observed", "SurfaceMemory"]
@@ -39,9 +40,8 @@ class SurfaceMemory(nn.Module):
     def __init__(self, capacity: int, every: int) -> None:
         super().__init__()
         self.every = every
-        self.register_buffer("points", torch.zeros(capacity, 12))
-        self.filled = 0
-        self.next = 0
+        self.capacity = capacity
+        self.points = Ring(capacity, 12)
         self.waited = 0
         self.age: int | None = None
 
@@ -50,31 +50,26 @@ class SurfaceMemory(nn.Module):
         """Whether it is time to fit: `every` steps after each fit, and soon for the first time."""
         if self.age is not None:
             return self.age >= self.every
-        return self.filled == len(self.points) or (self.filled > 0 and self.waited >= PATIENCE)
+        return self.points.full or (self.points.filled > 0 and self.waited >= PATIENCE)
 
     @torch.no_grad()
     def remember(self, seen: Observed) -> None:
         """Keep some rows, in the place of the oldest; before the first fit all of them."""
-        capacity = len(self.points)
         self.waited += self.age is None
-        share = capacity if self.age is None else math.ceil(capacity / self.every)
-        kept = torch.cat((seen.position, seen.normal, seen.wo, seen.pixel), -1)[:share].to(self.points.dtype)
-        slots = torch.arange(self.next, self.next + len(kept), device=kept.device) % capacity
-        self.points[slots] = kept
-        self.next = (self.next + len(kept)) % capacity
-        self.filled = min(self.filled + len(kept), capacity)
+        share = len(seen) if self.age is None else math.ceil(self.capacity / self.every)
+        self.points.keep(torch.cat((seen.position, seen.normal, seen.wo, seen.pixel), -1)[:share])
         if self.age is not None:
             self.age += 1
 
     def recall(self) -> Observed:
         """Everything that is remembered, for a fit that is done now."""
         self.age = 0
-        return Observed(*self.points[: self.filled].split(3, -1))
+        return Observed(*self.points.kept().split(3, -1))
 
     def get_extra_state(self) -> dict[str, int | None]:
         """Where the memory stands, for checkpoints."""
-        return {"filled": self.filled, "next": self.next, "age": self.age, "waited": self.waited}
+        return {"age": self.age, "waited": self.waited}
 
     def set_extra_state(self, state: dict[str, int | None]) -> None:
         """The inverse of `get_extra_state`."""
-        self.filled, self.next, self.age, self.waited = (state[key] for key in ("filled", "next", "age", "waited"))
+        self.age, self.waited = state["age"], state["waited"]

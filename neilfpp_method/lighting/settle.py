@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from neilfpp_method.fields.lamps import LampPlaces
@@ -33,6 +33,8 @@ QUICKER = 3.0
 """Rate of axes and of logarithms of intensity over that of places."""
 GAIN_RATE = 0.1
 """Of the logarithms of the factors on base colour."""
+LEAST_GAIN = 0.01
+"""Share of the loss that a panel must save: with an axis, which a bulb has not, it explains a little more of anything."""
 FAINTEST = 1e-3
 """Of the strongest: a channel that is darker starts here, where its logarithm has a slope."""
 
@@ -56,8 +58,8 @@ def settle_lamps(
 ) -> FoundLamps:
     """Where the lamps are, which way they send and how strong they are, once all of it may change; no more than it takes.
 
-    A lamp that sends one way becomes a bulb where that explains the points better: a panel elsewhere looks much like it. Then,
-    from the weakest to the strongest, a lamp goes where the others, its power with its neighbour, do as well without it.
+    From the weakest to the strongest, a lamp goes where the others, its power with its neighbour, do as well without it. Of
+    those that are left each is tried as a panel and as a bulb: the one elsewhere looks much like the other.
 
     Args:
         found: lamps to start from, the strongest first.
@@ -83,22 +85,26 @@ def settle_lamps(
         return _descend(lamps, target, objective, lambda moved, gain: loss_of(moved, sight, gain))
 
     best = settle(found)
-    for number in torch.nonzero(found.places.axis.any(-1))[:, 0]:
-        bulb = settle(_as_bulb(best.lamps, number))
-        if bulb.loss < best.loss:
-            best = bulb
+    if not math.isfinite(best.loss):
+        return found
     for number in reversed(range(len(found.intensity))):
         if len(best.lamps.intensity) == 1:
             break
         without = settle(_without(best.lamps, number))
         if without.loss < best.loss:
             best = without
+    for number in range(len(best.lamps.intensity)):
+        pair = best, settle(_of_other_kind(best.lamps, number, seen.position))
+        panel, bulb = pair if best.lamps.places.axis[number].any() else reversed(pair)
+        best = panel if panel.loss < (1 - LEAST_GAIN) * bulb.loss else bulb
     return settle(best.lamps).lamps
 
 
-def _as_bulb(lamps: FoundLamps, number: Int[Tensor, ""]) -> FoundLamps:
-    """All lamps as they are, but one that sends alike in all directions."""
-    axis = lamps.places.axis.index_fill(0, number, 0.0)
+def _of_other_kind(lamps: FoundLamps, number: int, points: Float[Tensor, "N 3"]) -> FoundLamps:
+    """All lamps as they are, but a panel that is a bulb, or a bulb that faces the points as a panel."""
+    position, axis = lamps.places.position[number], lamps.places.axis.clone()
+    towards = safe_normalize((points - position).mean(0, keepdim=True))[0]
+    axis[number] = torch.where(axis[number].any(), 0.0, towards)
     return FoundLamps(LampPlaces(lamps.places.position, axis), lamps.intensity)
 
 

@@ -99,13 +99,14 @@ def test_two_lamps_stay_two_and_come_to_where_they_are(evenness):
     torch.testing.assert_close(found.intensity, TRUE.intensity, rtol=0.1, atol=0)
 
 
-@pytest.mark.parametrize("number", [0, 1], ids=["bulb", "panel"])
-def test_what_was_taken_for_a_panel_becomes_a_bulb_where_it_is_one(number):
+@pytest.mark.parametrize("start", [torch.zeros(3), torch.tensor([0.6, 0.0, -0.8])], ids=["from a bulb", "from a panel"])
+@pytest.mark.parametrize("number", [0, 1], ids=["a bulb", "a panel"])
+def test_a_lamp_is_of_the_kind_that_explains_the_points(number, start):
     row = slice(number, number + 1)
     true = FoundLamps(TRUE.places[row], TRUE.intensity[row])
-    turned = LampPlaces(true.places.position + 0.05, torch.tensor([[0.6, 0.0, -0.8]]))
-    found = settled(FoundLamps(turned, true.intensity), true, EVENNESS)
+    found = settled(FoundLamps(LampPlaces(true.places.position + 0.05, start[None]), true.intensity), true, EVENNESS)
     assert found.places.axis.any() == true.places.axis.any()
+    torch.testing.assert_close(found.places.axis, true.places.axis, rtol=0, atol=0.1)
 
 
 @pytest.mark.parametrize(("evenness", "within"), [(EVENNESS, 0.07), (0.0, math.inf)])
