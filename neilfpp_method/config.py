@@ -336,7 +336,7 @@ class TrainConfig:
     rays: int = 4096
     """Rays per step and process."""
     fresh: float = 1.0
-    """Share of the rays of a step that are rendered while the surface stands still; the other points are those of earlier steps."""
+    """Share of a step's rays that are rendered while the surface stands still; the other points are those of earlier steps."""
     seed: int = 0
     """Every random number of step k follows from seed and k alone."""
     checkpoint_every: int = 500
