@@ -53,7 +53,9 @@ def fast() -> NeilfConfig:
     return NeilfConfig(
         preset="fast",
         sdf=SdfConfig(encoding="hash", grid=grid, layers=1, width=64, skip=None, feature_width=15),
-        radiance=OutgoingRadianceConfig(layers=2, width=64, direction_encoding="spherical_harmonics"),
+        radiance=OutgoingRadianceConfig(
+            encoding="hash", grid=grid, layers=2, width=64, direction_encoding="spherical_harmonics"
+        ),
         brdf=BrdfConfig(
             encoding="hash",
             initial_base_color=0.3,
@@ -74,14 +76,14 @@ def fast() -> NeilfConfig:
             direction_degree=5,
         ),
         background=BackgroundConfig(layers=4, width=64, samples=16),
-        volume=VolumeConfig(radius=1.75, beta_init=0.05, initial_samples=64, rounds=2, samples=32),
+        volume=VolumeConfig(radius=1.75, beta_init=0.05, skip_empty=True, initial_samples=32, rounds=2, samples=32),
         shading=ShadingConfig(sampler="mis", train_samples=32, eval_samples=128),
         inter_reflection=InterReflectionConfig(mode="hard", rays_per_point=0.25),
         loss=LossConfig(
             unit="median",
             eikonal=0.05,
             hessian=2e-4,
-            hessian_growth=15.0,
+            hessian_growth=30.0,
             hessian_joint=2e-3,
             surface=1e-2,
             surface_joint=1e-3,
