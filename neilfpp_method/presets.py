@@ -84,7 +84,7 @@ def fast() -> NeilfConfig:
             eikonal=0.05,
             hessian=2e-4,
             hessian_growth=30.0,
-            hessian_joint=2e-3,
+            hessian_joint=6e-3,
             surface=1e-2,
             surface_joint=1e-3,
             mask=0.1,
