@@ -39,6 +39,7 @@ def config_of(name: str) -> NeilfConfig:
     return dataclasses.replace(
         config,
         loss=dataclasses.replace(config.loss, point_cloud=0.0),
+        train=dataclasses.replace(config.train, rays=RAYS),
         volume=dataclasses.replace(config.volume, beta_init=SHARP),
     )
 
@@ -77,6 +78,12 @@ def step_of(model: NeilfModel, stage: Stage, rays: int = RAYS) -> Callable[[], N
     return step
 
 
+def warm_up(model: NeilfModel, step: Callable[[], None]) -> None:
+    """Take steps of a material stage until it renders no more than it does in the long run."""
+    while model.replay is not None and model.replay.share == 1.0:
+        step()
+
+
 def peak_mebibytes(name: str) -> float:
     """What a joint step of a model adds, at its peak, to the memory of the process. Linux alone tells."""
     step = step_of(model_of(name), Stage.JOINT)
@@ -97,7 +104,10 @@ def measurements() -> Iterator[Measurement]:
     for name in PRESETS:
         model = model_of(name)
         for stage in Stage:
-            taken = in_yardsticks(step_of(model, stage), REPETITIONS)
+            step = step_of(model, stage)
+            if stage is Stage.MATERIAL_INIT:
+                warm_up(model, step)
+            taken = in_yardsticks(step, REPETITIONS)
             yield Measurement(f"step/{name}/{stage.value}", taken, "yardsticks", "lower", tolerance=0.5)
         model.eval()
         rays = _pixels().sample(EVALUATED).rays
