@@ -79,8 +79,8 @@ def test_two_processes_end_with_one_model(tmp_path, capture):
     assert seen[0].keys() == gradients[0].keys()
     for name, gradient in seen[0].items():
         torch.testing.assert_close(gradient, (gradients[0][name] + gradients[1][name]) / 2.0, rtol=1e-4, atol=1e-7)
-    largest = max(seen[0], key=lambda name: seen[0][name].norm())
-    assert (gradients[0][largest] - gradients[1][largest]).norm() > 0.1 * seen[0][largest].norm()  # other rays
+    apart = [(gradients[0][name] - gradients[1][name]).norm() > 0.1 * seen[0][name].norm() for name in seen[0]]
+    assert sum(apart) > 0.8 * len(apart)  # other rays
 
 
 def local_gradients(training, rank: int) -> dict[str, torch.Tensor]:
