@@ -29,11 +29,12 @@ from benchmarks.straightforward import straightforward
 from benchmarks.true_light import read_light
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.demo import demo_scene
+from neilfpp_method.facts import SceneFacts
 from neilfpp_method.fields.free_light import make_incident_light
 from neilfpp_method.fields.sdf import SdfField
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.kernels.process import computing_fast
-from neilfpp_method.model import NeilfModel, SceneFacts
+from neilfpp_method.model import NeilfModel
 from neilfpp_method.presets import preset
 from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.shading.sampling import shared_sphere

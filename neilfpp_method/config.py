@@ -259,6 +259,9 @@ class InterReflectionConfig:
 
     mode: Literal["off", "soft", "hard"] = "soft"
     """soft: the paper's loss. hard: a direction that meets the scene brings R from there; only the others ask the light."""
+    unseen: Literal["radiance", "shaded"] = "radiance"
+    """What hard inter-reflection takes places to send that no camera has looked at. radiance: what R guesses. shaded: what
+    their material makes of the light that they get; the images of what they shine on then teach it."""
     grid_resolution: int = 96
     """Vertices along an edge of the grid that hard inter-reflection traces in a distance field."""
     rays_per_point: float = 1.0

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from neilfpp_method import losses
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.errors import UserError
+from neilfpp_method.facts import SceneFacts, radiance_units
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.factorised_light import FactorisedLightField
@@ -28,10 +29,10 @@ from neilfpp_method.inter_reflection import scene_light, trace_light
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.memory import Observed, SurfaceMemory
 from neilfpp_method.lighting.solve import solve_light
+from neilfpp_method.lighting.transport import SceneTracer
 from neilfpp_method.replay import Replay, SurfacePixels
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, active_losses
 from neilfpp_method.shading.brdf import LOBES
-from neilfpp_method.shading.color import apply_response
 from neilfpp_method.shading.frame import dot
 from neilfpp_method.shading.rendering_equation import shade
 from neilfpp_method.shading.sampling import Technique, sample_directions
@@ -44,27 +45,13 @@ from neilfpp_method.structures import (
     Shading,
     SurfaceHits,
 )
+from neilfpp_method.unseen import SeenPlaces, shade_unseen
 
-__all__ = ["Maps", "NeilfModel", "RadianceUnits", "SceneFacts"]
+__all__ = ["Maps", "NeilfModel"]
 
 
-@dataclass(frozen=True)
-class SceneFacts:
-    """What the images of a capture decide before training.
-
-    Attributes:
-        response: "linear" (HDR) or "srgb" (LDR): what a pixel is of radiance.
-        median_radiance: median linear luminance of the object's pixels; the first render matches it.
-        radiance_scale: the largest radiance that R can reach.
-        background: "none", "constant" or "inverted_sphere".
-        background_color: linear RGB of a constant background.
-    """
-
-    response: str
-    median_radiance: float
-    radiance_scale: float
-    background: str
-    background_color: tuple[float, float, float] = (0.0, 0.0, 0.0)
+SECOND_SAMPLES = 16
+"""Incident directions of a place that no camera sees, where what it sends is shaded."""
 
 
 @dataclass(frozen=True)
@@ -84,23 +71,6 @@ class Maps:
     opacity: Float[Tensor, "N 1"]
 
 
-@dataclass(frozen=True)
-class RadianceUnits:
-    """What the losses on radiance are measured in, each in the units that it compares (METHOD §4, last line)."""
-
-    volume: float
-    physical: float
-    incident: float
-
-
-def radiance_units(config: NeilfConfig, facts: SceneFacts) -> RadianceUnits:
-    """The units that `config.loss.unit` names."""
-    if config.loss.unit == "activation":
-        return RadianceUnits(facts.radiance_scale, 1.0, 1.0)
-    pixel = apply_response(torch.tensor(facts.median_radiance), facts.response).item()
-    return RadianceUnits(pixel, pixel, facts.median_radiance)
-
-
 class NeilfModel(nn.Module):
     """The method on top of any host.
 
@@ -112,7 +82,7 @@ class NeilfModel(nn.Module):
             module's, though gradients reach it in the joint stage.
 
     Raises:
-        UserError: the light and the inter-reflection of the settings do not go together.
+        UserError: settings of the light and of the inter-reflection do not go together.
     """
 
     def __init__(self, host: Host, config: NeilfConfig, facts: SceneFacts, borrowed: bool = False) -> None:
@@ -139,6 +109,14 @@ class NeilfModel(nn.Module):
         stands_still = not borrowed and not self.stages[Stage.MATERIAL_INIT].moves_host
         train = config.train
         self.replay = Replay(train.fresh, train.rays) if train.fresh < 1 and stands_still else None
+        self.seen: SeenPlaces | None = None
+        if config.inter_reflection.unseen == "shaded":
+            if config.inter_reflection.mode != "hard":
+                raise UserError(
+                    f"places that no camera sees are shaded, with inter-reflection '{config.inter_reflection.mode}'",
+                    "set --config.inter-reflection.mode hard, or --config.inter-reflection.unseen radiance",
+                )
+            self.seen = SeenPlaces(config.volume.radius)
         if config.light.kind != "free":
             if config.inter_reflection.mode == "soft":
                 raise UserError(
@@ -174,6 +152,8 @@ class NeilfModel(nn.Module):
             hits, terms = self._render_host(batch, names)
         if "volume" in names:
             terms["volume"] = losses.photometric(hits.color, batch.color, self.facts.response, self.units.volume)
+        if self.seen is not None and self.training:
+            self.seen.remember(hits.position[hits.is_hit(self.config.shading.hit_share)])
         if not plan.moves_material:
             return terms
 
@@ -277,7 +257,20 @@ class NeilfModel(nn.Module):
         return scene.radiance.index_put((point, direction), light)
 
     def _scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
+        """What the scene sends: R, and where no camera looked what material and light say."""
+        scene = self._by_radiance(x, wi)
+        if self.seen is None:
+            return scene
+        return shade_unseen(scene, x.detach(), wi, self.seen, self.host, self.config.shading.hit_share, self._leaving)
+
+    def _by_radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
         return scene_light(self.host, x, wi, self.config.inter_reflection, self.config.shading.hit_share)
+
+    def _leaving(
+        self, position: Float[Tensor, "K 3"], normal: Float[Tensor, "K 3"], wo: Float[Tensor, "K 3"]
+    ) -> Float[Tensor, "K 3"]:
+        """What unseen places send, by R and the light that they get."""
+        return self.shade(position, normal, wo, self.brdf(position), SECOND_SAMPLES, self._by_radiance).color
 
     def shade(
         self,
@@ -286,9 +279,13 @@ class NeilfModel(nn.Module):
         wo: Float[Tensor, "N 3"],
         material: Material,
         samples: int,
+        scene: SceneTracer | None = None,
     ) -> Shading:
-        """Outgoing radiance towards wo by the rendering equation, from `samples` incident directions per point."""
-        settings = self.config.shading
+        """Outgoing radiance towards wo by the rendering equation, from `samples` incident directions per point.
+
+        `scene`: what hard inter-reflection asks; none: `_scene_light`.
+        """
+        settings, scene = self.config.shading, scene or self._scene_light
         # Without a lobe there is nothing for a lobe to sample: the cosine has no variance left that light does not bring.
         without_lobe = {"mis": "cosine", "lobe": "cosine"}
         sampler = settings.sampler if settings.specular else without_lobe.get(settings.sampler, settings.sampler)
@@ -296,7 +293,7 @@ class NeilfModel(nn.Module):
         drawn = sample_directions(sampler, about, wo, roughness, samples, self.lobe, self.training, self._sky(about))
         if self.config.inter_reflection.mode == "hard":
             wi = drawn.wi.expand(len(position), -1, -1)
-            incident = self._before_light(self._scene_light(position, wi), position, wi)
+            incident = self._before_light(scene(position, wi), position, wi)
         elif len(drawn.wi) < len(position) and not isinstance(self.light, EnvironmentLight):
             incident = self.light.radiance(position, drawn.wi, dot(drawn.wi, about) > 0)
         else:
@@ -308,7 +305,7 @@ class NeilfModel(nn.Module):
         rays = self.lamps.rays_from(position)
         radiance = self.lamps.arriving(rays)
         if self.config.inter_reflection.mode == "hard":
-            radiance = radiance * (self._scene_light(position, rays.wi).distance >= rays.distance)[..., None]
+            radiance = radiance * (self._by_radiance(position, rays.wi).distance >= rays.distance)[..., None]
         lit = shade(material, normal, wo, rays.samples(), radiance, self.lobe, settings.specular)
         return Shading(shading.color + lit.color, shading.diffuse + lit.diffuse, shading.specular + lit.specular)
 

@@ -24,19 +24,23 @@ class Ring(nn.Module):
         self.next = 0
 
     @property
+    def capacity(self) -> int:
+        """How many rows are kept."""
+        return len(self.rows)
+
+    @property
     def full(self) -> bool:
         """Whether what is kept next takes the place of something."""
-        return self.filled == len(self.rows)
+        return self.filled == self.capacity
 
     @torch.no_grad()
     def keep(self, rows: Float[Tensor, "N W"]) -> None:
         """Keep rows, the first ones where there are more than fit."""
-        capacity = len(self.rows)
-        rows = rows[:capacity].to(self.rows.dtype)
-        slots = torch.arange(self.next, self.next + len(rows), device=rows.device) % capacity
+        rows = rows[: self.capacity].to(self.rows.dtype)
+        slots = torch.arange(self.next, self.next + len(rows), device=rows.device) % self.capacity
         self.rows[slots] = rows
-        self.next = (self.next + len(rows)) % capacity
-        self.filled = min(self.filled + len(rows), capacity)
+        self.next = (self.next + len(rows)) % self.capacity
+        self.filled = min(self.filled + len(rows), self.capacity)
 
     def kept(self) -> Float[Tensor, "K W"]:
         """Everything that is remembered, in no order."""

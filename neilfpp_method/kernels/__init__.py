@@ -1,14 +1,14 @@
-"""Hash-grid encoding: one contract, several backends.
+"""What is worth code of its own: hash-grid encoding, and rays through a sampled distance field.
 
-Every backend computes what `reference.encode` computes, which the tests hold it to. A grid's setting `backend` names one;
-"auto" takes the compiled loops on a CPU, Triton's kernels on a GPU, and the reference anywhere else.
+Every backend of the encoding computes what `reference.encode` computes, which the tests hold it to. A grid's setting
+`backend` names one; "auto" takes the compiled loops on a CPU, Triton's kernels on a GPU, and the reference anywhere else.
 """
 
 from __future__ import annotations
 
 import importlib
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 
 from jaxtyping import Float
@@ -19,7 +19,7 @@ from neilfpp_method.kernels import reference
 from neilfpp_method.kernels.function import Kernels, encode_with, fits
 from neilfpp_method.kernels.grid import Encoded, GridSpec, grid_spec
 
-__all__ = ["Encoded", "GridSpec", "encode", "grid_spec"]
+__all__ = ["Encoded", "GridSpec", "encode", "grid_spec", "ray_tracer"]
 
 FASTEST: Mapping[str, str] = {"cpu": "cpu", "cuda": "triton"}
 """The backend of each kind of device; the reference runs on those that are not named."""
@@ -64,3 +64,15 @@ def _kernels(backend: str, device: str) -> Kernels | None:
     if device not in module.KERNELS.devices:
         raise UserError(f"hash-grid backend '{name}' does not run on {device}", "set the grid's backend to auto")
     return module.KERNELS
+
+
+@lru_cache(maxsize=8)
+def ray_tracer(device: str) -> Callable[..., None] | None:
+    """`tracing.sphere_trace`, where it runs on a device of this kind."""
+    if device != "cpu":
+        return None
+    try:
+        return importlib.import_module("neilfpp_method.kernels.tracing").sphere_trace
+    except ImportError as error:
+        warnings.warn(f"rays are traced by the slow reference: {error}", RuntimeWarning, stacklevel=3)
+        return None

@@ -1,9 +1,9 @@
-"""The loops of the CPU backend, compiled by Numba on first use and kept on disk from then on.
+"""The loops of the CPU, of hash grids and of rays, compiled by Numba on first use and kept on disk from then on.
 
 They hold no lock of the interpreter, start no threads and add up in a fixed order. All compiled code stands in this one
 file, because what is kept on disk is renewed when its own file changes, and for no other.
 
-A grid comes in parts, one entry per level: `offsets` (first table row; and the end), `cells` along an edge, and `dense`.
+A hash grid comes in parts, one entry per level: `offsets` (first table row; and the end), `cells` along an edge, and `dense`.
 The vertices of a cell are numbered x + 2 y + 4 z, each coordinate 0 or 1. Arrays are dense, and all of one float type.
 """
 
@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 from numba import njit
 
-__all__ = ["add_to_table", "interpolate", "pull_to_points"]
+__all__ = ["add_to_table", "interpolate", "pull_to_points", "sphere_trace"]
 
 BLOCK = 128  # points that take all levels in turn: what they write stays in the nearest cache
 Y_PRIME, Z_PRIME = np.uint32(2654435761), np.uint32(805459861)  # of the spatial hash
@@ -192,3 +192,42 @@ def pull_to_points(points, table, offsets, cells, dense, features, jacobian, wit
                 to_y += by_y * dy
                 to_z += by_z * dz
         gradient[n, 0], gradient[n, 1], gradient[n, 2] = to_x, to_y, to_z
+
+
+@compiled
+def sphere_trace(grid, radius, origins, directions, least, most_steps, distance, hit, start, stop):
+    """Write how far the rays from `start` to `stop` go, and whether they come closer to a surface than `least`."""
+    number = grid.dtype.type
+    cells = len(grid) - 1
+    edge, reach = number(2 * radius / cells), number(radius)
+    for n in range(start, stop):
+        gone, met = number(0), False
+        for _ in range(most_steps):
+            x = origins[n, 0] + gone * directions[n, 0]
+            y = origins[n, 1] + gone * directions[n, 1]
+            z = origins[n, 2] + gone * directions[n, 2]
+            if abs(x) > reach or abs(y) > reach or abs(z) > reach:
+                break
+            clearance = _at_vertices(grid, (x + reach) / edge, (y + reach) / edge, (z + reach) / edge, cells)
+            if clearance < least:
+                met = True
+                break
+            gone += max(clearance, least)
+        distance[n], hit[n] = gone, met
+
+
+@compiled
+def _at_vertices(grid, x, y, z, cells):
+    """Trilinear interpolation at a place in units of cells; what is not a number takes the first cell, and stays none."""
+    number = grid.dtype.type
+    last = number(cells - 1)
+    low_x, low_y, low_z = min(np.floor(x), last), min(np.floor(y), last), min(np.floor(z), last)
+    i, j, k = (int(low_x) if low_x > 0 else 0), (int(low_y) if low_y > 0 else 0), (int(low_z) if low_z > 0 else 0)
+    x, y, z = x - low_x, y - low_y, z - low_z
+    near = grid[k, j, i] + x * (grid[k, j, i + 1] - grid[k, j, i])
+    far = grid[k, j + 1, i] + x * (grid[k, j + 1, i + 1] - grid[k, j + 1, i])
+    front = near + y * (far - near)
+    near = grid[k + 1, j, i] + x * (grid[k + 1, j, i + 1] - grid[k + 1, j, i])
+    far = grid[k + 1, j + 1, i] + x * (grid[k + 1, j + 1, i + 1] - grid[k + 1, j + 1, i])
+    back = near + y * (far - near)
+    return front + z * (back - front)

@@ -40,7 +40,6 @@ class SurfaceMemory(nn.Module):
     def __init__(self, capacity: int, every: int) -> None:
         super().__init__()
         self.every = every
-        self.capacity = capacity
         self.points = Ring(capacity, 12)
         self.waited = 0
         self.age: int | None = None
@@ -56,7 +55,7 @@ class SurfaceMemory(nn.Module):
     def remember(self, seen: Observed) -> None:
         """Keep some rows, in the place of the oldest; before the first fit all of them."""
         self.waited += self.age is None
-        share = len(seen) if self.age is None else math.ceil(self.capacity / self.every)
+        share = len(seen) if self.age is None else math.ceil(self.points.capacity / self.every)
         self.points.keep(torch.cat((seen.position, seen.normal, seen.wo, seen.pixel), -1)[:share])
         if self.age is not None:
             self.age += 1

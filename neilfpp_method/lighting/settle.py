@@ -33,7 +33,7 @@ QUICKER = 3.0
 """Rate of axes and of logarithms of intensity over that of places."""
 GAIN_RATE = 0.1
 """Of the logarithms of the factors on base colour."""
-LEAST_GAIN = 0.01
+PANEL_GAIN = 0.01
 """Share of the loss that a panel must save: with an axis, which a bulb has not, it explains a little more of anything."""
 FAINTEST = 1e-3
 """Of the strongest: a channel that is darker starts here, where its logarithm has a slope."""
@@ -96,7 +96,7 @@ def settle_lamps(
     for number in range(len(best.lamps.intensity)):
         pair = best, settle(_of_other_kind(best.lamps, number, seen.position))
         panel, bulb = pair if best.lamps.places.axis[number].any() else reversed(pair)
-        best = panel if panel.loss < (1 - LEAST_GAIN) * bulb.loss else bulb
+        best = panel if panel.loss < (1 - PANEL_GAIN) * bulb.loss else bulb
     return settle(best.lamps).lamps
 
 

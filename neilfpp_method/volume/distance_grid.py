@@ -13,6 +13,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
+from neilfpp_method.kernels import ray_tracer
+
 __all__ = ["GridHits", "cell_size", "look_up", "sample_grid", "trace_grid"]
 
 CHUNK = 65_536
@@ -58,22 +60,30 @@ def trace_grid(
 ) -> GridHits:
     """Sphere tracing: each step goes as far as the distance allows, and at least a quarter of a cell.
 
-    Rays that have ended are left out of the next steps where that is free, on a CPU; elsewhere all take all steps, and the
-    host never waits for the device.
+    On a CPU by compiled loops; elsewhere all rays take all steps together, and the host never waits for the device.
     """
-    cell = cell_size(grid, radius)
-    distance, hit = origins.new_zeros(len(origins)), origins.new_zeros(len(origins), dtype=torch.bool)
-    rows = torch.arange(len(origins), device=origins.device)
+    least = HIT_CELLS * cell_size(grid, radius)
+    compiled = ray_tracer(origins.device.type)
+    if compiled is None or grid.dtype.itemsize < 4:
+        return _trace_together(grid, radius, origins, directions, least)
+    found = GridHits(grid.new_empty(len(origins)), grid.new_empty(len(origins), dtype=torch.bool))
+    compiled(grid, radius, origins.to(grid.dtype), directions.to(grid.dtype), least, STEPS, found.distance, found.hit)
+    return found
+
+
+def _trace_together(
+    grid: Float[Tensor, "R R R"],
+    radius: float,
+    origins: Float[Tensor, "P 3"],
+    directions: Float[Tensor, "P 3"],
+    least: float,
+) -> GridHits:
+    distance, hit = torch.zeros_like(origins[:, 0]), torch.zeros_like(origins[:, 0], dtype=torch.bool)
+    gone = hit
     for _ in range(STEPS):
-        point = origins[rows] + distance[rows, None] * directions[rows]
-        clearance = look_up(grid, radius, point)
-        met = clearance < HIT_CELLS * cell
-        gone = point.abs().amax(-1) > radius
-        hit[rows] = met & ~gone
-        going = ~met & ~gone
-        distance[rows] += torch.where(going, clearance.clamp_min(HIT_CELLS * cell), 0.0)
-        if origins.device.type == "cpu":
-            rows = rows[going]
-            if not len(rows):
-                break
+        point = origins + distance[:, None] * directions
+        clearance = look_up(grid, radius, point).to(distance.dtype)
+        gone = gone | (point.abs().amax(-1) > radius)
+        hit = hit | ((clearance < least) & ~gone)
+        distance = distance + torch.where(hit | gone, 0.0, clearance.clamp_min(least))
     return GridHits(distance, hit)

@@ -28,7 +28,8 @@ from neilfpp_method.evaluate.views import (
     render_view,
     surface_points,
 )
-from neilfpp_method.model import Maps, NeilfModel, SceneFacts
+from neilfpp_method.facts import SceneFacts
+from neilfpp_method.model import Maps, NeilfModel
 from neilfpp_method.presets import preset
 from neilfpp_method.structures import Material, RayBatch
 from neilfpp_method.train.run import Run

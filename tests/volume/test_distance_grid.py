@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from torch.nn.functional import normalize
 
+from neilfpp_method.volume import distance_grid
 from neilfpp_method.volume.distance_grid import cell_size, look_up, sample_grid, trace_grid
 
 RADIUS = 1.5
@@ -54,3 +56,32 @@ def test_a_ray_that_leaves_the_cube_hits_nothing():
     origins = torch.tensor([[0.0, 0.0, 0.9]]).expand(3, 3)
     found = trace_grid(grid, RADIUS, origins, torch.eye(3))
     assert not found.hit.any()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("field", [sphere, plate])
+def test_compiled_loops_go_where_the_reference_goes(field, threads, monkeypatch):
+    torch.manual_seed(0)
+    grid = sample_grid(field, RADIUS, 33, torch.zeros(1, dtype=torch.float64))
+    origins = 3 * torch.rand(5000, 3, dtype=torch.float64) - 1.5
+    directions = normalize(torch.randn(5000, 3, dtype=torch.float64), dim=-1)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(threads)
+        found = trace_grid(grid, RADIUS, origins, directions)
+    finally:
+        torch.set_num_threads(before)
+    monkeypatch.setattr(distance_grid, "ray_tracer", lambda device: None)
+    expected = trace_grid(grid, RADIUS, origins, directions)
+    assert found.hit.any()
+    assert not found.hit.all()
+    assert torch.equal(found.hit, expected.hit)
+    torch.testing.assert_close(found.distance, expected.distance, atol=1e-9, rtol=0.0)
+
+
+def test_rays_that_are_no_rays_hit_nothing():
+    grid = sample_grid(sphere, RADIUS, 17, torch.zeros(1))
+    broken = torch.tensor([[torch.nan, 0.0, 0.0], [torch.inf, 0.0, 0.0], [0.0, -torch.inf, torch.nan]])
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3)
+    assert not trace_grid(grid, RADIUS, broken, up).hit.any()
+    assert not trace_grid(grid, RADIUS, up, broken).hit.any()
