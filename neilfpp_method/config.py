@@ -218,6 +218,8 @@ class VolumeConfig:
     """In training, rays skip what a coarse grid of the SDF shows to be empty. Evaluation takes whole rays."""
     initial_samples: int = 128
     """SDF queries per ray of the first round; also those added in each refinement."""
+    narrowed_samples: int = 64
+    """The same for rays that skip empty space: what is left of them is short."""
     rounds: int = 5
     """Most refinement rounds."""
     bisections: int = 10

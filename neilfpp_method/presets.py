@@ -76,7 +76,16 @@ def fast() -> NeilfConfig:
             direction_degree=5,
         ),
         background=BackgroundConfig(layers=4, width=64, samples=16),
-        volume=VolumeConfig(radius=1.75, beta_init=0.05, skip_empty=True, initial_samples=64, rounds=2, samples=32),
+        volume=VolumeConfig(
+            radius=1.75,
+            beta_init=0.05,
+            skip_empty=True,
+            initial_samples=64,
+            narrowed_samples=32,
+            rounds=2,
+            bisections=5,
+            samples=32,
+        ),
         shading=ShadingConfig(sampler="mis", train_samples=32, eval_samples=128),
         inter_reflection=InterReflectionConfig(mode="hard", rays_per_point=0.25),
         loss=LossConfig(

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from neilfpp_method import losses
-from neilfpp_method.config import NeilfConfig
+from neilfpp_method.config import NeilfConfig, VolumeConfig
 from neilfpp_method.fields.background import InvertedSphere
 from neilfpp_method.fields.outgoing_radiance import MID_GREY, OutgoingRadianceField
 from neilfpp_method.fields.sdf import SdfField, SdfSample
@@ -21,7 +21,7 @@ from neilfpp_method.volume.compositing import Weights, composite, render_weights
 from neilfpp_method.volume.density import LaplaceDensity
 from neilfpp_method.volume.distance_grid import cell_size, sample_grid, trace_grid
 from neilfpp_method.volume.empty_space import EmptySpace
-from neilfpp_method.volume.intersect import sphere_interval
+from neilfpp_method.volume.intersect import Interval, sphere_interval
 from neilfpp_method.volume.samplers import error_bounded_samples, uniform_samples
 
 __all__ = ["VolSdfHost"]
@@ -189,9 +189,11 @@ class VolSdfHost(nn.Module):
 
     def _march(self, rays: RayBatch) -> March:
         interval = sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
+        volume = self.config.volume
         if self.empty_space is not None and self.training:
             interval = self.empty_space.narrow(self.sdf, rays, interval, self.surface_width())
-        distances = self._sample(rays, interval.near, interval.far)
+            volume = replace(volume, initial_samples=volume.narrowed_samples)
+        distances = self._sample(rays, interval, volume)
         points = rays.origins[:, None] + distances[..., None] * rays.directions[:, None]
         surface = self._surface(points.reshape(-1, 3))
         density = self.density(surface.distance).reshape(distances.shape)
@@ -202,8 +204,8 @@ class VolSdfHost(nn.Module):
         hits = self._blend(rays, points, distances, weights, normals, radiance)
         return March(points, surface, weights, hits)
 
-    def _sample(self, rays: RayBatch, near: Float[Tensor, " N"], far: Float[Tensor, " N"]) -> Float[Tensor, "N M"]:
-        volume = self.config.volume
+    def _sample(self, rays: RayBatch, interval: Interval, volume: VolumeConfig) -> Float[Tensor, "N M"]:
+        near, far = interval.near, interval.far
         if volume.sampler == "uniform":
             return uniform_samples(near, far, volume.samples, self.training)
         with torch.no_grad():

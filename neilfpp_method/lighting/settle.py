@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -26,7 +26,8 @@ from neilfpp_method.shading.frame import safe_normalize
 
 __all__ = ["settle_lamps"]
 
-STEPS = 100
+STEPS, FEWER_STEPS = 100, 50
+"""Of a descent, and of one from where all has settled but for a lamp that is gone."""
 RATE = 0.02
 """Scene units per step, at the start."""
 QUICKER = 3.0
@@ -43,6 +44,7 @@ FAINTEST = 1e-3
 class _Settled:
     lamps: FoundLamps
     loss: float
+    log_gain: Float[Tensor, "#N 3"] | None = None
 
 
 @torch.no_grad()
@@ -79,25 +81,25 @@ def settle_lamps(
         misfit = objective.misfit(lamps.intensity, Transport(kernel, beside.scene), target, gain)
         return misfit + objective.price(brought.mean(-1), all_light)
 
-    def settle(lamps: FoundLamps) -> _Settled:
+    def settle(start: _Settled, steps: int) -> _Settled:
         # A shadow's edge has no derivative here: what is hidden at the start stays so, and the next fit looks again.
-        sight = in_sight(lamps.places, radius, seen.position, scene)
-        return _descend(lamps, target, objective, lambda moved, gain: loss_of(moved, sight, gain))
+        sight = in_sight(start.lamps.places, radius, seen.position, scene)
+        return _descend(start, steps, target, objective, lambda moved, gain: loss_of(moved, sight, gain))
 
-    best = settle(found)
+    best = settle(_Settled(found, math.inf), STEPS)
     if not math.isfinite(best.loss):
         return found
     for number in reversed(range(len(found.intensity))):
         if len(best.lamps.intensity) == 1:
             break
-        without = settle(_without(best.lamps, number))
+        without = settle(replace(best, lamps=_without(best.lamps, number)), FEWER_STEPS)
         if without.loss < best.loss:
             best = without
     for number in range(len(best.lamps.intensity)):
-        pair = best, settle(_of_other_kind(best.lamps, number, seen.position))
-        panel, bulb = pair if best.lamps.places.axis[number].any() else reversed(pair)
+        other = settle(replace(best, lamps=_of_other_kind(best.lamps, number, seen.position)), STEPS)
+        panel, bulb = (best, other) if best.lamps.places.axis[number].any() else (other, best)
         best = panel if panel.loss < (1 - PANEL_GAIN) * bulb.loss else bulb
-    return settle(best.lamps).lamps
+    return settle(best, STEPS).lamps
 
 
 def _of_other_kind(lamps: FoundLamps, number: int, points: Float[Tensor, "N 3"]) -> FoundLamps:
@@ -118,24 +120,28 @@ def _without(lamps: FoundLamps, number: int) -> FoundLamps:
 
 
 def _descend(
-    start: FoundLamps,
+    start: _Settled,
+    steps: int,
     target: Target,
     objective: Objective,
     loss_of: Callable[[FoundLamps, Float[Tensor, "#N 3"]], Float[Tensor, ""]],
 ) -> _Settled:
     """To the nearest minimum of a loss over place, axis and intensity. Where that leads to what is not finite: the start."""
-    bare = start.places.axis.square().sum(-1, keepdim=True) == 0
-    position = start.places.position.clone().requires_grad_()
-    axis = start.places.axis.clone().requires_grad_()
-    log_intensity = start.intensity.clamp_min(FAINTEST * start.intensity.max()).log().requires_grad_()
+    first = start.lamps
+    bare = first.places.axis.square().sum(-1, keepdim=True) == 0
+    position = first.places.position.clone().requires_grad_()
+    axis = first.places.axis.clone().requires_grad_()
+    log_intensity = first.intensity.clamp_min(FAINTEST * first.intensity.max()).log().requires_grad_()
 
     def lamps() -> FoundLamps:
         return FoundLamps(LampPlaces(position, safe_normalize(axis).masked_fill(bare, 0.0)), log_intensity.exp())
 
     unknowns = (Unknown(position, RATE), Unknown(axis, QUICKER * RATE), Unknown(log_intensity, QUICKER * RATE))
-    loss = descend(unknowns, GAIN_RATE, STEPS, target, objective, lambda gain: loss_of(lamps(), gain)).item()
-    settled = lamps()
+    descent = descend(
+        unknowns, GAIN_RATE, steps, target, objective, lambda gain: loss_of(lamps(), gain), start.log_gain
+    )
+    loss, settled = descent.loss.item(), lamps()
     settled = FoundLamps(settled.places.detach(), settled.intensity.detach())
     values = torch.cat((settled.places.position, settled.places.axis, settled.intensity))
     finite = math.isfinite(loss) and values.isfinite().all()
-    return _Settled(settled, loss) if finite else _Settled(start, math.inf)
+    return _Settled(settled, loss, descent.log_gain) if finite else replace(start, loss=math.inf)
