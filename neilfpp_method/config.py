@@ -228,6 +228,8 @@ class VolumeConfig:
     """Bound on the opacity's error."""
     samples: int = 64
     """Final samples per ray."""
+    normal_radius: float = 0.0
+    """Surfaces are shaded with the normal of a neighbourhood of this radius, edges kept; 0: with that of the hit alone."""
     hit_radius: float = 0.05
     """The blending weight within this distance of the blended hit is its concentration: a sharp surface has nearly all."""
 

@@ -23,7 +23,7 @@ from neilfpp_method.fields.factorised_light import FactorisedLightField
 from neilfpp_method.fields.free_light import make_incident_light
 from neilfpp_method.fields.incident_light import IncidentLightField
 from neilfpp_method.fields.lamps import Lamps
-from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised
+from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
 from neilfpp_method.inter_reflection import scene_light, trace_light
 from neilfpp_method.lighting.fit import Evidence
@@ -33,7 +33,7 @@ from neilfpp_method.lighting.transport import SceneTracer
 from neilfpp_method.replay import Replay, SurfacePixels
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, active_losses
 from neilfpp_method.shading.brdf import LOBES
-from neilfpp_method.shading.frame import dot
+from neilfpp_method.shading.frame import dot, safe_normalize
 from neilfpp_method.shading.rendering_equation import shade
 from neilfpp_method.shading.sampling import Technique, sample_directions
 from neilfpp_method.structures import (
@@ -191,7 +191,7 @@ class NeilfModel(nn.Module):
         settings = self.config.loss
         return SurfacePixels(
             position=losses.scale_gradient(hits.position, settings.position_gradient),
-            normal=losses.scale_gradient(hits.normal, settings.normal_gradient),
+            normal=losses.scale_gradient(self.shading_normals(hits.position, hits.normal), settings.normal_gradient),
             wo=-pixels.directions,
             pixel=pixels.color,
             image_gradient=pixels.image_gradient,
@@ -241,6 +241,13 @@ class NeilfModel(nn.Module):
         """Base colour, roughness and metallic at points of the scene frame."""
         return self.brdf(x)
 
+    def shading_normals(self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """Unit normals at hits as surfaces are shaded with them; their gradient is that of the hits' normals."""
+        if not isinstance(self.host, SmoothsNormals):
+            return normal
+        smooth = self.host.smooth_normals(position.detach(), normal.detach())
+        return safe_normalize(normal + (smooth - normal).detach())
+
     def incident_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
         """Linear radiance that arrives at x from wi: from the light, or in hard inter-reflection from the scene before it."""
         if self.config.inter_reflection.mode != "hard":
@@ -270,6 +277,7 @@ class NeilfModel(nn.Module):
         self, position: Float[Tensor, "K 3"], normal: Float[Tensor, "K 3"], wo: Float[Tensor, "K 3"]
     ) -> Float[Tensor, "K 3"]:
         """What unseen places send, by R and the light that they get."""
+        normal = self.shading_normals(position, normal)
         return self.shade(position, normal, wo, self.brdf(position), SECOND_SAMPLES, self._by_radiance).color
 
     def shade(
@@ -325,11 +333,13 @@ class NeilfModel(nn.Module):
         hits = self.host.render(rays)
         size = len(rays)
         surfaces = torch.zeros(size, 11, dtype=hits.color.dtype, device=hits.color.device)
-        rgb = hits.color.clone()
+        rgb, normals = hits.color.clone(), hits.normal.clone()
         # A picture has no holes: where a pixel sees two surfaces, too blurred to learn from, it shows what lies between them.
         rows = torch.nonzero(hits.opacity > 0.5)[:, 0]
         if with_material and len(rows):
-            position, normal, wo = hits.position[rows], hits.normal[rows], -rays.directions[rows]
+            position, wo = hits.position[rows], -rays.directions[rows]
+            normal = self.shading_normals(position, hits.normal[rows])
+            normals[rows] = normal
             material = self.brdf(position)
             shading = self.shade(position, normal, wo, material, self.config.shading.eval_samples)
             rgb[rows] = shading.color
@@ -339,7 +349,7 @@ class NeilfModel(nn.Module):
         diffuse, specular, base_color, roughness, metallic = surfaces.split([3, 3, 3, 1, 1], dim=-1)
         depth = ((hits.position - rays.origins) * rays.directions).sum(-1, keepdim=True)
         return Maps(
-            rgb, hits.color, diffuse, specular, base_color, roughness, metallic, hits.normal, depth, hits.opacity[:, None]
+            rgb, hits.color, diffuse, specular, base_color, roughness, metallic, normals, depth, hits.opacity[:, None]
         )
 
     # ------------------------------------------------------------------------------------------------------- parameters

@@ -85,6 +85,7 @@ def fast() -> NeilfConfig:
             rounds=2,
             bisections=5,
             samples=32,
+            normal_radius=0.15,
         ),
         shading=ShadingConfig(sampler="mis", train_samples=32, eval_samples=128),
         inter_reflection=InterReflectionConfig(mode="hard", rays_per_point=0.25),

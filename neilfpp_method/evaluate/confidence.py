@@ -83,7 +83,8 @@ def gather_evidence(run: Run) -> Evidence:
         rows = torch.nonzero(hits.is_hit(run.config.shading.hit_share))[:, 0]
         if not len(rows):
             continue
-        position, normal, wo, seen = hits.position[rows], hits.normal[rows], -part.directions[rows], part.color[rows]
+        position, wo, seen = hits.position[rows], -part.directions[rows], part.color[rows]
+        normal = model.shading_normals(position, hits.normal[rows])
         material = model.materials(position)
         shading = model.shade(position, normal, wo, material, run.config.shading.eval_samples)
         shown = apply_response(shading.color, model.facts.response)

@@ -26,6 +26,7 @@ __all__ = [
     "LightsItself",
     "Regularised",
     "RegularisedHits",
+    "SmoothsNormals",
 ]
 
 
@@ -79,6 +80,17 @@ class HasSurfaceWidth(Protocol):
 
     def surface_width(self) -> Float[Tensor, ""]:
         """Scale of the layer, scene units (VolSDF's β)."""
+        ...
+
+
+@runtime_checkable
+class SmoothsNormals(Protocol):
+    """A host whose normals are wavy, and which knows better ones. Without: surfaces are shaded with the normals of the hits."""
+
+    def smooth_normals(
+        self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N 3"]:
+        """Unit normals at hits for shading; constants, no gradient."""
         ...
 
 

@@ -15,6 +15,7 @@ from neilfpp_method.fields.background import InvertedSphere
 from neilfpp_method.fields.outgoing_radiance import MID_GREY, OutgoingRadianceField
 from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.base import RegularisedHits
+from neilfpp_method.hosts.smooth_normals import smooth_normals
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayBatch, SceneLight, SurfaceHits
 from neilfpp_method.volume.compositing import Weights, composite, render_weights
@@ -136,6 +137,12 @@ class VolSdfHost(nn.Module):
         )
         distance = torch.where(found.hit, found.distance, torch.inf)
         return SceneLight(found.hit.view(wi.shape[:2]), radiance.view(wi.shape), distance.view(wi.shape[:2]))
+
+    @torch.no_grad()
+    def smooth_normals(self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """The normals of `volume.normal_radius` about hits, edges kept; where that is 0, those of the hits."""
+        radius = self.config.volume.normal_radius
+        return smooth_normals(lambda x: self._surface(x).gradient, position, normal, radius) if radius > 0 else normal
 
     @torch.no_grad()
     def may_meet(self, rays: RayBatch) -> Bool[Tensor, " N"]:

@@ -1,0 +1,85 @@
+"""Normals of a neighbourhood, against surfaces whose normals are known."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import torch
+from torch.nn.functional import normalize
+
+from neilfpp_method.hosts.smooth_normals import NEIGHBOURS, smooth_normals
+from tests.scenes import sphere_batch, sphere_model, tiny_config
+
+RADIUS = 0.15
+
+
+def degrees_between(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    return torch.rad2deg(torch.acos((a * b).sum(-1).clamp(-1, 1)))
+
+
+def test_a_sphere_keeps_its_normals():
+    torch.manual_seed(0)
+    normal = normalize(torch.randn(100, 3, dtype=torch.float64), dim=-1)
+    found = smooth_normals(lambda x: x, 0.3 * normal, normal, RADIUS)
+    torch.testing.assert_close(found, normal, atol=1e-7, rtol=0)
+
+
+def test_ripples_go():
+    """A floor that waves by the cells of a grid: 5° at most, a cell of 0.03."""
+    waves, slope = 2 * math.pi / 0.03, math.tan(math.radians(5.0))
+
+    def gradient(x: torch.Tensor) -> torch.Tensor:
+        return torch.stack((slope * (waves * x[:, 0]).sin(), slope * (waves * x[:, 1]).cos(), torch.ones(len(x))), -1)
+
+    torch.manual_seed(0)
+    position = torch.rand(500, 3) * torch.tensor([1.0, 1.0, 0.0])
+    rough = normalize(gradient(position), dim=-1)
+    up = torch.tensor([0.0, 0.0, 1.0])
+    found = smooth_normals(gradient, position, rough, RADIUS)
+    assert degrees_between(found, up).median() < degrees_between(rough, up).median() / 3
+
+
+def test_edges_stay():
+    def gradient(x: torch.Tensor) -> torch.Tensor:
+        """Of the distance from the cube |x| < 0.5."""
+        return torch.nn.functional.one_hot(x.abs().argmax(-1), 3) * x.sign()
+
+    torch.manual_seed(0)
+    inset = torch.rand(500, 2) * 0.96 - 0.48
+    position = torch.cat((inset, torch.full((500, 1), 0.5)), -1)
+    up = torch.tensor([0.0, 0.0, 1.0])
+    found = smooth_normals(gradient, position, up.expand(500, 3), RADIUS)
+    assert degrees_between(found, up).max() < 0.1
+
+
+def test_what_has_no_normal_stays_finite():
+    zero = torch.zeros(3, 3)
+    assert smooth_normals(torch.zeros_like, zero, zero, RADIUS).isfinite().all()
+    up = torch.tensor([[0.0, 0.0, 1.0]])
+    torch.testing.assert_close(smooth_normals(torch.zeros_like, zero[:1], up, RADIUS), up)
+
+
+def test_a_radius_of_zero_asks_nothing_and_others_ask_for_the_neighbours():
+    config = tiny_config()
+    for radius, expected in ((0.0, 0), (RADIUS, NEIGHBOURS)):
+        model = sphere_model(dataclasses.replace(config, volume=dataclasses.replace(config.volume, normal_radius=radius)))
+        hits = model.host.render(sphere_batch(spread=0.3).rays).detach()
+        asked = []
+        original = model.host.sdf_field.with_gradient
+        model.host.sdf_field.with_gradient = lambda x, original=original, asked=asked: asked.append(len(x)) or original(x)
+        model.shading_normals(hits.position, hits.normal)
+        assert sum(asked) == expected * len(hits)
+
+
+def test_the_gradient_is_that_of_the_hits_normals():
+    config = tiny_config()
+    model = sphere_model(dataclasses.replace(config, volume=dataclasses.replace(config.volume, normal_radius=RADIUS)))
+    hits = model.host.render(sphere_batch(spread=0.3).rays).detach()
+    normal = hits.normal.clone().requires_grad_()
+    weight = torch.randn_like(normal)
+    (gradient,) = torch.autograd.grad((model.shading_normals(hits.position, normal) * weight).sum(), normal)
+    # Of a unit vector: what lies along it is lost.
+    smooth = model.shading_normals(hits.position, hits.normal)
+    expected = weight - (weight * smooth).sum(-1, keepdim=True) * smooth
+    torch.testing.assert_close(gradient, expected, atol=1e-4, rtol=0)
