@@ -142,7 +142,8 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
 
     R has no feature of G that knows the place, so it encodes positions as G would; 8×128 is the paper's surface light
     field. A surface without thickness needs no distance to leave it, and what leaves it is known well enough to learn
-    from L_ref (METHOD §2, §4). Steps without volume rendering are cheap, and R is new as well: there are three times as many.
+    from L_ref (METHOD §2, §4). Its normals are taken as they are. Steps without volume rendering are cheap, and R is new as
+    well: there are three times as many.
     """
     replace, train = dataclasses.replace, config.train
     return replace(
@@ -157,6 +158,7 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
             layers=8,
             width=128,
         ),
+        volume=replace(config.volume, normal_radius=0.0),
         inter_reflection=replace(config.inter_reflection, radiance_gradient=0.7, offset=2e-3),
         loss=replace(config.loss, lambertian=10.0 * config.loss.lambertian),
         train=replace(

@@ -14,6 +14,7 @@ from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.fields.background import InvertedSphere
 from neilfpp_method.fields.outgoing_radiance import MID_GREY, OutgoingRadianceField
 from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_tracer, meet, tree_tracer
+from neilfpp_method.hosts.smooth_normals import NEIGHBOURS, smooth_normals
 from neilfpp_method.schedule import FIXED_GEOMETRY
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import RayBatch, SceneLight, SurfaceHits
@@ -74,6 +75,7 @@ class MeshHost(nn.Module):
         self.register_buffer("outward", outward, persistent=False)
         self.register_buffer("corner_normals", smooth.expand(-1, 3, -1), persistent=False)
         self.offset = config.inter_reflection.offset
+        self.normal_radius = config.volume.normal_radius
         self._tracers: dict[torch.device, FirstHits] = {}
 
     # ------------------------------------------------------------------------------------------------ the host contract
@@ -107,6 +109,19 @@ class MeshHost(nn.Module):
             radiance[rows] = self.radiance_field(position, -directions[rows], met.normal[part], position[:, :0])
         distance = distance.view(wi.shape[:2])
         return SceneLight(distance.isfinite(), radiance.view(wi.shape), distance)
+
+    @torch.no_grad()
+    def smooth_normals(self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """For meshes that are noisy, the normals of `volume.normal_radius` about hits, edges kept; at 0 those of the hits."""
+        if self.normal_radius == 0:
+            return normal
+        up = normal.repeat_interleave(NEIGHBOURS, 0)
+
+        def beneath(x: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+            met = self.cross(RayBatch(x + self.normal_radius * up, -up))
+            return torch.zeros_like(x).index_put((met.rows,), met.normal * met.outside[:, None])
+
+        return smooth_normals(beneath, position, normal, self.normal_radius)
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
         """R, and the background where it is a field."""
