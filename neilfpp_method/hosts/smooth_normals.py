@@ -1,9 +1,9 @@
 """Normals for shading: those of a surface's neighbourhood, with its edges kept.
 
 A learned distance field is a little wavy, by the cells of its grid, and a highlight moves twice as far as the normal that
-throws it: a ripple of three degrees blurs all that tells a metal from paint. Normals around a point are averaged, the more
-alike the more they count (bilateral filtering; of normals: Zheng et al. 2011, "Bilateral normal filtering for mesh denoising").
-In the tangent plane a ring about a point takes nothing from a sphere, a cylinder or a saddle.
+throws it: a ripple of three degrees blurs all that tells a metal from paint. So the normals around a point are fitted by a
+plane, robustly: they may turn evenly, as on a ball, and those beyond an edge do not count (Öztireli, Guennebaud and Gross 2009,
+"Feature preserving point set surfaces based on non-linear kernel regression").
 """
 
 from __future__ import annotations
@@ -22,10 +22,12 @@ __all__ = ["NEIGHBOURS", "smooth_normals"]
 RINGS = ((6, 1 / 3), (10, 2 / 3), (16, 1.0))
 """Neighbours on each ring, and its share of the radius."""
 NEIGHBOURS = sum(count for count, _ in RINGS)
-UNLIKE = 0.02
-"""1 − cos of the angle (11.5°) at which a neighbour counts for 1/e."""
-ROUNDS = 3
-"""Each round compares the neighbours with what the one before has found."""
+UNLIKE = 0.2
+"""Distance between two unit normals, 11.5°, at which one counts for 1/√e."""
+ROUNDS = 4
+"""Of the fit; each weighs the neighbours by what the one before has left over."""
+RIDGE = 1e-2
+"""Of a neighbour's weight: what ties a slope to 0 where no neighbour says anything."""
 
 
 @torch.no_grad()
@@ -43,13 +45,17 @@ def smooth_normals(
         normal: their unit normals, as noisy as they are.
         radius: of the neighbourhood, scene units. Relief that is finer than this and flatter than `UNLIKE` is lost.
     """
-    around = (_rings(position) * radius) @ local_frame(normal)
-    others = safe_normalize(gradient((position[:, None] + around).flatten(0, 1))).view_as(around)
-    found = normal
+    rings = _rings(position)
+    others = (position[:, None] + (rings * radius) @ local_frame(normal)).flatten(0, 1)
+    seen = torch.cat((normal[:, None], safe_normalize(gradient(others)).unflatten(0, (-1, NEIGHBOURS))), 1)
+    places = torch.cat((torch.tensor([[1.0, 0.0, 0.0]]).to(rings), torch.cat((torch.ones_like(rings[:, :1]), rings[:, :2]), 1)))
+    ridge = RIDGE * torch.eye(3).to(rings)
+    left_over = seen - normal[:, None]
     for _ in range(ROUNDS):
-        unlike = 1 - (others * found[:, None]).sum(-1, keepdim=True)
-        found = safe_normalize(normal + (others * torch.exp(-unlike / UNLIKE)).sum(1))
-    return found
+        weighted = places * torch.exp(-left_over.square().sum(-1, keepdim=True) / (2 * UNLIKE**2))
+        plane = torch.linalg.solve(weighted.mT @ places + ridge, weighted.mT @ seen)
+        left_over = seen - places @ plane
+    return safe_normalize(plane[:, 0])
 
 
 def _rings(like: Tensor) -> Float[Tensor, "K 3"]:
