@@ -109,14 +109,14 @@ class NeilfModel(nn.Module):
         stands_still = not borrowed and not self.stages[Stage.MATERIAL_INIT].moves_host
         train = config.train
         self.replay = Replay(train.fresh, train.rays) if train.fresh < 1 and stands_still else None
-        self.seen: SeenPlaces | None = None
+        self.seen_places: SeenPlaces | None = None
         if config.inter_reflection.unseen == "shaded":
             if config.inter_reflection.mode != "hard":
                 raise UserError(
                     f"places that no camera sees are shaded, with inter-reflection '{config.inter_reflection.mode}'",
                     "set --config.inter-reflection.mode hard, or --config.inter-reflection.unseen radiance",
                 )
-            self.seen = SeenPlaces(config.volume.radius)
+            self.seen_places = SeenPlaces(config.volume.radius)
         if config.light.kind != "free":
             if config.inter_reflection.mode == "soft":
                 raise UserError(
@@ -152,8 +152,8 @@ class NeilfModel(nn.Module):
             hits, terms = self._render_host(batch, names)
         if "volume" in names:
             terms["volume"] = losses.photometric(hits.color, batch.color, self.facts.response, self.units.volume)
-        if self.seen is not None and self.training:
-            self.seen.remember(hits.position[hits.is_hit(self.config.shading.hit_share)])
+        if self.seen_places is not None and self.training:
+            self.seen_places.remember(hits.position[hits.is_hit(self.config.shading.hit_share)])
         if not plan.moves_material:
             return terms
 
@@ -266,9 +266,9 @@ class NeilfModel(nn.Module):
     def _scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
         """What the scene sends: R, and where no camera looked what material and light say."""
         scene = self._by_radiance(x, wi)
-        if self.seen is None:
+        if self.seen_places is None:
             return scene
-        return shade_unseen(scene, x.detach(), wi, self.seen, self.host, self.config.shading.hit_share, self._leaving)
+        return shade_unseen(scene, x.detach(), wi, self.seen_places, self.host, self.config.shading.hit_share, self._leaving)
 
     def _by_radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
         return scene_light(self.host, x, wi, self.config.inter_reflection, self.config.shading.hit_share)

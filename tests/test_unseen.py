@@ -49,7 +49,7 @@ def look_at_the_floor(model: NeilfModel) -> None:
     across = torch.linspace(-1.7, 1.7, 140)
     floor = torch.cartesian_prod(across, across, torch.zeros(1))
     for _ in range(unseen.LIFE // len(floor) + 1):
-        model.seen.remember(floor)
+        model.seen_places.remember(floor)
 
 
 def from_the_floor(model: NeilfModel) -> torch.Tensor:
@@ -108,4 +108,4 @@ def test_it_goes_with_hard_inter_reflection_alone():
 
 
 def test_switched_off_nothing_is_remembered():
-    assert between_plates("radiance").seen is None
+    assert between_plates("radiance").seen_places is None

@@ -14,6 +14,7 @@ from collections.abc import Callable
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 from neilfpp_method.shading.frame import local_frame, safe_normalize
 
@@ -45,22 +46,24 @@ def smooth_normals(
         normal: their unit normals, as noisy as they are.
         radius: of the neighbourhood, scene units. Relief that is finer than this and flatter than `UNLIKE` is lost.
     """
-    rings = _rings(position)
-    others = (position[:, None] + (rings * radius) @ local_frame(normal)).flatten(0, 1)
-    seen = torch.cat((normal[:, None], safe_normalize(gradient(others)).unflatten(0, (-1, NEIGHBOURS))), 1)
-    places = torch.cat((torch.tensor([[1.0, 0.0, 0.0]]).to(rings), torch.cat((torch.ones_like(rings[:, :1]), rings[:, :2]), 1)))
-    ridge = RIDGE * torch.eye(3).to(rings)
+    ring = _rings(position)
+    around = position[:, None] + radius * (ring @ local_frame(normal)[:, :2])
+    seen = torch.cat((normal[:, None], safe_normalize(gradient(around.flatten(0, 1))).view_as(around)), 1)
+    # What a plane is linear in: 1 and the place, in units of the radius. The point itself comes first.
+    places = functional.pad(torch.cat((torch.zeros_like(ring[:1]), ring)), (1, 0), value=1.0)
+    ridge = RIDGE * torch.eye(3).to(ring)
     left_over = seen - normal[:, None]
     for _ in range(ROUNDS):
         weighted = places * torch.exp(-left_over.square().sum(-1, keepdim=True) / (2 * UNLIKE**2))
-        plane = torch.linalg.solve(weighted.mT @ places + ridge, weighted.mT @ seen)
+        # Never singular, by the ridge; `solve` would have the host wait for the device to hear that.
+        plane = torch.linalg.solve_ex(weighted.mT @ places + ridge, weighted.mT @ seen).result
         left_over = seen - places @ plane
     return safe_normalize(plane[:, 0])
 
 
-def _rings(like: Tensor) -> Float[Tensor, "K 3"]:
+def _rings(like: Tensor) -> Float[Tensor, "K 2"]:
     """Places in the tangent plane for a radius of 1; each ring is turned against the one before."""
     angles = [(torch.arange(count) + 0.5 * number) * (2 * math.pi / count) for number, (count, _) in enumerate(RINGS)]
     shares = torch.cat([torch.full((count,), share) for count, share in RINGS])
     angle = torch.cat(angles)
-    return torch.stack((shares * angle.cos(), shares * angle.sin(), torch.zeros_like(angle)), -1).to(like)
+    return (shares * torch.stack((angle.cos(), angle.sin()))).t().to(like)

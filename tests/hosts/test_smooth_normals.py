@@ -60,6 +60,11 @@ def test_what_has_no_normal_stays_finite():
     torch.testing.assert_close(smooth_normals(torch.zeros_like, zero[:1], up, RADIUS), up)
 
 
+def test_no_points_have_no_normals():
+    none = torch.zeros(0, 3)
+    assert smooth_normals(lambda x: x, none, none, RADIUS).shape == (0, 3)
+
+
 def test_a_radius_of_zero_asks_nothing_and_others_ask_for_the_neighbours():
     config = tiny_config()
     for radius, expected in ((0.0, 0), (RADIUS, NEIGHBOURS)):
