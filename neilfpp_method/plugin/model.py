@@ -32,7 +32,7 @@ from neilfpp_method.shading.color import apply_response, tone_map
 from neilfpp_method.shading.sampling import sample_directions
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
-from neilfpp_method.train.loop import seed_step, set_rates
+from neilfpp_method.train.loop import adam, seed_step, set_rates
 
 __all__ = ["FieldAdamConfig", "NeilfMethod", "NeilfMethodConfig"]
 
@@ -46,7 +46,7 @@ class FieldAdamConfig(OptimizerConfig):
 
     def setup(self, params: list[nn.Parameter]) -> torch.optim.Optimizer:
         """Adam, as in `train.loop.make_optimizer`."""
-        return torch.optim.Adam([{"params": params, "name": self.name}], lr=self.lr, betas=(0.9, 0.99), eps=1e-15)
+        return adam([{"params": params, "name": self.name, "lr": self.lr}])
 
 
 @dataclass

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from neilfpp_method.train.light_record import LightFit, note_fit, read_fits, wri
 from neilfpp_method.train.progress import Reporter
 from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, save_checkpoint, write_json
 
-__all__ = ["Training", "make_optimizer", "seed_step", "set_rates", "train"]
+__all__ = ["Training", "adam", "make_optimizer", "seed_step", "set_rates", "train"]
 
 # So many steps in a row without a finite gradient are no accident.
 MOST_SKIPPED = 10
@@ -155,7 +155,14 @@ def make_optimizer(model: NeilfModel, config: OptimizerConfig) -> torch.optim.Op
         for name, parameters in model.parameter_groups().items()
         if parameters
     ]
-    # Fused: one pass over the tables of hash grids, which are most of all parameters, in place of a dozen.
+    return adam(groups)
+
+
+def adam(groups: Sequence[Mapping[str, object]]) -> torch.optim.Adam:
+    """Adam as every loop here uses it.
+
+    Fused: one pass over the tables of hash grids, which are most of all parameters, in place of a dozen.
+    """
     return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
 
