@@ -69,7 +69,7 @@ def fast() -> NeilfConfig:
         light=IncidentLightConfig(
             kind="auto",
             environment_height=48,
-            fit=LightFitConfig(smoothness=0.02),
+            fit=LightFitConfig(smoothness=0.02, every=150),
             layers=4,
             width=64,
             direction_encoding="spherical_harmonics",
@@ -105,7 +105,7 @@ def fast() -> NeilfConfig:
             hessian_method="finite_difference",
         ),
         optimizer=OptimizerConfig(geometry=2e-2, radiance=5e-3, brdf=5e-3, light=3e-2, background=5e-3, beta=1e-3),
-        train=TrainConfig(sdf_steps=2_000, material_steps=800, joint_steps=200, rays=512, fresh=0.25),
+        train=TrainConfig(sdf_steps=2_000, material_steps=1_500, joint_steps=100, rays=512, fresh=0.25),
     )
 
 
@@ -142,8 +142,8 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
 
     R has no feature of G that knows the place, so it encodes positions as G would; 8×128 is the paper's surface light
     field. A surface without thickness needs no distance to leave it, and what leaves it is known well enough to learn
-    from L_ref (METHOD §2, §4). Its normals are taken as they are. Steps without volume rendering are cheap, and R is new as
-    well: there are three times as many.
+    from L_ref (METHOD §2, §4). Its normals are taken as they are. R is new as well, so there are twice as many steps with a
+    material.
     """
     replace, train = dataclasses.replace, config.train
     return replace(
@@ -164,7 +164,7 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
         train=replace(
             train,
             sdf_steps=train.sdf_steps // 10,
-            material_steps=3 * (train.material_steps + train.joint_steps),
+            material_steps=2 * (train.material_steps + train.joint_steps),
             joint_steps=0,
         ),
     )
