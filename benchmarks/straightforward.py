@@ -18,13 +18,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from neilfpp_method.config import NeilfConfig
+from neilfpp_method.config import NeilfConfig, VolumeConfig
 from neilfpp_method.fields.brdf import BrdfField, BrdfSample
 from neilfpp_method.fields.incident_light import IncidentLightField
 from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.structures import Material, RayBatch
+from neilfpp_method.volume.intersect import Interval
 from neilfpp_method.volume.samplers import (
     bound_shares,
     bounded_beta,
@@ -105,9 +106,9 @@ class PlainHost(VolSdfHost):
         self.sdf_field = PlainSdf(self.sdf_field)
 
     @torch.no_grad()
-    def _sample(self, rays: RayBatch, near: Float[Tensor, " N"], far: Float[Tensor, " N"]) -> Float[Tensor, "N M"]:
-        volume, beta = self.config.volume, self.density.beta().reshape(1, 1)
-        partition = first_cuts(self.sdf, rays, near, far, volume.initial_samples, self.training)
+    def _sample(self, rays: RayBatch, interval: Interval, volume: VolumeConfig) -> Float[Tensor, "N M"]:
+        beta = self.density.beta().reshape(1, 1)
+        partition = first_cuts(self.sdf, rays, interval.near, interval.far, volume.initial_samples, self.training)
         worst = partition.width.square().sum(dim=-1, keepdim=True).div(4.0 * math.log1p(volume.epsilon)).sqrt()
         wide = torch.maximum(worst, beta)
         for number in range(volume.rounds + 1):

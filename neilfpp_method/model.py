@@ -33,7 +33,7 @@ from neilfpp_method.lighting.transport import SceneTracer
 from neilfpp_method.replay import Replay, SurfacePixels
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, active_losses
 from neilfpp_method.shading.brdf import LOBES
-from neilfpp_method.shading.frame import dot, safe_normalize
+from neilfpp_method.shading.frame import dot
 from neilfpp_method.shading.rendering_equation import shade
 from neilfpp_method.shading.sampling import Technique, sample_directions
 from neilfpp_method.structures import (
@@ -246,7 +246,7 @@ class NeilfModel(nn.Module):
         if not isinstance(self.host, SmoothsNormals):
             return normal
         smooth = self.host.smooth_normals(position.detach(), normal.detach())
-        return safe_normalize(normal + (smooth - normal).detach())
+        return smooth + (normal - normal.detach())
 
     def incident_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
         """Linear radiance that arrives at x from wi: from the light, or in hard inter-reflection from the scene before it."""

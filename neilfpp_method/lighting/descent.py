@@ -17,7 +17,7 @@ from torch import Tensor
 
 from neilfpp_method.lighting.objective import Objective, Target, nearest_points, unevenness
 
-__all__ = ["Descent", "Unknown", "descend"]
+__all__ = ["Unknown", "descend"]
 
 LEAST_RATE = 0.05
 """The last step's rate over the first's."""
@@ -31,14 +31,6 @@ class Unknown:
     rate: float
 
 
-@dataclass(frozen=True)
-class Descent:
-    """Where a descent ended: the loss before its last step, and the logarithms of the factors on base colour."""
-
-    loss: Float[Tensor, ""]
-    log_gain: Float[Tensor, "#N 3"]
-
-
 def descend(
     unknowns: Sequence[Unknown],
     gain_rate: float,
@@ -46,8 +38,7 @@ def descend(
     target: Target,
     objective: Objective,
     loss_of: Callable[[Float[Tensor, "#N 3"]], Float[Tensor, ""]],
-    log_gain: Float[Tensor, "#N 3"] | None = None,
-) -> Descent:
+) -> Float[Tensor, ""]:
     """Move the unknowns to where a loss is least, and with them factors on the base colour of the points.
 
     Every point has factors of its own; all share one per channel where the weight of evenness is 0. The mean of their
@@ -59,11 +50,12 @@ def descend(
         steps: how many.
         target, objective: whose base colour is to be even, and how much that weighs.
         loss_of: all that speaks against the unknowns, from the factors.
-        log_gain: where the factors start; none: at 1.
+
+    Returns:
+        The loss before the last step.
     """
     weight, base_color = objective.config.evenness, target.material.base_color
-    even = torch.zeros_like(base_color if weight > 0 else base_color[:1])
-    log_gain = (even if log_gain is None else log_gain.clone()).requires_grad_()
+    log_gain = torch.zeros_like(base_color if weight > 0 else base_color[:1], requires_grad=True)
     nearest = nearest_points(target.position) if weight > 0 else None
     groups = [{"params": [u.value], "lr": u.rate} for u in (*unknowns, Unknown(log_gain, gain_rate))]
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
@@ -78,4 +70,4 @@ def descend(
             loss.backward()
             optimizer.step()
             falling.step()
-    return Descent(loss.detach(), log_gain.detach())
+    return loss.detach()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -26,8 +26,7 @@ from neilfpp_method.shading.frame import safe_normalize
 
 __all__ = ["settle_lamps"]
 
-STEPS, FEWER_STEPS = 100, 50
-"""Of a descent, and of one from where all has settled but for a lamp that is gone."""
+STEPS = 100
 RATE = 0.02
 """Scene units per step, at the start."""
 QUICKER = 3.0
@@ -44,7 +43,6 @@ FAINTEST = 1e-3
 class _Settled:
     lamps: FoundLamps
     loss: float
-    log_gain: Float[Tensor, "#N 3"] | None = None
 
 
 @torch.no_grad()
@@ -81,25 +79,25 @@ def settle_lamps(
         misfit = objective.misfit(lamps.intensity, Transport(kernel, beside.scene), target, gain)
         return misfit + objective.price(brought.mean(-1), all_light)
 
-    def settle(start: _Settled, steps: int) -> _Settled:
+    def settle(lamps: FoundLamps) -> _Settled:
         # A shadow's edge has no derivative here: what is hidden at the start stays so, and the next fit looks again.
-        sight = in_sight(start.lamps.places, radius, seen.position, scene)
-        return _descend(start, steps, target, objective, lambda moved, gain: loss_of(moved, sight, gain))
+        sight = in_sight(lamps.places, radius, seen.position, scene)
+        return _descend(lamps, target, objective, lambda moved, gain: loss_of(moved, sight, gain))
 
-    best = settle(_Settled(found, math.inf), STEPS)
+    best = settle(found)
     if not math.isfinite(best.loss):
         return found
     for number in reversed(range(len(found.intensity))):
         if len(best.lamps.intensity) == 1:
             break
-        without = settle(replace(best, lamps=_without(best.lamps, number)), FEWER_STEPS)
+        without = settle(_without(best.lamps, number))
         if without.loss < best.loss:
             best = without
     for number in range(len(best.lamps.intensity)):
-        other = settle(replace(best, lamps=_of_other_kind(best.lamps, number, seen.position)), STEPS)
-        panel, bulb = (best, other) if best.lamps.places.axis[number].any() else (other, best)
+        pair = best, settle(_of_other_kind(best.lamps, number, seen.position))
+        panel, bulb = pair if best.lamps.places.axis[number].any() else reversed(pair)
         best = panel if panel.loss < (1 - PANEL_GAIN) * bulb.loss else bulb
-    return settle(best, STEPS).lamps
+    return settle(best.lamps).lamps
 
 
 def _of_other_kind(lamps: FoundLamps, number: int, points: Float[Tensor, "N 3"]) -> FoundLamps:
@@ -120,28 +118,24 @@ def _without(lamps: FoundLamps, number: int) -> FoundLamps:
 
 
 def _descend(
-    start: _Settled,
-    steps: int,
+    start: FoundLamps,
     target: Target,
     objective: Objective,
     loss_of: Callable[[FoundLamps, Float[Tensor, "#N 3"]], Float[Tensor, ""]],
 ) -> _Settled:
     """To the nearest minimum of a loss over place, axis and intensity. Where that leads to what is not finite: the start."""
-    first = start.lamps
-    bare = first.places.axis.square().sum(-1, keepdim=True) == 0
-    position = first.places.position.clone().requires_grad_()
-    axis = first.places.axis.clone().requires_grad_()
-    log_intensity = first.intensity.clamp_min(FAINTEST * first.intensity.max()).log().requires_grad_()
+    bare = start.places.axis.square().sum(-1, keepdim=True) == 0
+    position = start.places.position.clone().requires_grad_()
+    axis = start.places.axis.clone().requires_grad_()
+    log_intensity = start.intensity.clamp_min(FAINTEST * start.intensity.max()).log().requires_grad_()
 
     def lamps() -> FoundLamps:
         return FoundLamps(LampPlaces(position, safe_normalize(axis).masked_fill(bare, 0.0)), log_intensity.exp())
 
     unknowns = (Unknown(position, RATE), Unknown(axis, QUICKER * RATE), Unknown(log_intensity, QUICKER * RATE))
-    descent = descend(
-        unknowns, GAIN_RATE, steps, target, objective, lambda gain: loss_of(lamps(), gain), start.log_gain
-    )
-    loss, settled = descent.loss.item(), lamps()
+    loss = descend(unknowns, GAIN_RATE, STEPS, target, objective, lambda gain: loss_of(lamps(), gain)).item()
+    settled = lamps()
     settled = FoundLamps(settled.places.detach(), settled.intensity.detach())
     values = torch.cat((settled.places.position, settled.places.axis, settled.intensity))
     finite = math.isfinite(loss) and values.isfinite().all()
-    return _Settled(settled, loss, descent.log_gain) if finite else replace(start, loss=math.inf)
+    return _Settled(settled, loss) if finite else _Settled(start, math.inf)
