@@ -47,19 +47,20 @@ class SeenPlaces(nn.Module):
     def remember(self, x: Float[Tensor, "N 3"]) -> None:
         """Camera rays met a surface here; the nearest eight cells count."""
         self.hits += len(x)
-        at = x / self.radius * (CELLS / 2) + CELLS / 2
-        steps = torch.tensor([-0.5, 0.5], device=x.device, dtype=x.dtype)
-        around = torch.cartesian_prod(steps, steps, steps)
-        self.latest[self._cells(at[:, None] + around)] = self.hits
+        half = torch.tensor([-1.0, 1.0], device=x.device, dtype=x.dtype) * (self.radius / CELLS)
+        around = torch.cartesian_prod(half, half, half)
+        self.latest[self._cells(x[:, None] + around)] = self.hits
 
     @torch.no_grad()
     def unseen(self, x: Float[Tensor, "*B 3"]) -> Bool[Tensor, "*B"]:
         """Whether no camera has looked at points of surfaces, for all that is known."""
         if self.hits < LIFE:
             return torch.zeros_like(x[..., 0], dtype=torch.bool)
-        return self.hits - self.latest[self._cells(x / self.radius * (CELLS / 2) + CELLS / 2)] > LIFE
+        return self.hits - self.latest[self._cells(x)] > LIFE
 
-    def _cells(self, at: Float[Tensor, "*B 3"]) -> Int[Tensor, "*B"]:
+    def _cells(self, x: Float[Tensor, "*B 3"]) -> Int[Tensor, "*B"]:
+        """The number of the cell that a point lies in, or the nearest to it."""
+        at = (x / self.radius + 1) * (CELLS / 2)
         i, j, k = at.nan_to_num().floor().long().clamp(0, CELLS - 1).unbind(-1)
         return (k * CELLS + j) * CELLS + i
 
@@ -81,11 +82,11 @@ def shade_unseen(
     hit_share: float,
     shade_at: ShadeAt,
 ) -> SceneLight:
-    """What the scene sends, with what leaves unseen places by the rendering equation in the place of R.
+    """What the scene sends, with what leaves unseen places by the rendering equation in the place of R (METHOD §1).
 
     Args:
-        scene: what arrives at x from wi, by R.
-        x, wi: surface points, and directions away from them.
+        scene: what arrives at x from wi, by R: linear radiance, and distances in scene units.
+        x, wi: surface points, scene frame, and unit directions away from them.
         seen: where cameras have looked.
         host: renders a ray to every place that is shaded, for its normal.
         hit_share: least concentration of a hit.
