@@ -266,6 +266,9 @@ class InterReflectionConfig:
     unseen: Literal["radiance", "shaded"] = "radiance"
     """What hard inter-reflection takes places to send that no camera has looked at. radiance: what R guesses. shaded: what
     their material makes of the light that they get; the images of what they shine on then teach it."""
+    traced_share: float = 1.0
+    """Share of the incident directions of a step that hard inter-reflection traces. Below 1 it corrects what the light alone
+    would bring, without bias and with more noise: for hosts that trace by rendering. Evaluation traces all."""
     grid_resolution: int = 96
     """Vertices along an edge of the grid that hard inter-reflection traces in a distance field."""
     rays_per_point: float = 1.0

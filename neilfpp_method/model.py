@@ -25,11 +25,10 @@ from neilfpp_method.fields.incident_light import IncidentLightField
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
-from neilfpp_method.inter_reflection import scene_light, trace_light
+from neilfpp_method.inter_reflection import before_light, scene_light, trace_light, traced_in_part
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.memory import Observed, SurfaceMemory
 from neilfpp_method.lighting.solve import solve_light
-from neilfpp_method.lighting.transport import SceneTracer
 from neilfpp_method.replay import Replay, SurfacePixels
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, active_losses
 from neilfpp_method.shading.brdf import LOBES
@@ -42,6 +41,7 @@ from neilfpp_method.structures import (
     PixelBatch,
     RayBatch,
     SceneLight,
+    SceneTracer,
     Shading,
     SurfaceHits,
 )
@@ -254,14 +254,8 @@ class NeilfModel(nn.Module):
             radiance, nearest = self.light.radiance(x, wi), torch.full_like(wi[..., 0], math.inf)
         else:
             scene = self._scene_light(x, wi)
-            radiance, nearest = self._before_light(scene, x, wi), scene.distance
+            radiance, nearest = before_light(scene, self.light.radiance, x, wi), scene.distance
         return radiance if self.lamps is None else radiance + self.lamps.seen(x, wi, nearest)
-
-    def _before_light(self, scene: SceneLight, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
-        """What the scene sends, and where it is not in the way the light."""
-        point, direction = torch.nonzero(~scene.hit, as_tuple=True)
-        light = self.light.radiance(x[point], wi[point, direction][:, None])[:, 0]
-        return scene.radiance.index_put((point, direction), light)
 
     def _scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
         """What the scene sends: R, and where no camera looked what material and light say."""
@@ -300,8 +294,7 @@ class NeilfModel(nn.Module):
         about, roughness = normal.detach(), material.roughness.detach()
         drawn = sample_directions(sampler, about, wo, roughness, samples, self.lobe, self.training, self._sky(about))
         if self.config.inter_reflection.mode == "hard":
-            wi = drawn.wi.expand(len(position), -1, -1)
-            incident = self._before_light(scene(position, wi), position, wi)
+            incident = self._hard_light(scene, position, drawn.wi.expand(len(position), -1, -1))
         elif len(drawn.wi) < len(position) and not isinstance(self.light, EnvironmentLight):
             incident = self.light.radiance(position, drawn.wi, dot(drawn.wi, about) > 0)
         else:
@@ -316,6 +309,14 @@ class NeilfModel(nn.Module):
             radiance = radiance * (self._by_radiance(position, rays.wi).distance >= rays.distance)[..., None]
         lit = shade(material, normal, wo, rays.samples(), radiance, self.lobe, settings.specular)
         return Shading(shading.color + lit.color, shading.diffuse + lit.diffuse, shading.specular + lit.specular)
+
+    def _hard_light(
+        self, scene: SceneTracer, position: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]
+    ) -> Float[Tensor, "N S 3"]:
+        share = self.config.inter_reflection.traced_share
+        if self.training and share < 1:
+            return traced_in_part(scene, self.light.radiance, position, wi, share)
+        return before_light(scene(position, wi), self.light.radiance, position, wi)
 
     def _sky(self, normal: Float[Tensor, "N 3"]) -> Technique | None:
         """The map, as one that draws directions; none for a light that cannot be sampled."""

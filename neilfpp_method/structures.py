@@ -6,7 +6,7 @@ unit sphere, see docs/conventions.md); directions are unit vectors in that frame
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple, TypeVar
 
@@ -24,6 +24,7 @@ __all__ = [
     "PixelBatch",
     "RayBatch",
     "SceneLight",
+    "SceneTracer",
     "Shading",
     "SurfaceHits",
 ]
@@ -151,6 +152,10 @@ class SceneLight(Indexable):
     hit: Bool[Tensor, "N S"]
     radiance: Float[Tensor, "N S 3"]
     distance: Float[Tensor, "N S"]
+
+
+SceneTracer = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N S 3"]], SceneLight]
+"""What the scene sends to points from directions."""
 
 
 class LossTerm(NamedTuple):

@@ -20,9 +20,10 @@ from neilfpp_method.lighting.candidates import FoundLamps
 from neilfpp_method.lighting.descent import Unknown, descend
 from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.lighting.objective import Objective, Target
-from neilfpp_method.lighting.transport import SceneTracer, Transport, in_sight, lamp_kernel
+from neilfpp_method.lighting.transport import Transport, in_sight, lamp_kernel
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.shading.frame import safe_normalize
+from neilfpp_method.structures import SceneTracer
 
 __all__ = ["settle_lamps"]
 

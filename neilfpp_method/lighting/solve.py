@@ -12,9 +12,9 @@ from neilfpp_method.lighting.fit import Evidence, Light, compare, evidence, fit_
 from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.settle import settle_lamps
-from neilfpp_method.lighting.transport import SceneTracer, from_lamps, from_texels
+from neilfpp_method.lighting.transport import from_lamps, from_texels
 from neilfpp_method.shading.brdf import Lobe
-from neilfpp_method.structures import Material
+from neilfpp_method.structures import Material, SceneTracer
 
 __all__ = ["solve_light"]
 

@@ -11,7 +11,6 @@ the scene's own surfaces add.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -23,12 +22,9 @@ from neilfpp_method.fields.lamps import LampPlaces, rays_towards
 from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.shading.brdf import Lobe, diffuse_reflectance, normal_reflectance, specular_terms
 from neilfpp_method.shading.frame import dot
-from neilfpp_method.structures import Material, SceneLight
+from neilfpp_method.structures import Material, SceneTracer
 
-__all__ = ["SceneTracer", "Transport", "from_lamps", "from_texels", "in_sight", "lamp_kernel"]
-
-SceneTracer = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N S 3"]], SceneLight]
-"""What the scene sends to points from directions."""
+__all__ = ["Transport", "from_lamps", "from_texels", "in_sight", "lamp_kernel"]
 
 PAIRS_AT_ONCE = 2**18
 """Pairs of a point and a direction that are traced together: what bounds the memory."""

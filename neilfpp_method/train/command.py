@@ -161,8 +161,10 @@ def _check(config: NeilfConfig) -> None:
         if getattr(config.train, name) < 1:
             option = f"--config.train.{name.replace('_', '-')}"
             raise UserError(f"{option} is {getattr(config.train, name)}", "set it to 1 or more")
-    if not 0 < config.train.fresh <= 1:
-        raise UserError(f"--config.train.fresh is {config.train.fresh}", "set it above 0 and to 1 at most")
+    shares = {"train.fresh": config.train.fresh, "inter-reflection.traced-share": config.inter_reflection.traced_share}
+    for name, share in shares.items():
+        if not 0 < share <= 1:
+            raise UserError(f"--config.{name} is {share}", "set it above 0 and to 1 at most")
     if config.light.map is not None:
         if config.light.kind == "free":
             raise UserError(
