@@ -2,6 +2,7 @@
 
     python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results
     python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results-mesh --host mesh --compare ladder
+    python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results-mesh --host mesh --compare effects
 
 For each capture: the preset trained from scratch, beside it the paper's free light field with and without L_ref (the paper's
 Table 2), with `--compare ladder` every light with every inter-reflection that goes with it; each measured after the material
@@ -54,6 +55,13 @@ COLUMNS = {
     "incident_light_log_mae_occluded": "… occluded",
 }
 STAGES = {"material_init": "Sep.", "joint": "joint"}
+EFFECTS = {
+    "specular loss": ("loss", "specular", 1.0),
+    "energy loss": ("loss", "energy", 1.0),
+    "unseen places shaded": ("inter_reflection", "unseen", "shaded"),
+    "a quarter of the directions traced": ("inter_reflection", "traced_share", 0.25),
+}
+"""What the preset leaves out: room, setting and value of each."""
 
 
 @dataclass
@@ -68,9 +76,9 @@ class Options:
     """Which settings."""
     host: Literal["volsdf", "mesh"] = "volsdf"
     """Geometry to be found, or given as a mesh."""
-    compare: Literal["preset", "paper", "ladder"] = "paper"
+    compare: Literal["preset", "paper", "ladder", "effects"] = "paper"
     """preset: nothing else. paper: the free light field with and without L_ref. ladder: every light with every
-    inter-reflection that goes with it."""
+    inter-reflection that goes with it. effects: each effect that the preset leaves out, switched on by itself."""
     material_steps: int | None = None
     """Steps of the stage material init; none: the preset's."""
     device: str = "auto"
@@ -81,23 +89,27 @@ def variants(config: NeilfConfig, which: str) -> dict[str, NeilfConfig]:
     """What is compared; the first is the preset as it is."""
     if which == "preset":
         return {"preset": config}
+    if which == "effects":
+        return {"preset": config} | {
+            name: changed(config, room, **{setting: value}) for name, (room, setting, value) in EFFECTS.items()
+        }
     free = free_light(config)
     compared = {
         "preset": config,
         "free light, with L_ref": free,
-        "free light, without L_ref": between_surfaces(free, "off"),
+        "free light, without L_ref": changed(free, "inter_reflection", mode="off"),
     }
     if which == "ladder":
-        compared["free light, hard"] = between_surfaces(free, "hard")
+        compared["free light, hard"] = changed(free, "inter_reflection", mode="hard")
         for kind, name in (("distant", "map"), ("distant_near", "map and lamps")):
-            light = dataclasses.replace(config, light=dataclasses.replace(config.light, kind=kind))
-            compared |= {f"{name}, {mode}": between_surfaces(light, mode) for mode in ("hard", "off")}
+            light = changed(config, "light", kind=kind)
+            compared |= {f"{name}, {mode}": changed(light, "inter_reflection", mode=mode) for mode in ("hard", "off")}
     return compared
 
 
-def between_surfaces(config: NeilfConfig, mode: str) -> NeilfConfig:
-    """The same settings with this inter-reflection."""
-    return dataclasses.replace(config, inter_reflection=dataclasses.replace(config.inter_reflection, mode=mode))
+def changed(config: NeilfConfig, room: str, **settings: object) -> NeilfConfig:
+    """The same settings but for these of a room."""
+    return dataclasses.replace(config, **{room: dataclasses.replace(getattr(config, room), **settings)})
 
 
 def train(capture: Path, out: Path, config: NeilfConfig, device: str, start_from: Path | None = None) -> None:

@@ -305,6 +305,10 @@ class LossConfig:
     inter_reflection: float = 0.1
     smoothness: float = 5e-4
     lambertian: float = 5e-4
+    energy: float = 0.0
+    """What a surface would send beyond the light that it gets."""
+    specular: float = 0.0
+    """How highlights change from view to view, beside how R does; the diffuse part takes itself out."""
     mask: float = 0.0
     """Opacity against the object mask, where the capture has masks or shows exactly its background."""
     hessian_method: Literal["analytic", "finite_difference"] = "analytic"

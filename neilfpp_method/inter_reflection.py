@@ -16,7 +16,7 @@ from neilfpp_method.losses import scale_gradient
 from neilfpp_method.shading.frame import local_frame
 from neilfpp_method.structures import RayBatch, SceneLight, SceneTracer
 
-__all__ = ["TracedLight", "before_light", "scene_light", "trace_light", "traced_in_part"]
+__all__ = ["TracedLight", "before_light", "off_surface", "scene_light", "trace_light", "traced_in_part"]
 
 # A layer of scale β still absorbs along a ray that leaves it: from a height h, the optical depth is exp(−h/β) / (2 cos θ).
 # Four scales up it is 1 % along the normal and 5 % at 80°.
@@ -66,9 +66,8 @@ def trace_light(
     position, normal = position.detach(), normal.detach()
     rows = _random_rows(position.shape[0], config.rays_per_point, position.device)
     position, normal = position[rows], normal[rows]
-    wi, cosine = _cone_directions(normal, math.cos(math.radians(config.max_angle_deg)))
-    width = host.surface_width() if isinstance(host, HasSurfaceWidth) else 0.0
-    start = position + ((config.offset + HEIGHT_IN_WIDTHS * width) / cosine) * wi
+    wi = _cone_directions(normal, math.cos(math.radians(config.max_angle_deg)))
+    start = off_surface(host, position, normal, wi, config.offset)
     if isinstance(host, KnowsMisses):
         worth = torch.nonzero(host.may_meet(RayBatch(start, wi)))[:, 0]
         position, start, wi = position[worth], start[worth], wi[worth]
@@ -99,6 +98,18 @@ def scene_light(
         radiance.append(torch.where(hit[:, None], hits.color, 0.0))
     distance = torch.cat(distance).view(wi.shape[:2])
     return SceneLight(distance.isfinite(), torch.cat(radiance).view(wi.shape), distance)
+
+
+def off_surface(
+    host: Host, x: Float[Tensor, "K 3"], normal: Float[Tensor, "K 3"], w: Float[Tensor, "K 3"], offset: float
+) -> Float[Tensor, "K 3"]:
+    """Points along w beyond the layer that a host's surface is, at a height of `offset` and four widths of it.
+
+    Directions along the surface count as if they left it at 6°.
+    """
+    width = host.surface_width() if isinstance(host, HasSurfaceWidth) else 0.0
+    cosine = (w * normal).sum(-1, keepdim=True).clamp_min(0.1)
+    return x + ((offset + HEIGHT_IN_WIDTHS * width) / cosine) * w
 
 
 def before_light(
@@ -133,10 +144,10 @@ def _random_rows(points: int, per_point: float, device: torch.device) -> Tensor:
     return torch.cat([torch.arange(points, device=device).repeat(whole), torch.randperm(points, device=device)[:rest]])
 
 
-def _cone_directions(normal: Float[Tensor, "K 3"], least: float) -> tuple[Float[Tensor, "K 3"], Float[Tensor, "K 1"]]:
-    """Directions uniform in the cone cos θ ≥ `least` about the normal, and their cosines."""
+def _cone_directions(normal: Float[Tensor, "K 3"], least: float) -> Float[Tensor, "K 3"]:
+    """Directions uniform in the cone cos θ ≥ `least` about the normal."""
     azimuth = 2.0 * math.pi * torch.rand_like(normal[:, :1])
     cosine = least + (1.0 - least) * torch.rand_like(normal[:, :1])
     sine = (1.0 - cosine.square()).clamp_min(0.0).sqrt()
     local = torch.cat([sine * azimuth.cos(), sine * azimuth.sin(), cosine], dim=-1)
-    return (local[:, None] @ local_frame(normal))[:, 0], cosine
+    return (local[:, None] @ local_frame(normal))[:, 0]

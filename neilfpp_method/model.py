@@ -31,7 +31,10 @@ from neilfpp_method.lighting.memory import Observed, SurfaceMemory
 from neilfpp_method.lighting.solve import solve_light
 from neilfpp_method.replay import Replay, SurfacePixels
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, active_losses
+from neilfpp_method.second_view import lobe_difference, second_view
+from neilfpp_method.shading.albedo import directional_albedo
 from neilfpp_method.shading.brdf import LOBES
+from neilfpp_method.shading.color import srgb_to_linear
 from neilfpp_method.shading.frame import dot
 from neilfpp_method.shading.rendering_equation import shade
 from neilfpp_method.shading.sampling import Technique, sample_directions
@@ -173,6 +176,9 @@ class NeilfModel(nn.Module):
         shading = self.shade(seen.position, seen.normal, seen.wo, material, self.config.shading.train_samples)
         terms["physical"] = losses.photometric(shading.color, seen.pixel, self.facts.response, self.units.physical)
 
+        if "specular" in names:
+            terms["specular"] = self._specular_change(seen.detach(), material, shading)
+
         # 6. What arrives from another surface is what that surface sends.
         if "inter_reflection" in names:
             terms["inter_reflection"] = self._inter_reflection(seen.position, seen.normal)
@@ -210,6 +216,8 @@ class NeilfModel(nn.Module):
             material = self.brdf(seen.position)
         if "lambertian" in names:
             terms["lambertian"] = losses.lambertian(material)
+        if "energy" in names:
+            terms["energy"] = losses.energy(directional_albedo(material, seen.normal, seen.wo, self.lobe))
         return material
 
     def _inter_reflection(self, position: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]) -> LossTerm:
@@ -219,6 +227,18 @@ class NeilfModel(nn.Module):
         hit = torch.nonzero(traced.hit)[:, 0]
         incident = self.light.radiance(traced.position[hit], traced.wi[hit][:, None])[:, 0]
         return losses.inter_reflection(incident, traced.radiance[hit], self.units.incident)
+
+    def _specular_change(self, seen: SurfacePixels, material: Material, shading: Shading) -> LossTerm:
+        """Looks at some of the points again: highlights must change as R does, whatever the diffuse part is."""
+        settings = self.config.shading
+        second = second_view(self.host, seen, self.config.inter_reflection.offset, settings.hit_share)
+        seen, material, first = seen[second.row], material[second.row], shading.specular[second.row]
+        other = self.shade(seen.position, seen.normal, second.wo, material, settings.train_samples).specular
+        weight = lobe_difference(self.lobe, material.roughness, seen.normal, seen.wo, second.wo)
+        pixel, known = seen.pixel, 1.0
+        if self.facts.response == "srgb":
+            pixel, known = srgb_to_linear(pixel), (pixel < 1).all(-1, keepdim=True)  # a clipped pixel says too little
+        return losses.specular(first - other, pixel - second.radiance, weight * known, self.units.physical)
 
     def _keep_fitting(self, seen: Observed) -> None:
         """Remember some of what was seen, and when it is time solve for the light that explains what is remembered."""
@@ -369,12 +389,11 @@ class NeilfModel(nn.Module):
                 parameter.grad = None
 
     def _first_albedo(self) -> float:
-        """Directional albedo of the material that B starts as, seen from the normal under uniform light."""
-        half = torch.full((1, 1), 0.5)
-        up = torch.tensor([[0.0, 0.0, 1.0]])
+        """Directional albedo of the material that B starts as, seen from the normal."""
         start = self.config.brdf
-        metallic = torch.full((1, 1), start.initial_metallic)
+        if not self.config.shading.specular:
+            return start.initial_base_color
+        half, metallic = torch.full((1, 1), 0.5), torch.full((1, 1), start.initial_metallic)
+        up = torch.tensor([[0.0, 0.0, 1.0]])
         material = Material(torch.full((1, 3), start.initial_base_color), half, metallic)
-        samples = sample_directions("fibonacci", up, up, half, 4096, self.lobe, stochastic=False)
-        white = torch.ones_like(samples.wi)
-        return shade(material, up, up, samples, white, self.lobe, self.config.shading.specular).color.mean().item()
+        return directional_albedo(material, up, up, self.lobe).mean().item()

@@ -5,6 +5,8 @@
     material init    x     -     -     -      -      -     x      x      x   | B, L
     joint            x     x     x     low    low    -     x      x      x   | G, R, B, L
 
+L_en and L_spec, which the paper does not have, go with L_phys where they are switched on.
+
 Two more tables are for hosts whose geometry is not ours to train: where it is given, R is a surface light field and
 moves with the material; where the host belongs to another trainer, that one sees to the first stage.
 """
@@ -50,7 +52,9 @@ GEOMETRY = LIGHT_FIELD | {"geometry", "beta"}
 MATERIAL = frozenset({"brdf", "light"})
 
 # Each loss of the material stages with the setting that weighs it.
-MATERIAL_LOSSES = {name: name for name in ("physical", "inter_reflection", "smoothness", "lambertian")}
+MATERIAL_LOSSES = {
+    name: name for name in ("physical", "inter_reflection", "smoothness", "lambertian", "energy", "specular")
+}
 
 
 @dataclass(frozen=True)
@@ -165,9 +169,9 @@ def active_losses(
     if config.inter_reflection.mode != "soft":
         weights.pop("inter_reflection", None)
     if not config.shading.specular:
-        # A Lambertian surface has neither roughness nor metallic to keep smooth or to pull back.
-        weights.pop("smoothness", None)
-        weights.pop("lambertian", None)
+        # A Lambertian surface has neither roughness nor metallic, and sends what it gets times its colour.
+        for loss in ("smoothness", "lambertian", "energy", "specular"):
+            weights.pop(loss, None)
     return {loss: weight for loss, weight in weights.items() if weight > 0}
 
 

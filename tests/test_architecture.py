@@ -25,6 +25,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("fields", "data", "losses", "facts"),
     ("hosts.base", "lighting"),
     ("hosts", "inter_reflection", "replay", "unseen"),
+    ("second_view",),
     ("model",),
     ("attach", "train"),
     ("export",),

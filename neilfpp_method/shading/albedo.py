@@ -1,0 +1,57 @@
+"""Directional albedo: what a surface sends to a viewer of light that is 1 from everywhere."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from neilfpp_method.shading.brdf import Lobe, diffuse_reflectance, normal_reflectance, specular_terms
+from neilfpp_method.shading.frame import dot
+from neilfpp_method.shading.rendering_equation import PDF_FLOOR
+from neilfpp_method.shading.sampling import specular_lobe
+from neilfpp_method.structures import Material
+
+__all__ = ["directional_albedo"]
+
+SIZE = 32
+"""Entries along either axis, roughness and cosine of the viewer."""
+DIRECTIONS = 512
+"""Of the sum for an entry."""
+
+
+def directional_albedo(
+    material: Material, n: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"], lobe: Lobe
+) -> Float[Tensor, "N 3"]:
+    """∫ f(wo, wi) cos θ dwi of the BRDF of METHOD §1, per channel.
+
+        ρ = (1 − m) b + F0 A(r, n·wo) + B(r, n·wo)
+
+    A and B are the integrals of the two terms of the lobe (`specular_terms`): one table for each, bilinear between its
+    entries. `n`, `wo` are unit and constants; the gradient goes to the material.
+    """
+    table = _lobe_integrals(lobe).to(n.device, n.dtype)
+    cosine = (n * wo).sum(-1, keepdim=True).detach()
+    # The places of `grid_sample` have the last axis first, and go from −1 to 1.
+    place = torch.cat((cosine, material.roughness.to(n.dtype)), -1) * 2 - 1
+    found = functional.grid_sample(table, place[None, :, None], padding_mode="border", align_corners=False)
+    facing, grazing = found[0, :, :, 0].unsqueeze(-1)
+    return diffuse_reflectance(material) + normal_reflectance(material) * facing + grazing
+
+
+@lru_cache
+@torch.no_grad()
+def _lobe_integrals(lobe: Lobe) -> Float[Tensor, "1 2 R C"]:
+    """A and B at the middles of equal parts of roughness and of the viewer's cosine."""
+    middle = (torch.arange(SIZE) + 0.5) / SIZE
+    roughness, cosine = torch.cartesian_prod(middle, middle)[:, :, None].unbind(1)
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(len(cosine), 3)
+    wo = torch.cat(((1 - cosine.square()).sqrt(), torch.zeros_like(cosine), cosine), -1)
+    technique = specular_lobe(up, wo, roughness, lobe)
+    wi = technique.draw(DIRECTIONS, False)
+    terms = specular_terms(roughness, up, wo, wi, lobe)
+    weight = dot(wi, up).clamp_min(0) / technique.pdf(wi).clamp_min(PDF_FLOOR)
+    return torch.stack([(term * weight).mean(1).view(1, SIZE, SIZE) for term in (terms.facing, terms.grazing)], 1)
