@@ -33,7 +33,7 @@ from neilfpp_method.facts import SceneFacts
 from neilfpp_method.fields.free_light import make_incident_light
 from neilfpp_method.fields.sdf import SdfField
 from neilfpp_method.hosts.volsdf import VolSdfHost
-from neilfpp_method.kernels.process import computing_fast
+from neilfpp_method.kernels.process import computing_fast, rounded_products
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.presets import preset
 from neilfpp_method.schedule import Stage, active_losses, weigh
@@ -112,7 +112,9 @@ def step_on(model: NeilfModel, batch: PixelBatch) -> Callable[[], None]:
 
     def step() -> None:
         optimizer.zero_grad(set_to_none=True)
-        weigh(model(batch, Stage.JOINT), weights).loss.backward()
+        loss = weigh(model(batch, Stage.JOINT), weights).loss
+        with rounded_products(model.config.train.gradients == "rounded"):
+            loss.backward()
         optimizer.step()
 
     return step

@@ -351,6 +351,9 @@ class TrainConfig:
     """Rays per step and process."""
     fresh: float = 1.0
     """Share of a step's rays that are rendered while the surface stands still; the other points are those of earlier steps."""
+    gradients: Literal["exact", "rounded"] = "exact"
+    """Products of matrices in backward passes. rounded: factors of bfloat16 with sums of float32, where the machine has units
+    for them; what a step renders, and its losses, stay exact."""
     seed: int = 0
     """Every random number of step k follows from seed and k alone."""
     checkpoint_every: int = 500

@@ -1,6 +1,6 @@
-"""How a process computes on a CPU: without denormal numbers, and with memory that it keeps.
+"""How a process computes: without denormal numbers, with memory that it keeps, with products of rounded factors.
 
-Both are settings of the whole process, so a command makes them and a library does not. docs/performance.md has what they gain.
+All are settings of the whole process, so a command makes them and a library does not. docs/performance.md has what they gain.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 import torch
 
-__all__ = ["computing_fast"]
+__all__ = ["computing_fast", "rounded_products"]
 
 # Options of glibc's allocator (malloc.h), and the values that it comes to by itself in a process with large arrays.
 TRIM_THRESHOLD, MMAP_THRESHOLD, MMAP_MAX = -1, -3, -4
@@ -33,6 +33,18 @@ def computing_fast() -> Iterator[None]:
         yield
     finally:
         _set(fast=False)
+
+
+@contextmanager
+def rounded_products(rounded: bool = True) -> Iterator[None]:
+    """Products of float32 matrices with rounded factors (bfloat16; TF32 on a GPU) and exact sums, where the machine has units
+    for that; elsewhere, and where `rounded` is off, all exact. Afterwards the process is as it was."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("medium" if rounded else before)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
 
 
 def _set(fast: bool) -> None:
