@@ -39,7 +39,8 @@ class ViewFigures:
     Attributes:
         name: the view's.
         unreadable: why the pixels cannot be read, else empty; nothing else is known then.
-        luminance: the median linear luminance of the object, on the scale that all views share; 0 for a black image.
+        luminance: the geometric mean of the linear luminance of the object, on the scale that all views share; 0 for a black
+            image. A median jumps where the image is half sky and half ground; the mean of stops moves as the exposure does.
         stops: between the 1st and the 99.9th percentile of that luminance, in powers of two.
         sharpness: variance of the Laplacian over the variance of the picture, at one brightness for all views.
         clipped: share at 255 (display values), or at a level at which an HDR image piles up, in any channel.
@@ -79,12 +80,13 @@ def measure(view: View, hdr: bool) -> ViewFigures:
     linear = color if hdr else srgb_to_linear(torch.from_numpy(color)).numpy()
     light = luminance(torch.from_numpy(linear)).numpy()
     lit = light[shown & (light > DARK * light[shown].mean())] if shown.any() else light[shown]
-    low, middle, high = np.percentile(lit, [1, 50, 99.9]) if lit.size else (1.0, 0.0, 1.0)
+    low, high = np.percentile(lit, [1, 99.9]) if lit.size else (1.0, 1.0)
+    typical = float(np.exp(np.log(lit).mean(dtype=np.float64))) if lit.size else 0.0
     return ViewFigures(
         name=view.name,
-        luminance=float(middle),
+        luminance=typical,
         stops=float(np.log2(high / low)),
-        sharpness=_sharpness(light, shown, float(middle)),
+        sharpness=_sharpness(light, shown, typical),
         clipped=_clipped(image, color, shown),
         invalid=float(1.0 - valid.mean()),
         broken=float((valid & ~sound).mean()),
@@ -116,10 +118,10 @@ def _off_the_background(color: Float32[np.ndarray, "H W 3"], usable: Bool[np.nda
     return ~(color == common).all(axis=-1) if even else np.ones(usable.shape, bool)
 
 
-def _sharpness(light: Float32[np.ndarray, "H W"], shown: Bool[np.ndarray, "H W"], middle: float) -> float:
-    if middle <= 0:
+def _sharpness(light: Float32[np.ndarray, "H W"], shown: Bool[np.ndarray, "H W"], typical: float) -> float:
+    if typical <= 0:
         return 0.0
-    grey = linear_to_srgb(torch.from_numpy(light * np.float32(MIDDLE_GREY / middle)).clamp(0, 1)).numpy()
+    grey = linear_to_srgb(torch.from_numpy(light * np.float32(MIDDLE_GREY / typical)).clamp(0, 1)).numpy()
     grey, kept = _fitted(grey, SHARP), _fitted(shown.astype(np.float32), SHARP) > 0.5
     if not kept.any():
         return 0.0

@@ -47,6 +47,17 @@ def test_luminance_and_range_are_linear_and_of_the_object(view: View) -> None:
     assert figures(view, grey, hdr=False).luminance == pytest.approx(0.491, abs=0.002)  # of the sRGB curve
 
 
+def test_luminance_moves_with_the_exposure_and_hardly_with_what_is_in_view(view: View) -> None:
+    def seen(bright_rows: int, exposure: float = 1.0) -> float:
+        pixels = exposure * (0.2 + 0.02 * NOISE)
+        pixels[:bright_rows] *= 4.0
+        return figures(view, pixels).luminance
+
+    # A little more than half of it sky, or a little less: what a step to the side does to a view without a mask.
+    assert seen(32) / seen(28) == pytest.approx(1.0, abs=0.15)
+    assert seen(32, exposure=2.0) / seen(32) == pytest.approx(2.0, rel=1e-3)
+
+
 def test_sharpness_falls_with_blur_and_not_with_exposure(view: View) -> None:
     sharp = figures(view, NOISE).sharpness
     assert figures(view, 0.1 * NOISE).sharpness == pytest.approx(sharp, rel=1e-3)
