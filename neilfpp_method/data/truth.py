@@ -121,6 +121,8 @@ class Truth:
         if self._file(path) is None:
             return None
         pixels = read_image(path).pixels
+        if channels == 1 and (pixels == pixels[..., :1]).all():
+            pixels = pixels[..., :1]  # many programs write grey as three channels that are alike
         wanted = (view.camera.height, view.camera.width, channels)
         if pixels.shape != wanted:
             raise UserError(f"{path}: the shape {pixels.shape}, where the view needs {wanted}", "render it again")

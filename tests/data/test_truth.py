@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import write_exr
+from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.errors import UserError
@@ -44,6 +44,20 @@ def test_material_is_linear_and_of_test_views(truth: Truth) -> None:
     assert torch.allclose(material.roughness[hit], torch.tensor(ROUGHNESS))
     assert torch.allclose(material.metallic[hit], torch.tensor(METALLIC))
     assert truth.material(truth.capture.train_views[0]) is None
+
+
+def test_grey_as_three_channels_is_grey(truth: Truth) -> None:
+    (view,) = truth.capture.test_views
+    before = truth.material(view).roughness
+    path = truth.capture.root / "ground_truths" / "materials" / "roughness" / f"{view.name}.png"
+    pixels = read_image(path).pixels
+    three = np.rint(255 * np.repeat(pixels, 3, axis=-1)).astype(np.uint8)
+    write_png(path, three)
+    assert torch.equal(truth.material(view).roughness, before)
+    three[0, 0] = (0, 128, 255)
+    write_png(path, three)
+    with pytest.raises(UserError, match="the shape"):
+        truth.material(view)
 
 
 def test_mesh(truth: Truth) -> None:
