@@ -20,7 +20,7 @@ from neilfpp_method.train.run import load_run, read_json
 __all__ = ["demo_config", "demo_scene", "run_demo"]
 
 STEPS = {"sdf_steps": 1600, "material_steps": 1200, "joint_steps": 100}
-"""Of the three stages: some less than the preset has, for a quarter of an hour on two cores."""
+"""Of the three stages: some less than the preset has, for five to ten minutes on two cores of today."""
 SHORT = 20
 """A short demo takes one step in so many."""
 
