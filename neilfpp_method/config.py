@@ -332,7 +332,7 @@ class OptimizerConfig:
     background: float = 5e-4
     beta: float = 5e-4
     joint: float = 0.5
-    """Factor on the rates of geometry and radiance in the joint stage."""
+    """Factor on all rates in the joint stage."""
     final: float = 0.1
     """Rate at the end of a stage over its start."""
 
