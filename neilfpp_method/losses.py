@@ -97,7 +97,12 @@ def lambertian(material: Material) -> LossTerm:
 
 
 def energy(albedo: Float[Tensor, "N 3"]) -> LossTerm:
-    """max(ρ − 1, 0): no surface sends more light than it gets. Diffuse and specular part may together, neither by itself."""
+    """max(ρ − 1, 0): no surface sends more light than it gets. Diffuse and specular part may together, neither by itself.
+
+    Args:
+        albedo: ρ, directional albedo per channel (`shading.albedo`). PBR-NeRF (Wu et al. 2025) bounds a sum over samples of
+            light; this integral has no noise.
+    """
     return LossTerm((albedo - 1.0).clamp_min(0.0))
 
 

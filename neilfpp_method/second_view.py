@@ -11,7 +11,7 @@ from torch import Tensor
 from neilfpp_method.hosts.base import Host
 from neilfpp_method.inter_reflection import off_surface
 from neilfpp_method.lighting.memory import Observed
-from neilfpp_method.shading.brdf import Lobe
+from neilfpp_method.shading.brdf import Lobe, cosines
 from neilfpp_method.structures import Indexable, RayBatch
 
 __all__ = ["SecondView", "lobe_difference", "second_view"]
@@ -70,6 +70,5 @@ def lobe_difference(
     views a few degrees apart, a rough one hardly. All vectors are unit and point away from the surface.
     """
     mirror = 2 * (n * wo).sum(-1, keepdim=True) * n - wo
-    half = torch.nn.functional.normalize(mirror + other, dim=-1, eps=1e-6)
-    cosine = (half * n).sum(-1, keepdim=True).clamp(0, 1)
+    cosine = cosines(n, other, mirror[:, None]).h.clamp_min(0)
     return 1 - lobe.distribution(cosine, roughness) / lobe.distribution(torch.ones_like(cosine), roughness)

@@ -12,7 +12,7 @@ from neilfpp_method.facts import SceneFacts
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.presets import free_light, preset
-from neilfpp_method.structures import PixelBatch
+from neilfpp_method.structures import PixelBatch, RayBatch
 
 
 def tiny_config(**changes) -> NeilfConfig:
@@ -58,3 +58,11 @@ def sphere_batch(count: int = 48, spread: float = 0.8, color: float = 0.3) -> Pi
         image_gradient=torch.zeros(count),
         view=torch.zeros(count, dtype=torch.long),
     )
+
+
+def meet_ball(rays: RayBatch, radius: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where rays meet a ball about the origin, (N, 3), and whether they do, 1 or 0."""
+    along = -(rays.origins * rays.directions).sum(-1)
+    square = along.square() - rays.origins.square().sum(-1) + radius**2
+    position = rays.origins + (along - square.clamp_min(0).sqrt())[:, None] * rays.directions
+    return position, ((square > 0) & (along > 0)).float()

@@ -14,7 +14,7 @@ from neilfpp_method.inter_reflection import before_light, traced_in_part
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage
 from neilfpp_method.structures import RayBatch, SceneLight, SurfaceHits
-from tests.scenes import sphere_batch, tiny_config
+from tests.scenes import meet_ball, sphere_batch, tiny_config
 
 WALL, SKY = 0.3, 2.0
 
@@ -78,13 +78,8 @@ class Sphere:
 
     def render(self, rays: RayBatch) -> SurfaceHits:
         self.rays += len(rays)
-        along = -(rays.origins * rays.directions).sum(-1)
-        square = along.square() - rays.origins.square().sum(-1) + 1.0
-        met = (square > 0) & (along > 0)
-        position = rays.origins + (along - square.clamp_min(0).sqrt())[:, None] * rays.directions
-        opacity = met.float()
-        color = torch.full_like(position, 0.5)
-        return SurfaceHits(color, position, normalize(position, dim=-1), opacity, opacity)
+        position, met = meet_ball(rays, 1.0)
+        return SurfaceHits(torch.full_like(position, 0.5), position, normalize(position, dim=-1), met, met)
 
 
 def test_a_step_traces_the_share_that_is_set_and_a_picture_traces_all():

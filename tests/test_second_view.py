@@ -17,7 +17,7 @@ from neilfpp_method.second_view import SHARE, lobe_difference, second_view
 from neilfpp_method.shading.albedo import directional_albedo
 from neilfpp_method.shading.brdf import GGX, LOBES
 from neilfpp_method.structures import Material, RayBatch, SurfaceHits
-from tests.scenes import sphere_batch, tiny_config
+from tests.scenes import meet_ball, sphere_batch, tiny_config
 
 LIGHT, ROUGHNESS = 0.7, 0.35
 
@@ -35,13 +35,10 @@ class Ball:
 
     def render(self, rays: RayBatch) -> SurfaceHits:
         self.rays += len(rays)
-        along = -(rays.origins * rays.directions).sum(-1)
-        square = along.square() - rays.origins.square().sum(-1) + 0.36
-        met = (square > 0) & (along > 0)
-        position = rays.origins + (along - square.clamp_min(0).sqrt())[:, None] * rays.directions
+        position, met = meet_ball(rays, 0.6)
         normal = normalize(position, dim=-1)
         color = LIGHT * directional_albedo(material_of(len(rays)), normal, -rays.directions, GGX)
-        return SurfaceHits(color, position, normal, met.float(), met * self.concentration)
+        return SurfaceHits(color, position, normal, met, met * self.concentration)
 
 
 def points_seen(count: int = 2000) -> Observed:

@@ -31,9 +31,10 @@ def directional_albedo(
         ρ = (1 − m) b + F0 A(r, n·wo) + B(r, n·wo)
 
     A and B are the integrals of the two terms of the lobe (`specular_terms`): one table for each, bilinear between its
-    entries. `n`, `wo` are unit and constants; the gradient goes to the material.
+    entries; the split of Karis 2013 (Real Shading in Unreal Engine 4). `n`, `wo` are unit and constants; the gradient goes to
+    the material.
     """
-    table = _lobe_integrals(lobe).to(n.device, n.dtype)
+    table = _lobe_integrals(lobe, n.device, n.dtype)
     cosine = (n * wo).sum(-1, keepdim=True).detach()
     # The places of `grid_sample` have the last axis first, and go from −1 to 1.
     place = torch.cat((cosine, material.roughness.to(n.dtype)), -1) * 2 - 1
@@ -44,8 +45,8 @@ def directional_albedo(
 
 @lru_cache
 @torch.no_grad()
-def _lobe_integrals(lobe: Lobe) -> Float[Tensor, "1 2 R C"]:
-    """A and B at the middles of equal parts of roughness and of the viewer's cosine."""
+def _lobe_integrals(lobe: Lobe, device: torch.device, dtype: torch.dtype) -> Float[Tensor, "1 2 R C"]:
+    """A and B at the middles of equal parts of roughness and of the viewer's cosine; made once for each device and type."""
     middle = (torch.arange(SIZE) + 0.5) / SIZE
     roughness, cosine = torch.cartesian_prod(middle, middle)[:, :, None].unbind(1)
     up = torch.tensor([0.0, 0.0, 1.0]).expand(len(cosine), 3)
@@ -54,4 +55,5 @@ def _lobe_integrals(lobe: Lobe) -> Float[Tensor, "1 2 R C"]:
     wi = technique.draw(DIRECTIONS, False)
     terms = specular_terms(roughness, up, wo, wi, lobe)
     weight = dot(wi, up).clamp_min(0) / technique.pdf(wi).clamp_min(PDF_FLOOR)
-    return torch.stack([(term * weight).mean(1).view(1, SIZE, SIZE) for term in (terms.facing, terms.grazing)], 1)
+    table = torch.stack([(term * weight).mean(1).view(1, SIZE, SIZE) for term in (terms.facing, terms.grazing)], 1)
+    return table.to(device, dtype)
