@@ -122,12 +122,12 @@ def step_on(model: NeilfModel, batch: PixelBatch) -> Callable[[], None]:
 
 def cheap_paper() -> NeilfConfig:
     """The networks of `paper-mlp`, with what makes them cheap: directions that points share, empty space skipped, half of the
-    cuts a round for what is left of a ray (`benchmarks.sampler` has the error of that), and rounded products in the backward
-    pass."""
+    cuts a round for what is left of a ray and half precision in the sampler's queries (`benchmarks.sampler` has the error of
+    both), and rounded products in the backward pass."""
     config = preset("paper-mlp")
     return dataclasses.replace(
         config,
-        volume=dataclasses.replace(config.volume, skip_empty=True, initial_samples=64),
+        volume=dataclasses.replace(config.volume, skip_empty=True, initial_samples=64, queries="rounded"),
         shading=dataclasses.replace(config.shading, sampler="shared"),
         train=dataclasses.replace(config.train, gradients="rounded"),
     )

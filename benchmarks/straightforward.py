@@ -3,6 +3,7 @@
 The networks, their weights, the losses and the order of a step are those of the package; what is computed is the same. How it
 is computed is not:
 
+- softplus units by torch;
 - normals, Hessians and gradients of the material by autograd, which a loss on them differentiates once more;
 - every ray in every round of VolSDF's Algorithm 1 until all rays of the batch have converged, and no space skipped;
 - every traced ray of L_ref rendered, whether or not it meets anything;
@@ -11,16 +12,20 @@ is computed is not:
 
 from __future__ import annotations
 
-import dataclasses
+import copy
 import math
+from dataclasses import replace
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.nn import functional
 
 from neilfpp_method.config import NeilfConfig, VolumeConfig
 from neilfpp_method.fields.brdf import BrdfField, BrdfSample
 from neilfpp_method.fields.incident_light import IncidentLightField
+from neilfpp_method.fields.mlp import SOFTPLUS_SHARPNESS
 from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
@@ -48,7 +53,8 @@ class PlainSdf(nn.Module):
 
     def __init__(self, field: SdfField) -> None:
         super().__init__()
-        self.encoding, self.mlp = field.encoding, field.mlp
+        self.encoding, self.mlp = field.encoding, copy.copy(field.mlp)  # the same weights
+        self.mlp.activation = replace(self.mlp.activation, value=partial(functional.softplus, beta=SOFTPLUS_SHARPNESS))
 
     def forward(self, x: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
         return self.mlp(self.encoding(x))[:, 0]
@@ -123,10 +129,10 @@ class PlainHost(VolSdfHost):
 
 def straightforward(model: NeilfModel) -> NeilfModel:
     """A model with the weights of another, whose host is VolSDF and whose light is the paper's, that computes plainly."""
-    config = dataclasses.replace(
+    config = replace(
         model.config,
-        volume=dataclasses.replace(model.config.volume, skip_empty=False),
-        shading=dataclasses.replace(model.config.shading, sampler="fibonacci"),
+        volume=replace(model.config.volume, skip_empty=False),
+        shading=replace(model.config.shading, sampler="fibonacci"),
     )
     host = PlainHost(config, model.facts.radiance_scale, model.facts.background)
     plain = NeilfModel(host, config, model.facts)

@@ -224,6 +224,9 @@ class VolumeConfig:
     """Most refinement rounds."""
     bisections: int = 10
     """Bisection steps on β."""
+    queries: Literal["exact", "rounded"] = "exact"
+    """The sampler's own queries, which say where a ray is sampled and nothing more. rounded: in half precision where the device
+    has units for that; distances are off by some 1e-4, so this is for β well above."""
     epsilon: float = 0.1
     """Bound on the opacity's error."""
     samples: int = 64

@@ -18,6 +18,7 @@ from torch.nn import functional
 from torch.nn.utils import parametrizations
 
 from neilfpp_method.errors import UserError
+from neilfpp_method.kernels.softplus import UnitSample, softplus, softplus_and_slope
 
 __all__ = ["ACTIVATIONS", "Activation", "Mlp", "MlpSample", "geometric_init_", "weight_normalise_"]
 
@@ -29,10 +30,10 @@ RIDGE = 1e-2  # price of that correction, relative to the mean square of a unit
 
 @dataclass(frozen=True)
 class Activation:
-    """A hidden unit, its derivative, and the start of the linear layer that feeds it."""
+    """A hidden unit, the same with its slope, and the start of the linear layer that feeds it."""
 
     value: Callable[[Tensor], Tensor]
-    derivative: Callable[[Tensor], Tensor]
+    with_slope: Callable[[Tensor], UnitSample]
     init_: Callable[[nn.Linear], object]
 
 
@@ -50,11 +51,13 @@ def _siren_(layer: nn.Linear) -> None:
 
 ACTIVATIONS: Mapping[str, Activation] = {
     "softplus": Activation(
-        lambda z: functional.softplus(z, beta=SOFTPLUS_SHARPNESS), lambda z: torch.sigmoid(SOFTPLUS_SHARPNESS * z), _he_
+        lambda z: softplus(z, SOFTPLUS_SHARPNESS), lambda z: softplus_and_slope(z, SOFTPLUS_SHARPNESS), _he_
     ),
-    "relu": Activation(torch.relu, lambda z: (z > 0).to(z.dtype), _he_),
+    "relu": Activation(torch.relu, lambda z: UnitSample(torch.relu(z), (z > 0).to(z.dtype)), _he_),
     "sine": Activation(
-        lambda z: torch.sin(SINE_FREQUENCY * z), lambda z: SINE_FREQUENCY * torch.cos(SINE_FREQUENCY * z), _siren_
+        lambda z: torch.sin(SINE_FREQUENCY * z),
+        lambda z: UnitSample(torch.sin(SINE_FREQUENCY * z), SINE_FREQUENCY * torch.cos(SINE_FREQUENCY * z)),
+        _siren_,
     ),
 }
 
@@ -122,9 +125,11 @@ class Mlp(nn.Module):
         weights = [layer.weight for layer in self.layers]  # once: a normalised weight is computed when it is read
         hidden, slopes = x, []
         for number, layer in enumerate(self.layers[:-1]):
-            z = functional.linear(self._with_skip(hidden, x, number), weights[number], layer.bias)
-            slopes.append(self.activation.derivative(z)[:, None])
-            hidden = self.activation.value(z)
+            units = self.activation.with_slope(
+                functional.linear(self._with_skip(hidden, x, number), weights[number], layer.bias)
+            )
+            slopes.append(units.slope[:, None])
+            hidden = units.value
         hidden = self._with_skip(hidden, x, len(slopes))
         value = functional.linear(hidden, weights[-1], self.layers[-1].bias)
 

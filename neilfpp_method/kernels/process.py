@@ -1,17 +1,18 @@
 """How a process computes: without denormal numbers, with memory that it keeps, with products of rounded factors.
 
-All are settings of the whole process, so a command makes them and a library does not. docs/performance.md has what they gain.
+The first two are settings of the whole process, so a command makes them and a library does not. docs/performance.md has what
+they gain.
 """
 
 from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 import torch
 
-__all__ = ["computing_fast", "rounded_products"]
+__all__ = ["computing_fast", "half_precision", "rounded_products"]
 
 # Options of glibc's allocator (malloc.h), and the values that it comes to by itself in a process with large arrays.
 TRIM_THRESHOLD, MMAP_THRESHOLD, MMAP_MAX = -1, -3, -4
@@ -45,6 +46,19 @@ def rounded_products(rounded: bool = True) -> Iterator[None]:
         yield
     finally:
         torch.set_float32_matmul_precision(before)
+
+
+def half_precision(device: torch.device, wanted: bool = True) -> AbstractContextManager:
+    """Linear layers in float16, eleven bits to a number, with sums in float32, where the device has units for that; elsewhere,
+    and where it is not wanted, as ever."""
+    return torch.autocast(device.type, torch.float16, enabled=wanted and _has_half_units(device.type))
+
+
+def _has_half_units(kind: str) -> bool:
+    if kind != "cpu":
+        return kind == "cuda"
+    known = getattr(torch.cpu, "get_capabilities", dict)()  # torch below 2.10 does not say
+    return bool(known.get("avx512_fp16") or known.get("amx_fp16"))
 
 
 def _set(fast: bool) -> None:

@@ -1,0 +1,91 @@
+"""Softplus units, and their slope with them: compiled loops on a CPU, where torch takes ten passes over memory."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from functools import lru_cache
+from types import ModuleType
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import FunctionCtx
+from torch.nn import functional
+
+from neilfpp_method.kernels.threads import for_each, shares
+
+__all__ = ["UnitSample", "softplus", "softplus_and_slope"]
+
+LEAST = 65_536
+"""Numbers that are worth waking a thread for."""
+
+
+@dataclass(frozen=True)
+class UnitSample:
+    """What hidden units make of z, and the derivative with respect to z."""
+
+    value: Float[Tensor, "*S"]
+    slope: Float[Tensor, "*S"]
+
+
+def softplus(z: Float[Tensor, "*S"], sharpness: float) -> Float[Tensor, "*S"]:
+    """ln(1 + e^(sharpness z)) / sharpness. Of half precision on a CPU comes full precision, as torch takes longer for less."""
+    if z.dtype == torch.float16 and z.device.type == "cpu":
+        z = z.float()
+    if not _takes(z):
+        return functional.softplus(z, beta=sharpness)
+    if torch.is_grad_enabled() and z.requires_grad:
+        return _Softplus.apply(z, sharpness)[0]
+    value = torch.empty_like(z, memory_format=torch.contiguous_format)
+    _run("softplus", sharpness, z, value)
+    return value
+
+
+def softplus_and_slope(z: Float[Tensor, "*S"], sharpness: float) -> UnitSample:
+    """Value and slope; both can be differentiated any number of times."""
+    if not _takes(z):
+        return UnitSample(functional.softplus(z, beta=sharpness), torch.sigmoid(sharpness * z))
+    return UnitSample(*_Softplus.apply(z, sharpness))
+
+
+class _Softplus(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: FunctionCtx, z: Tensor, sharpness: float) -> tuple[Tensor, Tensor]:
+        value, slope = (torch.empty_like(z, memory_format=torch.contiguous_format) for _ in range(2))
+        _run("softplus_and_slope", sharpness, z, value, slope)
+        ctx.save_for_backward(slope)
+        ctx.sharpness = sharpness
+        return value, slope
+
+    @staticmethod
+    def backward(ctx: FunctionCtx, to_value: Tensor, to_slope: Tensor) -> tuple[Tensor, None]:
+        (slope,) = ctx.saved_tensors
+        if torch.is_grad_enabled():  # somebody differentiates the gradient
+            return slope * (to_value + to_slope * ctx.sharpness * (1.0 - slope)), None
+        gradient = torch.empty_like(slope)
+        _run("pull_through_softplus", ctx.sharpness, slope, to_value, to_slope, gradient)
+        return gradient, None
+
+
+def _takes(z: Tensor) -> bool:
+    """Whether the loops take these numbers; torch takes any."""
+    return z.device.type == "cpu" and z.dtype == torch.float32 and _loops() is not None
+
+
+@lru_cache(maxsize=1)
+def _loops() -> ModuleType | None:
+    try:
+        return importlib.import_module("neilfpp_method.kernels.compiled")
+    except ImportError:
+        return None
+
+
+def _run(loop: str, sharpness: float, *tensors: Tensor) -> None:
+    work, arrays = getattr(_loops(), loop), [_flat(tensor) for tensor in tensors]
+    for_each(lambda start, stop: work(*arrays, sharpness, start, stop), shares(tensors[0].numel(), LEAST))
+
+
+def _flat(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().view(-1).numpy()
