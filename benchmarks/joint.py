@@ -122,8 +122,8 @@ def step_on(model: NeilfModel, batch: PixelBatch) -> Callable[[], None]:
 
 def cheap_paper() -> NeilfConfig:
     """The networks of `paper-mlp`, with what makes them cheap: directions that points share, empty space skipped, half of the
-    cuts a round for what is left of a ray and half precision in the sampler's queries (`benchmarks.sampler` has the error of
-    both), and rounded products in the backward pass."""
+    cuts a round for what is left of a ray (`benchmarks.sampler` has the error of that), half precision in the sampler's queries
+    (of that the last line here), and rounded products in the backward pass."""
     config = preset("paper-mlp")
     return dataclasses.replace(
         config,
@@ -166,6 +166,18 @@ def measurements() -> Iterator[Measurement]:
     for name in list(steps)[1:]:
         yield Measurement(f"joint/plain over {name}", seconds["plain"] / seconds[name], "×", "higher", tolerance=0.5)
     yield from _errors()
+    yield Measurement("joint/hits moved by rounded queries", _moved_by_rounding(cheap, batch), "β, median", "lower", 1.0)
+
+
+@torch.no_grad()
+def _moved_by_rounding(model: NeilfModel, batch: PixelBatch) -> float:
+    """How far hits move when the sampler's queries are rounded, in β; sampled without random numbers."""
+    host = model.host.eval()
+    exact = dataclasses.replace(host.config.volume, queries="exact")
+    with computing_fast():
+        rounded = host.render(batch.rays).position
+        host.config = dataclasses.replace(host.config, volume=exact)
+        return (host.render(batch.rays).position - rounded).norm(dim=-1).median().item() / SHARP
 
 
 def _shared(scene: Scene, roughness: float, count: int) -> IncidentSamples:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from neilfpp_method import losses
 from neilfpp_method.config import NeilfConfig
-from neilfpp_method.errors import UserError
+from neilfpp_method.config_check import check_config
 from neilfpp_method.facts import SceneFacts, radiance_units
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
@@ -85,11 +85,12 @@ class NeilfModel(nn.Module):
             module's, though gradients reach it in the joint stage.
 
     Raises:
-        UserError: settings of the light and of the inter-reflection do not go together.
+        UserError: settings that do not go together (`config_check`).
     """
 
     def __init__(self, host: Host, config: NeilfConfig, facts: SceneFacts, borrowed: bool = False) -> None:
         super().__init__()
+        check_config(config)
         if borrowed:
             object.__setattr__(self, "host", host)  # past nn.Module, which would take it in
         else:
@@ -114,18 +115,8 @@ class NeilfModel(nn.Module):
         self.replay = Replay(train.fresh, train.rays) if train.fresh < 1 and stands_still else None
         self.seen_places: SeenPlaces | None = None
         if config.inter_reflection.unseen == "shaded":
-            if config.inter_reflection.mode != "hard":
-                raise UserError(
-                    f"places that no camera sees are shaded, with inter-reflection '{config.inter_reflection.mode}'",
-                    "set --config.inter-reflection.mode hard, or --config.inter-reflection.unseen radiance",
-                )
             self.seen_places = SeenPlaces(config.volume.radius)
         if config.light.kind != "free":
-            if config.inter_reflection.mode == "soft":
-                raise UserError(
-                    f"soft inter-reflection with the light '{config.light.kind}', which L_ref cannot teach",
-                    "set --config.inter-reflection.mode hard, or --config.light.kind free",
-                )
             fit = config.light.fit
             self.light = EnvironmentLight(config.light.environment_height, first_radiance)
             self.lamps = None if config.light.kind == "distant" else Lamps(fit.lamps, fit.lamp_radius)

@@ -20,7 +20,7 @@ SOURCES = {
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "structures"),
     ("config", "config_json"),
-    ("kernels",),
+    ("config_check", "kernels"),
     ("shading", "volume", "schedule", "presets", "ring"),
     ("fields", "data", "losses", "facts"),
     ("hosts.base", "lighting"),

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from neilfpp_method.config import NeilfConfig
+from neilfpp_method.config_check import check_config
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.environment_map import check_environment
 from neilfpp_method.data.pixels import PixelDataset
@@ -161,16 +162,8 @@ def _check(config: NeilfConfig) -> None:
         if getattr(config.train, name) < 1:
             option = f"--config.train.{name.replace('_', '-')}"
             raise UserError(f"{option} is {getattr(config.train, name)}", "set it to 1 or more")
-    shares = {"train.fresh": config.train.fresh, "inter-reflection.traced-share": config.inter_reflection.traced_share}
-    for name, share in shares.items():
-        if not 0 < share <= 1:
-            raise UserError(f"--config.{name} is {share}", "set it above 0 and to 1 at most")
+    check_config(config)
     if config.light.map is not None:
-        if config.light.kind == "free":
-            raise UserError(
-                f"{config.light.map}: a light that is free at every point takes no map",
-                "add --config.light.kind distant, or auto to look for lamps before the map as well",
-            )
         check_environment(Path(config.light.map))
     steps = config.train
     for name, needed in {"volume": steps.sdf_steps, "physical": steps.material_steps + steps.joint_steps}.items():

@@ -57,9 +57,12 @@ def test_the_gradient_of_the_value_alone():
 
 def test_what_is_no_number_stays_none():
     units = softplus_and_slope(torch.tensor([math.nan, math.inf, -math.inf, 0.0]), 100.0)
-    assert units.value[0].isnan() and units.slope[0].isnan()
-    assert units.value[1] == math.inf and units.slope[1] == 1.0
-    assert 0.0 <= units.value[2] < 1e-18 and 0.0 <= units.slope[2] < 1e-16
+    assert units.value[0].isnan()
+    assert units.slope[0].isnan()
+    assert units.value[1] == math.inf
+    assert units.slope[1] == 1.0
+    assert 0.0 <= units.value[2] < 1e-18
+    assert 0.0 <= units.slope[2] < 1e-16
     assert units.slope[3] == 0.5
 
 
