@@ -12,19 +12,19 @@ that whatever else the machine does falls on all; medians and their ratios are p
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import itertools
-import platform
-import statistics
-import time
 from collections.abc import Callable
-from pathlib import Path
+from dataclasses import dataclass
+from functools import partial
 
 import torch
+import tyro
 from jaxtyping import Float
 from torch import Tensor
 
+from benchmarks.measure import hardware, median_seconds
+from benchmarks.straightforward import plain_units
 from neilfpp_method.config import HashGridConfig, SdfConfig
 from neilfpp_method.fields.sdf import SdfField
 from neilfpp_method.kernels import GridSpec, encode
@@ -61,7 +61,7 @@ def naive_step(field: SdfField, x: Float[Tensor, "N 3"]) -> None:
     grid = field.encoding
     x = x.detach().requires_grad_()
     features = naive_encode(x / (2 * RADIUS) + 0.5, grid.table, grid.spec)
-    distance = field.mlp(torch.cat((x, features), 1))[:, 0]
+    distance = plain_units(field.mlp)(torch.cat((x, features), 1))[:, 0]
     (gradient,) = torch.autograd.grad(distance.sum(), x, create_graph=True)
     loss_on(distance, gradient).backward()
 
@@ -115,46 +115,39 @@ def measure(config: SdfConfig, points: int, repeats: int, device: torch.device) 
         gradients.append(field.encoding.table.grad.clone())
     for gradient in gradients[1:]:
         torch.testing.assert_close(gradient, gradients[0], rtol=1e-2, atol=1e-4 * gradients[0].abs().max().item())
-    seconds: dict[str, list[float]] = {name: [] for name in routes}
-    for _, (name, route) in itertools.product(range(repeats), routes.items()):
-        field.zero_grad()
-        synchronize(device)
-        started = time.perf_counter()
-        route(field, x)
-        synchronize(device)
-        seconds[name].append(time.perf_counter() - started)
-    return {name: 1e3 * statistics.median(values) for name, values in seconds.items()}
+    calls = [partial(_fresh, route, field, x) for route in routes.values()]
+    taken = median_seconds(*calls, repetitions=repeats, where=device)
+    return {name: 1e3 * seconds for name, seconds in zip(routes, taken, strict=True)}
 
 
-def synchronize(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
+def _fresh(route: Callable[[SdfField, Tensor], None], field: SdfField, x: Float[Tensor, "N 3"]) -> None:
+    """A route from no gradients, as in a step of training."""
+    field.zero_grad()
+    route(field, x)
 
 
-def hardware(device: torch.device) -> str:
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    listed = Path("/proc/cpuinfo")
-    names = [line.split(":")[1].strip() for line in listed.open() if "model name" in line] if listed.exists() else []
-    return f"{names[0] if names else platform.processor()}, {torch.get_num_threads()} threads"
+@dataclass
+class Options:
+    """Time the three routes."""
+
+    points: int = 32_768
+    """Points of a step."""
+    repeats: int = 9
+    """Steps that count."""
+    device: str = "cpu"
+    """Where to run."""
 
 
-def main() -> None:
+def main(options: Options) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--points", type=int, default=32_768)
-    parser.add_argument("--repeats", type=int, default=9)
-    parser.add_argument("--device", default="cpu")
-    told = parser.parse_args()
-    device = torch.device(told.device)
     paper = SdfConfig(encoding="hash", grid=HashGridConfig(), layers=2, width=64, skip=None, feature_width=15)
-    print(f"{hardware(device)}; {told.points} points, medians of {told.repeats}")
+    print(f"{hardware()}; {options.points} points, medians of {options.repeats}")
     for title, config in {"16 levels × 2, 2^19": paper, "the grid of `fast`, 8 × 2, 2^16": preset("fast").sdf}.items():
-        medians = measure(config, told.points, told.repeats, device)
+        medians = measure(config, options.points, options.repeats, torch.device(options.device))
         print(title)
         for name, median in medians.items():
             print(f"  {name:24} {median:9.1f} ms   {medians['naive'] / median:6.1f} times faster than naive")
 
 
 if __name__ == "__main__":
-    main()
+    main(tyro.cli(Options))

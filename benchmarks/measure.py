@@ -60,13 +60,15 @@ def clock(where: torch.device) -> Callable[[], float]:
     return now
 
 
-def median_seconds(*functions: Callable[[], object], repetitions: int = 7) -> list[float]:
-    """The median duration of each function, after one call that does not count.
+def median_seconds(
+    *functions: Callable[[], object], repetitions: int = 7, where: torch.device | None = None
+) -> list[float]:
+    """The median duration of each function, after one call that does not count; `where` they run, if not on `device()`.
 
     They take turns, so that whatever else the machine does falls on all of them: their ratios are worth more than their
     durations.
     """
-    now = clock(device())
+    now = clock(where or device())
     for function in functions:
         function()
     seconds: list[list[float]] = [[] for _ in functions]

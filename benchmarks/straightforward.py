@@ -25,7 +25,7 @@ from torch.nn import functional
 from neilfpp_method.config import NeilfConfig, VolumeConfig
 from neilfpp_method.fields.brdf import BrdfField, BrdfSample
 from neilfpp_method.fields.incident_light import IncidentLightField
-from neilfpp_method.fields.mlp import SOFTPLUS_SHARPNESS
+from neilfpp_method.fields.mlp import SOFTPLUS_SHARPNESS, Mlp
 from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
@@ -40,7 +40,7 @@ from neilfpp_method.volume.samplers import (
     with_cuts,
 )
 
-__all__ = ["straightforward"]
+__all__ = ["plain_units", "straightforward"]
 
 
 def gradient_of(output: Float[Tensor, " N"], x: Float[Tensor, "N 3"], differentiable: bool) -> Float[Tensor, "N 3"]:
@@ -48,13 +48,19 @@ def gradient_of(output: Float[Tensor, " N"], x: Float[Tensor, "N 3"], differenti
     return torch.autograd.grad(output.sum(), x, create_graph=differentiable, retain_graph=True)[0]
 
 
+def plain_units(mlp: Mlp) -> Mlp:
+    """The same weights, with torch's softplus."""
+    plain = copy.copy(mlp)
+    plain.activation = replace(mlp.activation, value=partial(functional.softplus, beta=SOFTPLUS_SHARPNESS))
+    return plain
+
+
 class PlainSdf(nn.Module):
     """G, with ∇G and H G by autograd."""
 
     def __init__(self, field: SdfField) -> None:
         super().__init__()
-        self.encoding, self.mlp = field.encoding, copy.copy(field.mlp)  # the same weights
-        self.mlp.activation = replace(self.mlp.activation, value=partial(functional.softplus, beta=SOFTPLUS_SHARPNESS))
+        self.encoding, self.mlp = field.encoding, plain_units(field.mlp)
 
     def forward(self, x: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
         return self.mlp(self.encoding(x))[:, 0]
