@@ -1,4 +1,4 @@
-"""What is worth code of its own: hash-grid encoding, and rays through a sampled distance field.
+"""What is worth code of its own: hash-grid encoding, rays through a sampled distance field, and softplus units (`softplus`).
 
 Every backend of the encoding computes what `reference.encode` computes, which the tests hold it to. A grid's setting
 `backend` names one; "auto" takes the compiled loops on a CPU, Triton's kernels on a GPU, and the reference anywhere else.

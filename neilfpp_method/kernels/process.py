@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 import torch
 
@@ -51,7 +51,7 @@ def rounded_products(rounded: bool = True) -> Iterator[None]:
 def half_precision(device: torch.device, wanted: bool = True) -> AbstractContextManager:
     """Linear layers in float16, eleven bits to a number, with sums in float32, where the device has units for that; elsewhere,
     and where it is not wanted, as ever."""
-    return torch.autocast(device.type, torch.float16, enabled=wanted and _has_half_units(device.type))
+    return torch.autocast(device.type, torch.float16) if wanted and _has_half_units(device.type) else nullcontext()
 
 
 def _has_half_units(kind: str) -> bool:

@@ -8,13 +8,11 @@ import sys
 import pytest
 import torch
 
-from neilfpp_method.kernels.process import rounded_products
+from neilfpp_method.kernels.process import half_precision, rounded_products
 
 SMALL = "import torch\nsmall = lambda: (torch.full((64,), 1e-38) * 0.01).count_nonzero().item()\n"
 RESIDENT = """
 import torch
-
-from neilfpp_method.kernels.process import rounded_products
 def resident():
     torch.ones(16_000_000)  # 64 MB, and gone at once
     return int(next(line for line in open("/proc/self/status") if line.startswith("VmRSS")).split()[1]) // 1024
@@ -94,3 +92,20 @@ def test_rounding_ends_with_an_error():
     with pytest.raises(KeyError), rounded_products():
         raise KeyError(torch.get_float32_matmul_precision())
     assert torch.get_float32_matmul_precision() == before
+
+
+@pytest.mark.parametrize("units", [True, False])
+@pytest.mark.parametrize("wanted", [True, False])
+def test_half_precision_is_taken_where_there_are_units_and_it_is_wanted(monkeypatch, units, wanted):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_fp16": units}, raising=False)
+    x = torch.randn(4, 3)
+    with half_precision(torch.device("cpu"), wanted):
+        inside = torch.nn.functional.linear(x, x).dtype
+    assert inside == (torch.float16 if units and wanted else torch.float32)
+    assert torch.nn.functional.linear(x, x).dtype == torch.float32
+
+
+def test_half_precision_where_torch_does_not_say_what_there_is(monkeypatch):
+    monkeypatch.delattr(torch.cpu, "get_capabilities", raising=False)
+    with half_precision(torch.device("cpu")):
+        assert torch.ones(2, 2).matmul(torch.ones(2, 2)).dtype == torch.float32
