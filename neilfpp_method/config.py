@@ -180,7 +180,7 @@ class BackgroundConfig:
     """none: the scene sphere is a surface that closes the scene (VolSDF). constant: one colour. inverted_sphere: a NeRF++
     field. auto: constant where the borders of the images are of one colour, else inverted_sphere."""
     color: tuple[float, float, float] | None = None
-    """Linear RGB of a constant background; none: read from the borders of the images."""
+    """Linear RGB of a constant background, and what an inverted_sphere starts as; none: read from the borders of the images."""
     layers: int = 8
     """Hidden layers of the NeRF++ field."""
     width: int = 256
@@ -338,6 +338,9 @@ class OptimizerConfig:
     """Factor on all rates in the joint stage."""
     final: float = 0.1
     """Rate at the end of a stage over its start."""
+    background_from: float = 0.0
+    """Share of SDF init that is over when the field beyond the scene starts to move. Until then it is the colour that it starts
+    as, so that what lies within the scene is made of surfaces: a field that is seen from everywhere can paint it as well."""
 
 
 @dataclass(frozen=True)

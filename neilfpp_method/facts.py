@@ -21,7 +21,7 @@ class SceneFacts:
         median_radiance: median linear luminance of the object's pixels; the first render matches it.
         radiance_scale: the largest radiance that R can reach.
         background: "none", "constant" or "inverted_sphere".
-        background_color: linear RGB of a constant background.
+        background_color: linear RGB of a constant background, and what an inverted sphere starts as.
     """
 
     response: str

@@ -106,7 +106,14 @@ def fast() -> NeilfConfig:
         ),
         # The joint stage is short: geometry goes on at the rate that SDF init ended with, and is not stirred up again.
         optimizer=OptimizerConfig(
-            geometry=2e-2, radiance=5e-3, brdf=5e-3, light=3e-2, background=5e-3, beta=1e-3, joint=0.1
+            geometry=2e-2,
+            radiance=5e-3,
+            brdf=5e-3,
+            light=3e-2,
+            background=1e-3,
+            beta=1e-3,
+            joint=0.1,
+            background_from=0.5,
         ),
         train=TrainConfig(sdf_steps=2_000, material_steps=1_500, joint_steps=100, rays=512, fresh=0.25),
     )

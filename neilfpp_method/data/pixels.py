@@ -11,9 +11,11 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int
 from torch import Tensor
 
+from neilfpp_method.data.backdrop import MOST_RAYS, leaves_room
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.drawing import ValidPixels
 from neilfpp_method.data.images import ImageFile, read_image
+from neilfpp_method.data.silhouettes import MOST_VIEWS, Outline
 from neilfpp_method.data.views import CameraRays, View
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.color import luminance, srgb_to_linear, tone_map
@@ -111,7 +113,7 @@ class PixelDataset:
 
         Rendered captures, and clipped backdrops, have such pixels; in front of a noisy backdrop hardly any pixel is exact.
         """
-        border = self._border()
+        border = self._color[self._border()]
         if not len(border):
             return
         color = border.median(dim=0).values
@@ -157,25 +159,48 @@ class PixelDataset:
         """The linear RGB that most pixels on the borders of the images share, or none.
 
         The border's median colour counts when half of the border shares it: differs from it by at most 2 % of the
-        brighter of that colour and the object's median radiance.
+        brighter of that colour and the object's median radiance. The rest must find room within the scene (`backdrop`):
+        the colour of the ground is not that of the sky above.
         """
-        border = self._linear(self._border())
-        if not len(border):
+        numbers, color = self._border(), self.border_median()
+        if not len(numbers):
             return None
-        color = border.median(dim=0).values
-        tolerance = BORDER_TOLERANCE * max(float(color.max()), self.median_radiance())
-        share = ((border - color).abs().amax(dim=-1) <= tolerance).float().mean()
-        return color if share >= BORDER_SHARE else None
+        other = self._unlike(color)
+        others = numbers[other[numbers]]
+        if len(others) > (1 - BORDER_SHARE) * len(numbers):
+            return None
+        return color if self._within_the_scene(others, other) else None
 
-    def _border(self) -> Float[Tensor, "B 3"]:
-        """The colours of the valid pixels on the borders of all images."""
+    def border_median(self) -> Float[Tensor, " 3"]:
+        """The median linear RGB of the borders of the images; black where no pixel there is valid."""
+        border = self._linear(self._color[self._border()])
+        return border.median(dim=0).values if len(border) else border.new_zeros(3)
+
+    def _unlike(self, color: Float[Tensor, " 3"]) -> Bool[Tensor, " P"]:
+        """Which pixels differ from a linear colour by more than the border may."""
+        tolerance = BORDER_TOLERANCE * max(float(color.max()), self.median_radiance())
+        return (self._linear(self._color) - color).abs().amax(dim=-1) > tolerance
+
+    def _within_the_scene(self, numbers: Int[Tensor, " N"], other: Bool[Tensor, " P"]) -> bool:
+        """Whether what some pixels show can lie within the scene, as all views have it by which pixels are `other`."""
+        if not len(numbers):
+            return True
+        chosen = self._batch(numbers[:: -(-len(numbers) // MOST_RAYS)].contiguous())
+        outlines = []
+        for i in range(0, len(self.views), -(-len(self.views) // MOST_VIEWS)):
+            view, pixels = self.views[i], other[self._starts[i] : self._starts[i + 1]]
+            outlines.append(Outline(view, pixels.view(view.camera.height, -1).cpu().numpy()))
+        return leaves_room(outlines, chosen.rays, self.capture.normalisation)
+
+    def _border(self) -> Int[Tensor, " B"]:
+        """The numbers of the valid pixels on the borders of all images."""
         parts = []
         for view, (start, end) in zip(self.views, itertools.pairwise(self._starts), strict=True):
             number = torch.arange(start, end, device=self._color.device)
             image = number.view(view.camera.height, view.camera.width)
             parts += [image[0], image[-1], image[1:-1, 0], image[1:-1, -1]]
         border = torch.cat(parts)
-        return self._color[border[self._valid[border]]]
+        return border[self._valid[border]]
 
     def _linear(self, color: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         return color if self.capture.hdr else srgb_to_linear(color)

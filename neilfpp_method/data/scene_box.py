@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 
 from neilfpp_method.data.images import read_image
-from neilfpp_method.data.views import Normalisation, SceneSource, View, project
+from neilfpp_method.data.silhouettes import AGREEMENT, MOST_VIEWS, Outline, agreement
+from neilfpp_method.data.views import Normalisation, SceneSource, View
 from neilfpp_method.errors import UserError
 
 __all__ = ["SceneBox", "box_of_cameras", "box_of_points", "find_box"]
@@ -23,8 +23,6 @@ __all__ = ["SceneBox", "box_of_cameras", "box_of_points", "find_box"]
 OUTLIERS = 0.01
 MARGIN = 1.1
 FEWEST_POINTS = 20
-MOST_MASKS = 32
-AGREEMENT = 0.9
 CELLS = 32
 REFINEMENTS = 3
 
@@ -50,7 +48,7 @@ def find_box(views: Sequence[View], points: Float64[np.ndarray, "P 3"] | None = 
     """
     outlines = _outlines(views)
     if points is not None and outlines:
-        points = points[_agreement(outlines, points) >= AGREEMENT]
+        points = points[agreement(outlines, points) >= AGREEMENT]
     if points is not None and len(points) >= FEWEST_POINTS:
         return SceneBox(box_of_points(points), "points")
     if outlines:
@@ -107,22 +105,9 @@ def _box(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> Nor
 # ---------------------------------------------------------------------------------------------------------- silhouettes
 
 
-@dataclass(frozen=True)
-class Outline:
-    """A view with its silhouette; where that does not touch the border, what lies out of the image is beside it, too."""
-
-    view: View
-    inside: Bool[np.ndarray, "H W"]
-
-    @property
-    def complete(self) -> bool:
-        mask = self.inside
-        return not (mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
-
-
 def _outlines(views: Sequence[View]) -> list[Outline]:
-    """The silhouettes of at most `MOST_MASKS` views, evenly chosen; none where fewer than half of these have one."""
-    step = -(-len(views) // MOST_MASKS)
+    """The silhouettes of at most `MOST_VIEWS` views, evenly chosen; none where fewer than half of these have one."""
+    step = -(-len(views) // MOST_VIEWS)
     outlines, chosen = [], views[::step]
     for view in chosen:
         image = read_image(view.mask or view.image)
@@ -130,21 +115,6 @@ def _outlines(views: Sequence[View]) -> list[Outline]:
         if values is not None:
             outlines.append(Outline(view, values > 0.5))
     return outlines if len(outlines) >= len(chosen) / 2 else []
-
-
-def _agreement(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, " P"]:
-    """The share of the views that can tell of a point, in whose silhouette it lies; 0 where fewer than half of them can."""
-    told, inside = np.zeros(len(points)), np.zeros(len(points))
-    for outline in outlines:
-        camera = outline.view.camera
-        image = project(camera, torch.from_numpy(points))
-        pixel, depth = np.nan_to_num(image.pixel.numpy(), nan=-1.0, posinf=-1.0, neginf=-1.0), image.depth.numpy()
-        size = np.array([camera.width, camera.height])
-        shown = (depth > 0) & (pixel >= 0).all(axis=1) & (pixel < size).all(axis=1)
-        column, row = np.where(shown[:, None], pixel, 0).astype(np.int64).T
-        told += shown | outline.complete
-        inside += shown & outline.inside[row, column]
-    return np.where(told >= len(outlines) / 2, inside / np.maximum(told, 1), 0.0)
 
 
 def _carve(outlines: Sequence[Outline], start: Normalisation) -> Normalisation:
@@ -155,7 +125,7 @@ def _carve(outlines: Sequence[Outline], start: Normalisation) -> Normalisation:
         axes = [np.linspace(a, b, CELLS) for a, b in zip(low, high, strict=True)]
         cell = (high - low) / (CELLS - 1)
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        held = grid[_agreement(outlines, grid) >= AGREEMENT]
+        held = grid[agreement(outlines, grid) >= AGREEMENT]
         if not len(held):
             raise UserError("the masks have no place in common", "check masks and cameras, or add a scene box")
         low, high = held.min(axis=0) - cell, held.max(axis=0) + cell

@@ -16,6 +16,10 @@ __all__ = ["InvertedSphere"]
 
 POSITION_OCTAVES = 10
 DIRECTION_OCTAVES = 4
+DARKEST = 1e-2
+"""Share of the largest radiance that the field starts as at least, and stays below the largest by: a sigmoid has no ends."""
+START_SCALE = 1e-3
+"""Of the weights that make it vary at the start."""
 
 
 class InvertedSphere(nn.Module):
@@ -23,9 +27,21 @@ class InvertedSphere(nn.Module):
 
     Density is per unit of 1/r, and samples are the midpoints of equal steps of 1/r from the sphere to infinity. What
     passes them all has the colour of the last.
+
+    Args:
+        config: the settings.
+        radius: of the scene sphere.
+        scale: the largest radiance that it can reach.
+        start: linear RGB that it starts as, all around; none: half of the largest.
     """
 
-    def __init__(self, config: BackgroundConfig, radius: float, scale: float) -> None:
+    def __init__(
+        self,
+        config: BackgroundConfig,
+        radius: float,
+        scale: float,
+        start: Float[Tensor, " 3"] | None = None,
+    ) -> None:
         super().__init__()
         self.radius = radius
         self.scale = scale
@@ -34,7 +50,10 @@ class InvertedSphere(nn.Module):
         self.direction = FrequencyEncoding(DIRECTION_OCTAVES)
         width = config.width
         self.trunk = Mlp(self.position.width, 1 + width, config.layers, width, "relu", skip=config.layers // 2)
-        self.head = Mlp(width + self.direction.width, 3, 1, width // 2, "relu", output_scale=0.1)
+        self.head = Mlp(width + self.direction.width, 3, 1, width // 2, "relu", output_scale=START_SCALE)
+        if start is not None:
+            with torch.no_grad():
+                self.head.layers[-1].bias.copy_(torch.logit(start / scale, eps=DARKEST))
 
     def forward(self, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """Radiance in [0, scale] that reaches the sphere along each ray from outside.

@@ -65,8 +65,12 @@ class MeshHost(nn.Module):
         super().__init__()
         radius = config.volume.radius
         self.radiance_field = OutgoingRadianceField(config.radiance, 0, radius, radiance_scale, radiance_start)
-        self.background = InvertedSphere(config.background, radius, radiance_scale) if background == "inverted_sphere" else None
         self.register_buffer("background_color", torch.tensor(background_color))
+        self.background = (
+            InvertedSphere(config.background, radius, radiance_scale, self.background_color)
+            if background == "inverted_sphere"
+            else None
+        )
         triangles = mesh.vertices[mesh.faces]
         across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         outward = safe_normalize(across, eps=TINY)

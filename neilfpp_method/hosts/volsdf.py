@@ -49,7 +49,7 @@ class VolSdfHost(nn.Module):
         config: the settings.
         radiance_scale: the largest radiance that R can reach.
         background: "none", "constant" or "inverted_sphere" (`config.background.kind`, decided).
-        background_color: linear RGB of a constant background.
+        background_color: linear RGB of a constant background, and what an inverted sphere starts as.
         points: oriented cloud on the surface, scene frame, for L_pcd.
         radiance_start: what R starts near.
     """
@@ -76,11 +76,13 @@ class VolSdfHost(nn.Module):
             config.radiance, config.sdf.feature_width, radius, radiance_scale, radiance_start
         )
         self.density = LaplaceDensity(config.volume.beta_init, config.volume.beta_floor)
+        self.register_buffer("background_color", torch.tensor(background_color))
         self.background = (
-            InvertedSphere(config.background, radius, radiance_scale) if background == "inverted_sphere" else None
+            InvertedSphere(config.background, radius, radiance_scale, self.background_color)
+            if background == "inverted_sphere"
+            else None
         )
         self.empty_space = EmptySpace(radius) if config.volume.skip_empty else None
-        self.register_buffer("background_color", torch.tensor(background_color))
         hard = config.inter_reflection.mode == "hard"
         resolution = config.inter_reflection.grid_resolution if hard else 0
         # Kept in checkpoints, with its age: a resumed run must trace the very same grid.

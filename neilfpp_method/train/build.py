@@ -43,11 +43,10 @@ def scene_facts(capture: Capture, pixels: PixelDataset, config: NeilfConfig) -> 
         hdr = max(HDR_MEDIANS * median, pixels.radiance_quantile(BRIGHT_QUANTILE))
         scale = LDR_SCALE if response == "srgb" else hdr
     kind, color = config.background.kind, config.background.color
-    if color is None and kind in ("auto", "constant"):
-        border = pixels.border_color()
-        color = None if border is None else tuple(border.tolist())
     if kind == "auto":
-        kind = "inverted_sphere" if color is None else "constant"
+        kind = "inverted_sphere" if color is None and pixels.border_color() is None else "constant"
+    if color is None and kind != "none":
+        color = tuple(pixels.border_median().tolist())
     return SceneFacts(response, median, scale, kind, color or (0.0, 0.0, 0.0))
 
 

@@ -171,8 +171,10 @@ def adam(groups: Sequence[Mapping[str, object]]) -> torch.optim.Adam:
 def set_rates(optimizer: torch.optim.Optimizer, config: OptimizerConfig, stage: Stage, share: float) -> None:
     """The rate of each field when `share` of a stage is over."""
     factor = (config.joint if stage is Stage.JOINT else 1.0) * config.final**share
+    waits = stage is Stage.SDF_INIT and share < config.background_from
     for group in optimizer.param_groups:
-        group["lr"] = getattr(config, group["name"]) * factor
+        name = group["name"]
+        group["lr"] = 0.0 if waits and name == "background" else getattr(config, name) * factor
 
 
 def seed_step(seed: int, step: int, rank: int = 0) -> None:

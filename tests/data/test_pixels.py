@@ -16,8 +16,10 @@ from neilfpp_method.data.drawing import ValidPixels
 from neilfpp_method.data.images import write_exr, write_png
 from neilfpp_method.data.lens import Lens
 from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.demo import demo_scene
 from neilfpp_method.errors import UserError
 from tests.data.make_capture import RADIUS, SCALE, make_capture, radiance, srgb
+from tests.data.skies import GROUND, make_sky_capture
 
 SPHERE = RADIUS / SCALE
 WIDTH, HEIGHT = 24, 18
@@ -276,6 +278,24 @@ def test_no_border_color_where_the_border_varies(tmp_path: Path) -> None:
         write_exr(root / "inputs" / "images" / f"{i:03d}.exr", {"RGB": image})
     capture = load_capture(root)
     assert PixelDataset(capture, capture.views).border_color() is None
+
+
+def test_no_border_color_under_a_sky(tmp_path: Path) -> None:
+    """Most of the border is ground, the rest a sky, which no place of the scene could be."""
+    capture = load_capture(make_sky_capture(tmp_path))
+    pixels = PixelDataset(capture, capture.views)
+    border = pixels._color[pixels._border()]
+    assert 0.5 < (border == GROUND).all(-1).float().mean() < 0.95
+    assert pixels.border_color() is None
+    assert np.allclose(pixels.border_median(), GROUND)
+
+
+def test_a_table_that_runs_out_of_the_picture_leaves_the_border_its_color() -> None:
+    """The capture in the package: a third of the border is table."""
+    capture = load_capture(demo_scene())
+    pixels = PixelDataset(capture, capture.train_views)
+    assert (pixels._color[pixels._border()] == 0).all(-1).float().mean() < 0.75
+    assert torch.equal(pixels.border_color(), torch.zeros(3))
 
 
 def test_loading_reports_each_view(tmp_path: Path) -> None:

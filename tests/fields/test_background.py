@@ -47,6 +47,23 @@ def test_samples_lie_on_the_rays_in_equal_steps_of_inverse_radius():
     torch.testing.assert_close(travelled, along * directions[:, None])
 
 
+@pytest.mark.parametrize("start", [(0.25, 0.2, 0.15), (1.0, 0.5, 0.04)])
+def test_it_starts_as_the_colour_that_it_is_told(start):
+    torch.manual_seed(0)
+    field = InvertedSphere(CONFIG, radius=3.0, scale=2.0, start=torch.tensor(start))
+    color = field(*(t.float() for t in rays(3.0)))
+    torch.testing.assert_close(color, torch.tensor(start).expand(20, 3), rtol=0.02, atol=1e-3)
+
+
+@pytest.mark.parametrize("start", [0.0, 2.0, 5.0])
+def test_a_colour_that_it_cannot_reach_leaves_it_able_to_learn(start):
+    field = InvertedSphere(CONFIG, radius=3.0, scale=2.0, start=torch.full((3,), start))
+    color = field(*(t.float() for t in rays(3.0)))
+    color.sum().backward()
+    assert ((color > 0.01) & (color < 1.99)).all()
+    assert (field.head.layers[-1].bias.grad.abs() > 1e-3).all()
+
+
 def test_two_samples_by_hand():
     """An optical depth of ln 2 over the whole chart: half of the light would pass all of it, √½ each half of it."""
     torch.manual_seed(0)

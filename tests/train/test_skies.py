@@ -1,0 +1,70 @@
+"""What lies behind a scene must not swallow it: a ground and a sky are found to be two, and surfaces come first."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+from neilfpp_method.config import OptimizerConfig
+from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.presets import preset
+from neilfpp_method.schedule import Stage
+from neilfpp_method.train.build import scene_facts
+from neilfpp_method.train.loop import make_optimizer, set_rates, train
+from tests.data.make_capture import make_capture
+from tests.data.skies import GROUND, make_sky_capture
+from tests.scenes import sphere_model, tiny_config
+from tests.train.small_runs import small_training
+
+
+def facts_of(root: Path):
+    capture = load_capture(root)
+    return scene_facts(capture, PixelDataset(capture, capture.train_views), tiny_config())
+
+
+def test_what_lies_behind_is_told_from_the_images(tmp_path):
+    even, sky = facts_of(make_capture(tmp_path / "even", background=GROUND)), facts_of(make_sky_capture(tmp_path / "sky"))
+    assert (even.background, sky.background) == ("constant", "inverted_sphere")
+    assert even.background_color == sky.background_color == (GROUND, GROUND, GROUND)
+
+
+@pytest.mark.parametrize(("stage", "share", "moves"), [
+    (Stage.SDF_INIT, 0.0, False),
+    (Stage.SDF_INIT, 0.39, False),
+    (Stage.SDF_INIT, 0.4, True),
+    (Stage.MATERIAL_INIT, 0.0, True),
+    (Stage.JOINT, 0.0, True),
+])  # fmt: skip
+def test_it_waits_until_there_are_surfaces(stage, share, moves):
+    model = sphere_model(background="inverted_sphere")
+    config = OptimizerConfig(background_from=0.4)
+    optimizer = make_optimizer(model, config)
+    set_rates(optimizer, config, stage, share)
+    rates = {group["name"]: group["lr"] for group in optimizer.param_groups}
+    assert (rates.pop("background") > 0) == moves
+    assert all(rate > 0 for rate in rates.values())
+
+
+def test_a_sphere_under_a_sky_gets_a_surface(tmp_path):
+    """With the settings of `fast` for what lies behind, and small networks."""
+    config = tiny_config()
+    fast = preset("fast").optimizer
+    steps = dataclasses.replace(config.train, sdf_steps=300, material_steps=0, joint_steps=0, rays=256, checkpoint_every=1000)
+    config = dataclasses.replace(config, optimizer=fast, train=steps)
+    training = small_training(make_sky_capture(tmp_path / "sky", views=10, size=(48, 36)), tmp_path / "run", config)
+    train(training)
+    model = training.model.eval()
+    capture = training.pixels.capture
+    truth = PixelDataset(load_capture(make_capture(tmp_path / "truth", views=10, size=(48, 36), masks=True)), capture.views)
+    with torch.no_grad():
+        batch = truth.view(3)
+        hits = model.host.render(batch.rays)
+    on = batch.mask > 0.5
+    assert hits.opacity[on].median() > 0.9
+    assert hits.opacity[~on].median() < 0.1
+    outward = torch.nn.functional.normalize(hits.position[on], dim=-1)
+    assert (hits.normal[on] * outward).sum(-1).median() > 0.9
