@@ -165,30 +165,29 @@ class PixelDataset:
         numbers, color = self._border(), self.border_median()
         if not len(numbers):
             return None
-        other = self._unlike(color)
-        others = numbers[other[numbers]]
+        tolerance = BORDER_TOLERANCE * max(float(color.max()), self.median_radiance())
+
+        def unlike(pixels: Int[Tensor, " N"] | slice) -> Bool[Tensor, " N"]:
+            return (self._linear(self._color[pixels]) - color).abs().amax(dim=-1) > tolerance
+
+        others = numbers[unlike(numbers)]
         if len(others) > (1 - BORDER_SHARE) * len(numbers):
             return None
-        return color if self._within_the_scene(others, other) else None
+        return color if self._within_the_scene(others, unlike) else None
 
     def border_median(self) -> Float[Tensor, " 3"]:
         """The median linear RGB of the borders of the images; black where no pixel there is valid."""
         border = self._linear(self._color[self._border()])
         return border.median(dim=0).values if len(border) else border.new_zeros(3)
 
-    def _unlike(self, color: Float[Tensor, " 3"]) -> Bool[Tensor, " P"]:
-        """Which pixels differ from a linear colour by more than the border may."""
-        tolerance = BORDER_TOLERANCE * max(float(color.max()), self.median_radiance())
-        return (self._linear(self._color) - color).abs().amax(dim=-1) > tolerance
-
-    def _within_the_scene(self, numbers: Int[Tensor, " N"], other: Bool[Tensor, " P"]) -> bool:
-        """Whether what some pixels show can lie within the scene, as all views have it by which pixels are `other`."""
+    def _within_the_scene(self, numbers: Int[Tensor, " N"], other: Callable[[slice], Bool[Tensor, " V"]]) -> bool:
+        """Whether what some pixels show can lie within the scene, as the views have it by which of their pixels are `other`."""
         if not len(numbers):
             return True
         chosen = self._batch(numbers[:: -(-len(numbers) // MOST_RAYS)].contiguous())
         outlines = []
         for i in range(0, len(self.views), -(-len(self.views) // MOST_VIEWS)):
-            view, pixels = self.views[i], other[self._starts[i] : self._starts[i + 1]]
+            view, pixels = self.views[i], other(slice(self._starts[i], self._starts[i + 1]))
             outlines.append(Outline(view, pixels.view(view.camera.height, -1).cpu().numpy()))
         return leaves_room(outlines, chosen.rays, self.capture.normalisation)
 
