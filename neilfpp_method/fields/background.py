@@ -12,7 +12,7 @@ from neilfpp_method.fields.encodings import FrequencyEncoding
 from neilfpp_method.fields.mlp import Mlp
 from neilfpp_method.volume.compositing import composite, render_weights
 
-__all__ = ["InvertedSphere"]
+__all__ = ["InvertedSphere", "field_beyond"]
 
 POSITION_OCTAVES = 10
 DIRECTION_OCTAVES = 4
@@ -20,6 +20,13 @@ DARKEST = 1e-2
 """Share of the largest radiance that the field starts as at least, and stays below the largest by: a sigmoid has no ends."""
 START_SCALE = 1e-3
 """Of the weights that make it vary at the start."""
+
+
+def field_beyond(
+    kind: str, config: BackgroundConfig, radius: float, scale: float, start: Float[Tensor, " 3"]
+) -> InvertedSphere | None:
+    """What lies beyond the scene sphere, where `kind` says that it is an inverted sphere; see there."""
+    return InvertedSphere(config, radius, scale, start) if kind == "inverted_sphere" else None
 
 
 class InvertedSphere(nn.Module):

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.mesh import Mesh
-from neilfpp_method.fields.background import InvertedSphere
+from neilfpp_method.fields.background import field_beyond
 from neilfpp_method.fields.outgoing_radiance import MID_GREY, OutgoingRadianceField
 from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_tracer, meet, tree_tracer
 from neilfpp_method.hosts.smooth_normals import NEIGHBOURS, smooth_normals
@@ -66,11 +66,7 @@ class MeshHost(nn.Module):
         radius = config.volume.radius
         self.radiance_field = OutgoingRadianceField(config.radiance, 0, radius, radiance_scale, radiance_start)
         self.register_buffer("background_color", torch.tensor(background_color))
-        self.background = (
-            InvertedSphere(config.background, radius, radiance_scale, self.background_color)
-            if background == "inverted_sphere"
-            else None
-        )
+        self.background = field_beyond(background, config.background, radius, radiance_scale, self.background_color)
         triangles = mesh.vertices[mesh.faces]
         across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         outward = safe_normalize(across, eps=TINY)

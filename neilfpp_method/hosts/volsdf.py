@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from neilfpp_method import losses
 from neilfpp_method.config import NeilfConfig, VolumeConfig
-from neilfpp_method.fields.background import InvertedSphere
+from neilfpp_method.fields.background import field_beyond
 from neilfpp_method.fields.outgoing_radiance import MID_GREY, OutgoingRadianceField
 from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.base import RegularisedHits
@@ -77,11 +77,7 @@ class VolSdfHost(nn.Module):
         )
         self.density = LaplaceDensity(config.volume.beta_init, config.volume.beta_floor)
         self.register_buffer("background_color", torch.tensor(background_color))
-        self.background = (
-            InvertedSphere(config.background, radius, radiance_scale, self.background_color)
-            if background == "inverted_sphere"
-            else None
-        )
+        self.background = field_beyond(background, config.background, radius, radiance_scale, self.background_color)
         self.empty_space = EmptySpace(radius) if config.volume.skip_empty else None
         hard = config.inter_reflection.mode == "hard"
         resolution = config.inter_reflection.grid_resolution if hard else 0
