@@ -178,7 +178,7 @@ class BackgroundConfig:
 
     kind: Literal["auto", "none", "constant", "inverted_sphere"] = "auto"
     """none: the scene sphere is a surface that closes the scene (VolSDF). constant: one colour. inverted_sphere: a NeRF++
-    field. auto: constant where the borders of the images are of one colour, else inverted_sphere."""
+    field. auto: constant where one colour is all that the borders of the images show behind the scene, else inverted_sphere."""
     color: tuple[float, float, float] | None = None
     """Linear RGB of a constant background, and what an inverted_sphere starts as; none: read from the borders of the images."""
     layers: int = 8
