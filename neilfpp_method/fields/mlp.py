@@ -141,7 +141,7 @@ class Mlp(nn.Module):
         return MlpSample(value, gradient + skipped)
 
     def _with_skip(self, hidden: Float[Tensor, "... H"], x: Float[Tensor, "... I"], number: int) -> Tensor:
-        return torch.cat((hidden, x), -1) if number == self.skip else hidden
+        return torch.cat((hidden, x.to(hidden.dtype)), -1) if number == self.skip else hidden
 
 
 @torch.no_grad()

@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 import torch
 
-__all__ = ["computing_fast", "half_precision", "rounded_products"]
+__all__ = ["computing_fast", "half_precision", "has_half_units", "rounded_products"]
 
 # Options of glibc's allocator (malloc.h), and the values that it comes to by itself in a process with large arrays.
 TRIM_THRESHOLD, MMAP_THRESHOLD, MMAP_MAX = -1, -3, -4
@@ -51,10 +51,11 @@ def rounded_products(rounded: bool = True) -> Iterator[None]:
 def half_precision(device: torch.device, wanted: bool = True) -> AbstractContextManager:
     """Linear layers in float16, eleven bits to a number, with sums in float32, where the device has units for that; elsewhere,
     and where it is not wanted, as ever."""
-    return torch.autocast(device.type, torch.float16) if wanted and _has_half_units(device.type) else nullcontext()
+    return torch.autocast(device.type, torch.float16) if wanted and has_half_units(device.type) else nullcontext()
 
 
-def _has_half_units(kind: str) -> bool:
+def has_half_units(kind: str) -> bool:
+    """Whether devices of a kind ("cpu", "cuda") multiply matrices of float16 in units for that."""
     if kind != "cpu":
         return kind == "cuda"
     known = getattr(torch.cpu, "get_capabilities", dict)()  # torch below 2.10 does not say

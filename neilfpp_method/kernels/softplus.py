@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx
 from torch.nn import functional
 
+from neilfpp_method.kernels.process import has_half_units
 from neilfpp_method.kernels.threads import for_each, shares
 
 __all__ = ["UnitSample", "softplus", "softplus_and_slope"]
@@ -31,15 +32,15 @@ class UnitSample:
 
 
 def softplus(z: Float[Tensor, "*S"], sharpness: float) -> Float[Tensor, "*S"]:
-    """ln(1 + e^(sharpness z)) / sharpness. Of half precision on a CPU comes full precision, as torch takes longer for less."""
-    if z.dtype == torch.float16 and z.device.type == "cpu":
-        z = z.float()
-    if not _takes(z):
+    """ln(1 + e^(sharpness z)) / sharpness."""
+    differentiated = torch.is_grad_enabled() and z.requires_grad
+    half = z.dtype == torch.float16 and has_half_units(z.device.type) and not differentiated
+    if not _takes(z, torch.float16 if half else torch.float32):
         return functional.softplus(z, beta=sharpness)
-    if torch.is_grad_enabled() and z.requires_grad:
+    if differentiated:
         return _Softplus.apply(z, sharpness)[0]
     value = torch.empty_like(z, memory_format=torch.contiguous_format)
-    _run("softplus", sharpness, z, value)
+    _run("softplus_of_half" if half else "softplus", sharpness, z, value)
     return value
 
 
@@ -69,9 +70,9 @@ class _Softplus(torch.autograd.Function):
         return gradient, None
 
 
-def _takes(z: Tensor) -> bool:
-    """Whether the loops take these numbers; torch takes any."""
-    return z.device.type == "cpu" and z.dtype == torch.float32 and _loops() is not None
+def _takes(z: Tensor, dtype: torch.dtype = torch.float32) -> bool:
+    """Whether the loops take these numbers, and they are of that type; torch takes any."""
+    return z.device.type == "cpu" and z.dtype == dtype and _loops() is not None
 
 
 @lru_cache(maxsize=1)
@@ -88,4 +89,5 @@ def _run(loop: str, sharpness: float, *tensors: Tensor) -> None:
 
 
 def _flat(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().contiguous().view(-1).numpy()
+    flat = tensor.detach().contiguous().view(-1)
+    return (flat.view(torch.int16) if flat.dtype == torch.float16 else flat).numpy()
