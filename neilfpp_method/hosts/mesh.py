@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+import trimesh
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor, nn
 
 from neilfpp_method.config import NeilfConfig
@@ -23,6 +28,8 @@ __all__ = ["MeshHost"]
 
 TINY = 1e-18
 """Length under which a sum of edge products has no direction: triangles may be small."""
+CREASE = math.radians(40)
+"""Faces that meet at a sharper angle make an edge; between others normals are interpolated."""
 RADIANCE_AT_ONCE = 2**16
 """Points at which R is asked together where light is traced: bounds the memory."""
 
@@ -70,7 +77,7 @@ class MeshHost(nn.Module):
         triangles = mesh.vertices[mesh.faces]
         across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         outward = safe_normalize(across, eps=TINY)
-        smooth = _vertex_normals(mesh, across)[mesh.faces] if config.mesh.smooth_normals else outward[:, None]
+        smooth = _corner_normals(mesh, outward) if config.mesh.smooth_normals else outward[:, None]
         self.register_buffer("triangles", triangles, persistent=False)
         self.register_buffer("outward", outward, persistent=False)
         self.register_buffer("corner_normals", smooth.expand(-1, 3, -1), persistent=False)
@@ -164,7 +171,22 @@ class MeshHost(nn.Module):
         return beyond.new_zeros(len(rays), 3).index_put((missed,), beyond)
 
 
-def _vertex_normals(mesh: Mesh, across: Float[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
-    """Unit normals of vertices: of the faces around each, by area. Vertices that faces do not share make edges."""
-    around = torch.zeros_like(mesh.vertices).index_add(0, mesh.faces.reshape(-1), across.repeat_interleave(3, dim=0))
-    return safe_normalize(around, eps=TINY)
+def _corner_normals(mesh: Mesh, outward: Float[Tensor, "F 3"]) -> Float[Tensor, "F 3 3"]:
+    """Unit normals at the corners of faces: of the faces around the vertex that lie on the same side of every crease, by their
+    angles there, as of how many triangles a face is made says nothing (Thürmer and Wüthrich 1998). Vertices that faces do
+    not share make edges."""
+    count, faces = 3 * len(mesh.faces), mesh.faces.numpy()
+    shape = trimesh.Trimesh(mesh.vertices.numpy(), faces, process=False)
+    pair, ends = shape.face_adjacency, shape.face_adjacency_edges
+    first, second = outward.numpy()[pair].swapaxes(0, 1)
+    smooth = (first * second).sum(-1) > math.cos(CREASE)
+    pair, ends = pair[smooth], ends[smooth]
+    # Corners of one vertex in two faces that share a smooth edge are one corner.
+    slot = (faces[pair][:, :, None] == ends[:, None, :, None]).argmax(-1)
+    corner = 3 * pair[..., None] + slot
+    joined = coo_array((np.ones(ends.size), (corner[:, 0].ravel(), corner[:, 1].ravel())), shape=(count, count))
+    number, group = connected_components(joined, directed=False)
+    angle = torch.from_numpy(np.nan_to_num(shape.face_angles)).to(outward)
+    turned = (angle[..., None] * outward[:, None]).view(-1, 3)
+    around = outward.new_zeros(number, 3).index_add(0, torch.from_numpy(group).long(), turned)
+    return safe_normalize(around, eps=TINY)[group].view(-1, 3, 3)
