@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from neilfpp_method.config import NeilfConfig
-from neilfpp_method.shading.color import apply_response
+from neilfpp_method.shading.color import apply_response, response_slope
 
 __all__ = ["RadianceUnits", "SceneFacts", "radiance_units"]
 
@@ -41,8 +41,13 @@ class RadianceUnits:
 
 
 def radiance_units(config: NeilfConfig, facts: SceneFacts) -> RadianceUnits:
-    """The units that `config.loss.unit` names."""
+    """The units that `config.loss.unit` names.
+
+    "median": an error of as much as the median radiance is 1, whether the camera stores radiance or display values. The sRGB
+    curve halves all contrasts; in units of the pixel, what speaks against noise would count twice as much.
+    """
     if config.loss.unit == "activation":
         return RadianceUnits(facts.radiance_scale, 1.0, 1.0)
-    pixel = apply_response(torch.tensor(facts.median_radiance), facts.response).item()
-    return RadianceUnits(pixel, pixel, facts.median_radiance)
+    pixel = apply_response(torch.tensor(facts.median_radiance), facts.response)
+    unit = response_slope(pixel, facts.response).item()
+    return RadianceUnits(unit, unit, facts.median_radiance)

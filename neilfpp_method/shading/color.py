@@ -8,7 +8,10 @@ from torch import Tensor
 
 from neilfpp_method.errors import UserError
 
-__all__ = ["apply_response", "linear_to_srgb", "luminance", "srgb_to_linear", "tone_map"]
+__all__ = ["apply_response", "linear_to_srgb", "luminance", "response_slope", "srgb_to_linear", "tone_map"]
+
+KNEE = 0.04045
+"""The pixel at which the sRGB curve goes over from a line to a power."""
 
 
 def linear_to_srgb(color: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
@@ -22,8 +25,7 @@ def linear_to_srgb(color: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 
 def srgb_to_linear(color: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """The inverse of `linear_to_srgb`: c/12.92 up to 0.04045, then ((c + 0.055)/1.055)^2.4."""
-    knee = 0.04045
-    return torch.where(color <= knee, color / 12.92, ((color.clamp_min(knee) + 0.055) / 1.055).pow(2.4))
+    return torch.where(color <= KNEE, color / 12.92, ((color.clamp_min(KNEE) + 0.055) / 1.055).pow(2.4))
 
 
 def tone_map(color: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
@@ -42,6 +44,14 @@ def apply_response(color: Float[Tensor, "*shape"], response: str) -> Float[Tenso
     if response == "srgb":
         return tone_map(color)
     raise UserError(f"unknown response '{response}'", "choose linear or srgb")
+
+
+def response_slope(pixel: Float[Tensor, "*shape"], response: str) -> Float[Tensor, "*shape"]:
+    """What a pixel changes by per unit of the logarithm of radiance, dp / d ln c: an error over this is one of radiance,
+    relative, whatever the camera stores. The pixel itself (HDR); along the power of the sRGB curve (p + 0.055) / 2.4."""
+    if response == "linear":
+        return pixel
+    return torch.where(pixel <= KNEE, pixel, (pixel + 0.055) / 2.4)
 
 
 def luminance(color: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:

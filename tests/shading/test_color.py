@@ -6,7 +6,14 @@ import pytest
 import torch
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.shading.color import apply_response, linear_to_srgb, luminance, srgb_to_linear, tone_map
+from neilfpp_method.shading.color import (
+    apply_response,
+    linear_to_srgb,
+    luminance,
+    response_slope,
+    srgb_to_linear,
+    tone_map,
+)
 
 
 def test_known_values():
@@ -43,3 +50,13 @@ def test_an_unsettled_response_is_refused():
 def test_luminance():
     assert luminance(torch.eye(3)).allclose(torch.tensor([0.2126, 0.7152, 0.0722]))
     assert luminance(torch.ones(2, 3)).allclose(torch.ones(2))
+
+
+@pytest.mark.parametrize("response", ["linear", "srgb"])
+def test_the_slope_of_a_response_is_its_derivative_by_log_radiance(response):
+    radiance = torch.logspace(-5, -0.01, 200, dtype=torch.float64)
+    logarithm = radiance.log().requires_grad_()
+    pixel = apply_response(logarithm.exp(), response)
+    (slope,) = torch.autograd.grad(pixel.sum(), logarithm)
+    # The standard rounds the constants of its curve: at the knee the slopes of its two parts are 1.6 % apart.
+    torch.testing.assert_close(response_slope(pixel.detach(), response), slope, rtol=1e-6, atol=0.0)
