@@ -116,6 +116,9 @@ class LightFitConfig:
     """Rate of log radiance at the start of a fit."""
     smoothness: float = 0.03
     """Weight of the total variation of log radiance, per texel, against the relative error."""
+    sky: float = 1.0
+    """Weight of the difference between the map's log radiance and what cameras saw beyond the scene, per texel, against the
+    relative error. It counts where there is a background to see (`background.kind` inverted_sphere)."""
     whiteness: float = 0.05
     """Weight of the tint of all light that reaches the points, against the relative error: images hardly tell the tint of the
     light from that of the surfaces."""
@@ -199,7 +202,7 @@ class MeshConfig:
     path: str | None = None
     """The triangle mesh, in the world frame of the capture; none: the capture's inputs/model/mesh.ply."""
     smooth_normals: bool = True
-    """Normals interpolated between the vertices; off: those of the triangles."""
+    """Normals interpolated between the vertices, edges kept; off: those of the triangles."""
 
 
 @dataclass(frozen=True)
@@ -293,7 +296,7 @@ class LossConfig:
 
     unit: Literal["activation", "median"] = "activation"
     """What radiance is measured in. activation: L_vol in the range of R's output, all else absolute, as the paper has it.
-    median: all in the median of the images, so that the weights do not depend on the exposure."""
+    median: all in the median of the images, so that the weights depend neither on the exposure nor on what cameras store."""
     volume: float = 1.0
     physical: float = 1.0
     eikonal: float = 0.1

@@ -28,6 +28,7 @@ from neilfpp_method.hosts.outputs import OutputCheck
 from neilfpp_method.inter_reflection import before_light, scene_light, trace_light, traced_in_part
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.memory import Observed, SurfaceMemory
+from neilfpp_method.lighting.sky import SkySightings
 from neilfpp_method.lighting.solve import solve_light
 from neilfpp_method.replay import Replay, SurfacePixels
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, active_losses
@@ -53,6 +54,8 @@ from neilfpp_method.unseen import SeenPlaces, shade_unseen
 __all__ = ["Maps", "NeilfModel"]
 
 
+CLEAR = 0.01
+"""Opacity of a ray that shows what lies beyond the scene."""
 SECOND_SAMPLES = 16
 """Incident directions of a place that no camera sees, where what it sends is shaded."""
 
@@ -113,6 +116,7 @@ class NeilfModel(nn.Module):
         stands_still = not borrowed and not self.stages[Stage.MATERIAL_INIT].moves_host
         train = config.train
         self.replay = Replay(train.fresh, train.rays) if train.fresh < 1 and stands_still else None
+        self.sky: SkySightings | None = None
         self.seen_places: SeenPlaces | None = None
         if config.inter_reflection.unseen == "shaded":
             self.seen_places = SeenPlaces(config.volume.radius)
@@ -122,6 +126,8 @@ class NeilfModel(nn.Module):
             self.lamps = None if config.light.kind == "distant" else Lamps(fit.lamps, fit.lamp_radius)
             if config.light.map is None or self.lamps is not None:
                 self.memory = SurfaceMemory(fit.points, fit.every)
+            if config.light.map is None and facts.background == "inverted_sphere" and fit.sky > 0:
+                self.sky = SkySightings(config.light.environment_height, facts.response)
         else:
             self.light = make_incident_light(config.light, base, first_radiance)
 
@@ -150,6 +156,9 @@ class NeilfModel(nn.Module):
             self.seen_places.remember(hits.position[hits.is_hit(self.config.shading.hit_share)])
         if not plan.moves_material:
             return terms
+        if self.sky is not None and self.training:
+            outside = (batch.mask < 0.5) | (batch.mask_known == 0)
+            self.sky.remember(batch.directions, batch.color, outside & (hits.opacity.detach() < CLEAR))
 
         # 2. Rays that meet one surface, on the object, are shaded; a scaled gradient goes back to where they met it.
         rows = torch.nonzero((hits.is_hit(self.config.shading.hit_share)) & (batch.mask > 0.5))[:, 0]
@@ -229,7 +238,7 @@ class NeilfModel(nn.Module):
         pixel, known = seen.pixel, 1.0
         if self.facts.response == "srgb":
             pixel, known = srgb_to_linear(pixel), (pixel < 1).all(-1, keepdim=True)  # a clipped pixel says too little
-        return losses.specular(first - other, pixel - second.radiance, weight * known, self.units.physical)
+        return losses.specular(first - other, pixel - second.radiance, weight * known, self.units.incident)
 
     def _keep_fitting(self, seen: Observed) -> None:
         """Remember some of what was seen, and when it is time solve for the light that explains what is remembered."""
@@ -242,8 +251,9 @@ class NeilfModel(nn.Module):
         lobe = self.lobe if self.config.shading.specular else None
         scene = None if self.config.inter_reflection.mode == "off" else self._scene_light
         response, unit = self.facts.response, self.units.physical
+        sky = None if self.sky is None else self.sky.known()
         self.evidence = solve_light(
-            self.light, self.lamps, seen, material, lobe, scene, response, unit, self.config.light, first
+            self.light, self.lamps, seen, material, lobe, scene, response, unit, self.config.light, first, sky
         )
 
     # ------------------------------------------------------------------------------------------------------- the parts

@@ -9,24 +9,27 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["interpolate", "map_directions"]
+__all__ = ["interpolate", "map_directions", "texels_of"]
 
 
 def interpolate(values: Float[Tensor, "C H W"], wi: Float[Tensor, "M S 3"]) -> Float[Tensor, "M S C"]:
     """The map at unit directions, bilinear between its texels and closed in azimuth."""
-    x, y, z = wi.unbind(-1)
     _, height, width = values.shape
-    turn = torch.atan2(x, y) / (2 * math.pi)
-    column = (turn - turn.floor()) * width - 0.5
-    row = torch.acos(z.clamp(-1, 1)) / math.pi * (height - 1)
+    column, row = _columns_and_rows(wi, height, width)
     # One column more on each side closes the map; the azimuth of a column is at its middle.
     closed = torch.cat((values[..., -1:], values, values[..., :1]), -1)
     at = torch.stack((2 * (column + 1) / (width + 1) - 1, 2 * row / (height - 1) - 1), -1)
     return functional.grid_sample(closed[None], at[None].to(closed.dtype), align_corners=True)[0].permute(1, 2, 0)
+
+
+def texels_of(wi: Float[Tensor, "*B 3"], height: int, width: int) -> Int[Tensor, "*B"]:
+    """The number of the texel that a unit direction lies in, row by row."""
+    column, row = _columns_and_rows(wi, height, width)
+    return (row + 0.5).long().clamp(0, height - 1) * width + (column + 0.5).floor().long() % width
 
 
 def map_directions(height: int, width: int) -> Float[Tensor, "height width 3"]:
@@ -35,3 +38,12 @@ def map_directions(height: int, width: int) -> Float[Tensor, "height width 3"]:
     phi = 2 * math.pi * (torch.arange(width, dtype=torch.float64)[None] + 0.5) / width
     axes = (phi.sin() * theta.sin(), phi.cos() * theta.sin(), theta.cos().expand(-1, width))
     return torch.stack(axes, -1).float()
+
+
+def _columns_and_rows(
+    wi: Float[Tensor, "*B 3"], height: int, width: int
+) -> tuple[Float[Tensor, "*B"], Float[Tensor, "*B"]]:
+    """Where a direction lies in a map, in texels: column in [−½, w − ½), row in [0, h − 1]."""
+    x, y, z = wi.unbind(-1)
+    turn = torch.atan2(x, y) / (2 * math.pi)
+    return (turn - turn.floor()) * width - 0.5, torch.acos(z.clamp(-1, 1)) / math.pi * (height - 1)

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from neilfpp_method.fields.direction_map import interpolate
+from neilfpp_method.fields.direction_map import interpolate, texels_of
 from neilfpp_method.shading.color import luminance
 from neilfpp_method.structures import IncidentSamples
 
@@ -102,25 +102,12 @@ class EnvironmentLight(nn.Module):
     @torch.no_grad()
     def pdf(self, wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S"]:
         """Density of `sample`, per steradian of the sphere: constant on each texel."""
-        return (self._texel_shares() / self._texel_solid_angles())[self._cells(wi)]
-
-    def _cells(self, wi: Float[Tensor, "*B 3"]) -> Int[Tensor, "*B"]:
-        """The number of the texel that a direction lies in."""
-        column, row = self._columns_and_rows(wi)
-        _, height, width = self.log_radiance.shape
-        return (row + 0.5).long().clamp(0, height - 1) * width + (column + 0.5).floor().long() % width
+        return (self._texel_shares() / self._texel_solid_angles())[texels_of(wi, *self.log_radiance.shape[1:])]
 
     def _resize(self, height: int, width: int) -> None:
         """A map of this size, of which nothing is known."""
         self.log_radiance = self.log_radiance.new_zeros(3, height, width)
         self.cos_edges = _cos_edges(height).to(self.log_radiance)
-
-    def _columns_and_rows(self, wi: Float[Tensor, "*B 3"]) -> tuple[Float[Tensor, "*B"], Float[Tensor, "*B"]]:
-        """Where a direction lies in the map, in texels: column in [−½, w − ½), row in [0, h − 1]."""
-        x, y, z = wi.unbind(-1)
-        _, height, width = self.log_radiance.shape
-        turn = torch.atan2(x, y) / (2 * math.pi)
-        return (turn - turn.floor()) * width - 0.5, torch.acos(z.clamp(-1, 1)) / math.pi * (height - 1)
 
     def _within(
         self, cell: Int[Tensor, "N S"], down: Float[Tensor, "N S"], across: Float[Tensor, "N S"]

@@ -42,7 +42,8 @@ def descend(
     """Move the unknowns to where a loss is least, and with them factors on the base colour of the points.
 
     Every point has factors of its own; all share one per channel where the weight of evenness is 0. The mean of their
-    logarithms is 0: light and base colour share a scale, and surfaces have learned what there is to know of it.
+    logarithms is 0: light and base colour share a scale, and surfaces have learned what there is to know of it. Where cameras
+    saw some of the light itself it is free.
 
     Args:
         unknowns: what moves, in place.
@@ -62,7 +63,7 @@ def descend(
     falling = torch.optim.lr_scheduler.ExponentialLR(optimizer, LEAST_RATE ** (1 / steps))
     with torch.enable_grad():
         for _ in range(steps):
-            gain = (log_gain - log_gain.mean()).exp()
+            gain = (log_gain - log_gain.mean() if objective.sky is None else log_gain).exp()
             loss = loss_of(gain)
             if nearest is not None:
                 loss = loss + weight * unevenness(base_color * gain, nearest)

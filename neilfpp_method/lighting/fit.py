@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.lighting.descent import Unknown, descend
-from neilfpp_method.lighting.objective import Objective, Target, total_variation
+from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.transport import Transport
 
 __all__ = ["Evidence", "Light", "compare", "evidence", "fit_light"]
@@ -79,8 +79,9 @@ def fit_light(start: Light, carried: Transport, target: Target, objective: Objec
     """The light that explains the points best, the smoothest and with the fewest lamps where they do not say.
 
     Minimises the relative error, robustly; the total variation of the map's log radiance, so that lamps in it may be sharp
-    and what no point sees takes after its surroundings; the unevenness of base colour, which is free during the fit
-    (`descent`); and the price of lamps and of tint, which images hardly tell from that of the surfaces (`objective`).
+    and what no point sees takes after its surroundings; how far the map is from what cameras saw of it; the unevenness of
+    base colour, which is free during the fit (`descent`); and the price of lamps and of tint, which images hardly tell from
+    that of the surfaces (`objective`).
 
     Args:
         start: where the search starts.
@@ -115,7 +116,7 @@ def fit_light(start: Light, carried: Transport, target: Target, objective: Objec
         strength = light().strength()[felt]
         strength = torch.where(told, strength, strength.detach())
         loss = objective.misfit(strength, carried, target, gain)
-        loss = loss + config.smoothness * total_variation(log_radiance)
+        loss = loss + objective.unlikely(log_radiance)
         return loss + objective.price(unit * root.square().mean(-1), reaching @ strength)
 
     unknowns = (Unknown(log_radiance, config.rate), Unknown(root, ROOT_RATE * config.rate))

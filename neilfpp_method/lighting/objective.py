@@ -15,8 +15,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from neilfpp_method.config import LightFitConfig
+from neilfpp_method.lighting.sky import KnownSky
 from neilfpp_method.lighting.transport import Transport
-from neilfpp_method.shading.color import apply_response
+from neilfpp_method.shading.color import apply_response, response_slope
 from neilfpp_method.structures import Indexable, Material
 
 __all__ = ["Objective", "Target", "nearest_points", "tint", "total_variation", "unevenness"]
@@ -49,22 +50,26 @@ class Objective:
 
     Attributes:
         response: of the capture, "linear" or "srgb".
-        unit: a pixel of typical brightness; errors are relative to the pixel and a share of this.
+        unit: what a pixel of typical brightness changes by per unit of log radiance (`response_slope`): itself, where the
+            response is linear. Errors are relative to that of the pixel and a share of this.
         config: the weights.
+        sky: what cameras saw of the light itself; none where they saw nothing of it.
     """
 
     response: str
     unit: float
     config: LightFitConfig
+    sky: KnownSky | None = None
 
     def relative_error(
         self, strength: Float[Tensor, "T 3"], carried: Transport, target: Target, gain: Float[Tensor, "#N 3"] | float
     ) -> Float[Tensor, "N 3"]:
-        """What the camera stores of the points, their base colour times `gain`, against their pixels."""
+        """How far radiance is off, of itself: what the camera stores of the points, their base colour times `gain`, against
+        their pixels."""
         material = target.material
         tinted = Material((material.base_color * gain).clamp(0, 1), material.roughness, material.metallic)
         shown = apply_response(carried.outgoing(tinted, strength), self.response)
-        return (shown - target.pixel) / (target.pixel + self.config.floor * self.unit)
+        return (shown - target.pixel) / (response_slope(target.pixel, self.response) + self.config.floor * self.unit)
 
     def misfit(
         self, strength: Float[Tensor, "T 3"], carried: Transport, target: Target, gain: Float[Tensor, "#N 3"]
@@ -72,6 +77,13 @@ class Objective:
         """The relative error in the mean: by its square where it is small, by its size where it is large."""
         error = self.relative_error(strength, carried, target, gain)
         return functional.smooth_l1_loss(error, torch.zeros_like(error), beta=self.config.outlier)
+
+    def unlikely(self, log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, ""]:
+        """What speaks against a map by itself: that it is uneven, and that it is not what cameras saw of it."""
+        uneven = self.config.smoothness * total_variation(log_radiance)
+        if self.sky is None or not log_radiance.numel():
+            return uneven
+        return uneven + self.config.sky * self.sky.misfit(log_radiance)
 
     def price(self, brought: Float[Tensor, " M"], all_light: Float[Tensor, " 3"]) -> Float[Tensor, ""]:
         """Of lamps, by the light that each brings to the points, and of the tint of all light that reaches them.

@@ -12,6 +12,7 @@ from neilfpp_method.lighting.fit import Evidence, Light, compare, evidence, fit_
 from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.settle import settle_lamps
+from neilfpp_method.lighting.sky import KnownSky
 from neilfpp_method.lighting.transport import from_lamps, from_texels
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import Material, SceneTracer
@@ -36,6 +37,7 @@ def solve_light(
     unit: float,
     config: IncidentLightConfig,
     first: bool,
+    sky: KnownSky | None = None,
 ) -> Evidence | None:
     """Set the map, and the lamps where there may be any, to what explains the points. A map that is known stays.
 
@@ -47,12 +49,13 @@ def solve_light(
         config: with "auto" the lamps must earn their place: the fit is done with and without, and they stay where they
             lower the error at points kept back from both (`Evidence.favours`).
         first: nothing has been decided yet.
+        sky: as of `Objective`; a map of as many rows.
 
     Returns:
         What spoke for lamps, or against them; none where the settings had decided.
     """
     target = Target(seen.position, material, seen.pixel)
-    objective = Objective(response, unit, config.fit)
+    objective = Objective(response, unit, config.fit, sky)
     dark = environment.log_radiance.new_zeros(0, 3)
     if config.map is None:
         sought = environment.log_radiance

@@ -11,14 +11,15 @@ import torch
 from neilfpp_method.config import OptimizerConfig
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.model import CLEAR
 from neilfpp_method.presets import preset
 from neilfpp_method.schedule import Stage
 from neilfpp_method.train.build import scene_facts
 from neilfpp_method.train.loop import make_optimizer, set_rates, train
 from tests.data.make_capture import make_capture
-from tests.data.skies import GROUND, make_sky_capture
+from tests.data.skies import GROUND, SKY, make_sky_capture
 from tests.scenes import sphere_model, tiny_config
-from tests.train.small_runs import small_training
+from tests.train.small_runs import small_training, solved_light
 
 
 def facts_of(root: Path):
@@ -68,3 +69,21 @@ def test_a_sphere_under_a_sky_gets_a_surface(tmp_path):
     assert hits.opacity[~on].median() < 0.1
     outward = torch.nn.functional.normalize(hits.position[on], dim=-1)
     assert (hits.normal[on] * outward).sum(-1).median() > 0.9
+
+
+@pytest.mark.parametrize("background", ["inverted_sphere", "constant"])
+def test_pixels_beyond_the_scene_are_remembered_as_its_light(tmp_path, background):
+    """A constant background is a backdrop, or black for want of one: no light."""
+    model = sphere_model(solved_light(tiny_config()), background=background).train()
+    capture = load_capture(make_sky_capture(tmp_path / "sky"))
+    batch = PixelDataset(capture, capture.views).sample(400)
+    model.losses(batch, Stage.MATERIAL_INIT)
+    if background == "constant":
+        assert model.sky is None
+        return
+    with torch.no_grad():
+        clear = model.host.render(batch.rays).opacity < CLEAR
+    assert 0 < clear.sum() < 400
+    known = model.sky.known()
+    assert model.sky.pixels.sum() == clear.sum()
+    assert torch.isin(known.log_radiance[0][known.weight > 0.5], torch.tensor([GROUND, SKY[0]]).log()).any()

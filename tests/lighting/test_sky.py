@@ -1,0 +1,103 @@
+"""What cameras saw of the light: what is remembered, what it is worth, and what a fit makes of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from neilfpp_method.config import LightFitConfig
+from neilfpp_method.fields.direction_map import map_directions
+from neilfpp_method.fields.environment import EnvironmentLight
+from neilfpp_method.lighting.fit import Light, fit_light
+from neilfpp_method.lighting.objective import Objective, Target
+from neilfpp_method.lighting.sky import FAITH, SkySightings
+from neilfpp_method.lighting.transport import from_texels
+from neilfpp_method.shading.color import linear_to_srgb
+from tests.lighting.surfaces import material, points
+
+HEIGHT = 12
+
+
+def gradient(wi: torch.Tensor) -> torch.Tensor:
+    """Radiance of a sky that is bright above, bluish below, and changes slowly."""
+    height = wi[..., 2:]
+    return (0.3 + 0.2 * height) * torch.tensor([1.0, 1.1, 1.3]) - 0.1 * height * torch.tensor([0.0, 0.0, 1.0])
+
+
+def looks(count: int, below: float = 1.0) -> torch.Tensor:
+    """Directions in which cameras look; none of them above a height."""
+    wi = normalize(torch.randn(8 * count, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    return wi[wi[:, 2] <= below][:count]
+
+
+@pytest.mark.parametrize("response", ["linear", "srgb"])
+def test_texels_are_what_their_pixels_show(response):
+    sky, wi = SkySightings(HEIGHT, response), looks(20_000, below=0.2)
+    shown = gradient(wi)
+    beyond = torch.rand(len(wi), generator=torch.Generator().manual_seed(1)) < 0.5
+    color = torch.where(beyond[:, None], shown, 7.0 if response == "linear" else 0.99)  # the rest is the object
+    sky.remember(wi, color if response == "linear" else torch.where(beyond[:, None], linear_to_srgb(color), color), beyond)
+    known, middle = sky.known(), map_directions(HEIGHT, 2 * HEIGHT)
+    inside = (middle[..., 2] < 0.0) & (middle[..., 2] > -0.95)
+    assert (known.weight[inside] > 0.8).all()
+    assert (known.weight[middle[..., 2] > 0.5] == 0).all()
+    expected = gradient(middle)[inside].log()
+    torch.testing.assert_close(known.log_radiance.permute(1, 2, 0)[inside], expected, atol=0.05, rtol=0.0)
+
+
+def test_what_lies_near_counts_for_less():
+    """Half of the pixels of every direction show something else: a wall that each camera sees elsewhere."""
+    sky, wi = SkySightings(HEIGHT, "linear"), looks(20_000)
+    color = torch.where(torch.arange(len(wi))[:, None] % 2 == 0, 0.1, 1.0).expand(-1, 3)
+    sky.remember(wi, color, torch.ones(len(wi), dtype=torch.bool))
+    expected = 1 / (1 + (0.45 / 0.55) ** 2 / FAITH**2)  # 0.12
+    assert sky.known().weight[sky.pixels > 30].mean() == pytest.approx(expected, rel=0.15)
+
+
+def test_a_clipped_pixel_makes_its_texel_unseen():
+    sky, wi = SkySightings(HEIGHT, "srgb"), looks(5000)
+    color = torch.full((len(wi), 3), 0.5)
+    color[wi[:, 2] > 0.5, 0] = 1.0
+    sky.remember(wi, color, torch.ones(len(wi), dtype=torch.bool))
+    up = map_directions(HEIGHT, 2 * HEIGHT)[..., 2]
+    weight = sky.known().weight
+    assert (weight[up > 0.7] == 0).all()
+    assert (weight[up.abs() < 0.2] > 0.5).all()
+
+
+def test_nothing_seen_is_nothing_known():
+    sky = SkySightings(HEIGHT, "linear")
+    sky.remember(looks(100), torch.zeros(100, 3), torch.zeros(100, dtype=torch.bool))
+    known = sky.known()
+    assert not known.weight.any()
+    assert known.log_radiance.isfinite().all()
+    assert known.misfit(torch.zeros(3, HEIGHT, 2 * HEIGHT)) == 0
+
+
+def test_a_fit_keeps_to_what_was_seen_and_finds_the_rest():
+    """Cameras saw the lower half of the sky and the horizon, surfaces say what is above."""
+    torch.manual_seed(0)
+    seen, of = points(256), material(256)
+    directions = map_directions(HEIGHT, 2 * HEIGHT)
+    truth = gradient(directions).permute(2, 0, 1)
+    environment = EnvironmentLight(HEIGHT, 1.0)
+    carried = from_texels(environment, seen, of.roughness, None, None)
+    image = carried.outgoing(of, truth.flatten(1).t())
+    sky, wi = SkySightings(HEIGHT, "linear"), looks(20_000, below=0.1)
+    sky.remember(wi, gradient(wi), torch.ones(len(wi), dtype=torch.bool))
+    wrong = dataclasses.replace(of, base_color=0.7 * of.base_color)
+
+    def error(known: SkySightings | None) -> torch.Tensor:
+        config = LightFitConfig(steps=300)
+        objective = Objective("linear", image.median().item(), config, known and known.known())
+        start = Light(torch.full((3, HEIGHT, 2 * HEIGHT), math.log(0.5)), torch.zeros(0, 3))
+        found = fit_light(start, carried, Target(seen.position, wrong, image), objective)
+        return (found.log_radiance - truth.log()).abs().mean(0)
+
+    below = directions[..., 2] < -0.1
+    assert error(sky)[below].mean() < 0.05
+    assert error(None)[below].mean() > 0.2
