@@ -60,9 +60,7 @@ def clock(where: torch.device) -> Callable[[], float]:
     return now
 
 
-def median_seconds(
-    *functions: Callable[[], object], repetitions: int = 7, where: torch.device | None = None
-) -> list[float]:
+def median_seconds(*functions: Callable[[], object], repetitions: int = 7, where: torch.device | None = None) -> list[float]:
     """The median duration of each function, after one call that does not count; `where` they run, if not on `device()`.
 
     They take turns, so that whatever else the machine does falls on all of them: their ratios are worth more than their

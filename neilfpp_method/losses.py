@@ -69,9 +69,7 @@ def surface(distance: Float[Tensor, ...], epsilon: float) -> LossTerm:
     return LossTerm(epsilon / (math.pi * (epsilon**2 + distance**2)))
 
 
-def point_cloud(
-    distance: Float[Tensor, " P"], gradient: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]
-) -> LossTerm:
+def point_cloud(distance: Float[Tensor, " P"], gradient: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]) -> LossTerm:
     """L_pcd = |G(x_D)| + 1 − cos∠(n_D, ∇G(x_D)) at the points x_D of an oriented cloud."""
     cosine = (functional.normalize(gradient, dim=-1, eps=1e-6) * normal).sum(-1)
     return LossTerm(distance.abs() + (1.0 - cosine))

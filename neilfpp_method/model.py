@@ -203,15 +203,11 @@ class NeilfModel(nn.Module):
             image_gradient=pixels.image_gradient,
         )
 
-    def _material_and_priors(
-        self, seen: SurfacePixels, names: Mapping[str, float], terms: dict[str, LossTerm]
-    ) -> Material:
+    def _material_and_priors(self, seen: SurfacePixels, names: Mapping[str, float], terms: dict[str, LossTerm]) -> Material:
         if "smoothness" in names:
             sample = self.brdf.with_gradients(seen.position)
             material = sample.material
-            terms["smoothness"] = losses.smoothness(
-                sample.roughness_gradient, sample.metallic_gradient, seen.image_gradient
-            )
+            terms["smoothness"] = losses.smoothness(sample.roughness_gradient, sample.metallic_gradient, seen.image_gradient)
         else:
             material = self.brdf(seen.position)
         if "lambertian" in names:
@@ -221,9 +217,7 @@ class NeilfModel(nn.Module):
         return material
 
     def _inter_reflection(self, position: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]) -> LossTerm:
-        traced = trace_light(
-            self.host, position, normal, self.config.inter_reflection, self.config.shading.hit_share
-        )
+        traced = trace_light(self.host, position, normal, self.config.inter_reflection, self.config.shading.hit_share)
         hit = torch.nonzero(traced.hit)[:, 0]
         incident = self.light.radiance(traced.position[hit], traced.wi[hit][:, None])[:, 0]
         return losses.inter_reflection(incident, traced.radiance[hit], self.units.incident)
@@ -370,9 +364,7 @@ class NeilfModel(nn.Module):
             )
         diffuse, specular, base_color, roughness, metallic = surfaces.split([3, 3, 3, 1, 1], dim=-1)
         depth = ((hits.position - rays.origins) * rays.directions).sum(-1, keepdim=True)
-        return Maps(
-            rgb, hits.color, diffuse, specular, base_color, roughness, metallic, normals, depth, hits.opacity[:, None]
-        )
+        return Maps(rgb, hits.color, diffuse, specular, base_color, roughness, metallic, normals, depth, hits.opacity[:, None])
 
     # ------------------------------------------------------------------------------------------------------- parameters
 

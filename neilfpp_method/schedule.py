@@ -52,9 +52,7 @@ GEOMETRY = LIGHT_FIELD | {"geometry", "beta"}
 MATERIAL = frozenset({"brdf", "light"})
 
 # Each loss of the material stages with the setting that weighs it.
-MATERIAL_LOSSES = {
-    name: name for name in ("physical", "inter_reflection", "smoothness", "lambertian", "energy", "specular")
-}
+MATERIAL_LOSSES = {name: name for name in ("physical", "inter_reflection", "smoothness", "lambertian", "energy", "specular")}
 
 
 @dataclass(frozen=True)
@@ -156,9 +154,7 @@ def stage_at(step: int, config: TrainConfig) -> StagePosition:
     return StagePosition(stage, length, length)
 
 
-def active_losses(
-    stage: Stage, config: NeilfConfig, stages: StageTable = STAGES, share: float = 0.0
-) -> Mapping[str, float]:
+def active_losses(stage: Stage, config: NeilfConfig, stages: StageTable = STAGES, share: float = 0.0) -> Mapping[str, float]:
     """The losses that count in a stage, with their weights when `share` of it is over.
 
     One of weight 0, or whose effect is switched off, is absent: nothing computes it.

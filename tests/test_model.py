@@ -166,11 +166,13 @@ def test_the_gradient_into_outgoing_radiance_is_scaled():
     config = tiny_config()
     gradients = {}
     for scale in (0.0, 0.35, 0.7):
-        model = sphere_model(dataclasses.replace(
-            config,
-            inter_reflection=dataclasses.replace(config.inter_reflection, radiance_gradient=scale),
-            shading=dataclasses.replace(config.shading, hit_share=0.0),  # every ray counts as a hit
-        ))
+        model = sphere_model(
+            dataclasses.replace(
+                config,
+                inter_reflection=dataclasses.replace(config.inter_reflection, radiance_gradient=scale),
+                shading=dataclasses.replace(config.shading, hit_share=0.0),  # every ray counts as a hit
+            )
+        )
         torch.manual_seed(3)
         hits = model.host.render(batch.rays).detach()
         term = model._inter_reflection(hits.position, hits.normal)

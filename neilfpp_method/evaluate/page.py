@@ -104,9 +104,7 @@ def _metrics_table(metrics: Mapping[str, float]) -> str:
         if name in companions:
             continue
         entry = explain(name)
-        value, frame, baseline = (
-            entry.format(metrics[key]) if key in metrics else "–" for key in (name, *beside[name])
-        )
+        value, frame, baseline = (entry.format(metrics[key]) if key in metrics else "–" for key in (name, *beside[name]))
         arrow = {"higher": "↑", "lower": "↓"}[entry.better]
         rows.append(
             f"<tr><th>{escape(entry.title)}<code>{escape(name)}</code></th>"

@@ -166,9 +166,7 @@ LEAST_ROW = 100
 TITLE, HEADING, TEXT, NOTE = 34, 24, 20, 16
 
 
-def contact_sheet(
-    title: str, subtitle: str, sections: Sequence[Section], cell_width: int = 240
-) -> UInt8[np.ndarray, "H W 3"]:
+def contact_sheet(title: str, subtitle: str, sections: Sequence[Section], cell_width: int = 240) -> UInt8[np.ndarray, "H W 3"]:
     """Lay sections out below one another; every picture is scaled to the width of a cell and keeps its proportions.
 
     A sheet without a title has no head.
@@ -254,7 +252,5 @@ def _fit(picture: Shaped[np.ndarray, "H W C"] | None, width: int) -> UInt8[np.nd
     return np.ascontiguousarray(np.broadcast_to(scaled.reshape(height, width, -1), (height, width, 3)))
 
 
-def _write(
-    draw: ImageDraw.ImageDraw, corner: tuple[int, int], text: str, size: int, color: tuple[int, int, int] = INK
-) -> None:
+def _write(draw: ImageDraw.ImageDraw, corner: tuple[int, int], text: str, size: int, color: tuple[int, int, int] = INK) -> None:
     draw.multiline_text(corner, text, font=ImageFont.load_default(size), fill=color, spacing=4)

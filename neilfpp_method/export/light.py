@@ -1,9 +1,9 @@
 """The light of a run as files for other programs: the environment map, the lamps before it, and light probes (docs/light.md).
 
-    <out>/environment.exr    radiance from far away, where the run has an environment map
-    <out>/lamps.json         lamps close to the scene, in the world frame of the capture; beside every environment map
-    <out>/probes/<k>.exr     what arrives at points of the surface
-    <out>/probes.json        where these points are
+<out>/environment.exr    radiance from far away, where the run has an environment map
+<out>/lamps.json         lamps close to the scene, in the world frame of the capture; beside every environment map
+<out>/probes/<k>.exr     what arrives at points of the surface
+<out>/probes.json        where these points are
 """
 
 from __future__ import annotations

@@ -82,9 +82,7 @@ def export_mesh(run: Run, path: Path, resolution: int = 256) -> trimesh.Trimesh:
         UserError: the host is no distance field, or it has no surface.
     """
     if not isinstance(run.model.host, HasSdf):
-        raise UserError(
-            f"{run.path}: the host of this run has no distance field", "export from a run of the VolSDF host"
-        )
+        raise UserError(f"{run.path}: the host of this run has no distance field", "export from a run of the VolSDF host")
     device = next(run.model.parameters()).device
     volume = run.config.volume
     # The sphere that may close the scene (METHOD §3) is no surface of the object.
@@ -98,9 +96,7 @@ def export_mesh(run: Run, path: Path, resolution: int = 256) -> trimesh.Trimesh:
     return mesh
 
 
-def _sparse_grid(
-    sdf: Sdf, radius: float, blocks: int, step: float, device: torch.device | str
-) -> Float[np.ndarray, "G G G"]:
+def _sparse_grid(sdf: Sdf, radius: float, blocks: int, step: float, device: torch.device | str) -> Float[np.ndarray, "G G G"]:
     """sdf on the grid of cubes; a block far from the surface holds the value of its centre throughout."""
     corners = _lattice(blocks, device) * (BLOCK * step) - radius
     half_edge = 0.5 * (BLOCK - 1) * step

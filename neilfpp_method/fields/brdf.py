@@ -32,9 +32,7 @@ class BrdfField(nn.Module):
     def __init__(self, config: BrdfConfig, radius: float) -> None:
         super().__init__()
         self.encoding = position_encoding(config.encoding, config.grid, radius, config.frequencies)
-        self.mlp = Mlp(
-            self.encoding.width, 5, config.layers, config.width, config.activation, config.skip, output_scale=1e-2
-        )
+        self.mlp = Mlp(self.encoding.width, 5, config.layers, config.width, config.activation, config.skip, output_scale=1e-2)
         nn.init.zeros_(self.mlp.layers[-1].bias)
         with torch.no_grad():
             self.mlp.layers[-1].bias[:3] = math.atanh(2 * config.initial_base_color - 1)

@@ -40,9 +40,7 @@ def map_directions(height: int, width: int) -> Float[Tensor, "height width 3"]:
     return torch.stack(axes, -1).float()
 
 
-def _columns_and_rows(
-    wi: Float[Tensor, "*B 3"], height: int, width: int
-) -> tuple[Float[Tensor, "*B"], Float[Tensor, "*B"]]:
+def _columns_and_rows(wi: Float[Tensor, "*B 3"], height: int, width: int) -> tuple[Float[Tensor, "*B"], Float[Tensor, "*B"]]:
     """Where a direction lies in a map, in texels: column in [−½, w − ½), row in [0, h − 1]."""
     x, y, z = wi.unbind(-1)
     turn = torch.atan2(x, y) / (2 * math.pi)

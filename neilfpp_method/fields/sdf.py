@@ -52,9 +52,7 @@ class SdfField(nn.Module):
         sample = self.mlp.with_gradient(encoded.features, slice(0, 1))
         return SdfSample(sample.value[:, 0], pull_back(sample.gradient, encoded)[:, 0], sample.value[:, 1:])
 
-    def hessian(
-        self, x: Float[Tensor, "N 3"], method: Literal["analytic", "finite_difference"]
-    ) -> Float[Tensor, "N 3 3"]:
+    def hessian(self, x: Float[Tensor, "N 3"], method: Literal["analytic", "finite_difference"]) -> Float[Tensor, "N 3 3"]:
         """H_ij = ∂²G / ∂x_i ∂x_j; a loss on it reaches the parameters.
 
         analytic: autograd through `with_gradient`. Exact, but inside a grid cell a trilinear function has no curvature

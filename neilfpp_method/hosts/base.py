@@ -87,9 +87,7 @@ class HasSurfaceWidth(Protocol):
 class SmoothsNormals(Protocol):
     """A host whose normals are wavy, and which knows better ones. Without: surfaces are shaded with the normals of the hits."""
 
-    def smooth_normals(
-        self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N 3"]:
+    def smooth_normals(self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """Unit normals at hits for shading; constants, no gradient."""
         ...
 

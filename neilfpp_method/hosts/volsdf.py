@@ -131,9 +131,7 @@ class VolSdfHost(nn.Module):
         points = origins[rows] + found.distance[rows, None] * directions[rows]
         surface = self.sdf_field.with_gradient(points)
         radiance = torch.zeros_like(directions)
-        radiance[rows] = self.radiance_field(
-            points, -directions[rows], safe_normalize(surface.gradient), surface.feature
-        )
+        radiance[rows] = self.radiance_field(points, -directions[rows], safe_normalize(surface.gradient), surface.feature)
         distance = torch.where(found.hit, found.distance, torch.inf)
         return SceneLight(found.hit.view(wi.shape[:2]), radiance.view(wi.shape), distance.view(wi.shape[:2]))
 
@@ -163,9 +161,7 @@ class VolSdfHost(nn.Module):
 
     def _grid(self) -> Float[Tensor, "R R R"]:
         if self.grid_age is None or self.grid_age >= GRID_LIFE:
-            fresh = sample_grid(
-                self.sdf_field, self.config.volume.radius, self.distance_grid.shape[0], self.distance_grid
-            )
+            fresh = sample_grid(self.sdf_field, self.config.volume.radius, self.distance_grid.shape[0], self.distance_grid)
             self.distance_grid.copy_(fresh)
             self.grid_age = 0
         return self.distance_grid
@@ -216,9 +212,7 @@ class VolSdfHost(nn.Module):
             return uniform_samples(near, far, volume.samples, self.training)
         with torch.no_grad(), half_precision(near.device, volume.queries == "rounded"):
             beta = self.density.beta()
-            found = error_bounded_samples(
-                self.sdf, rays.origins, rays.directions, near, far, beta, volume, self.training
-            )
+            found = error_bounded_samples(self.sdf, rays.origins, rays.directions, near, far, beta, volume, self.training)
         return found.distances
 
     def _blend(

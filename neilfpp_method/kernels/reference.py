@@ -77,9 +77,7 @@ class _Gather(torch.autograd.Function):
     """Table rows by number, features first."""
 
     @staticmethod
-    def forward(
-        ctx: FunctionCtx, table: Float[Tensor, "T F"], rows: Int[Tensor, "2 2 2 N"]
-    ) -> Float[Tensor, "F 2 2 2 N"]:
+    def forward(ctx: FunctionCtx, table: Float[Tensor, "T F"], rows: Int[Tensor, "2 2 2 N"]) -> Float[Tensor, "F 2 2 2 N"]:
         ctx.save_for_backward(rows)
         ctx.entries = table.shape[0]
         return table.index_select(0, rows.reshape(-1)).t().contiguous().view(table.shape[1], *rows.shape)

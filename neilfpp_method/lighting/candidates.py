@@ -59,9 +59,7 @@ def propose(lamps: Lamps, surface: Float[Tensor, "N 3"], count: int) -> LampPlac
 
 
 @torch.no_grad()
-def merge(
-    places: LampPlaces, intensity: Float[Tensor, "M 3"], reach: Float[Tensor, " M"], most: int
-) -> FoundLamps:
+def merge(places: LampPlaces, intensity: Float[Tensor, "M 3"], reach: Float[Tensor, " M"], most: int) -> FoundLamps:
     """Neighbours made one, in their middle by power and of their joint intensity; those that bring little are left out.
 
     `reach` is the light that a lamp of intensity 1 brings to the scene: a strong one that reaches nothing counts for nothing.

@@ -142,9 +142,7 @@ def from_lamps(
 
 
 @torch.no_grad()
-def in_sight(
-    lamps: LampPlaces, radius: float, x: Float[Tensor, "N 3"], scene: SceneTracer | None
-) -> Bool[Tensor, "N M"]:
+def in_sight(lamps: LampPlaces, radius: float, x: Float[Tensor, "N 3"], scene: SceneTracer | None) -> Bool[Tensor, "N M"]:
     """Whether the middle of a lamp is to be seen from a point."""
     rays = rays_towards(x, lamps.position, lamps.axis, radius)
     if scene is None:

@@ -48,8 +48,7 @@ class Photo:
 
 @dataclass(frozen=True)
 class Photos:
-    """The photographs of a folder in the order of their paths; all of one kind. `unreadable`: what is wrong with others.
-    """
+    """The photographs of a folder in the order of their paths; all of one kind. `unreadable`: what is wrong with others."""
 
     root: Path
     items: tuple[Photo, ...]

@@ -176,9 +176,7 @@ def _load_pixels(capture: Capture, fabric: Fabric, console: Console) -> PixelDat
     hidden = not (fabric.is_global_zero and console.is_terminal)
     with Progress(*columns, console=console, transient=True, disable=hidden) as progress:
         task = progress.add_task("", total=len(capture.train_views))
-        return PixelDataset(
-            capture, capture.train_views, device=fabric.device, on_view=lambda _: progress.advance(task)
-        )
+        return PixelDataset(capture, capture.train_views, device=fabric.device, on_view=lambda _: progress.advance(task))
 
 
 def _preview(out: Path, capture: Capture, fabric: Fabric, reporter: Reporter) -> Callable[[NeilfModel, Stage], None]:

@@ -71,9 +71,7 @@ def train(run: Training) -> None:
         model.train()
 
 
-def _train_stage(
-    run: Training, model: NeilfModel, optimizer: torch.optim.Optimizer, step: int, position: StagePosition
-) -> int:
+def _train_stage(run: Training, model: NeilfModel, optimizer: torch.optim.Optimizer, step: int, position: StagePosition) -> int:
     """The rest of a stage. Returns the number of the step that follows it."""
     settings = run.config.train
     stage = position.stage

@@ -1,10 +1,10 @@
 """A run folder: everything that made a result, and the result.
 
-    config.json       every setting               environment.json  versions, hardware, command
-    capture.json      where the images are        timing.json       seconds of each stage
-    scene.json        what the images decided     checkpoints/      last.pt, and one at the end of each stage
-    previews/         a picture per stage         tensorboard/      scalars and pictures
-    light.json        what spoke for lamps, fit by fit; not there where the settings had decided
+config.json       every setting               environment.json  versions, hardware, command
+capture.json      where the images are        timing.json       seconds of each stage
+scene.json        what the images decided     checkpoints/      last.pt, and one at the end of each stage
+previews/         a picture per stage         tensorboard/      scalars and pictures
+light.json        what spoke for lamps, fit by fit; not there where the settings had decided
 """
 
 from __future__ import annotations

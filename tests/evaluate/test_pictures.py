@@ -52,9 +52,7 @@ def test_depth_is_white_near_and_black_far():
 
 
 def test_exposure_scales_before_clipping():
-    np.testing.assert_array_equal(
-        display_color(flat(1.0, 2.0, 4.0), 0.25)[0, 0], display_color(flat(0.25, 0.5, 1.0))[0, 0]
-    )
+    np.testing.assert_array_equal(display_color(flat(1.0, 2.0, 4.0), 0.25)[0, 0], display_color(flat(0.25, 0.5, 1.0))[0, 0])
 
 
 def test_auto_exposure_ignores_lamps():
@@ -114,9 +112,7 @@ def test_directional_light_has_its_peak_in_its_pixel(row: int, column: int):
 def sheet(value: int, rows: int = 2) -> np.ndarray:
     picture = np.full((30, 40, 3), value, dtype=np.uint8)
     row = Row("base colour", (picture, picture[..., :1], None), "as estimated", "0.2")
-    return contact_sheet(
-        "a run", "fast", [Section((Group("view 004", ("truth", "estimate", "error")),), rows * (row,))], 160
-    )
+    return contact_sheet("a run", "fast", [Section((Group("view 004", ("truth", "estimate", "error")),), rows * (row,))], 160)
 
 
 def test_contact_sheet_has_the_size_of_its_cells():

@@ -145,10 +145,7 @@ def test_albedo_scale_undoes_a_factor_per_channel(root: Path):
     run = make_run(root)
     known = known_test_views(run, render_test_views(run)).views
     factors = np.array([0.5, 0.8, 1.25])
-    halved = [
-        RenderedView(k.view.name, {"base_color": (k.material["base_color"] * factors).astype(np.float32)})
-        for k in known
-    ]
+    halved = [RenderedView(k.view.name, {"base_color": (k.material["base_color"] * factors).astype(np.float32)}) for k in known]
     np.testing.assert_allclose(albedo_scale(halved, known), 1.0 / factors, rtol=1e-5)
 
 

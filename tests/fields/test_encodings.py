@@ -42,9 +42,7 @@ def test_spherical_harmonics_agree_with_scipy():
         for m in range(-band, band + 1):
             value = (-1.0) ** m * sph_harm_y(band, abs(m), theta, phi)  # (−1)^m takes the Condon–Shortley phase away
             expected.append(value.real if m == 0 else np.sqrt(2) * (value.real if m > 0 else value.imag))
-    np.testing.assert_allclose(
-        SphericalHarmonics(5)(directions(theta, phi)).numpy(), np.stack(expected, -1), atol=1e-12
-    )
+    np.testing.assert_allclose(SphericalHarmonics(5)(directions(theta, phi)).numpy(), np.stack(expected, -1), atol=1e-12)
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3, 4, 5])

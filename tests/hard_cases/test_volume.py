@@ -110,8 +110,6 @@ def test_inverse_cdf_of_an_even_mass_is_even(mass, span):
 
 def test_no_rays():
     empty = torch.zeros(0)
-    found = error_bounded_samples(
-        sphere, torch.zeros(0, 3), torch.zeros(0, 3), empty, empty, torch.tensor(0.1), CONFIG, True
-    )
+    found = error_bounded_samples(sphere, torch.zeros(0, 3), torch.zeros(0, 3), empty, empty, torch.tensor(0.1), CONFIG, True)
     assert found.distances.shape == (0, 8)
     assert found.sdf_queries == 0

@@ -33,9 +33,7 @@ def random_scene(count: int = 5, samples: int = 16):
     n, wo, wi = (torch.randn(*shape, 3).double() for shape in ((count,), (count,), (count, samples)))
     n, wo, wi = (v / v.norm(dim=-1, keepdim=True) for v in (n, wo, wi))
     wo = wo * (wo * n).sum(-1, keepdim=True).sign()
-    material = Material(
-        torch.rand(count, 3).double(), 0.3 + 0.6 * torch.rand(count, 1).double(), torch.rand(count, 1).double()
-    )
+    material = Material(torch.rand(count, 3).double(), 0.3 + 0.6 * torch.rand(count, 1).double(), torch.rand(count, 1).double())
     return material, n, wo, IncidentSamples(wi, 0.1 + torch.rand(count, samples).double()), torch.rand_like(wi) * 3
 
 
