@@ -150,6 +150,7 @@ def attach_neilf(
     response: str = "linear",
     median_radiance: float = 0.5,
     radiance_scale: float | None = None,
+    open_scene: bool = False,
 ) -> AttachedNeilf:
     """Put the material field, the light field and their losses on top of a host.
 
@@ -161,13 +162,15 @@ def attach_neilf(
         response: what the pixels are: "linear" (HDR) or "srgb" (LDR).
         median_radiance: median linear luminance of the object in the images; sets the light's first guess.
         radiance_scale: the range of the host's radiance; none: 3 for HDR, 1 for LDR.
+        open_scene: pixels of rays that meet nothing show the light from far away, not a backdrop; a map keeps to them.
 
     Raises:
         UserError: the host is none of the three, or the environment map that the settings name cannot be used.
     """
     adapted = _adapt(host, response)
     borrowed = not isinstance(host, HasParameterGroups)
-    facts = SceneFacts(response, median_radiance, radiance_scale or RADIANCE_SCALE[response], background="constant")
+    background = "inverted_sphere" if open_scene else "constant"
+    facts = SceneFacts(response, median_radiance, radiance_scale or RADIANCE_SCALE[response], background)
     if config is None:
         config = preset("fast") if isinstance(adapted, LightsItself) else free_light(preset("fast"))
     attached = AttachedNeilf(NeilfModel(adapted, config, facts, borrowed=borrowed))

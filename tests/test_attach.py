@@ -21,6 +21,7 @@ from neilfpp_method.structures import PixelBatch
 from tests.hosts.balls import Ball, BallHost, ball_rays
 from tests.hosts.test_mesh import SPHERE, mesh_config, mesh_host
 from tests.scenes import sphere_batch, sphere_model, tiny_config
+from tests.train.small_runs import solved_light
 
 
 def pixels(seed: int = 0, spread: float = 0.3) -> PixelBatch:
@@ -157,6 +158,16 @@ def test_a_map_that_the_settings_name_lights_the_scene_and_stays(tmp_path):
     assert neilf.losses(pixels(), Stage.MATERIAL_INIT).loss.isfinite()
     shown = neilf.model.light.log_radiance.exp().permute(1, 2, 0)
     torch.testing.assert_close(shown, torch.from_numpy(known))
+
+
+def test_in_an_open_scene_rays_that_meet_nothing_show_its_light():
+    config, batch = solved_light(steps(sdf=0, material=4, joint=0)), pixels(spread=1.5)
+    missed = (mesh_host(SPHERE).render(batch.rays).opacity == 0).sum()
+    assert 0 < missed < len(batch)
+    neilf = attach_neilf(mesh_host(SPHERE), config, open_scene=True).train()
+    neilf.losses(batch, Stage.MATERIAL_INIT)
+    assert neilf.model.sky.pixels.sum() == missed
+    assert attach_neilf(mesh_host(SPHERE), config).model.sky is None
 
 
 def test_shading_is_that_of_the_maps_and_nothing_where_nothing_is_hit():
