@@ -5,8 +5,8 @@
 256 rays, all of which meet the object, 128 incident directions each for the paper's networks. The scene is a table with two
 balls; each geometry is fitted to it first, so that rays converge, and traced rays hit, as in a scene that trains. Everything
 runs in one process and takes turns; a figure is the median of the CPU time that the process spends (of the clock on a GPU,
-where there is one), or of its ratio to the plain one of the same turn. The plain implementation runs twice: as any process starts, and with the settings that the commands make
-(`kernels.process`).
+where there is one), or of its ratio to the plain one of the same turn. The plain implementation runs twice: as any process
+starts, and with the settings that the commands make (`kernels.process`).
 """
 
 from __future__ import annotations

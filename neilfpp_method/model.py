@@ -116,7 +116,7 @@ class NeilfModel(nn.Module):
         stands_still = not borrowed and not self.stages[Stage.MATERIAL_INIT].moves_host
         train = config.train
         self.replay = Replay(train.fresh, train.rays) if train.fresh < 1 and stands_still else None
-        self.sky: SkySightings | None = None
+        self.seen_sky: SkySightings | None = None
         self.seen_places: SeenPlaces | None = None
         if config.inter_reflection.unseen == "shaded":
             self.seen_places = SeenPlaces(config.volume.radius)
@@ -127,7 +127,7 @@ class NeilfModel(nn.Module):
             if config.light.map is None or self.lamps is not None:
                 self.memory = SurfaceMemory(fit.points, fit.every)
             if config.light.map is None and facts.background == "inverted_sphere" and fit.sky > 0:
-                self.sky = SkySightings(config.light.environment_height, facts.response)
+                self.seen_sky = SkySightings(config.light.environment_height, facts.response)
         else:
             self.light = make_incident_light(config.light, base, first_radiance)
 
@@ -156,9 +156,9 @@ class NeilfModel(nn.Module):
             self.seen_places.remember(hits.position[hits.is_hit(self.config.shading.hit_share)])
         if not plan.moves_material:
             return terms
-        if self.sky is not None and self.training:
+        if self.seen_sky is not None and self.training:
             outside = (batch.mask < 0.5) | (batch.mask_known == 0)
-            self.sky.remember(batch.directions, batch.color, outside & (hits.opacity.detach() < CLEAR))
+            self.seen_sky.remember(batch.directions, batch.color, outside & (hits.opacity.detach() < CLEAR))
 
         # 2. Rays that meet one surface, on the object, are shaded; a scaled gradient goes back to where they met it.
         rows = torch.nonzero((hits.is_hit(self.config.shading.hit_share)) & (batch.mask > 0.5))[:, 0]
@@ -245,7 +245,7 @@ class NeilfModel(nn.Module):
         lobe = self.lobe if self.config.shading.specular else None
         scene = None if self.config.inter_reflection.mode == "off" else self._scene_light
         response, unit = self.facts.response, self.units.physical
-        sky = None if self.sky is None else self.sky.known()
+        sky = None if self.seen_sky is None else self.seen_sky.known()
         self.evidence = solve_light(
             self.light, self.lamps, seen, material, lobe, scene, response, unit, self.config.light, first, sky
         )

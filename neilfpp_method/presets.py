@@ -91,6 +91,7 @@ def fast() -> NeilfConfig:
         inter_reflection=InterReflectionConfig(mode="hard", rays_per_point=0.25),
         loss=LossConfig(
             unit="median",
+            volume=2.0,
             eikonal=0.05,
             hessian=2e-4,
             hessian_growth=30.0,

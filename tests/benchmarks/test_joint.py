@@ -48,7 +48,8 @@ def test_every_query_of_the_sampler_is_counted(monkeypatch):
     assert said[0].sdf_queries >= host.config.volume.initial_samples
 
 
-def test_steps_take_turns():
+def test_steps_take_turns_and_each_comes_after_one_like_it():
     calls = []
-    seconds_of({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, {"a": False, "b": True})
-    assert calls == ["a", "b"] * (joint.REPETITIONS + 1)
+    taken = seconds_of({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, {"a": False, "b": True})
+    assert calls == ["a", "a", "b", "b"] * joint.REPETITIONS
+    assert [len(taken[name]) for name in "ab"] == [joint.REPETITIONS] * 2

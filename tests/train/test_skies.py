@@ -79,11 +79,11 @@ def test_pixels_beyond_the_scene_are_remembered_as_its_light(tmp_path, backgroun
     batch = PixelDataset(capture, capture.views).sample(400)
     model.losses(batch, Stage.MATERIAL_INIT)
     if background == "constant":
-        assert model.sky is None
+        assert model.seen_sky is None
         return
     with torch.no_grad():
         clear = model.host.render(batch.rays).opacity < CLEAR
     assert 0 < clear.sum() < 400
-    known = model.sky.known()
-    assert model.sky.pixels.sum() == clear.sum()
+    known = model.seen_sky.known()
+    assert model.seen_sky.pixels.sum() == clear.sum()
     assert torch.isin(known.log_radiance[0][known.weight > 0.5], torch.tensor([GROUND, SKY[0]]).log()).any()
