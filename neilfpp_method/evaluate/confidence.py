@@ -16,7 +16,9 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.nn import functional
 
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.evaluate.arriving import PATCHES, arriving_light, by_patch, patch_count
@@ -41,6 +43,9 @@ KNOWN = 0.05
 PIXELS = 1024
 """Training pixels that say how well the run explains its images, and what light a typical point receives."""
 POINTS_AT_ONCE, SIGHTED_AT_ONCE = 512, 2**16
+NEIGHBOURS, NEAR, TURN = 9, 0.1, 0.1
+"""Most points that tell how sure one is, itself among them; how near they are, in scene units; and how far a radian between
+normals puts two of them apart."""
 LEAST_NOISE = 1e-3
 """No image is better than this."""
 STEP = 1e-3
@@ -115,8 +120,9 @@ def material_deviation(
         on_progress: told the share that is done.
 
     Returns:
-        Root mean square errors: base colour up to a factor per channel that is one for all points. Points that no view
-        sees have those of a guess. Roughness and metallic mean nothing where the run's shading is Lambertian.
+        Root mean square errors, of each point the median of its neighbours' among these: base colour up to a factor per
+        channel that is one for all points. Points that no view sees have those of a guess. Roughness and metallic mean
+        nothing where the run's shading is Lambertian.
     """
     parts = [Deviation(*position.new_zeros(3, 0, 1))]
     for block in range(0, len(position), SIGHTED_AT_ONCE):
@@ -127,7 +133,8 @@ def material_deviation(
             seen = sightings[rows.start - block : rows.stop - block]
             parts.append(_deviation(model, evidence, position[rows], normal[rows], seen))
             on_progress(rows.stop / len(position))
-    return Deviation(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Deviation)))
+    deviation = Deviation(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Deviation)))
+    return _evened(deviation, position, normal)
 
 
 def with_deviation(run: Run, evidence: Evidence, view: RenderedView, step: int = 1) -> RenderedView:
@@ -157,6 +164,16 @@ def shown_surface(run: Run, view: RenderedView, pixels: Int[np.ndarray, " P"]) -
         torch.from_numpy(view.maps[name].reshape(-1, size)[pixels]) for name, size in (("depth", 1), ("normal", 3))
     )
     return OrientedPoints(rays.origins + depth * rays.directions, normal).to(next(run.model.parameters()).device)
+
+
+def _evened(deviation: Deviation, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> Deviation:
+    """Medians over neighbours. Directions are drawn for each point by itself, and what the views of one point do not tell those
+    of its neighbours may: the material is a field."""
+    place = torch.cat((position, TURN * normal), -1).cpu().numpy()
+    nearest = cKDTree(place).query(place, k=range(1, 1 + NEIGHBOURS), distance_upper_bound=NEAR)[1]
+    # Where there are fewer, the tree says a row past the last.
+    values = (functional.pad(getattr(deviation, f.name), (0, 0, 0, 1), value=math.nan)[nearest] for f in fields(Deviation))
+    return Deviation(*(value.nanmedian(1).values for value in values))
 
 
 def _deviation(

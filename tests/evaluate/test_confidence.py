@@ -143,6 +143,19 @@ def test_the_better_the_images_are_explained_the_less_is_left_to_guess(run: Run,
     assert doubt[0] < 1e-6 < doubt[1]  # nothing is learned: every point has the deviation of a guess
 
 
+def test_neighbours_agree_and_no_others(run: Run, evidence):
+    apart = on_sphere(9)
+    around = torch.nn.functional.normalize(
+        apart[:1] + 0.01 * torch.randn(9, 3, generator=torch.Generator().manual_seed(0)), dim=-1
+    )
+    normal = torch.cat((around, apart[1:]))
+    alone = material_deviation(run.model, evidence, SPHERE * apart[1:], apart[1:]).roughness
+    found = material_deviation(run.model, evidence, SPHERE * normal, normal).roughness
+    assert (found[:9] == found[0]).all()
+    torch.testing.assert_close(found[9:], alone, rtol=1e-3, atol=1e-4)
+    assert len(found[9:].unique()) > 1
+
+
 def test_no_points_have_no_deviation(run: Run, evidence):
     assert len(material_deviation(run.model, evidence, torch.zeros(0, 3), torch.zeros(0, 3))) == 0
 
