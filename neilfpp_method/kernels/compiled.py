@@ -244,7 +244,7 @@ def _at_vertices(grid, x, y, z, cells):
     return front + z * (back - front)
 
 
-# --------------------------------------------------------------------------------------------------- softplus, in float32
+# ------------------------------------------------------------------------------------------- softplus, computed in float32
 
 FAINT = np.float32(40)  # e^−40 is nothing beside 1, and its square no denormal number yet
 HALF, UNIT = np.float32(0.5), np.float32(1)
