@@ -22,12 +22,12 @@ from torch.nn import functional
 
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.evaluate.arriving import PATCHES, arriving_light, by_patch, patch_count
-from neilfpp_method.evaluate.posterior import ROUGHNESS_NODES, Deviation, Looks, Sights, expected_error
+from neilfpp_method.evaluate.looks import possible_looks, sent_by_patch
+from neilfpp_method.evaluate.posterior import Deviation, Sights, expected_error, guessed_error
 from neilfpp_method.evaluate.sightings import Sightings, TrainingViews
 from neilfpp_method.evaluate.views import RenderedView
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.shading.brdf import cosines, diffuse_reflectance, normal_reflectance
-from neilfpp_method.shading.color import apply_response, srgb_to_linear
+from neilfpp_method.shading.color import apply_response, response_slope, srgb_to_linear
 from neilfpp_method.structures import OrientedPoints
 from neilfpp_method.train.run import Run
 
@@ -41,7 +41,9 @@ radiance the cameras see, and of all light from outside together, whose scale no
 KNOWN = 0.05
 """The same of a light that was given."""
 PIXELS = 1024
-"""Training pixels that say how well the run explains its images, and what light a typical point receives."""
+"""Training pixels whose points say how well the run explains its images, and what light a typical point receives."""
+TYPICAL_LOOKS = 1
+"""Looks at a point that is explained as well as a typical one, which count beside those that there are."""
 POINTS_AT_ONCE, SIGHTED_AT_ONCE = 512, 2**16
 NEIGHBOURS, NEAR, TURN = 9, 0.1, 0.1
 """Most points that tell how sure one is, itself among them; how near they are, in scene units; and how far a radian between
@@ -59,19 +61,21 @@ class Evidence:
 
     Attributes:
         views: the training views.
-        noise: half of the relative errors of pixels are below it; errors are relative to the pixel and a share of a
-            typical one (`config.light.fit.floor`).
+        noise: half of the relative errors of radiance are below it; they are relative to what was seen and a share of what
+            is typical (`config.light.fit.floor`).
+        misfit: half of the points have a root mean square of their relative errors below it.
         typical: the mean over points of the shares of diffuse light that come from each patch.
     """
 
     views: TrainingViews
     noise: float
+    misfit: float
     typical: Float[Tensor, "3 K"]
 
 
 @torch.no_grad()
 def gather_evidence(run: Run) -> Evidence:
-    """Load a run's training views, and compare some of their pixels with what the run shows of them.
+    """Load a run's training views, and compare what they hold of some points with what the run shows of them.
 
     Where it shows no surface in any of them, the noise is as large as the pixels.
 
@@ -80,26 +84,28 @@ def gather_evidence(run: Run) -> Evidence:
     """
     model = run.model
     views = TrainingViews(run.capture, next(model.parameters()).device)
-    errors, shares = [], []
+    errors, misfits, shares = [], [], []
     pixels = views.evenly(PIXELS)
     for start in range(0, len(pixels), POINTS_AT_ONCE):
-        part = pixels[start : start + POINTS_AT_ONCE]
-        hits = model.host.render(part.rays)
-        rows = torch.nonzero(hits.is_hit(run.config.shading.hit_share))[:, 0]
+        hits = model.host.render(pixels[start : start + POINTS_AT_ONCE].rays)
+        hits = hits[torch.nonzero(hits.is_hit(run.config.shading.hit_share))[:, 0]]
+        normal = model.shading_normals(hits.position, hits.normal)
+        seen = views.sightings(model, hits.position, normal, VIEWS)
+        rows = torch.nonzero(seen.seen.any(1))[:, 0]
         if not len(rows):
             continue
-        position, wo, seen = hits.position[rows], -part.directions[rows], part.color[rows]
-        normal = model.shading_normals(position, hits.normal[rows])
+        position, normal, seen = hits.position[rows], normal[rows], seen[rows]
         material = model.materials(position)
-        shading = model.shade(position, normal, wo, material, run.config.shading.eval_samples)
-        shown = apply_response(shading.color, model.facts.response)
-        errors.append(((shown - seen).abs() / _brightness(model, seen)).flatten())
-        arriving = arriving_light(model, position, normal, wo[:, None], material)
+        arriving = arriving_light(model, position, normal, seen.wo, material)
+        error = _relative_error(model, sent_by_patch(model, arriving, material, normal, seen.wo).sum(-1), seen)
+        errors.append(error[seen.seen].abs().flatten())
+        misfits.append(_mean_over_looks(error.square(), seen).sqrt())
         parts = by_patch(arriving.light, arriving.patch, patch_count(model))
         shares.append(parts / parts.sum(-1, keepdim=True).clamp_min(TINY))
     if not errors:
-        return Evidence(views, 1.0, views.centres.new_zeros(3, patch_count(model)))
-    return Evidence(views, max(torch.cat(errors).median().item(), LEAST_NOISE), torch.cat(shares).mean(0))
+        return Evidence(views, 1.0, 1.0, views.centres.new_zeros(3, patch_count(model)))
+    noise, misfit = (max(torch.cat(values).median().item(), LEAST_NOISE) for values in (errors, misfits))
+    return Evidence(views, noise, misfit, torch.cat(shares).mean(0))
 
 
 @torch.no_grad()
@@ -181,34 +187,39 @@ def _deviation(
 ) -> Deviation:
     """Of points that are treated together."""
     material = model.materials(position)
-    specular = model.config.shading.specular
     arriving = arriving_light(model, position, normal, seen.wo, material)
-    patches = patch_count(model)
-    diffuse = arriving.light.sum(1) / math.pi
-    kd, f0 = diffuse_reflectance(material, specular), normal_reflectance(material)
-    nodes = diffuse.new_tensor(ROUGHNESS_NODES)[:, None, None].expand(-1, len(diffuse), 1)
-    facing = diffuse.new_zeros(len(diffuse), seen.wo.shape[1], len(nodes), 3)
-    grazing, sent = torch.zeros_like(facing), []
-    for v, wo in enumerate(seen.wo.unbind(1)):
-        reflected = kd[:, None] / math.pi
-        if specular:
-            cos = cosines(normal, wo, arriving.wi)
-            i, o, steep = cos.i.clamp_min(0), cos.o.clamp_min(0), (1 - cos.d).pow(5)
-            toward = torch.cat((arriving.light * (1 - steep)[..., None], arriving.light * steep[..., None]), -1)
-            lobe = [model.lobe.distribution(cos.h, r) * model.lobe.visibility(i, o, r) for r in (*nodes, material.roughness)]
-            facing[:, v], grazing[:, v] = (torch.stack(lobe[:-1], 1) @ toward).split(3, -1)
-            steep = steep[..., None]
-            reflected = reflected + lobe[-1][..., None] * (f0[:, None] * (1 - steep) + steep)
-        sent.append(by_patch(arriving.light * reflected, arriving.patch, patches))
-    shared = torch.stack(sent, 1)
-    deviations = _light_deviations(model).to(shared)
-    peculiar = shared - shared.sum(-1, keepdim=True) * evidence.typical
+    sent = sent_by_patch(model, arriving, material, normal, seen.wo)
+    deviations = _light_deviations(model).to(sent)
+    peculiar = sent - sent.sum(-1, keepdim=True) * evidence.typical
     outside = torch.cat((peculiar[..., :PATCHES], peculiar[..., 2 * PATCHES :]), -1).sum(-1, keepdim=True)
-    errors = torch.cat((peculiar * deviations[:-1], outside * deviations[-1]), -1)
-    radiance, brighter = (_to_radiance(model, seen.pixel + step) for step in (0.0, STEP))
-    noise = evidence.noise * _brightness(model, seen.pixel) * (brighter - radiance) / STEP
-    sights = Sights(seen.seen, radiance, noise, errors)
-    return expected_error(Looks(diffuse, facing, grazing), sights, material, specular)
+    shared = torch.cat((peculiar * deviations[:-1], outside * deviations[-1]), -1)
+    sights = Sights(seen.seen, _to_radiance(model, seen.pixel), evidence.noise * _unit_error(model, seen.pixel), shared)
+    looks = possible_looks(model, arriving, normal, seen.wo)
+    deviation = expected_error(looks, sights, material, model.config.shading.specular)
+    return _widened(deviation, guessed_error(material), _birge_ratio(model, evidence, sent.sum(-1), seen))
+
+
+def _birge_ratio(model: NeilfModel, evidence: Evidence, sent: Float[Tensor, "N V 3"], seen: Sightings) -> Float[Tensor, "N 1"]:
+    """How far off a point's own pixels are, against those of a typical point; 1 where nothing was seen."""
+    off = (_relative_error(model, sent, seen) / evidence.misfit).square()
+    looks = seen.seen.sum(1)
+    return ((TYPICAL_LOOKS + looks * _mean_over_looks(off, seen)) / (TYPICAL_LOOKS + looks)).sqrt()[:, None]
+
+
+def _widened(deviation: Deviation, guess: Deviation, ratio: Float[Tensor, "N 1"]) -> Deviation:
+    """Deviations times the ratio, which makes none worse than a guess."""
+    pairs = ((getattr(deviation, f.name), getattr(guess, f.name)) for f in fields(Deviation))
+    return Deviation(*((own * ratio).minimum(own.maximum(worst)) for own, worst in pairs))
+
+
+def _relative_error(model: NeilfModel, sent: Float[Tensor, "N V 3"], seen: Sightings) -> Float[Tensor, "N V 3"]:
+    """Of the radiance that a model sends towards views, against what they saw."""
+    return (sent - _to_radiance(model, seen.pixel)) / _unit_error(model, seen.pixel)
+
+
+def _mean_over_looks(values: Float[Tensor, "N V 3"], seen: Sightings) -> Float[Tensor, " N"]:
+    """Over the channels of the views that saw a point; 0 where there is none."""
+    return (values.mean(-1) * seen.seen).sum(1) / seen.seen.sum(1).clamp_min(1)
 
 
 def _light_deviations(model: NeilfModel) -> Float[Tensor, " E"]:
@@ -219,10 +230,12 @@ def _light_deviations(model: NeilfModel) -> Float[Tensor, " E"]:
     return torch.tensor([direct] * PATCHES + [REFLECTED] * PATCHES + [DIRECT] * lamps + [overall])
 
 
-def _brightness(model: NeilfModel, pixel: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
-    """What errors of pixels are relative to, in the response of the capture."""
-    typical = apply_response(torch.tensor(model.facts.median_radiance), model.facts.response).item()
-    return pixel + model.config.light.fit.floor * typical
+def _unit_error(model: NeilfModel, pixel: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
+    """The radiance that a relative error of 1 stands for at a pixel, as fits of the light have it (`Objective`)."""
+    response = model.facts.response
+    typical = apply_response(torch.tensor(model.facts.median_radiance), response)
+    unit = response_slope(pixel, response) + model.config.light.fit.floor * response_slope(typical, response).item()
+    return unit * (_to_radiance(model, pixel + STEP) - _to_radiance(model, pixel)) / STEP
 
 
 def _to_radiance(model: NeilfModel, pixel: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:

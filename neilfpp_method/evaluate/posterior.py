@@ -20,7 +20,7 @@ from torch import Tensor
 
 from neilfpp_method.structures import Indexable, Material
 
-__all__ = ["ROUGHNESS_NODES", "Deviation", "Looks", "Sights", "expected_error"]
+__all__ = ["ROUGHNESS_NODES", "Deviation", "Looks", "Sights", "expected_error", "guessed_error"]
 
 ROUGHNESS_NODES = (0.05, 0.15, 0.25, 0.35, 0.5, 0.65, 0.8, 1.0)
 """Roughnesses at which F and G are known; between them both are linear."""
@@ -89,6 +89,13 @@ def expected_error(looks: Looks, sights: Sights, estimate: Material, specular: b
         (weight.sum(1) * (metallic - estimate.metallic).square()).sum(1, keepdim=True),
     )
     return Deviation(*(square.sqrt().to(looks.diffuse.dtype) for square in squares))
+
+
+def guessed_error(estimate: Material) -> Deviation:
+    """The deviation of an estimate under the prior alone: that of a guess."""
+    even, to_the_ends = 1 / 12, 1 / 8  # variances about one half
+    off = [(value - 0.5).square() for value in (estimate.base_color, estimate.roughness, estimate.metallic)]
+    return Deviation((even + off[0].mean(1, keepdim=True)).sqrt(), (even + off[1]).sqrt(), (to_the_ends + off[2]).sqrt())
 
 
 def _between_nodes(roughness: Float[Tensor, " Q"]) -> Float[Tensor, "R Q"]:

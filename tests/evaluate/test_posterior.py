@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from neilfpp_method.evaluate.posterior import ROUGHNESS_NODES, Deviation, Looks, Sights, expected_error
+from neilfpp_method.evaluate.posterior import ROUGHNESS_NODES, Deviation, Looks, Sights, expected_error, guessed_error
 from neilfpp_method.structures import Material
 
 R = len(ROUGHNESS_NODES)
@@ -76,6 +76,8 @@ def test_what_nobody_sees_has_the_deviation_from_the_prior(estimate):
     assert roughness == pytest.approx(math.sqrt(1 / 12 + (estimate[1] - 0.5) ** 2), rel=1e-2)
     # The variance of the arcsine distribution is 1/8; on a grid that holds 0 and 1 themselves it is a little more.
     assert 1 / 8 < metallic**2 - (estimate[2] - 0.5) ** 2 < 0.15
+    guess = numbers(guessed_error(material(*estimate)))
+    assert guess == pytest.approx((base_color, roughness, math.hypot(math.sqrt(1 / 8), estimate[2] - 0.5)), rel=1e-2)
 
 
 def test_base_color_stays_between_black_and_white():
