@@ -65,6 +65,9 @@ class OutgoingRadianceConfig:
     """Octaves of the frequency encoding of positions."""
     grid: HashGridConfig = field(default_factory=HashGridConfig)
     """The grid, where `encoding` is hash."""
+    direction: Literal["outgoing", "mirrored"] = "outgoing"
+    """Which direction is encoded: the outgoing one, as in the paper, or the one that it mirrors about the normal. What a shiny
+    surface sends changes evenly with the latter, so its normals are found (Verbin et al. 2022, "Ref-NeRF")."""
     direction_encoding: Literal["frequency", "spherical_harmonics"] = "frequency"
     """How directions are encoded."""
     direction_degree: int = 4

@@ -54,7 +54,12 @@ def fast() -> NeilfConfig:
         preset="fast",
         sdf=SdfConfig(encoding="hash", grid=grid, layers=1, width=64, skip=None, feature_width=15),
         radiance=OutgoingRadianceConfig(
-            encoding="hash", grid=grid, layers=2, width=64, direction_encoding="spherical_harmonics"
+            encoding="hash",
+            grid=grid,
+            layers=2,
+            width=64,
+            direction="mirrored",
+            direction_encoding="spherical_harmonics",
         ),
         brdf=BrdfConfig(
             encoding="hash",

@@ -25,9 +25,10 @@ class OutgoingRadianceField(nn.Module):
     ) -> None:
         super().__init__()
         self.scale = scale
+        self.mirrored = config.direction == "mirrored"
         self.position = position_encoding(config.encoding, config.grid, radius, config.frequencies)
         self.direction = direction_encoding(config.direction_encoding, config.direction_degree)
-        inputs = self.position.width + self.direction.width + 3 + feature_width
+        inputs = self.position.width + self.direction.width + self.mirrored + 3 + feature_width
         self.mlp = Mlp(inputs, 3, config.layers, config.width, "relu", output_scale=0.1)
         share = min(start / scale, 0.5)
         nn.init.constant_(self.mlp.layers[-1].bias, math.log(share / (1 - share)))
@@ -40,5 +41,12 @@ class OutgoingRadianceField(nn.Module):
         feature: Float[Tensor, "N F"],
     ) -> Float[Tensor, "N 3"]:
         """Radiance that leaves x towards wo; `normal` and `feature` are those of the distance field at x."""
-        inputs = torch.cat((self.position(x), self.direction(wo), normal, feature), -1)
+        inputs = torch.cat((self.position(x), *self._directions(wo, normal), normal, feature), -1)
         return self.scale * torch.sigmoid(self.mlp(inputs))
+
+    def _directions(self, wo: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> tuple[Tensor, ...]:
+        """The encoded direction; a mirrored one with n·wo, for Fresnel's sake (Ref-NeRF §3)."""
+        if not self.mirrored:
+            return (self.direction(wo),)
+        cosine = (normal * wo).sum(-1, keepdim=True)
+        return self.direction(2 * cosine * normal - wo), cosine

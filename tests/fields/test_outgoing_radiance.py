@@ -31,12 +31,34 @@ def test_starts_near_what_is_asked_and_below_its_scale(name, scale, asked, start
     assert color.mean().item() == pytest.approx(start, rel=0.3)
 
 
-def test_depends_on_all_that_it_is_given():
+@pytest.mark.parametrize("name", ["paper-ngp", "fast"])
+def test_depends_on_all_that_it_is_given(name):
     torch.manual_seed(0)
-    config = preset("paper-ngp")
+    config = preset(name)
     field = OutgoingRadianceField(config.radiance, 15, 3.0, 1.0)
     with torch.no_grad():
         field.position.table.normal_()
     given = [t.requires_grad_() for t in inputs(15)]
     for gradient in torch.autograd.grad(field(*given).sum(), given):
         assert (gradient.abs().amax(1) > 0).all()
+
+
+def test_what_a_mirror_sends_moves_as_the_directions_that_it_mirrors():
+    torch.manual_seed(0)
+    field = OutgoingRadianceField(preset("fast").radiance, 15, 3.0, 1.0).double()
+    x, wo, normal, feature = (t.double() for t in inputs(15))
+    wo, normal = (torch.nn.functional.normalize(t, dim=-1) for t in (wo, normal))
+    seen = {}
+    field.direction.register_forward_hook(lambda module, given, encoded: seen.update(direction=given[0]))
+    field(x, wo, normal, feature)
+    half = torch.nn.functional.normalize(wo + seen["direction"], dim=-1)
+    torch.testing.assert_close(seen["direction"].norm(dim=-1), torch.ones(50).double())
+    torch.testing.assert_close((half * normal).sum(-1).abs(), torch.ones(50).double())  # the normal halves the angle
+
+
+def test_derivatives_of_a_mirrored_direction():
+    torch.manual_seed(0)
+    field = OutgoingRadianceField(preset("fast").radiance, 2, 3.0, 1.0).double()
+    x, wo, normal, feature = (t[:4].double() for t in inputs(2))
+    wo, normal = wo.requires_grad_(), normal.requires_grad_()
+    assert torch.autograd.gradcheck(lambda wo, normal: field(x, wo, normal, feature), (wo, normal))
