@@ -45,13 +45,16 @@ def photometric(
     return LossTerm((apply_response(radiance, response) - pixel).abs() / unit)
 
 
-def mask(opacity: Float[Tensor, " N"], object_mask: Float[Tensor, " N"], known: Float[Tensor, " N"]) -> LossTerm:
-    """L1 between a ray's opacity and the object mask, where the mask is known.
+def mask(
+    opacity: Float[Tensor, " N"], depth: Float[Tensor, " N"], object_mask: Float[Tensor, " N"], known: Float[Tensor, " N"]
+) -> LossTerm:
+    """On the object what a ray lets through, 1 − opacity; off it ln(1 + τ), τ the optical depth; where the mask is known.
 
-    Not the cross-entropy of IDR: its gradient grows without bound where an opaque surface meets a mask of 0, which is what
-    a mask that is wrong by a pixel brings about along every silhouette.
+    Opacity itself has no slope behind a solid, 1 − e^−τ: what stands where nothing may stand would stay there for good,
+    painted like the background. The cross-entropy of IDR is τ, and its slope grows without bound as surfaces become sharp,
+    which is what a mask that is wrong by a pixel brings about along every silhouette.
     """
-    return LossTerm((opacity - object_mask).abs() * known)
+    return LossTerm(known * (object_mask * (1 - opacity) + (1 - object_mask) * depth.log1p()))
 
 
 def eikonal(gradient: Float[Tensor, "P 3"]) -> LossTerm:

@@ -55,9 +55,16 @@ def test_lambertian_is_zero_for_a_rough_dielectric_only():
 
 
 def test_mask_counts_where_it_is_known():
-    opacity = torch.tensor([0.75, 0.75, 0.75])
-    term = losses.mask(opacity, torch.tensor([1.0, 0.0, 1.0]), known=torch.tensor([1.0, 1.0, 0.0]))
-    assert term.values.tolist() == pytest.approx([0.25, 0.75, 0.0])
+    opacity, depth = torch.full((4,), 0.75), torch.full((4,), math.e - 1)
+    term = losses.mask(opacity, depth, torch.tensor([1.0, 0.0, 1.0, 0.5]), known=torch.tensor([1.0, 1.0, 0.0, 1.0]))
+    assert term.values.tolist() == pytest.approx([0.25, 1.0, 0.0, 0.625])
+
+
+def test_a_mask_pulls_at_what_is_opaque_and_never_without_bound():
+    depth = torch.tensor([0.0, 0.1, 10.0, 1e4], requires_grad=True)
+    opacity = -torch.expm1(-depth)
+    losses.mask(opacity, depth, torch.zeros(4), torch.ones(4)).values.sum().backward()
+    assert depth.grad.tolist() == pytest.approx([1.0, 1 / 1.1, 1 / 11, 1e-4], rel=1e-3)
 
 
 def test_scale_gradient_keeps_the_value():

@@ -19,8 +19,8 @@ from neilfpp_method.hosts.smooth_normals import smooth_normals
 from neilfpp_method.kernels.process import half_precision
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayBatch, SceneLight, SurfaceHits
-from neilfpp_method.volume.compositing import Weights, composite, render_weights
-from neilfpp_method.volume.density import LaplaceDensity
+from neilfpp_method.volume.compositing import Weights, composite, optical_depth, render_weights
+from neilfpp_method.volume.density import LaplaceDensity, laplace_density
 from neilfpp_method.volume.distance_grid import cell_size, sample_grid, trace_grid
 from neilfpp_method.volume.empty_space import EmptySpace
 from neilfpp_method.volume.intersect import Interval, sphere_interval
@@ -36,6 +36,7 @@ GRID_LIFE = 100
 class March:
     """Samples along rays: where they are, what G says there, and how much each counts."""
 
+    distances: Float[Tensor, "N M"]
     points: Float[Tensor, "N M 3"]
     surface: SdfSample
     weights: Weights
@@ -204,7 +205,7 @@ class VolSdfHost(nn.Module):
         wo = (-rays.directions)[:, None].expand_as(points).reshape(-1, 3)
         radiance = self.radiance_field(points.reshape(-1, 3), wo, normals, surface.feature)
         hits = self._blend(rays, points, distances, weights, normals, radiance)
-        return March(points, surface, weights, hits)
+        return March(distances, points, surface, weights, hits)
 
     def _sample(self, rays: RayBatch, interval: Interval, volume: VolumeConfig) -> Float[Tensor, "N M"]:
         near, far = interval.near, interval.far
@@ -225,11 +226,7 @@ class VolSdfHost(nn.Module):
         radiance: Float[Tensor, "P 3"],
     ) -> SurfaceHits:
         color = composite(weights.weights, radiance.reshape(points.shape)) + self._beyond(rays, weights.transmittance)
-        surface_weights = weights.weights
-        if self.background_kind == "none":
-            # The sphere that closes the scene is painted by R, but it is no surface of the object.
-            on_object = self._to_sphere(points.reshape(-1, 3)).reshape(distances.shape) > self.config.volume.hit_radius
-            surface_weights = surface_weights * on_object
+        surface_weights = weights.weights * self._on_object(points)
         opacity = surface_weights.sum(-1)
         # A ray without weight ends at its last sample: a position that is finite and far from every surface.
         spare = 1e-6
@@ -242,6 +239,12 @@ class VolSdfHost(nn.Module):
             opacity=opacity,
             concentration=(surface_weights.detach() * near_hit).sum(-1),
         )
+
+    def _on_object(self, points: Float[Tensor, "N M 3"]) -> Bool[Tensor, "N M"] | float:
+        """The sphere that closes a scene without background is painted by R, but it is no surface of the object."""
+        if self.background_kind != "none":
+            return 1.0
+        return self._to_sphere(points.flatten(0, 1)).view(points.shape[:2]) > self.config.volume.hit_radius
 
     def _beyond(self, rays: RayBatch, transmittance: Float[Tensor, " N"]) -> Float[Tensor, "N 3"]:
         """What still arrives from beyond the scene sphere."""
@@ -266,8 +269,13 @@ class VolSdfHost(nn.Module):
             sample = self.sdf_field.with_gradient(self.point_position[rows])
             terms["point_cloud"] = losses.point_cloud(sample.distance, sample.gradient, self.point_normal[rows])
         if "mask" in names:
-            terms["mask"] = losses.mask(march.hits.opacity, batch.mask, batch.mask_known)
+            terms["mask"] = losses.mask(march.hits.opacity, self._depth_of_object(march), batch.mask, batch.mask_known)
         return terms
+
+    def _depth_of_object(self, march: March) -> Float[Tensor, " N"]:
+        """The optical depth of what is sampled of the object. A mask moves surfaces, it makes no fog of them: β is given."""
+        density = laplace_density(march.surface.distance, self.density.beta().detach()).view_as(march.distances)
+        return optical_depth(density * self._on_object(march.points), march.distances)
 
     def _near_surface(self, hits: SurfaceHits) -> Float[Tensor, "N 3"]:
         """One point per ray, scattered about its hit: where second derivatives shape the surface."""

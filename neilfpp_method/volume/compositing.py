@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["Weights", "composite", "render_weights"]
+__all__ = ["Weights", "composite", "optical_depth", "render_weights"]
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,11 @@ def render_weights(density: Float[Tensor, "N M"], distances: Float[Tensor, "N M"
     weights = torch.exp(-depth_before[:, :-1]) * -torch.expm1(-depth)
     total = depth_before[:, -1]
     return Weights(weights, torch.exp(-total), -torch.expm1(-total))
+
+
+def optical_depth(density: Float[Tensor, "N M"], distances: Float[Tensor, "N M"]) -> Float[Tensor, " N"]:
+    """τ = Σ σ_i δ_i from the first sample of a ray to the last."""
+    return (density[:, :-1] * distances.diff(dim=-1).clamp_min(0.0)).sum(-1)
 
 
 def composite(weights: Float[Tensor, "N M"], values: Float[Tensor, "N M C"]) -> Float[Tensor, "N C"]:

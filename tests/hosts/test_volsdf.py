@@ -17,14 +17,18 @@ from tests.scenes import sphere_batch, sphere_model, tiny_config
 RADIUS = 0.6
 
 
-@pytest.fixture
-def sharp() -> VolSdfHost:
+def thin_surface(background: str = "constant") -> VolSdfHost:
     """The sphere with a thin surface layer."""
     config = tiny_config()
     config = dataclasses.replace(
         config, volume=dataclasses.replace(config.volume, beta_init=2e-3, initial_samples=64, rounds=4, samples=64)
     )
-    return sphere_model(config).eval().host
+    return sphere_model(config, background=background).eval().host
+
+
+@pytest.fixture
+def sharp() -> VolSdfHost:
+    return thin_surface()
 
 
 def test_it_keeps_the_contracts(sharp):
@@ -69,6 +73,28 @@ def test_only_the_named_losses_are_computed(sharp):
     batch = sphere_batch(8)
     assert set(sharp.render_regularised(batch, ["eikonal", "surface"]).terms) == {"eikonal", "surface"}
     assert sharp.render_regularised(batch, []).terms == {}
+
+
+@pytest.mark.parametrize("background", ["constant", "none"])
+def test_a_mask_removes_a_solid_that_stands_in_empty_space(background):
+    """No ray comes through, so opacity has no slope; the surface must give way all the same, and not by getting foggy."""
+    host = thin_surface(background)
+    batch = sphere_batch(32, spread=0.2)
+    inside = 0.5 * batch.origins  # of the sphere that closes a scene without background
+    empty = dataclasses.replace(batch, origins=inside, mask=torch.zeros(32), mask_known=torch.ones(32))
+    rendered = host.render_regularised(empty, ["mask"])
+    assert rendered.hits.opacity.min() > 0.99
+    rendered.terms["mask"].mean().backward()
+    at, push = rendered.hits.position.detach(), torch.zeros(32)
+    for parameter in host.sdf_field.parameters():
+        before = parameter.detach().clone()
+        with torch.no_grad():
+            push -= host.sdf(at)
+            parameter -= 1e-3 * parameter.grad
+            push += host.sdf(at)
+            parameter.copy_(before)
+    assert push.min() > 1e-4
+    assert host.density.above_floor.grad == 0.0
 
 
 def test_a_cloud_on_the_surface_costs_little_and_one_off_it_its_distance():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from neilfpp_method.volume.compositing import composite, render_weights
+from neilfpp_method.volume.compositing import composite, optical_depth, render_weights
 
 
 def product_formula(density, distances, far):
@@ -50,6 +50,14 @@ def test_a_homogeneous_slab_is_beer_lambert_however_it_is_cut(sigma):
     assert found.opacity.item() == pytest.approx(expected, rel=1e-6)
     assert found.weights.sum().item() == pytest.approx(expected, rel=1e-6)
     assert found.transmittance.item() == pytest.approx(math.exp(-sigma * length), rel=1e-6)
+
+
+def test_optical_depth_is_that_of_a_slab_and_ends_at_the_last_sample():
+    cuts = torch.tensor([[1.0, 1.01, 1.5, 1.5, 2.2]])
+    assert optical_depth(torch.full((1, 5), 300.0), cuts).item() == pytest.approx(300.0 * 1.2, rel=1e-6)
+    density, distances = map(torch.from_numpy, rays()[:2])
+    opacity = render_weights(density, distances, distances[:, -1]).opacity
+    torch.testing.assert_close(-torch.expm1(-optical_depth(density, distances)), opacity)
 
 
 def test_an_opaque_sample_hides_what_is_behind_it():
