@@ -158,8 +158,8 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
 
     R has no feature of G that knows the place, so it encodes positions as G would; 8×128 is the paper's surface light
     field. A surface without thickness needs no distance to leave it, and what leaves it is known well enough to learn
-    from L_ref (METHOD §2, §4). Its normals are taken as they are. R is new as well, so there are twice as many steps with a
-    material. Rays through a mesh are cheap, so light is solved for more often.
+    from L_ref (METHOD §2, §4). Its normals are taken as they are, so R need not help to find them. R is new as well, so
+    there are twice as many steps with a material. Rays through a mesh are cheap, so light is solved for more often.
     """
     replace, train = dataclasses.replace, config.train
     return replace(
@@ -173,6 +173,7 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
             grid=config.sdf.grid,
             layers=8,
             width=128,
+            direction="outgoing",
         ),
         light=replace(config.light, fit=replace(config.light.fit, every=100)),
         volume=replace(config.volume, normal_radius=0.0),
