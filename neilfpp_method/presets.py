@@ -52,7 +52,10 @@ def fast() -> NeilfConfig:
     grid = HashGridConfig(levels=8, log2_entries=16, base_resolution=16, max_resolution=256)
     return NeilfConfig(
         preset="fast",
-        sdf=SdfConfig(encoding="hash", grid=grid, layers=1, width=64, skip=None, feature_width=15),
+        # The surface is all of a scene that is seen, and a table without collisions costs no more to read.
+        sdf=SdfConfig(
+            encoding="hash", grid=dataclasses.replace(grid, log2_entries=18), layers=1, width=64, skip=None, feature_width=15
+        ),
         radiance=OutgoingRadianceConfig(
             encoding="hash",
             grid=grid,
@@ -99,8 +102,8 @@ def fast() -> NeilfConfig:
             volume=2.0,
             eikonal=0.05,
             hessian=2e-4,
-            hessian_growth=30.0,
-            hessian_joint=6e-3,
+            hessian_growth=8.0,
+            hessian_joint=1.6e-3,
             surface=1e-2,
             surface_joint=1e-3,
             mask=0.1,
@@ -170,7 +173,6 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
             config.radiance,
             encoding=config.sdf.encoding,
             frequencies=config.sdf.frequencies,
-            grid=config.sdf.grid,
             layers=8,
             width=128,
             direction="outgoing",
