@@ -235,7 +235,9 @@ def _unit_error(model: NeilfModel, pixel: Float[Tensor, "*B 3"]) -> Float[Tensor
     response = model.facts.response
     typical = apply_response(torch.tensor(model.facts.median_radiance), response)
     unit = response_slope(pixel, response) + model.config.light.fit.floor * response_slope(typical, response).item()
-    return unit * (_to_radiance(model, pixel + STEP) - _to_radiance(model, pixel)) / STEP
+    if response == "linear":
+        return unit
+    return unit * (srgb_to_linear(pixel + STEP) - srgb_to_linear(pixel)) / STEP
 
 
 def _to_radiance(model: NeilfModel, pixel: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:

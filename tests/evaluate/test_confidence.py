@@ -177,6 +177,19 @@ def test_neighbours_agree_and_no_others(run: Run, evidence):
     assert len(found[9:].unique()) > 1
 
 
+def test_a_run_that_shows_no_surface_has_noise_as_large_as_its_pixels(run: Run):
+    class Nothing(Ball):
+        def render(self, rays: RayBatch) -> SurfaceHits:
+            hits = super().render(rays)
+            return replace(hits, opacity=0 * hits.opacity, concentration=0 * hits.concentration)
+
+    run = make_run(run.capture)
+    run.model.host = Nothing()
+    evidence = gather_evidence(run)
+    assert (evidence.noise, evidence.misfit) == (1.0, 1.0)
+    assert not evidence.typical.any()
+
+
 def test_no_points_have_no_deviation(run: Run, evidence):
     assert len(material_deviation(run.model, evidence, torch.zeros(0, 3), torch.zeros(0, 3))) == 0
 
