@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from neilfpp_method import losses
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.fields.incident_light import IncidentLightField
+from neilfpp_method.fields.incident_light import EXPONENT_BASE, IncidentLightField
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
@@ -96,8 +96,8 @@ class NeilfModel(nn.Module):
         self.facts = facts
         self.units = radiance_units(config, facts)
         self.lobe = LOBES[config.shading.lobe]
-        self.brdf = BrdfField(config.brdf, config.volume.radius)
-        base = config.light.base or (10.0 if facts.response == "linear" else math.e)
+        self.brdf = BrdfField(config.brdf, config.encoding, config.volume.radius)
+        base = EXPONENT_BASE[facts.response]
         first_radiance = facts.median_radiance / self._first_albedo()
         self.light: IncidentLightField | EnvironmentLight
         self.lamps: Lamps | None = None

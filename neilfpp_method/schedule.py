@@ -128,6 +128,11 @@ def stage_steps(config: TrainConfig) -> Mapping[Stage, int]:
     }
 
 
+def has_material(steps: int, config: TrainConfig) -> bool:
+    """Whether the first `steps` steps moved the material and the light; before that they are what they start as."""
+    return steps > config.sdf_steps
+
+
 @dataclass(frozen=True)
 class StagePosition:
     """Where a global step lies: its stage, its number within the stage, and the stage's length."""

@@ -36,7 +36,6 @@ from neilfpp_method.evaluate.confidence import gather_evidence, material_deviati
 from neilfpp_method.evaluate.views import (
     KnownView,
     RenderedView,
-    has_material,
     known_test_views,
     mask_source,
     mean_observed_color,
@@ -89,7 +88,7 @@ def evaluate(
     mesh, light = truth.mesh(), truth.light_field()
     if mesh is not None and isinstance(run.model.host, HasSdf):
         figures |= chamfer_metrics(run, mesh)
-    if light is not None and has_material(run):
+    if light is not None and run.has_material:
         figures |= light_metrics(run, light, mesh)
     on_progress(1.0)
     return figures
@@ -127,7 +126,7 @@ class Scores(defaultdict[str, list[float]]):
 
 def image_metrics(run: Run, pairs: Pairs) -> dict[str, float]:
     """PSNR and SSIM of what R and what the rendering equation show; the second once there is a material."""
-    shown = {"volume": "rgb_volume"} | ({"pbr": "rgb"} if has_material(run) else {})
+    shown = {"volume": "rgb_volume"} | ({"pbr": "rgb"} if run.has_material else {})
     scores = Scores()
     for view, known in pairs:
         image = _tone_mapped(known.image) if run.capture.hdr else known.image
@@ -147,7 +146,7 @@ def material_metrics(run: Run, pairs: Pairs) -> dict[str, float]:
     Both alignments are one for all test views. A Lambertian run estimates neither roughness nor metallic.
     """
     pairs = [(view, known) for view, known in pairs if known.material is not None]
-    if not pairs or not has_material(run):
+    if not pairs or not run.has_material:
         return {}
     estimate = np.concatenate([view.maps["base_color"][known.mask] for view, known in pairs])
     true = _pooled(pairs, "base_color")
@@ -171,7 +170,7 @@ def material_metrics(run: Run, pairs: Pairs) -> dict[str, float]:
 def confidence_metrics(run: Run, pairs: Pairs) -> dict[str, float]:
     """Whether the run knows where its material is wrong; absent where the other half is without error."""
     pairs = [(view, known) for view, known in pairs if known.material is not None]
-    if not pairs or not has_material(run) or not run.capture.train_views:
+    if not pairs or not run.has_material or not run.capture.train_views:
         return {}
     rows = [np.flatnonzero(known.mask & (view.maps["opacity"][..., 0] > 0.5)) for view, known in pairs]
     step = max(1, sum(map(len, rows)) // CONFIDENCE_PIXELS)

@@ -15,9 +15,14 @@ from neilfpp_method.fields.encodings import direction_encoding
 from neilfpp_method.fields.mlp import Mlp
 from neilfpp_method.settings.types import IncidentLightConfig
 
-__all__ = ["IncidentLightField", "exponential"]
+__all__ = ["EXPONENT_BASE", "IncidentLightField", "exponential"]
+
+EXPONENT_BASE = {"linear": 10.0, "srgb": math.e}
+"""Of the exponential at the end, by the response of the capture (METHOD §5)."""
 
 LARGEST_EXPONENT = 20.0  # radiance stays within e^±20 of its start
+DIRECTION_OCTAVES, DIRECTION_BANDS = 6, 5
+"""Of the encoding of directions: light is sharper in direction than what surfaces send (NeILF++ §5)."""
 
 
 class IncidentLightField(nn.Module):
@@ -31,7 +36,7 @@ class IncidentLightField(nn.Module):
         super().__init__()
         self.log_base = math.log(base)
         self.initial_radiance = initial_radiance
-        self.direction = direction_encoding(config.direction_encoding, config.direction_degree)
+        self.direction = direction_encoding(config.direction_encoding, DIRECTION_OCTAVES, DIRECTION_BANDS)
         middle, width = config.layers // 2, config.width
         self.direction_part = Mlp(self.direction.width, width, middle, width, config.activation, skip=middle)
         self.position_part = nn.Linear(3, width, bias=False)

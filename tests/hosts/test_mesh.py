@@ -24,7 +24,7 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import PRESETS, fixed_geometry
-from neilfpp_method.settings.types import NeilfConfig
+from neilfpp_method.settings.types import MeshConfig, NeilfConfig
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.train.run import load_run
 from tests.data.make_capture import CENTRE, make_capture
@@ -55,7 +55,7 @@ def rays_at(count: int, spread: float, seed: int = 0, dtype: torch.dtype = torch
 
 
 SPHERE = trimesh.creation.icosphere(subdivisions=5, radius=0.7)
-FLAT = {"mesh": dataclasses.replace(mesh_config().mesh, smooth_normals=False)}
+FLAT = {"host": MeshConfig(smooth_normals=False)}
 
 
 @pytest.fixture(params=["embree", "tree"])
@@ -121,9 +121,9 @@ def test_an_open_scene_lies_behind_the_mesh():
 
 @pytest.mark.parametrize("smooth", [True, False])
 def test_no_normal_points_away_from_the_viewer(smooth):
-    mesh = dataclasses.replace(mesh_config().mesh, smooth_normals=smooth)
     rays = rays_at(2000, 0.8)
-    hits = mesh_host(trimesh.creation.icosphere(subdivisions=1, radius=0.7), mesh=mesh).render(rays)
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.7)
+    hits = mesh_host(ball, host=MeshConfig(smooth_normals=smooth)).render(rays)
     seen = hits.concentration > 0
     assert ((hits.normal * rays.directions).sum(-1)[seen] < 0.0).all()
     torch.testing.assert_close(hits.normal[seen].norm(dim=-1), torch.ones(int(seen.sum())))

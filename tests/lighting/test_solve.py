@@ -15,12 +15,12 @@ from neilfpp_method.lighting.candidates import merge, propose
 from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.lighting.solve import solve_light
 from neilfpp_method.lighting.transport import from_lamps, from_texels
-from neilfpp_method.settings.types import IncidentLightConfig, LightFitConfig
+from neilfpp_method.settings.types import LightFitConfig, MapLightConfig
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.structures import Material
 from tests.lighting.surfaces import material, patches
 
-CONFIG = IncidentLightConfig(kind="auto", environment_height=12, fit=LightFitConfig(points=800, steps=150))
+CONFIG = MapLightConfig(kind="auto", environment_height=12, fit=LightFitConfig(points=800, steps=150))
 KNOWN = dataclasses.replace(CONFIG, fit=dataclasses.replace(CONFIG.fit, evenness=0.0, whiteness=0.0))
 """Base colour is what surfaces have learned, and nothing else is known of the tint of light."""
 LAMP = torch.tensor([[0.3, -0.2, 0.5]])
@@ -55,7 +55,7 @@ def photographed(lamp: LampPlaces | None, speckled: bool = False) -> tuple[Obser
     return dataclasses.replace(seen, pixel=image), of
 
 
-def solved(seen: Observed, of: Material, rounds: int, config: IncidentLightConfig = CONFIG) -> tuple[Lamps, object]:
+def solved(seen: Observed, of: Material, rounds: int, config: MapLightConfig = CONFIG) -> tuple[Lamps, object]:
     torch.manual_seed(0)
     environment, lamps = EnvironmentLight(12, 0.7), Lamps(4, 0.06)
     for number in range(rounds):
