@@ -11,7 +11,7 @@ import torch
 
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.base import LightsItself
-from neilfpp_method.inter_reflection import trace_light
+from neilfpp_method.incident.traced import trace_light
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.facts import SceneFacts
@@ -231,7 +231,7 @@ class HalfRoom(Room):
 def test_hard_inter_reflection_asks_the_scene_first_and_the_light_for_the_rest():
     config = tiny_config()
     hard = dataclasses.replace(config.inter_reflection, mode="hard", offset=1e-4)
-    distant = dataclasses.replace(config.light, kind="distant")
+    distant = MapLightConfig(kind="distant")
     config = dataclasses.replace(config, inter_reflection=hard, light=distant)
     model = NeilfModel(HalfRoom(), config, SceneFacts("linear", 0.2, 3.0, "constant"))
     wi = torch.nn.functional.normalize(torch.randn(1, 64, 3), dim=-1)
@@ -320,6 +320,6 @@ def test_a_lamp_shines_where_nothing_stands_before_it():
 
 def test_l_ref_cannot_teach_a_map():
     config = tiny_config()
-    config = dataclasses.replace(config, light=dataclasses.replace(config.light, kind="distant"))
+    config = dataclasses.replace(config, light=MapLightConfig(kind="distant"))
     with pytest.raises(UserError, match="soft inter-reflection"):
         sphere_model(config)

@@ -43,6 +43,7 @@ from neilfpp_method.evaluate.views import (
     surface_points,
 )
 from neilfpp_method.export.mesh import HasSdf, extract_mesh
+from neilfpp_method.hosts.volsdf import HIT_RADIUS
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.train.run import Run, write_json
 
@@ -227,7 +228,7 @@ def chamfer_metrics(run: Run, truth: Mesh) -> dict[str, float]:
     corner = np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))
     device = next(run.model.parameters()).device
     # The sphere that may close the scene is no surface of the object, and what lies far from the truth is cut anyway.
-    radius = min(float(corner), volume.radius - volume.hit_radius)
+    radius = min(float(corner), volume.radius - HIT_RADIUS)
     surface = extract_mesh(run.model.host.sdf, radius, MESH_RESOLUTION, device=device)
     points = metrics.sample_surface(surface, SURFACE_POINTS)
     points = points[((points >= low) & (points <= high)).all(axis=-1)]

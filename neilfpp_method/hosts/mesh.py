@@ -77,7 +77,7 @@ class MeshHost(nn.Module):
         triangles = mesh.vertices[mesh.faces]
         across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         outward = safe_normalize(across, eps=TINY)
-        smooth = _corner_normals(mesh, outward) if config.host.smooth_normals else outward[:, None]
+        smooth = _corner_normals(mesh, outward)
         self.register_buffer("triangles", triangles, persistent=False)
         self.register_buffer("outward", outward, persistent=False)
         self.register_buffer("corner_normals", smooth.expand(-1, 3, -1), persistent=False)

@@ -27,6 +27,8 @@ from neilfpp_method.volume.samplers import error_bounded_samples
 
 __all__ = ["VolSdfHost"]
 
+HIT_RADIUS = 0.05
+"""Scene units: the blending weight within this distance of the blended hit is its concentration (METHOD §2)."""
 GRID_LIFE = 100
 """Steps in which the geometry moves before the distance grid is sampled again."""
 
@@ -229,7 +231,7 @@ class VolSdfHost(nn.Module):
         # A ray without weight ends at its last sample: a position that is finite and far from every surface.
         spare = 1e-6
         depth = ((surface_weights * distances).sum(-1) + spare * distances[:, -1]) / (opacity + spare)
-        near_hit = (distances - depth[:, None]).abs() <= self.config.volume.hit_radius
+        near_hit = (distances - depth[:, None]).abs() <= HIT_RADIUS
         return SurfaceHits(
             color=color,
             position=rays.origins + depth[:, None] * rays.directions,
@@ -242,7 +244,7 @@ class VolSdfHost(nn.Module):
         """The sphere that closes a scene without background is painted by R, but it is no surface of the object."""
         if self.background_kind != "none":
             return 1.0
-        return self._to_sphere(points.flatten(0, 1)).view(points.shape[:2]) > self.config.volume.hit_radius
+        return self._to_sphere(points.flatten(0, 1)).view(points.shape[:2]) > HIT_RADIUS
 
     def _beyond(self, rays: RayBatch, transmittance: Float[Tensor, " N"]) -> Float[Tensor, "N 3"]:
         """What still arrives from beyond the scene sphere."""
@@ -277,4 +279,4 @@ class VolSdfHost(nn.Module):
 
     def _near_surface(self, hits: SurfaceHits) -> Float[Tensor, "N 3"]:
         """One point per ray, scattered about its hit: where second derivatives shape the surface."""
-        return hits.position.detach() + self.config.volume.hit_radius * torch.randn_like(hits.position)
+        return hits.position.detach() + HIT_RADIUS * torch.randn_like(hits.position)

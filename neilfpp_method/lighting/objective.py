@@ -26,6 +26,9 @@ FLOOR = 0.1
 """Errors are relative to the pixel and this share of a typical one, so that dark pixels do not count for their noise."""
 OUTLIER = 0.1
 """Relative errors beyond this count by their size rather than by their square: some points no light explains."""
+SKY = 1.0
+"""Weight of the difference between the map's log radiance and what cameras saw beyond the scene, per texel, against the
+relative error: that much is certain, and the scale of light and base colour hangs on it."""
 SPARSITY = 0.001
 """Weight of the lamps, by the logarithm of their shares of all light, against the relative error."""
 SMOOTHED = 1e-2
@@ -89,7 +92,7 @@ class Objective:
         uneven = self.config.smoothness * total_variation(log_radiance)
         if self.sky is None or not log_radiance.numel():
             return uneven
-        return uneven + self.config.sky * self.sky.misfit(log_radiance)
+        return uneven + SKY * self.sky.misfit(log_radiance)
 
     def price(self, brought: Float[Tensor, " M"], all_light: Float[Tensor, " 3"]) -> Float[Tensor, ""]:
         """Of lamps, by the light that each brings to the points, and of the tint of all light that reaches them.

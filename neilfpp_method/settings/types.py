@@ -95,21 +95,12 @@ class LightFitConfig:
     """Steps of a fit."""
     smoothness: float = 0.03
     """Weight of the total variation of log radiance, per texel, against the relative error."""
-    sky: float = 1.0
-    """Weight of the difference between the map's log radiance and what cameras saw beyond the scene, per texel, against the
-    relative error. It counts where there is a background to see (`background.kind` inverted_sphere)."""
     whiteness: float = 0.05
     """Weight of the tint of all light that reaches the points, against the relative error: images hardly tell the tint of the
     light from that of the surfaces."""
     evenness: float = 0.3
     """Weight of the mean difference of log base colour between neighbouring points, against the relative error. The base colour
     of every point is free while light is fitted; 0: it is what surfaces have learned, up to a factor per channel."""
-    candidates: int = 256
-    """Places for lamps that one fit tries."""
-    lamps: int = 8
-    """Most lamps."""
-    lamp_radius: float = 0.06
-    """Of every lamp, scene units."""
 
 
 @dataclass(frozen=True)
@@ -186,9 +177,8 @@ class MeshConfig:
     kind: Literal["mesh"] = "mesh"
     """volsdf or mesh: where geometry comes from."""
     path: str | None = None
-    """The triangle mesh, in the world frame of the capture; none: the capture's inputs/model/mesh.ply."""
-    smooth_normals: bool = True
-    """Normals interpolated between the vertices, edges kept; off: those of the triangles."""
+    """The triangle mesh, in the world frame of the capture; none: the capture's inputs/model/mesh.ply. Normals are interpolated
+    between its vertices, edges kept."""
 
 
 HostConfig = Annotated[VolSdfConfig | MeshConfig, tyro.conf.AvoidSubcommands]
@@ -215,8 +205,6 @@ class VolumeConfig:
     """Final samples per ray."""
     normal_radius: float = 0.0
     """Surfaces are shaded with the normal of a neighbourhood of this radius, edges kept; 0: with that of the hit alone."""
-    hit_radius: float = 0.05
-    """The blending weight within this distance of the blended hit is its concentration: a sharp surface has nearly all."""
 
 
 # --------------------------------------------------------------------------------------------------------------- shading
@@ -253,8 +241,6 @@ class InterReflectionConfig:
     """Traced directions per surface point and step, in expectation."""
     radiance_gradient: float = 0.0
     """Scale of the gradient that reaches R; 0 detaches it, 0.7 suits fixed geometry."""
-    max_angle_deg: float = 80.0
-    """Largest angle from the normal at which a direction is traced."""
     offset: float = 0.02
     """Least displacement off the surface; it grows with β and as 1/cos towards grazing."""
 
@@ -264,13 +250,13 @@ class InterReflectionConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the losses (METHOD §4); `schedule.py` says in which stage each counts. 0 switches a loss off."""
+    """Weights of the losses (METHOD §4) beside L_phys, which has 1; `schedule.py` says in which stage each counts. 0 switches a
+    loss off."""
 
     unit: Literal["activation", "median"] = "activation"
     """What radiance is measured in. activation: L_vol in the range of R's output, all else absolute, as the paper has it.
     median: all in the median of the images, so that the weights depend neither on the exposure nor on what cameras store."""
     volume: float = 1.0
-    physical: float = 1.0
     eikonal: float = 0.1
     hessian: float = 1e-3
     hessian_growth: float = 1.0

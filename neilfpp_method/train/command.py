@@ -101,7 +101,8 @@ def run_training(
     continue_with = _continue_with(command, out, device, devices)
     with reporting(out, console, fabric.is_global_zero) as reporter, _stop_request() as stopped:
         preview = _preview(out, capture, fabric, reporter)
-        training = Training(out, config, model, pixels, fabric, reporter, stopped, preview, continue_with)
+        solver = model.light_solver()
+        training = Training(out, config, model, pixels, fabric, reporter, stopped, preview, continue_with, solver)
         train(training)
     if fabric.is_global_zero and training.fits:
         console.print(f"light: {in_words(config.light, training.fits)}", soft_wrap=True)
@@ -165,10 +166,8 @@ def _check(config: NeilfConfig) -> None:
     check_config(config)
     if config.known_map is not None:
         check_environment(Path(config.known_map))
-    steps = config.train
-    for name, needed in {"volume": steps.sdf_steps > 0, "physical": steps.material_steps + steps.joint_steps > 0}.items():
-        if needed and getattr(config.loss, name) <= 0.0:
-            raise UserError(f"--config.loss.{name} is off, so nothing compares with the images", "set it above 0")
+    if config.train.sdf_steps and config.loss.volume <= 0.0:
+        raise UserError("--config.loss.volume is off, so nothing compares with the images", "set it above 0")
 
 
 def _load_pixels(capture: Capture, fabric: Fabric, console: Console) -> PixelDataset:

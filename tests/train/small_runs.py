@@ -32,7 +32,7 @@ def small_config(**train) -> NeilfConfig:
 def solved_light(config: NeilfConfig) -> NeilfConfig:
     """The settings with the light of `fast`: a small map and lamps, fitted every third step, and traced visibility."""
     fast = preset("fast")
-    fit = dataclasses.replace(fast.light.fit, points=32, candidates=8, every=3, steps=5)
+    fit = dataclasses.replace(fast.light.fit, points=32, every=3, steps=5)
     return dataclasses.replace(
         config,
         light=dataclasses.replace(fast.light, environment_height=4, fit=fit),
@@ -62,7 +62,9 @@ def small_training(root: Path, out: Path, config: NeilfConfig) -> Training:
     seed_step(config.train.seed, step=-1)
     model = build_model(capture, scene_facts(capture, pixels, config), config)
     fabric = Fabric(accelerator="cpu", devices=1)
-    return Training(out, config, model, pixels, fabric, Listener(), lambda: False, lambda model, stage: None, "")
+    return Training(
+        out, config, model, pixels, fabric, Listener(), lambda: False, lambda model, stage: None, "", model.light_solver()
+    )
 
 
 def differences(one: object, other: object, where: str = "") -> list[str]:
