@@ -44,7 +44,7 @@ def environment(name: str, *packages: object) -> Path:
     """The Python of a new virtual environment that has these packages and no others."""
     run(sys.executable, "-m", "venv", WORK / name)
     python = WORK / name / "bin" / "python"
-    run(python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *packages)
+    run(python, "-m", "pip", "install", "--quiet", "--no-compile", "--disable-pip-version-check", *packages)
     return python
 
 
