@@ -22,11 +22,11 @@ import tyro
 from rich.console import Console
 from torch import Tensor
 
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.evaluate.protocols import evaluate
 from neilfpp_method.evaluate.report import write_report
-from neilfpp_method.presets import fixed_geometry, free_light, preset
 from neilfpp_method.schedule import Stage, stage_steps
+from neilfpp_method.settings.presets import fixed_geometry, free_light, preset
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.loop import make_optimizer, seed_step

@@ -22,13 +22,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from neilfpp_method.config import NeilfConfig, VolumeConfig
 from neilfpp_method.fields.brdf import BrdfField, BrdfSample
 from neilfpp_method.fields.incident_light import IncidentLightField
 from neilfpp_method.fields.mlp import SOFTPLUS_SHARPNESS, Mlp
 from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.settings.types import NeilfConfig, VolumeConfig
 from neilfpp_method.structures import Material, RayBatch
 from neilfpp_method.volume.intersect import Interval
 from neilfpp_method.volume.samplers import (

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from neilfpp_method.config import InterReflectionConfig
 from neilfpp_method.hosts.base import HasSurfaceWidth, Host, KnowsMisses, LightsItself
 from neilfpp_method.losses import scale_gradient
+from neilfpp_method.settings.types import InterReflectionConfig
 from neilfpp_method.shading.frame import local_frame
 from neilfpp_method.structures import RayBatch, SceneLight
 

@@ -14,9 +14,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from neilfpp_method import losses
-from neilfpp_method.config import NeilfConfig
-from neilfpp_method.config_check import check_config
-from neilfpp_method.facts import SceneFacts, radiance_units
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.incident_light import IncidentLightField
@@ -26,10 +23,13 @@ from neilfpp_method.hosts.outputs import OutputCheck
 from neilfpp_method.inter_reflection import before_light, scene_light, trace_light
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.memory import Observed, SurfaceMemory
+from neilfpp_method.lighting.replay import Replay, SurfacePixels
 from neilfpp_method.lighting.sky import SkySightings
 from neilfpp_method.lighting.solve import solve_light
-from neilfpp_method.replay import Replay, SurfacePixels
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, active_losses
+from neilfpp_method.settings.check import check_config
+from neilfpp_method.settings.facts import SceneFacts, radiance_units
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.albedo import directional_albedo
 from neilfpp_method.shading.brdf import LOBES
 from neilfpp_method.shading.rendering_equation import shade
@@ -79,7 +79,7 @@ class NeilfModel(nn.Module):
             module's, though gradients reach it in the joint stage.
 
     Raises:
-        UserError: settings that do not go together (`config_check`).
+        UserError: settings that do not go together (`settings.check`).
     """
 
     def __init__(self, host: Host, config: NeilfConfig, facts: SceneFacts, borrowed: bool = False) -> None:

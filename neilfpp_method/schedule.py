@@ -20,7 +20,7 @@ from enum import Enum
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.config import NeilfConfig, TrainConfig
+from neilfpp_method.settings.types import NeilfConfig, TrainConfig
 from neilfpp_method.structures import LossTerms
 
 __all__ = [

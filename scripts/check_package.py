@@ -34,7 +34,7 @@ def main() -> None:
     command = empty.with_name("neilfpp")
     print(run(command, "--version"), end="")
     assert "neilfpp train" in run(command, "--help")
-    scene = run(empty, "-c", "import neilfpp_method as n; print(n.__path__[0] + '/demo_scene')").strip()
+    scene = run(empty, "-c", "import neilfpp_method as n; print(n.__path__[0] + '/demo/scene')").strip()
     assert str(WORK) in scene, f"the command runs {scene}, not the wheel"
     assert "views of" in run(command, "inspect", scene)
     print(f"{source.name} and {wheel.name} are complete; the command runs")
@@ -68,7 +68,7 @@ def check_wheel(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
         metadata = message_from_bytes(archive.read(next(n for n in names if n.endswith(".dist-info/METADATA"))))
-    for ending in ("neilfpp_method/py.typed", "demo_scene/split.json", "licenses/LICENSE"):
+    for ending in ("neilfpp_method/py.typed", "demo/scene/split.json", "licenses/LICENSE"):
         assert any(name.endswith(ending) for name in names), f"{wheel.name} lacks {ending}"
     description = str(metadata.get_payload())
     relative = [end for end in description.split("](")[1:] if not end.startswith(("https://", "http://", "#"))]

@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.facts import SceneFacts
 from neilfpp_method.hosts.base import LightsItself
 from neilfpp_method.inter_reflection import trace_light
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.structures import Material, RayBatch, SurfaceHits
 from neilfpp_method.train.loop import make_optimizer
 from tests.scenes import sphere_batch, sphere_model, tiny_config

@@ -11,9 +11,9 @@ import math
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from neilfpp_method.config import IncidentLightConfig
 from neilfpp_method.fields.encodings import direction_encoding
 from neilfpp_method.fields.mlp import Mlp
+from neilfpp_method.settings.types import IncidentLightConfig
 
 __all__ = ["IncidentLightField", "exponential"]
 

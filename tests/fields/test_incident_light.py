@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from neilfpp_method.config import IncidentLightConfig
 from neilfpp_method.fields.incident_light import IncidentLightField
-from neilfpp_method.presets import preset
+from neilfpp_method.settings.presets import preset
+from neilfpp_method.settings.types import IncidentLightConfig
 
 
 def rays(points: int = 5, directions: int = 7) -> tuple[torch.Tensor, torch.Tensor]:

@@ -7,13 +7,13 @@ import math
 import pytest
 import torch
 
-from neilfpp_method.config import LightFitConfig
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import LampPlaces, Lamps
 from neilfpp_method.lighting.fit import Light, fit_light
 from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.transport import from_lamps, from_texels, in_sight, lamp_kernel
+from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.shading.brdf import GGX, SPHERICAL_GAUSSIAN
 from neilfpp_method.structures import Material
 from tests.hard_cases.test_fields import DTYPES, assert_bounded

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from neilfpp_method.config import InterReflectionConfig, NeilfConfig
 from neilfpp_method.errors import UserError
+from neilfpp_method.settings.types import InterReflectionConfig, NeilfConfig
 
 __all__ = ["check_config"]
 

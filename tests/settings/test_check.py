@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 
 from neilfpp_method.attach import attach_neilf
-from neilfpp_method.config import NeilfConfig
-from neilfpp_method.config_check import check_config
 from neilfpp_method.errors import UserError
-from neilfpp_method.presets import PRESETS, fixed_geometry, free_light, preset
+from neilfpp_method.settings.check import check_config
+from neilfpp_method.settings.presets import PRESETS, fixed_geometry, free_light, preset
+from neilfpp_method.settings.types import NeilfConfig
 from tests.scenes import tiny_config
 
 

@@ -1,4 +1,4 @@
-"""Every setting, one dataclass per room; `presets.py` has the sets of them.
+"""Every setting, one dataclass per room; `settings.presets` has the sets of them.
 
 Lengths are in scene units (the object lies in the unit sphere). A setting with `kind`, `mode` or a `bool` is a switch: an
 effect that is switched off asks no network and traces no ray.
