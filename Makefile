@@ -56,8 +56,9 @@ test-pythons:
 lint: $(VENV)/.installed-dev
 	$(RUN)/ruff check .
 
-results: $(VENV)/.installed  ## make results CAPTURES="DIR DIR"
-	$(RUN)/python -m benchmarks.results $(CAPTURES)
+results: $(VENV)/.installed  ## make results CAPTURES="DIR DIR" [OPTIONS="--save NAME"]; none: only the tables
+	$(if $(CAPTURES),$(RUN)/python -m benchmarks.results $(CAPTURES) $(OPTIONS))
+	$(RUN)/python -m benchmarks.tables
 
 clean:
 	rm -rf $(VENV) $(NERFSTUDIO) build dist demo-run
