@@ -4,10 +4,10 @@
     python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results-mesh --host mesh --compare ladder
 
 For each capture: the preset trained from scratch, beside it the paper's free light field with and without L_ref (the paper's
-Table 2), with `--compare ladder` every light with every inter-reflection that goes with it; each measured after the material
-stage (the paper's "Sep.") and after the joint stage (Table 3), beside baselines that need no method. The runs share the stage SDF init,
-which none of this enters; every step depends on seed and number alone, so sharing changes nothing. With the mesh host
-geometry is given, and there is one stage.
+Table 2), with `--compare ladder` every light with every inter-reflection that goes with it; each measured after the
+material stage (the paper's "Sep.") and after the joint stage (Table 3), beside baselines that need no method. The runs share
+the stage SDF init, which none of this enters; every step depends on seed and number alone, so sharing changes nothing. With
+the mesh host geometry is given, and there is one stage. `--save NAME` keeps the figures for docs/results.md.
 """
 
 from __future__ import annotations

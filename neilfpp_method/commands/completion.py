@@ -18,7 +18,7 @@ class Completion:
     """Print the script by which a shell completes commands and options."""
 
     shell: tyro.conf.Positional[Literal["bash", "zsh"]]
-    """Which shell. The script goes where the shell looks for one; docs/install.md has a line for each."""
+    """Which shell. The script goes where the shell looks for one; README.md has a line for each."""
 
 
 def run(options: Completion) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
+from itertools import pairwise
 
 __all__ = ["closest", "mistake"]
 
@@ -53,7 +54,7 @@ def _flag_with_a_value(what: str, arguments: Sequence[str]) -> str | None:
     if not what.startswith(TYRO_UNKNOWN):
         return None
     unknown = what.removeprefix(TYRO_UNKNOWN).replace(",", " ").split()
-    for option, word in zip(arguments, arguments[1:], strict=False):
+    for option, word in pairwise(arguments):
         if word in unknown and option.startswith("--") and option not in unknown:
             if word.lower() == "true":
                 return option

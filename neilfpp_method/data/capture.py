@@ -154,9 +154,8 @@ def _recognise(root: Path) -> str:
             return name
     photographs = _photographs(root)
     if photographs:
-        raise UserError(
-            f"{root}: {photographs} photographs and no cameras", f"run neilfpp prepare {root} --out CAPTURE, and train on CAPTURE"
-        )
+        remedy = f"run neilfpp prepare {root} --out CAPTURE, and train on CAPTURE"
+        raise UserError(f"{root}: {photographs} photographs and no cameras", remedy)
     layouts = "; ".join(f"{name} ({reader.LAYOUT})" for name, reader in READERS.items())
     raise UserError(f"{root}: no capture in this folder", f"the formats are: {layouts}")
 
