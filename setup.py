@@ -9,8 +9,8 @@ from setuptools import setup
 def index_page(readme: str) -> str:
     """The README without pictures of the repository, and with its links into the repository as plain text.
 
-    >>> index_page("![sheet](docs/a.png) see [results](docs/results.md) and [the paper](https://arxiv.org/abs/2303.17147)")
-    ' see results and [the paper](https://arxiv.org/abs/2303.17147)'
+    >>> index_page("![sheet](docs/a.png) [results](docs/results.md), [paper](https://arxiv.org/abs/2303.17147)")
+    ' results, [paper](https://arxiv.org/abs/2303.17147)'
     """
     without_pictures = re.sub(r"!\[[^\]]*\]\((?!https?://)[^)]*\)", "", readme)
     return re.sub(r"\[([^\]]*)\]\((?!https?://|#)[^)]*\)", r"\1", without_pictures)

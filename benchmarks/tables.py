@@ -5,8 +5,8 @@
 
 A result file holds the rows of one command on one machine:
 
-    {"format": 1, "table": "joint-step", "commit": "67cad1f", "command": "python -m benchmarks joint", "machine": "…",
-     "rows": [{"capture": "tabletop_env", "name": "`fast`", "figures": {"seconds": 0.13}}]}
+    {"format": 1, "table": "joint-step", "commit": "67cad1f", "command": "python -m benchmarks joint",
+     "machine": "…", "rows": [{"capture": "tabletop_env", "name": "`fast`", "figures": {"seconds": 0.13}}]}
 
 `table` says where the rows go: between `<!-- table: joint-step -->` and `<!-- end -->` of a document, or
 `<!-- table: joint-step seconds -->`, which shows the named figures alone. Several files may have rows of one table;
@@ -92,7 +92,8 @@ class Row:
 class Result:
     """The rows of one command.
 
-    `commit` is the version that was measured; in files older than this format, the one that first held the figures.
+    `commit` is the version that was measured; in files older than this format, the one that first held the
+    figures.
     """
 
     table: str
@@ -114,15 +115,21 @@ def read_results(folder: Path = RESULTS) -> list[Result]:
 def _read(path: Path) -> Result:
     try:
         content = json.loads(path.read_text("utf-8"))
-        rows = tuple(Row(row["name"], dict(row["figures"]), row.get("capture", "")) for row in content["rows"])
+        rows = tuple(
+            Row(row["name"], dict(row["figures"]), row.get("capture", "")) for row in content["rows"]
+        )
         result = Result(content["table"], content["commit"], content["command"], content["machine"], rows)
         format = content["format"]
     except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path}: not a result file ({error!r})", "see benchmarks/tables.py for what one holds") from error
+        raise UserError(
+            f"{path}: not a result file ({error!r})", "see benchmarks/tables.py for what one holds"
+        ) from error
     unknown = {name for row in rows for name in row.figures} - COLUMNS.keys()
     if format != FORMAT or unknown:
         wrong = f"figures without a column: {', '.join(sorted(unknown))}" if unknown else f"format {format}"
-        raise UserError(f"{path}: {wrong}", "add them to COLUMNS of benchmarks/tables.py, or correct the file")
+        raise UserError(
+            f"{path}: {wrong}", "add them to COLUMNS of benchmarks/tables.py, or correct the file"
+        )
     return result
 
 
@@ -149,7 +156,12 @@ def markdown(results: Sequence[Result], shown: Sequence[str] = ()) -> str:
     captures = list(dict.fromkeys(row.capture for row, _ in rows))
     rows.sort(key=lambda item: captures.index(item[0].capture))
     columns = [name for name in shown or COLUMNS if any(name in row.figures for row, _ in rows)]
-    head = [*(["capture"] if any(captures) else []), "", "version", *(COLUMNS[name].title for name in columns)]
+    head = [
+        *(["capture"] if any(captures) else []),
+        "",
+        "version",
+        *(COLUMNS[name].title for name in columns),
+    ]
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     shown_capture = None
     for row, commit in rows:
@@ -191,10 +203,14 @@ def filled(document: str, results: Sequence[Result]) -> str:
         _, name, shown, _ = match.groups()
         own = [result for result in results if result.table == name]
         if not own:
-            raise UserError(f"the table '{name}' has no result file", "run its command, or take the table out")
+            raise UserError(
+                f"the table '{name}' has no result file", "run its command, or take the table out"
+            )
         unknown = set(shown.split()) - COLUMNS.keys()
         if unknown:
-            raise UserError(f"the table '{name}' has no figure '{min(unknown)}'", "see COLUMNS of benchmarks/tables.py")
+            raise UserError(
+                f"the table '{name}' has no figure '{min(unknown)}'", "see COLUMNS of benchmarks/tables.py"
+            )
         return f"{match[1]}{markdown(own, shown.split())}\n{match[4]}"
 
     return MARKED.sub(table, document)

@@ -1,8 +1,8 @@
-"""Build the source distribution and, from it, the wheel; install the wheel into an empty environment; run its command there.
+"""Build the source distribution and, from it, the wheel; run the wheel's command from an empty environment.
 
     python scripts/check_package.py      needs git, and an index for pip; writes dist/ and build/package
 
-Build isolation would ask the index a second time, so the build's own tools lie in an environment that is made here.
+Build isolation would ask the index a second time, so the build's tools lie in an environment that is made here.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ def main() -> None:
     for folder in (WORK, DIST):
         shutil.rmtree(folder, ignore_errors=True)
     tools = environment("tools", *TOOLS)
-    run(tools, "-m", "build", "--no-isolation", "--outdir", DIST, ROOT)  # the wheel from the source distribution
+    run(
+        tools, "-m", "build", "--no-isolation", "--outdir", DIST, ROOT
+    )  # the wheel from the source distribution
     (source,), (wheel,) = DIST.glob("*.tar.gz"), DIST.glob("*.whl")
     check_source(source)
     check_wheel(wheel)
@@ -51,12 +53,16 @@ def environment(name: str, *packages: object) -> Path:
 def run(*command: object) -> str:
     """What a command prints; from a folder in which the package itself cannot be imported."""
     WORK.mkdir(parents=True, exist_ok=True)
-    return subprocess.run([str(word) for word in command], cwd=WORK, check=True, stdout=subprocess.PIPE, text=True).stdout
+    return subprocess.run(
+        [str(word) for word in command], cwd=WORK, check=True, stdout=subprocess.PIPE, text=True
+    ).stdout
 
 
 def check_source(source: Path) -> None:
     """Every file that git tracks is in the source distribution."""
-    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True).stdout
+    tracked = subprocess.run(
+        ["git", "ls-files"], cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True
+    ).stdout
     with tarfile.open(source) as archive:
         held = {name.partition("/")[2] for name in archive.getnames()}
     missing = sorted(set(tracked.splitlines()) - held)
@@ -64,14 +70,18 @@ def check_source(source: Path) -> None:
 
 
 def check_wheel(wheel: Path) -> None:
-    """Typing marker, licence and the demo's scene travel; the description has no link that an index page cannot follow."""
+    """Typing marker, licence and the demo's scene are there; no link of the description is relative."""
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
-        metadata = message_from_bytes(archive.read(next(n for n in names if n.endswith(".dist-info/METADATA"))))
+        metadata = message_from_bytes(
+            archive.read(next(n for n in names if n.endswith(".dist-info/METADATA")))
+        )
     for ending in ("neilfpp_method/py.typed", "demo/scene/split.json", "licenses/LICENSE"):
         assert any(name.endswith(ending) for name in names), f"{wheel.name} lacks {ending}"
     description = str(metadata.get_payload())
-    relative = [end for end in description.split("](")[1:] if not end.startswith(("https://", "http://", "#"))]
+    relative = [
+        end for end in description.split("](")[1:] if not end.startswith(("https://", "http://", "#"))
+    ]
     assert not relative, f"a link of the description leads nowhere: {relative[0].partition(')')[0]}"
 
 

@@ -1,10 +1,10 @@
-"""Resolve constraints.txt and start the package on the oldest and the newest Python that it supports, and on those between.
+"""Resolve constraints.txt and start the package on every supported Python that is on this machine.
 
     python scripts/check_pythons.py      needs an index for pip; writes build/pythons
 
-Resolving reads metadata alone (a build of torch can have gigabytes). To start the command takes its two imports; the whole
-package is compiled to byte code, which finds syntax that an older Python does not know. `make package PYTHON=python3.10`
-installs everything on one Python.
+Resolving reads metadata alone (a build of torch can have gigabytes). To start the command takes its two imports; the
+whole package is compiled to byte code, which finds syntax that an older Python does not know.
+`make package PYTHON=python3.10` installs everything on one Python.
 """
 
 from __future__ import annotations

@@ -167,14 +167,20 @@ def test_help_and_mistyped_options_do_not_wait_for_torch(arguments):
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
 @pytest.mark.parametrize(
     ("words", "completed"),
-    [("tr", "train"), ("train --da", "--data"), ("eval --check", "--checkpoint"), ("train --config.train.ra", "--config.train.rays")],
+    [
+        ("tr", "train"),
+        ("train --da", "--data"),
+        ("eval --check", "--checkpoint"),
+        ("train --config.train.ra", "--config.train.rays"),
+    ],
 )
 def test_bash_completes(completion, words, completed):
     """As bash asks: its variables are set, the registered function is called, and `COMPREPLY` is the answer."""
     before = ["neilfpp", *words.split()]
-    ask = f"COMP_WORDS=({' '.join(before)}); COMP_CWORD={len(before) - 1}; COMP_LINE='neilfpp {words}'; COMP_POINT=${{#COMP_LINE}}"
+    ask = f"COMP_WORDS=({' '.join(before)}); COMP_CWORD={len(before) - 1}; COMP_LINE='neilfpp {words}'"
     call = "eval \"$(complete -p neilfpp | sed 's/.*-F \\([^ ]*\\).*/\\1/')\" neilfpp; echo ${COMPREPLY[@]}"
-    done = subprocess.run(["bash", "-c", f"{completion}\n{ask}\n{call}"], capture_output=True, text=True, timeout=60, check=True)
+    script = f"{completion}\n{ask}; COMP_POINT=${{#COMP_LINE}}\n{call}"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.split() == [completed]
 
 

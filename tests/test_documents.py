@@ -1,4 +1,4 @@
-"""Documents keep their word: each command that they quote is one that the parser takes, and each link leads somewhere."""
+"""Each command that a document quotes is one that the parser takes, and each link leads somewhere."""
 
 from __future__ import annotations
 
@@ -24,11 +24,17 @@ ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 NOTEBOOK = sorted((ROOT / "docs" / "notebook").glob("*.md"))
 STARTS = ("neilfpp ", "python -m benchmarks", "make ")
-CHEAP = {"neilfpp --help", "neilfpp --version", "neilfpp train --help", "neilfpp completion bash", "neilfpp completion zsh"}
+CHEAP = {
+    "neilfpp --help",
+    "neilfpp --version",
+    "neilfpp train --help",
+    "neilfpp completion bash",
+    "neilfpp completion zsh",
+}
 
 
 def quoted(text: str) -> Iterator[str]:
-    """The commands of a Markdown text: in fenced and indented blocks, a line each (`\\` continues one), and in backticks."""
+    """The commands of a Markdown text: lines of fenced and indented blocks (`\\` continues one), and in backticks."""
     inline = []
     fenced = False
     block: list[str] = []
@@ -50,7 +56,7 @@ COMMAND_LINES = sorted({(path.name, line) for path in DOCUMENTS for line in quot
 
 
 def words_of(line: str) -> list[str]:
-    """A command line as the shell takes it apart, without comments and where its output goes. N stands for a number."""
+    """The words of a command line, without comments and where its output goes. N stands for a number."""
     words = ["2" if word == "N" else word for word in shlex.split(line, comments=True)]
     return words[: words.index(">")] if ">" in words else words
 
@@ -62,7 +68,9 @@ def refusal(line: str) -> str:
         return _refused_by_the_cli(words[1:])
     if words[0] == "make":
         targets = [word for word in words[1:] if "=" not in word]
-        dry = subprocess.run(["make", "--dry-run", *targets], cwd=ROOT, capture_output=True, text=True, check=False)
+        dry = subprocess.run(
+            ["make", "--dry-run", *targets], cwd=ROOT, capture_output=True, text=True, check=False
+        )
         return dry.stderr
     return _refused_by_a_benchmark(words[2], words[3:])
 

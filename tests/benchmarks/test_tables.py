@@ -9,8 +9,12 @@ import pytest
 from benchmarks.tables import COLUMNS, DOCUMENTS, Result, Row, filled, markdown, read_results, write_result
 from neilfpp_method.errors import UserError
 
-BALL = Result("t", "abc1234", "make ball", "a CPU", (Row("one", {"seconds": 12.34, "volume_psnr": 20.126}, "env"),))
-CUBE = Result("t", "abc1235", "make ball", "a GPU", (Row("two", {"seconds": 1234.0}, "env"), Row("three", {}, "mix")))
+BALL = Result(
+    "t", "abc1234", "make ball", "a CPU", (Row("one", {"seconds": 12.34, "volume_psnr": 20.126}, "env"),)
+)
+CUBE = Result(
+    "t", "abc1235", "make ball", "a GPU", (Row("two", {"seconds": 1234.0}, "env"), Row("three", {}, "mix"))
+)
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
@@ -66,7 +70,10 @@ def test_figures_that_no_table_shows_are_left_out(tmp_path):
     [
         ({"rows": 3}, "not a result file"),
         ({"format": 2}, "format 2"),
-        ({"rows": [{"name": "one", "figures": {"temperature": 20.0}}]}, "figures without a column: temperature"),
+        (
+            {"rows": [{"name": "one", "figures": {"temperature": 20.0}}]},
+            "figures without a column: temperature",
+        ),
     ],
 )
 def test_a_file_that_is_none(tmp_path, change, words):
@@ -79,7 +86,10 @@ def test_a_file_that_is_none(tmp_path, change, words):
 
 @pytest.mark.parametrize(
     ("marker", "words"),
-    [("<!-- table: other -->", "'other' has no result file"), ("<!-- table: t colour -->", "no figure 'colour'")],
+    [
+        ("<!-- table: other -->", "'other' has no result file"),
+        ("<!-- table: t colour -->", "no figure 'colour'"),
+    ],
 )
 def test_a_table_that_cannot_be(marker, words):
     with pytest.raises(UserError, match=words):
