@@ -15,13 +15,15 @@ __all__ = ["COMMAND"]
 
 @dataclass
 class Export:
-    """Write a run's surface, its light, or a textured asset for other programs, in the capture's frame and scale."""
+    """Write a run's surface, its light, or a textured asset for other programs, in the capture's frame and
+    scale."""
 
     run: tyro.conf.Positional[Path]
     """The run's folder."""
     what: tuple[Literal["mesh", "light", "asset"], ...] = ()
-    """mesh: the surface (PLY). light: environment map (EXR), lamps (JSON), probes (EXR). asset: textures, GLB, USD, light, and
-    scripts for Blender and Mitsuba (docs/assets.md). None named: mesh and light, as far as the run has them."""
+    """mesh: the surface (PLY). light: environment map (EXR), lamps (JSON), probes (EXR). asset: textures,
+    GLB, USD, light, and scripts for Blender and Mitsuba (docs/assets.md). None named: mesh and light, as far
+    as the run has them."""
     out: Path | None = None
     """The folder; none: RUN/export."""
     resolution: int = 256
@@ -33,9 +35,11 @@ class Export:
     faces: int = 30_000
     """Most triangles of the asset."""
     error: float = 0.001
-    """Scene units by which the asset's triangles may be off, to be fewer than that; a normal map makes up for the rest."""
+    """Scene units by which the asset's triangles may be off, to be fewer than that; a normal map makes up for
+    the rest."""
     confidence: bool = False
-    """Add a texture of how far off the asset's base colour, roughness and metallic may be; takes about twice as long."""
+    """Add a texture of how far off the asset's base colour, roughness and metallic may be; takes about twice
+    as long."""
     checkpoint: Checkpoint = "last"
     """Which weights."""
     device: Device = "auto"

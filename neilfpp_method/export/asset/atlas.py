@@ -60,5 +60,10 @@ def unwrap(surface: Surface, size: int) -> Unwrapped:
             "raise --texture-size, or lower --faces",
         )
     return Unwrapped(
-        vertices[source], normals[source], uv * (extent / extent.max()), faces.astype(np.int64), atlas.chart_count, gap
+        vertices[source],
+        normals[source],
+        uv * (extent / extent.max()),
+        faces.astype(np.int64),
+        atlas.chart_count,
+        gap,
     )

@@ -1,4 +1,5 @@
-"""Textures of an asset: what the run's material is at the surface point of each texel, and which way the fine surface faces."""
+"""Textures of an asset: what the run's material is at the surface point of each texel, and which way the fine
+surface faces."""
 
 from __future__ import annotations
 
@@ -19,7 +20,12 @@ from neilfpp_method.train.run import Run
 
 __all__ = ["Textures", "bake"]
 
-CHANNELS = {"base_color": slice(0, 3), "roughness": slice(3, 4), "metallic": slice(4, 5), "normal": slice(5, 8)}
+CHANNELS = {
+    "base_color": slice(0, 3),
+    "roughness": slice(3, 4),
+    "metallic": slice(4, 5),
+    "normal": slice(5, 8),
+}
 
 
 @dataclass(frozen=True)
@@ -30,9 +36,11 @@ class Textures:
         base_color: sRGB-encoded.
         roughness: linear.
         metallic: linear.
-        normal: 127.5 + 127.5 · (x along the tangent, y along the bitangent, z along the normal): "OpenGL", green up.
+        normal: 127.5 + 127.5 · (x along the tangent, y along the bitangent, z along the normal): "OpenGL",
+            green up.
         covered: the share of the texels that show the surface.
-        deviation: how far off base colour, roughness and metallic may be, 255 for 1; none where that was not asked for.
+        deviation: how far off base colour, roughness and metallic may be, 255 for 1; none where that was not
+            asked for.
     """
 
     base_color: UInt8[np.ndarray, "S S 3"]
@@ -43,7 +51,8 @@ class Textures:
     deviation: UInt8[np.ndarray, "S S 3"] | None
 
     def metallic_roughness(self) -> UInt8[np.ndarray, "S S 3"]:
-        """As glTF packs it: roughness in green, metallic in blue; red, where others keep occlusion, is white."""
+        """As glTF packs it: roughness in green, metallic in blue; red, where others keep occlusion, is
+        white."""
         return np.concatenate([np.full_like(self.roughness, 255), self.roughness, self.metallic], axis=-1)
 
 
@@ -59,8 +68,8 @@ def bake(
 ) -> Textures:
     """Ask the run at every texel.
 
-    A texel's point of the coarse surface is moved along the normal onto the fine one, where that is near; there the material
-    is asked for, and there the normal is taken.
+    A texel's point of the coarse surface is moved along the normal onto the fine one, where that is near;
+    there the material is asked for, and there the normal is taken.
 
     Args:
         run: knows the material.
@@ -73,7 +82,8 @@ def bake(
     """
     device = next(run.model.parameters()).device
     tracer, tangents = first_hits(fine), vertex_tangents(mesh)
-    texture, covered = np.zeros((size * size, 8 if deviation is None else 11), np.uint8), np.zeros(size * size, bool)
+    texture = np.zeros((size * size, 8 if deviation is None else 11), np.uint8)
+    covered = np.zeros(size * size, bool)
     for texels in covered_texels(mesh, size):
         position = texels.interpolate(mesh.vertices, mesh.faces)
         normal = texels.interpolate(mesh.normals, mesh.faces)
@@ -81,7 +91,8 @@ def bake(
         sign = tangents[mesh.faces[texels.face, 0], 3:]
         straight = normal / np.linalg.norm(normal, axis=-1, keepdims=True).clip(1e-12)
         footing = meet_along(fine, tracer, position, straight, reach)
-        material = materials_in_parts(run, torch.as_tensor(footing.position, dtype=torch.float32, device=device))
+        place = torch.as_tensor(footing.position, dtype=torch.float32, device=device)
+        material = materials_in_parts(run, place)
         values = [
             tone_map(material.base_color).cpu().numpy(),
             material.roughness.cpu().numpy(),
@@ -94,7 +105,9 @@ def bake(
         on_progress((texels.number[-1] + 1) / size**2 if len(texels.number) else 0.0)
     full = dilate(texture.reshape(size, size, -1), covered.reshape(size, size))
     textures = {name: full[..., channels] for name, channels in CHANNELS.items()}
-    return Textures(**textures, covered=float(covered.mean()), deviation=None if deviation is None else full[..., 8:])
+    return Textures(
+        **textures, covered=float(covered.mean()), deviation=None if deviation is None else full[..., 8:]
+    )
 
 
 def in_frame(
@@ -103,8 +116,8 @@ def in_frame(
     bitangent: Float[np.ndarray, "N 3"],
     normal: Float[np.ndarray, "N 3"],
 ) -> Float[np.ndarray, "N 3"]:
-    """The unit (x, y, z) for which x · tangent + y · bitangent + z · normal points along the vector: renderers interpolate the
-    frame and leave it as it is, neither orthogonal nor of unit length."""
+    """The unit (x, y, z) for which x · tangent + y · bitangent + z · normal points along the vector:
+    renderers interpolate the frame and leave it as it is, neither orthogonal nor of unit length."""
     frame = np.stack([tangent, bitangent, normal], axis=-1)
     singular = np.abs(np.linalg.det(frame)) < 1e-6
     frame[singular] = np.eye(3)

@@ -24,7 +24,9 @@ def clean(surface: Surface, seen: Bool[np.ndarray, " F"]) -> Surface:
         UserError: nothing was seen.
     """
     if not seen.any():
-        raise UserError("no training camera sees the surface", "train the run for longer, and look at its previews")
+        raise UserError(
+            "no training camera sees the surface", "train the run for longer, and look at its previews"
+        )
     return close_holes(without_crumbs(keep_seen(surface, seen)))
 
 
@@ -50,7 +52,8 @@ def without_crumbs(surface: Surface) -> Surface:
 
 
 def close_holes(surface: Surface) -> Surface:
-    """Borders of up to `HOLE` across get a fan of triangles about their middle, wound as their neighbours are."""
+    """Borders of up to `HOLE` across get a fan of triangles about their middle, wound as their neighbours
+    are."""
     vertices, fans = [surface.vertices], []
     count = len(surface.vertices)
     for loop in _borders(surface):
@@ -63,16 +66,17 @@ def close_holes(surface: Surface) -> Surface:
     if not fans:
         return surface
     fan = creased(np.concatenate(vertices), np.concatenate(fans))
-    faces, normals = np.concatenate([surface.faces, fan.faces]), np.concatenate([surface.normals, fan.normals])
-    return Surface(fan.vertices, faces, normals)
+    faces = np.concatenate([surface.faces, fan.faces])
+    return Surface(fan.vertices, faces, np.concatenate([surface.normals, fan.normals]))
 
 
 def _components(surface: Surface) -> Int[np.ndarray, " F"]:
     """A number for each triangle: the same for those that are joined by edges."""
     if not len(surface.faces):
         return np.zeros(0, dtype=np.int64)
-    adjacency = surface.mesh().face_adjacency
-    return np.asarray(trimesh.graph.connected_component_labels(adjacency, node_count=len(surface.faces))).astype(np.int64)
+    adjacency, count = surface.mesh().face_adjacency, len(surface.faces)
+    labels = trimesh.graph.connected_component_labels(adjacency, node_count=count)
+    return np.asarray(labels).astype(np.int64)
 
 
 def _width(surface: Surface, faces: Int[np.ndarray, "K 3"]) -> float:
@@ -80,8 +84,8 @@ def _width(surface: Surface, faces: Int[np.ndarray, "K 3"]) -> float:
 
 
 def _borders(surface: Surface) -> list[Int[np.ndarray, " L"]]:
-    """Closed loops of edges that belong to one triangle each, in the direction of that triangle. A vertex at which two loops
-    touch ends the walk; such loops stay open."""
+    """Closed loops of edges that belong to one triangle each, in the direction of that triangle. A vertex at
+    which two loops touch ends the walk; such loops stay open."""
     edges = np.concatenate([surface.faces[:, [0, 1]], surface.faces[:, [1, 2]], surface.faces[:, [2, 0]]])
     number = np.sort(edges, axis=1) @ np.array([len(surface.vertices), 1])
     _, index, times = np.unique(number, return_index=True, return_counts=True)

@@ -1,4 +1,5 @@
-"""`neilfpp export --what asset`: the surface with textures, the light, and scripts that open both in other programs."""
+"""`neilfpp export --what asset`: the surface with textures, the light, and scripts that open both in other
+programs."""
 
 from __future__ import annotations
 
@@ -7,7 +8,6 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from rich.console import Console
@@ -59,20 +59,32 @@ def check_asset(run: Run, options: AssetOptions) -> None:
         UserError: no surface, no material yet, or options out of range.
     """
     if not has_surface(run):
-        raise UserError(f"{run.path}: the host of this run has no surface to export", "export from a run of another host")
+        raise UserError(
+            f"{run.path}: the host of this run has no surface to export", "export from a run of another host"
+        )
     if run.step <= run.config.train.sdf_steps:
         raise UserError(f"{run.path}: there is no material yet at step {run.step}", "train the next stage")
     if not SMALLEST <= options.texture_size <= LARGEST:
-        raise UserError(f"a texture of {options.texture_size} texels a side", f"ask for {SMALLEST} to {LARGEST}")
+        raise UserError(
+            f"a texture of {options.texture_size} texels a side", f"ask for {SMALLEST} to {LARGEST}"
+        )
     if not FEWEST <= options.faces <= MOST_FACES:
-        raise UserError(f"an asset of {options.faces} triangles", f"ask for {FEWEST} to {MOST_FACES} with --faces")
+        raise UserError(
+            f"an asset of {options.faces} triangles", f"ask for {FEWEST} to {MOST_FACES} with --faces"
+        )
     if not options.error >= 0:
         raise UserError(f"--error {options.error:g}", "give a length in scene units, from 0 on")
 
 
 @torch.no_grad()
 def export_asset(
-    run: Run, out: Path, resolution: int, options: AssetOptions, console: Console, bar: Bar, deviations: Deviations | None
+    run: Run,
+    out: Path,
+    resolution: int,
+    options: AssetOptions,
+    console: Console,
+    bar: Bar,
+    deviations: Deviations | None,
 ) -> None:
     """Write the asset of a run into a folder; lengths are those of the capture's world.
 
@@ -86,20 +98,25 @@ def export_asset(
         deviations: for a texture of them; none: no such texture.
 
     Raises:
-        UserError: no surface, none that a camera sees, an atlas that does not fit, or a folder that cannot be written.
+        UserError: no surface, none that a camera sees, an atlas that does not fit, or a folder that cannot be
+            written.
     """
     whole = fine_surface(run, resolution)
     cameras = [run.capture.normalisation.camera(view.camera) for view in run.capture.train_views]
     fine = clean(whole, seen_faces(whole, cameras))
     console.print(f"surface: {len(fine.faces)} of {len(whole.faces)} triangles were seen and stay")
     coarse = simplified(fine, options.faces, options.error)
-    console.print(f"simplified: {len(coarse.surface.faces)} triangles, 99 % within {coarse.distance:.2g} scene units")
+    console.print(
+        f"simplified: {len(coarse.surface.faces)} triangles, 99 % within {coarse.distance:.2g} scene units"
+    )
     mesh = unwrap(coarse.surface, options.texture_size)
     unsure = None if deviations is None else deviations(run, _points(run, mesh)).double().cpu().numpy()
     with bar("textures") as advance:
         reach = max(NEAREST * coarse.distance, LEAST_REACH)
         textures = bake(run, mesh, fine, reach, options.texture_size, unsure, advance)
-    console.print(f"textures: {mesh.charts} charts on {100 * textures.covered:.0f} % of {options.texture_size}² texels")
+    console.print(
+        f"textures: {mesh.charts} charts on {100 * textures.covered:.0f} % of {options.texture_size}² texels"
+    )
     vertices = run.capture.normalisation.to_world(torch.from_numpy(mesh.vertices)).numpy()
     write_asset(run, replace(mesh, vertices=vertices), textures, out)
     if not has_usd():
@@ -109,4 +126,5 @@ def export_asset(
 
 def _points(run: Run, mesh: Unwrapped) -> OrientedPoints:
     device = next(run.model.parameters()).device
-    return OrientedPoints(*(torch.as_tensor(np.array(a), dtype=torch.float32, device=device) for a in (mesh.vertices, mesh.normals)))
+    parts = (torch.from_numpy(part).float().to(device) for part in (mesh.vertices, mesh.normals))
+    return OrientedPoints(*parts)

@@ -1,4 +1,5 @@
-"""What an asset's scene is made of, as JSON for the scripts that open it: files, cameras and lamps, in the capture's world."""
+"""What an asset's scene is made of, as JSON for the scripts that open it: files, cameras and lamps, in the
+capture's world."""
 
 from __future__ import annotations
 
@@ -22,13 +23,19 @@ def describe_scene(run: Run, environment: bool) -> dict[str, Any]:
         run: the run.
         environment: whether the asset has an environment map.
     """
-    maps = {"ours": "environment.exr", "blender": "environment_blender.exr", "unreal": "environment_unreal.exr"}
+    maps = {
+        "ours": "environment.exr",
+        "blender": "environment_blender.exr",
+        "unreal": "environment_unreal.exr",
+    }
     return {
         "format": FORMAT,
         "frame": "world of the capture, right-handed, Z up",
         "environment": maps if environment else None,
         "lamps": lamps_in_world(run),
-        "cameras": [_camera(view, "test" if view.name in run.capture.test else "train") for view in run.capture.views],
+        "cameras": [
+            _camera(view, "test" if view.name in run.capture.test else "train") for view in run.capture.views
+        ],
     }
 
 

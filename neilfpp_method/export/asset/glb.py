@@ -31,8 +31,8 @@ def glb_bytes(mesh: Unwrapped, textures: Textures, lamps: Sequence[Mapping[str, 
     Args:
         mesh: vertices and normals in the world frame.
         textures: of its atlas.
-        lamps: as `lamps_in_world` has them. Intensities become candela, as they are: glTF's factors from watt to lumen know
-            nothing of the units of a capture.
+        lamps: as `lamps_in_world` has them. Intensities become candela, as they are: glTF's factors from watt
+            to lumen know nothing of the units of a capture.
     """
     material = PBRMaterial(
         name="recovered",
@@ -72,7 +72,9 @@ def _add_lamps(tree: dict[str, Any], lamps: Sequence[Mapping[str, Any]]) -> None
         light = {
             "name": f"lamp {number}",
             "type": "point" if lamp["axis"] is None else "spot",
-            "color": [channel / brightest for channel in lamp["intensity"]] if brightest > 0 else [1.0, 1.0, 1.0],
+            "color": [channel / brightest for channel in lamp["intensity"]]
+            if brightest > 0
+            else [1.0, 1.0, 1.0],
             "intensity": brightest,
         }
         node = {

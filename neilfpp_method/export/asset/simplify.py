@@ -50,9 +50,12 @@ def simplified(fine: Surface, most_faces: int, error: float) -> Simplified:
 
 
 def distance_between(fine: Surface, coarse: Surface) -> float:
-    """The distance along the normals, scene units, that 99 of 100 points of the fine surface keep; infinite if they miss."""
+    """The distance along the normals, scene units, that 99 of 100 points of the fine surface keep; infinite
+    if they miss."""
     points, face = trimesh.sample.sample_surface(fine.mesh(), SAMPLES, seed=0)
-    footing = meet_along(coarse, first_hits(coarse), np.asarray(points), fine.mesh().face_normals[face], REACH)
+    footing = meet_along(
+        coarse, first_hits(coarse), np.asarray(points), fine.mesh().face_normals[face], REACH
+    )
     return float(np.percentile(np.where(footing.found, footing.distance, REACH), SHARE))
 
 

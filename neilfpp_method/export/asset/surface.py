@@ -60,7 +60,10 @@ def fine_surface(run: Run, resolution: int) -> Surface:
         position, normal = host.triangles.reshape(-1, 3), host.corner_normals.reshape(-1, 3)
         return Surface(vertices, faces, _shading_normals(host, position, normal).reshape(-1, 3, 3))
     device = next(run.model.parameters()).device
-    position, normal = (torch.as_tensor(np.array(a), dtype=torch.float32, device=device) for a in (vertices, mesh.vertex_normals))
+    position, normal = (
+        torch.as_tensor(np.array(a), dtype=torch.float32, device=device)
+        for a in (vertices, mesh.vertex_normals)
+    )
     return Surface(vertices, faces, _shading_normals(host, position, normal)[faces])
 
 
@@ -80,8 +83,8 @@ def first_hits(surface: Surface) -> FirstHits:
 
 @dataclass(frozen=True)
 class Footing:
-    """Where points come down on a surface along their normals: whether at all, how far, and the place and the unit normal
-    there. Where not, the place and the normal are those of the point."""
+    """Where points come down on a surface along their normals: whether at all, how far, and the place and the
+    unit normal there. Where not, the place and the normal are those of the point."""
 
     found: Bool[np.ndarray, " N"]
     distance: Float[np.ndarray, " N"]
@@ -90,9 +93,14 @@ class Footing:
 
 
 def meet_along(
-    surface: Surface, tracer: FirstHits, position: Float[np.ndarray, "N 3"], normal: Float[np.ndarray, "N 3"], reach: float
+    surface: Surface,
+    tracer: FirstHits,
+    position: Float[np.ndarray, "N 3"],
+    normal: Float[np.ndarray, "N 3"],
+    reach: float,
 ) -> Footing:
-    """The nearer of what a point's normal and its opposite meet, within a distance and on a side that faces the same way.
+    """The nearer of what a point's normal and its opposite meet, within a distance and on a side that faces
+    the same way.
 
     Args:
         surface: where the points come down.
@@ -121,7 +129,9 @@ def meet_along(
     return Footing(found.numpy(), nearest.numpy(), place.numpy(), turned.numpy())
 
 
-def _shading_normals(host: object, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> Float[np.ndarray, "N 3"]:
+def _shading_normals(
+    host: object, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
+) -> Float[np.ndarray, "N 3"]:
     if isinstance(host, SmoothsNormals):
         pairs = zip(position.split(POINTS_AT_ONCE), normal.split(POINTS_AT_ONCE), strict=True)
         normal = torch.cat([host.smooth_normals(places, normals) for places, normals in pairs])

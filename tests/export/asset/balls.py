@@ -46,13 +46,20 @@ def material(x: torch.Tensor) -> Material:
     return Material(wave, 0.55 + 0.4 * torch.sin(2 * x[:, :1]), 0.5 + 0.4 * torch.cos(2 * x[:, 1:2]))
 
 
-def ball_run(folder: Path, kind: str = "distant_near", step: int = 12, host: torch.nn.Module | None = None) -> Run:
+def ball_run(
+    folder: Path,
+    kind: str = "distant_near",
+    step: int = 12,
+    host: torch.nn.Module | None = None,
+    lobe: str = "spherical_gaussian",
+) -> Run:
     """A run without training. Its light is a map of 9×18 texels, one of them bright, and two lamps."""
     config = tiny_config()
     config = dataclasses.replace(
         config,
         light=dataclasses.replace(config.light, kind=kind, environment_height=9),
         inter_reflection=dataclasses.replace(config.inter_reflection, mode="off"),
+        shading=dataclasses.replace(config.shading, lobe=lobe),
     )
     torch.manual_seed(0)
     model = NeilfModel(host or Ball(), config, SceneFacts("linear", 0.2, 3.0, "constant")).eval()
@@ -62,7 +69,9 @@ def ball_run(folder: Path, kind: str = "distant_near", step: int = 12, host: tor
         radiance[:, 3, 2] = torch.tensor([8.0, 4.0, 2.0])
         model.light.show(radiance)
     if kind == "distant_near":
-        model.lamps.place(torch.tensor([BULB, PANEL]), torch.tensor(INTENSITY), torch.tensor([[0.0, 0.0, 0.0], AXIS]))
+        model.lamps.place(
+            torch.tensor([BULB, PANEL]), torch.tensor(INTENSITY), torch.tensor([[0.0, 0.0, 0.0], AXIS])
+        )
     capture = load_capture(make_capture(folder / "capture", views=8, size=(48, 36)))
     return Run(folder, config, capture, model.facts, model, step)
 
@@ -73,6 +82,14 @@ def no_bar(title: str) -> Iterator:
 
 
 def write_ball(
-    run: Run, out: Path, size: int = 256, faces: int = 600, error: float = 0.0, deviations=None, resolution: int = 48
+    run: Run,
+    out: Path,
+    size: int = 256,
+    faces: int = 600,
+    error: float = 0.0,
+    deviations=None,
+    resolution: int = 48,
 ) -> None:
-    export_asset(run, out, resolution, AssetOptions(size, faces, error), Console(quiet=True), no_bar, deviations)
+    export_asset(
+        run, out, resolution, AssetOptions(size, faces, error), Console(quiet=True), no_bar, deviations
+    )

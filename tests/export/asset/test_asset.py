@@ -18,7 +18,18 @@ from neilfpp_method.data.images import read_image
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.asset import files as files_module
 from tests.data.make_capture import CENTRE, SCALE, srgb
-from tests.export.asset.balls import AXIS, BULB, INTENSITY, PANEL, RADIUS, RIPPLES, Ball, ball_run, material, write_ball
+from tests.export.asset.balls import (
+    AXIS,
+    BULB,
+    INTENSITY,
+    PANEL,
+    RADIUS,
+    RIPPLES,
+    Ball,
+    ball_run,
+    material,
+    write_ball,
+)
 
 SIZE = 256
 
@@ -26,7 +37,9 @@ SIZE = 256
 @pytest.fixture(scope="module")
 def asset(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("ball")
-    write_ball(ball_run(folder), folder / "asset", SIZE, deviations=lambda run, points: 0.5 + 0.5 * points.position)
+    write_ball(
+        ball_run(folder), folder / "asset", SIZE, deviations=lambda run, points: 0.5 + 0.5 * points.position
+    )
     return folder / "asset"
 
 
@@ -52,7 +65,10 @@ def look_up(picture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """Bilinear, v upwards, as a renderer does it; values of 0 … 255."""
     height, width = picture.shape[:2]
     at = [(1 - uv[:, 1]) * height - 0.5, uv[:, 0] * width - 0.5]
-    return np.stack([map_coordinates(channel, at, order=1, mode="nearest") for channel in np.moveaxis(picture, -1, 0)], axis=1)
+    return np.stack(
+        [map_coordinates(channel, at, order=1, mode="nearest") for channel in np.moveaxis(picture, -1, 0)],
+        axis=1,
+    )
 
 
 def gltf_tree(path: Path) -> dict:
@@ -66,7 +82,8 @@ def test_textures_are_the_field(shape):
     uv = at_vertices(shape.visual.uv)
     truth = material(torch.from_numpy(to_scene(points)))
     pbr = shape.visual.material
-    # The coarse surface is up to 0.003 scene units off, and the field changes by 1 a unit: 255 · 0.003 is less than 1.
+    # The coarse surface is up to 0.003 scene units off, and the field changes by 1 a unit: 255 · 0.003 is
+    # less than 1.
     base_color = look_up(np.array(pbr.baseColorTexture, float), uv)
     np.testing.assert_allclose(base_color, 255 * srgb(truth.base_color.numpy()), atol=2)
     packed = look_up(np.array(pbr.metallicRoughnessTexture, float), uv)
@@ -84,9 +101,14 @@ def test_the_files_beside_hold_the_same(asset, shape):
         np.testing.assert_array_equal(np.rint(255 * stored), np.array(texture))
     packed = read_image(asset / "textures" / "metallic_roughness.png").pixels
     for name, channel in (("roughness", 1), ("metallic", 2)):
-        np.testing.assert_array_equal(read_image(asset / "textures" / f"{name}.png").pixels[..., 0], packed[..., channel])
+        np.testing.assert_array_equal(
+            read_image(asset / "textures" / f"{name}.png").pixels[..., 0], packed[..., channel]
+        )
     points, at_vertices = random_points(shape)
-    deviation = look_up(255 * read_image(asset / "textures" / "deviation.png").pixels.astype(float), at_vertices(shape.visual.uv))
+    deviation = look_up(
+        255 * read_image(asset / "textures" / "deviation.png").pixels.astype(float),
+        at_vertices(shape.visual.uv),
+    )
     np.testing.assert_allclose(deviation, 255 * (0.5 + 0.5 * to_scene(points)), atol=2)
 
 
@@ -106,7 +128,11 @@ def test_charts_lie_inside_the_texture_and_apart(shape):
     assert uv.max() <= 1
     corners = uv[shape.faces]
     points = np.random.default_rng(0).uniform(0, 1, (1500, 2))
-    first, second, to_point = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points[:, None] - corners[:, 0]
+    first, second, to_point = (
+        corners[:, 1] - corners[:, 0],
+        corners[:, 2] - corners[:, 0],
+        points[:, None] - corners[:, 0],
+    )
 
     def cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
         return one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0]
@@ -119,7 +145,8 @@ def test_charts_lie_inside_the_texture_and_apart(shape):
 
 
 def test_the_normal_map_turns_the_coarse_surface_into_the_fine_one(tmp_path):
-    """By the frame of the file's own tangents. Ripples of 0.015 · 12 = 0.18, 10°, are finer than the coarse triangles."""
+    """By the frame of the file's own tangents. Ripples of 0.015 · 12 = 0.18, 10°, are finer than the coarse
+    triangles."""
     asset = tmp_path / "asset"
     write_ball(ball_run(tmp_path, host=Ball(0.015)), asset, SIZE, faces=300, resolution=192)
     tree = gltf_tree(asset / "asset.glb")
@@ -139,7 +166,10 @@ def test_the_normal_map_turns_the_coarse_surface_into_the_fine_one(tmp_path):
     shape = trimesh.load(asset / "asset.glb", process=False).geometry["surface"]
     points, at_vertices = random_points(shape)
     n, t, sign = at_vertices(normal), at_vertices(tangent[:, :3]), np.sign(at_vertices(tangent[:, 3:]))
-    x, y, z = (look_up(np.array(shape.visual.material.normalTexture, float), at_vertices(shape.visual.uv)) / 127.5 - 1).T[..., None]
+    x, y, z = (
+        look_up(np.array(shape.visual.material.normalTexture, float), at_vertices(shape.visual.uv)) / 127.5
+        - 1
+    ).T[..., None]
     bumped = x * t + y * sign * np.cross(n, t) + z * n
     bumped /= np.linalg.norm(bumped, axis=1, keepdims=True)
     scene = to_scene(points)
@@ -165,7 +195,9 @@ def test_lamps_are_where_they_were(asset):
     for node, place, intensity in zip(nodes, (BULB, PANEL), INTENSITY, strict=True):
         light = lights[node["extensions"]["KHR_lights_punctual"]["light"]]
         np.testing.assert_allclose(to_scene(np.array([node["translation"]]))[0], place, atol=1e-6)
-        np.testing.assert_allclose(np.array(light["color"]) * light["intensity"], np.array(intensity) * SCALE**2, rtol=1e-6)
+        np.testing.assert_allclose(
+            np.array(light["color"]) * light["intensity"], np.array(intensity) * SCALE**2, rtol=1e-6
+        )
     # A spot looks along −Z of its node.
     looks = trimesh.transformations.quaternion_matrix(np.roll(nodes[1]["rotation"], 1))[:3, :3] @ [0, 0, -1]
     np.testing.assert_allclose(looks, [AXIS[0], AXIS[2], -AXIS[1]], atol=1e-6)
@@ -205,7 +237,7 @@ def test_usd_opens_again(asset, shape):
     np.testing.assert_allclose(power, np.array(INTENSITY[1]) * SCALE**2, rtol=1e-4)
 
 
-# ------------------------------------------------------------------------------------------------------------ bad weather
+# ------------------------------------------------------------------------------------------------ bad weather
 
 
 def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
@@ -236,7 +268,7 @@ def test_what_a_person_has_put_there_stays(tmp_path):
 
 
 def test_an_atlas_that_does_not_fit(tmp_path, monkeypatch):
-    with pytest.raises(UserError, match="charts .* do not fit on a texture of 8×8; raise --texture-size"):
+    with pytest.raises(UserError, match=r"charts .* do not fit on a texture of 8×8; raise --texture-size"):
         write_ball(ball_run(tmp_path), tmp_path / "asset", 8)
     assert not (tmp_path / "asset").exists()
 

@@ -1,4 +1,5 @@
-"""Open this asset in Blender 4 or later: surface, environment, lamps and cameras, in the capture's world (Z up).
+"""Open this asset in Blender 4 or later: surface, environment, lamps and cameras, in the capture's world (Z
+up).
 
     blender --python open_in_blender.py
     blender --background --python open_in_blender.py -- --camera 003 --render 003.exr --samples 256
@@ -21,7 +22,9 @@ SENSOR = 36.0  # mm; only its ratio to the focal length matters
 
 
 def main(arguments):
-    parser = argparse.ArgumentParser(prog="open_in_blender.py", description="Open an exported asset in Blender.")
+    parser = argparse.ArgumentParser(
+        prog="open_in_blender.py", description="Open an exported asset in Blender."
+    )
     parser.add_argument("--camera", help="name of a view; the first one where none is given")
     parser.add_argument("--render", type=Path, help="render to this EXR file, linear")
     parser.add_argument("--samples", type=int, default=128, help="samples per pixel")
@@ -59,11 +62,18 @@ def add_surface():
     bpy.ops.import_scene.gltf(filepath=str(HERE / "asset.glb"))
     for thing in [thing for thing in bpy.data.objects if thing.type == "LIGHT"]:
         bpy.data.objects.remove(thing)
+    # The material was found with a lobe that scatters once; Blender's default adds what it loses, up to half
+    # on rough metal.
+    for material in bpy.data.materials:
+        for node in material.node_tree.nodes:
+            if node.type == "BSDF_PRINCIPLED":
+                node.distribution = "GGX"
 
 
 def add_environment(scene, maps):
     scene.world = bpy.data.worlds.new("environment")
-    scene.world.use_nodes = True
+    if bpy.app.version < (5, 0):  # later worlds always have them
+        scene.world.use_nodes = True
     nodes, links = scene.world.node_tree.nodes, scene.world.node_tree.links
     background = next(node for node in nodes if node.type == "BACKGROUND")
     if maps is None:

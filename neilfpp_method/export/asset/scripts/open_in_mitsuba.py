@@ -2,7 +2,8 @@
 
     python open_in_mitsuba.py 003.exr --camera 003 --samples 256
 
-`scene(camera)` is the dictionary for `mitsuba.load_dict`. Choose a variant first, such as `mitsuba.set_variant("llvm_ad_rgb")`.
+`scene(camera)` is the dictionary for `mitsuba.load_dict`. Choose a variant first, such as
+`mitsuba.set_variant("llvm_ad_rgb")`.
 """
 
 import argparse
@@ -16,7 +17,9 @@ HERE = Path(__file__).resolve().parent
 
 
 def main():
-    parser = argparse.ArgumentParser(prog="open_in_mitsuba.py", description="Render an exported asset with Mitsuba 3.")
+    parser = argparse.ArgumentParser(
+        prog="open_in_mitsuba.py", description="Render an exported asset with Mitsuba 3."
+    )
     parser.add_argument("out", type=Path, help="EXR file, linear")
     parser.add_argument("--camera", help="name of a view; the first one where none is given")
     parser.add_argument("--samples", type=int, default=128, help="samples per pixel")
@@ -41,7 +44,11 @@ def scene(camera):
     if contents["environment"]:
         # Mitsuba lays maps out as we do, about an axis that is Y until it is turned.
         turn = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
-        parts["environment"] = {"type": "envmap", "filename": str(HERE / contents["environment"]["ours"]), "to_world": turn}
+        parts["environment"] = {
+            "type": "envmap",
+            "filename": str(HERE / contents["environment"]["ours"]),
+            "to_world": turn,
+        }
     for number, lamp in enumerate(contents["lamps"]):
         parts[f"lamp_{number}"] = lamp_shape(lamp)
     parts["sensor"] = sensor(next(view for view in contents["cameras"] if view["name"] == camera))
@@ -77,21 +84,22 @@ def lamp_shape(lamp):
         return {"type": "sphere", "center": lamp["position"], "radius": lamp["radius"], "emitter": emitter}
     position, axis = lamp["position"], lamp["axis"]
     up = [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0]
-    target = [p + a for p, a in zip(position, axis)]
+    target = [p + a for p, a in zip(position, axis, strict=True)]
     pose = mi.ScalarTransform4f().look_at(position, target, up).scale(lamp["radius"])
     return {"type": "disk", "to_world": pose, "emitter": emitter}
 
 
 def sensor(camera):
-    """Mitsuba's cameras have x to the left and y up; its pixels are square, and a lens is left out."""
+    """Mitsuba's cameras have x to the left and y up. Its pixels are square: where the capture's are not, the
+    picture has another number of rows for the same view. A lens is left out."""
     flip = mi.ScalarTransform4f().scale([-1, -1, 1])
-    width, height = camera["width"], camera["height"]
+    width, height = camera["width"], round(camera["height"] * camera["fx"] / camera["fy"])
     return {
         "type": "perspective",
         "fov_axis": "x",
         "fov": math.degrees(2.0 * math.atan(0.5 * width / camera["fx"])),
-        "principal_point_offset_x": camera["cx"] / width - 0.5,
-        "principal_point_offset_y": camera["cy"] / height - 0.5,
+        "principal_point_offset_x": 0.5 - camera["cx"] / width,
+        "principal_point_offset_y": 0.5 - camera["cy"] / camera["height"],
         "near_clip": 1e-3,
         "far_clip": 1e5,
         "to_world": mi.ScalarTransform4f(camera["camera_to_world"]) @ flip,
