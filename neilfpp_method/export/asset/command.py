@@ -106,13 +106,14 @@ def export_asset(
     fine = clean(whole, seen_faces(whole, cameras))
     console.print(f"surface: {len(fine.faces)} of {len(whole.faces)} triangles were seen and stay")
     coarse = simplified(fine, options.faces, options.error)
-    console.print(
-        f"simplified: {len(coarse.surface.faces)} triangles, 99 % within {coarse.distance:.2g} scene units"
-    )
+    distance = coarse.distance
+    near = f"99 % of the surface within {distance.near:.2g} scene units"
+    lost = f", {100 * distance.missed:.1f} % lost" if distance.missed > 0 else ""
+    console.print(f"simplified: {len(coarse.surface.faces)} triangles, {near}{lost}")
     mesh = unwrap(coarse.surface, options.texture_size)
     unsure = None if deviations is None else deviations(run, _points(run, mesh)).double().cpu().numpy()
     with bar("textures") as advance:
-        reach = max(NEAREST * coarse.distance, LEAST_REACH)
+        reach = max(NEAREST * distance.near, LEAST_REACH)
         textures = bake(run, mesh, fine, reach, options.texture_size, unsure, advance)
     console.print(
         f"textures: {mesh.charts} charts on {100 * textures.covered:.0f} % of {options.texture_size}² texels"

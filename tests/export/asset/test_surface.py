@@ -136,7 +136,7 @@ def test_an_error_decides_how_many_triangles():
     for error in (0.0, 0.003, 0.02):
         coarse = simplified(fine, 5000, error)
         assert len(coarse.surface.faces) <= 5000
-        assert coarse.distance <= max(error, simplified(fine, 5000, 0.0).distance)
+        assert coarse.distance.near <= max(error, simplified(fine, 5000, 0.0).distance.near)
         # The centre of a triangle with edges of length e lies e²/(6 r) below its corners: what all of them
         # must keep.
         sphere = np.linalg.norm(coarse.surface.mesh().triangles_center, axis=1)
@@ -147,8 +147,12 @@ def test_an_error_decides_how_many_triangles():
 
 def test_a_distance_is_that_of_the_surfaces():
     one, other = surface(ball((0, 0, 0), 0.5, 5)), surface(ball((0, 0, 0), 0.51, 5))
-    assert distance_between(one, other) == pytest.approx(0.01, abs=3e-4)
-    assert distance_between(one, one) == pytest.approx(0, abs=1e-5)
+    assert distance_between(one, other).near == pytest.approx(0.01, abs=3e-4)
+    assert distance_between(one, one).near == pytest.approx(0, abs=1e-5)
+    assert distance_between(one, other).missed == 0
+    # Where half of the surface is not there, half is missed.
+    half = one.part(one.mesh().triangles_center[:, 2] > 0)
+    assert distance_between(one, half).missed == pytest.approx(0.5, abs=0.02)
 
 
 def test_few_triangles_stay_as_they_are():
