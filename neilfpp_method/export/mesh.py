@@ -18,6 +18,7 @@ from torch import Tensor
 from neilfpp_method.data.images import replacing
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.mesh import MeshHost
+from neilfpp_method.hosts.volsdf import HIT_RADIUS
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.structures import Material
 from neilfpp_method.train.run import Run
@@ -106,7 +107,7 @@ def surface_mesh(run: Run, resolution: int = 256) -> trimesh.Trimesh:
     volume = run.config.volume
     # The sphere that may close the scene (METHOD §3) is no surface of the object.
     device = next(run.model.parameters()).device
-    return extract_mesh(host.sdf, volume.radius - volume.hit_radius, resolution, device=device)
+    return extract_mesh(host.sdf, volume.radius - HIT_RADIUS, resolution, device=device)
 
 
 def export_mesh(run: Run, path: Path, resolution: int = 256) -> trimesh.Trimesh:

@@ -12,8 +12,9 @@ from rich.console import Console
 
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.export.asset.command import AssetOptions, export_asset
-from neilfpp_method.facts import SceneFacts
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.types import MapLightConfig
 from neilfpp_method.structures import Material, RayBatch, SurfaceHits
 from neilfpp_method.train.run import Run
 from tests.data.make_capture import make_capture
@@ -57,7 +58,7 @@ def ball_run(
     config = tiny_config()
     config = dataclasses.replace(
         config,
-        light=dataclasses.replace(config.light, kind=kind, environment_height=9),
+        light=config.light if kind == "free" else MapLightConfig(kind=kind, environment_height=9),
         inter_reflection=dataclasses.replace(config.inter_reflection, mode="off"),
         shading=dataclasses.replace(config.shading, lobe=lobe),
     )

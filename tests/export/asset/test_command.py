@@ -13,7 +13,7 @@ import trimesh
 
 from neilfpp_method.cli import main
 from neilfpp_method.data.images import read_image
-from neilfpp_method.presets import PRESETS
+from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.train.run import load_run
 from tests.data.make_capture import CENTRE, RADIUS, SCALE, make_capture, srgb
 from tests.test_cli import refused
