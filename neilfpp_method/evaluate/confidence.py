@@ -32,7 +32,7 @@ from neilfpp_method.shading.color import apply_response, response_slope, srgb_to
 from neilfpp_method.structures import OrientedPoints
 from neilfpp_method.train.run import Run
 
-__all__ = ["Evidence", "gather_evidence", "material_deviation", "shown_surface", "with_deviation"]
+__all__ = ["Evidence", "deviations_at", "gather_evidence", "material_deviation", "shown_surface", "with_deviation"]
 
 VIEWS = 16
 """Views of a point that count. Those that lie between them add little that is new."""
@@ -142,6 +142,12 @@ def material_deviation(
             on_progress(rows.stop / len(position))
     deviation = Deviation(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Deviation)))
     return _evened(deviation, position, normal)
+
+
+def deviations_at(run: Run, points: OrientedPoints) -> Float[Tensor, "N 3"]:
+    """`material_deviation` of a run at points of its surface: of base colour, roughness and metallic."""
+    deviation = material_deviation(run.model, gather_evidence(run), points.position, points.normal)
+    return torch.cat([deviation.base_color, deviation.roughness, deviation.metallic], dim=-1)
 
 
 def with_deviation(run: Run, evidence: Evidence, view: RenderedView, step: int = 1) -> RenderedView:

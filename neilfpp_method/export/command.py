@@ -1,4 +1,4 @@
-"""`neilfpp export`: a run's surface and its light as files for other programs."""
+"""`neilfpp export`: a run's surface, its light, and both as an asset, as files for other programs."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from pathlib import Path
 
 from rich.console import Console
 
+from neilfpp_method.export.asset.command import AssetOptions, Bar, Deviations, check_asset, export_asset
 from neilfpp_method.export.light import check_light, export_light, has_light
-from neilfpp_method.export.mesh import HasSdf, export_mesh
+from neilfpp_method.export.mesh import export_mesh, has_surface
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.run import check_writable, load_run
 
@@ -22,17 +23,21 @@ def run_export(
     out: Path | None,
     resolution: int,
     probes: int | None,
+    asset: AssetOptions,
+    deviations: Deviations | None,
+    bar: Bar,
     checkpoint: str,
     device: str,
     console: Console,
 ) -> None:
-    """Write `mesh.ply` and `light/` into a folder, `RUN/export` where none is given.
+    """Write `mesh.ply`, `light/` and `asset/` into a folder, `RUN/export` where none is given.
 
     Args:
         run: the run's folder.
-        what: "mesh", "light", or both; none: what the run has.
+        what: some of "mesh", "light" and "asset"; none: mesh and light, as far as the run has them.
         resolution: of `export_mesh`.
         probes: of `export_light`.
+        asset: of `export_asset`, as are `deviations` and `bar`.
 
     Raises:
         UserError: the run does not have what is asked for.
@@ -40,10 +45,12 @@ def run_export(
     trained = load_run(run, pick_device(device), checkpoint)
     out = out or run / "export"
     check_writable(out)
-    has = {"mesh": isinstance(trained.model.host, HasSdf), "light": has_light(trained)}
+    has = {"mesh": has_surface(trained), "light": has_light(trained)}
     what = what or [name for name, there in has.items() if there] or ["mesh"]
     if "light" in what:
         check_light(trained, probes)
+    if "asset" in what:
+        check_asset(trained, asset)
     if "mesh" in what:
         mesh = export_mesh(trained, out / "mesh.ply", resolution)
         size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces"
@@ -52,3 +59,5 @@ def run_export(
         light = export_light(trained, out / "light", probes)
         parts = (["an environment map", f"{light.lamps} lamps"] if light.environment else []) + [f"{light.probes} probes"]
         console.print(f"{', '.join(parts)}, written to {out / 'light'}", soft_wrap=True)
+    if "asset" in what:
+        export_asset(trained, out / "asset", resolution, asset, console, bar, deviations)

@@ -19,10 +19,9 @@ from neilfpp_method.data.images import write_exr
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.probes import probe, spread_over_surface
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.train.run import Run, write_json
 
-__all__ = ["ExportedLight", "check_light", "export_light", "has_light"]
+__all__ = ["ExportedLight", "check_light", "export_light", "has_light", "lamps_in_world"]
 
 FORMAT = 1
 PROBE_HEIGHT = 64
@@ -73,7 +72,7 @@ def export_light(run: Run, out: Path, probes: int | None = None) -> ExportedLigh
     if isinstance(light, EnvironmentLight):
         environment = out / "environment.exr"
         write_exr(environment, {"RGB": light.log_radiance.exp().permute(1, 2, 0).cpu().numpy()})
-        described = _lamps(run, run.model.lamps)
+        described = lamps_in_world(run)
         lamps = len(described)
         write_json(out / "lamps.json", {"format": FORMAT, "frame": "world", "lamps": described})
     if probes is None:
@@ -82,8 +81,12 @@ def export_light(run: Run, out: Path, probes: int | None = None) -> ExportedLigh
     return ExportedLight(environment, lamps, written)
 
 
-def _lamps(run: Run, lamps: Lamps) -> list[dict[str, Any]]:
-    """Radiance is the same in every frame; intensity, radiance times the area of a disc, scales as that area does."""
+def lamps_in_world(run: Run) -> list[dict[str, Any]]:
+    """The lamps of a run as `lamps.json` has them (docs/light.md), in the capture's world; none where the light has none.
+
+    Radiance is the same in every frame; intensity, radiance times the area of a disc, scales as that area does.
+    """
+    lamps = run.model.lamps
     frame = run.capture.normalisation
     lit = slice(lamps.lit)
     positions = frame.to_world(lamps.position[lit].double()).tolist()

@@ -1,4 +1,5 @@
-"""The surface of a run as a triangle mesh: marching cubes on a grid that is queried only near the zero set."""
+"""The surface of a run as a triangle mesh: the one that it was given, or marching cubes on a grid that is queried only near
+the zero set."""
 
 from __future__ import annotations
 
@@ -16,11 +17,13 @@ from torch import Tensor
 
 from neilfpp_method.data.images import replacing
 from neilfpp_method.errors import UserError
+from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.hosts.volsdf import HIT_RADIUS
 from neilfpp_method.shading.color import tone_map
+from neilfpp_method.structures import Material
 from neilfpp_method.train.run import Run
 
-__all__ = ["HasSdf", "export_mesh", "extract_mesh"]
+__all__ = ["HasSdf", "export_mesh", "extract_mesh", "has_surface", "materials_in_parts", "surface_mesh"]
 
 Sdf = Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]
 
@@ -28,6 +31,8 @@ Sdf = Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]
 # With 8 and 1.5 nothing is lost, the edges between blocks included, for every field whose slope stays below 1.29.
 BLOCK = 8
 SLACK = 1.5
+POINTS_AT_ONCE = 65_536
+"""Points at which the material is asked together: bounds the memory."""
 
 
 @runtime_checkable
@@ -74,27 +79,64 @@ def extract_mesh(
     return mesh
 
 
+def has_surface(run: Run) -> bool:
+    """Whether the host of a run has a surface that can be written as a mesh."""
+    return isinstance(run.model.host, HasSdf | MeshHost)
+
+
+def surface_mesh(run: Run, resolution: int = 256) -> trimesh.Trimesh:
+    """The surface of a run in the scene frame; faces are wound outwards.
+
+    Args:
+        run: the run.
+        resolution: of `extract_mesh`; a mesh that the run was given keeps its triangles, and corners at one place become one.
+
+    Raises:
+        UserError: the host has no surface that is known as one, or none is found.
+    """
+    host = run.model.host
+    if isinstance(host, MeshHost):
+        corners = host.triangles.reshape(-1, 3).cpu().double().numpy()
+        mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+        mesh.merge_vertices()
+        return mesh
+    if not isinstance(host, HasSdf):
+        raise UserError(
+            f"{run.path}: the host of this run has no distance field and no mesh", "export from a run of another host"
+        )
+    volume = run.config.volume
+    # The sphere that may close the scene (METHOD §3) is no surface of the object.
+    device = next(run.model.parameters()).device
+    return extract_mesh(host.sdf, volume.radius - HIT_RADIUS, resolution, device=device)
+
+
 def export_mesh(run: Run, path: Path, resolution: int = 256) -> trimesh.Trimesh:
     """Write the surface of a run as a PLY file, in the frame and the scale of its capture.
 
-    Vertices carry normals and, once a stage has moved the material, the base colour, sRGB-encoded.
+    Vertices carry normals and, once a stage has moved the material, the base colour, sRGB-encoded, and the properties
+    `roughness` and `metallic`, floats in [0, 1].
 
     Raises:
-        UserError: the host is no distance field, or it has no surface.
+        UserError: see `surface_mesh`.
     """
-    if not isinstance(run.model.host, HasSdf):
-        raise UserError(f"{run.path}: the host of this run has no distance field", "export from a run of the VolSDF host")
-    device = next(run.model.parameters()).device
-    volume = run.config.volume
-    # The sphere that may close the scene (METHOD §3) is no surface of the object.
-    mesh = extract_mesh(run.model.host.sdf, volume.radius - HIT_RADIUS, resolution, device=device)
-    position = torch.as_tensor(mesh.vertices, dtype=torch.float32, device=device)
+    mesh = surface_mesh(run, resolution)
+    position = torch.as_tensor(np.array(mesh.vertices), dtype=torch.float32, device=next(run.model.parameters()).device)
     if run.step > run.config.train.sdf_steps:
-        mesh.visual.vertex_colors = _vertex_colors(run, position)
+        material = materials_in_parts(run, position)
+        mesh.visual.vertex_colors = (tone_map(material.base_color) * 255.0).round().byte().cpu().numpy()
+        mesh.vertex_attributes["roughness"] = material.roughness[:, 0].cpu().numpy()
+        mesh.vertex_attributes["metallic"] = material.metallic[:, 0].cpu().numpy()
     mesh.vertices = run.capture.normalisation.to_world(position.double()).cpu().numpy()
     with replacing(path) as temporary:
         temporary.write_bytes(mesh.export(file_type="ply", vertex_normal=True))
     return mesh
+
+
+@torch.no_grad()
+def materials_in_parts(run: Run, position: Float[Tensor, "N 3"]) -> Material:
+    """The material at any number of points of the scene frame."""
+    parts = [run.model.materials(part) for part in position.split(POINTS_AT_ONCE)]
+    return Material(*(torch.cat([getattr(part, name) for part in parts]) for name in ("base_color", "roughness", "metallic")))
 
 
 def _sparse_grid(sdf: Sdf, radius: float, blocks: int, step: float, device: torch.device | str) -> Float[np.ndarray, "G G G"]:
@@ -119,11 +161,6 @@ def _lattice(count: int, device: torch.device | str) -> Float[Tensor, "P 3"]:
     """All triples of 0 … count − 1, the last one running fastest."""
     axis = torch.arange(count, dtype=torch.float32, device=device)
     return torch.cartesian_prod(axis, axis, axis)
-
-
-def _vertex_colors(run: Run, position: Float[Tensor, "V 3"]) -> np.ndarray:
-    parts = [run.model.materials(part).base_color for part in position.split(65_536)]
-    return (tone_map(torch.cat(parts)) * 255.0).round().byte().cpu().numpy()
 
 
 def _no_surface(radius: float) -> UserError:

@@ -24,7 +24,7 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import RayBatch, SceneLight, SurfaceHits
 
-__all__ = ["MeshHost"]
+__all__ = ["MeshHost", "corner_normals"]
 
 TINY = 1e-18
 """Length under which a sum of edge products has no direction: triangles may be small."""
@@ -77,7 +77,7 @@ class MeshHost(nn.Module):
         triangles = mesh.vertices[mesh.faces]
         across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         outward = safe_normalize(across, eps=TINY)
-        smooth = _corner_normals(mesh, outward)
+        smooth = corner_normals(mesh, outward)
         self.register_buffer("triangles", triangles, persistent=False)
         self.register_buffer("outward", outward, persistent=False)
         self.register_buffer("corner_normals", smooth.expand(-1, 3, -1), persistent=False)
@@ -171,7 +171,7 @@ class MeshHost(nn.Module):
         return beyond.new_zeros(len(rays), 3).index_put((missed,), beyond)
 
 
-def _corner_normals(mesh: Mesh, outward: Float[Tensor, "F 3"]) -> Float[Tensor, "F 3 3"]:
+def corner_normals(mesh: Mesh, outward: Float[Tensor, "F 3"]) -> Float[Tensor, "F 3 3"]:
     """Unit normals at the corners of faces: of the faces around the vertex that lie on the same side of every crease, by their
     angles there, as of how many triangles a face is made says nothing (Thürmer and Wüthrich 1998). Vertices that faces do
     not share make edges."""

@@ -120,6 +120,10 @@ def test_export_is_in_the_frame_of_the_capture_with_colours(tmp_path: Path):
     assert ((mesh.vertex_normals * from_centre).sum(-1) / distance).min() > 0.98
     linear = 0.5 + 0.5 * from_centre / SCALE
     np.testing.assert_allclose(mesh.visual.vertex_colors[:, :3], 255 * srgb(linear), atol=0.51)
+    # Roughness is 1 throughout, metallic 0; other programs find both by their names.
+    stored = mesh.metadata["_ply_raw"]["vertex"]["data"]
+    assert (stored["roughness"] == 1).all()
+    assert (stored["metallic"] == 0).all()
     assert {path.name for path in tmp_path.iterdir()} == {"capture", "mesh.ply"}
 
 

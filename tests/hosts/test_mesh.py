@@ -302,8 +302,12 @@ def test_a_mesh_run_from_the_command_line(tmp_path: Path, monkeypatch, capsys):
     assert write_report(load_run(out), tmp_path / "report", metrics, {"material_init": 1.0}).is_file()
     assert main(["render", str(out), "--device", "cpu"]) == 0
     assert list((out / "renders").glob("*.exr"))
-    assert main(["export", str(out), "--what", "mesh", "--device", "cpu"]) == 2
-    assert "no distance field" in capsys.readouterr().err
+    assert main(["export", str(out), "--what", "mesh", "--device", "cpu"]) == 0
+    mesh = trimesh.load_mesh(out / "export" / "mesh.ply", process=False)
+    given = trimesh.load_mesh(capture / "inputs" / "model" / "mesh.ply")
+    assert len(mesh.faces) == len(given.faces)
+    np.testing.assert_allclose(mesh.bounds, given.bounds, atol=1e-5)
+    assert mesh.visual.vertex_colors.shape == (len(mesh.vertices), 4)
 
 
 def test_another_mesh_is_taken_by_its_path_and_found_again(tmp_path: Path, monkeypatch, capsys):

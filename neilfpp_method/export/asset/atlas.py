@@ -1,0 +1,69 @@
+"""A surface cut open and laid out on one square texture (xatlas)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xatlas
+from jaxtyping import Float, Int
+
+from neilfpp_method.errors import UserError
+from neilfpp_method.export.asset.surface import Surface
+
+__all__ = ["Unwrapped", "unwrap"]
+
+GAP = 6
+"""Texels that are asked for between charts."""
+LEAST_GAP = 2.0
+"""Texels that must be left between them, so that bilinear look-ups keep to their chart."""
+
+
+@dataclass(frozen=True)
+class Unwrapped:
+    """Triangles whose vertices have one normal and one place in the texture each.
+
+    `uv` is in [0, 1], v upwards. `gap` is the distance between charts, texels.
+    """
+
+    vertices: Float[np.ndarray, "V 3"]
+    normals: Float[np.ndarray, "V 3"]
+    uv: Float[np.ndarray, "V 2"]
+    faces: Int[np.ndarray, "F 3"]
+    charts: int
+    gap: float
+
+
+def unwrap(surface: Surface, size: int) -> Unwrapped:
+    """Lay the triangles out, each once, on a texture of size × size texels.
+
+    Raises:
+        UserError: the charts do not fit with two texels between them.
+    """
+    # A vertex on an edge has several normals: it is one vertex for each.
+    corners = np.concatenate([surface.faces[..., None], surface.normals], axis=-1).reshape(-1, 4)
+    wedges, wedge = np.unique(corners, axis=0, return_inverse=True)
+    vertices, normals = surface.vertices[wedges[:, 0].astype(np.int64)], wedges[:, 1:]
+    packing, atlas = xatlas.PackOptions(), xatlas.Atlas()
+    packing.resolution, packing.padding = size, GAP
+    atlas.add_mesh(
+        vertices.astype(np.float32), wedge.reshape(-1, 3).astype(np.uint32), normals.astype(np.float32)
+    )
+    atlas.generate(xatlas.ChartOptions(), packing)
+    source, faces, uv = atlas.get_mesh(0)
+    # The resolution is a wish; what came out is scaled to the texture.
+    extent = np.array([atlas.width, atlas.height])
+    gap = GAP * size / extent.max()
+    if atlas.atlas_count != 1 or gap < LEAST_GAP:
+        raise UserError(
+            f"{atlas.chart_count} charts of {len(faces)} triangles do not fit on a texture of {size}×{size}",
+            "raise --texture-size, or lower --faces",
+        )
+    return Unwrapped(
+        vertices[source],
+        normals[source],
+        uv * (extent / extent.max()),
+        faces.astype(np.int64),
+        atlas.chart_count,
+        gap,
+    )

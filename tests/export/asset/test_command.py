@@ -1,0 +1,124 @@
+"""`neilfpp export --what asset` from end to end, on a mesh that the run was given and on one that it
+found."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from neilfpp_method.cli import main
+from neilfpp_method.data.images import read_image
+from neilfpp_method.settings.presets import PRESETS
+from neilfpp_method.train.run import load_run
+from tests.data.make_capture import CENTRE, RADIUS, SCALE, make_capture, srgb
+from tests.test_cli import refused
+from tests.train.small_runs import small_config, solved_light
+
+SMALL = ["--device", "cpu", "--texture-size", "128", "--faces", "400", "--resolution", "32"]
+FILES = {"asset.glb", "mesh.ply", "scene.json", "open_in_blender.py", "open_in_mitsuba.py"}
+MAPS = {"environment.exr", "environment_blender.exr", "environment_unreal.exr"}
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory) -> Path:
+    """A run on a given mesh, with an environment map."""
+    folder = tmp_path_factory.mktemp("given")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "tiny", lambda: solved_light(small_config()))
+        capture = make_capture(folder / "capture", masks=True)
+        command = [
+            "train",
+            "--data",
+            capture,
+            "--preset",
+            "tiny",
+            "--host",
+            "mesh",
+            "--out",
+            folder / "run",
+            "--device",
+            "cpu",
+        ]
+        assert main(list(map(str, command))) == 0
+    return folder / "run"
+
+
+def test_an_asset_of_a_given_mesh(given, tmp_path, capfd):
+    assert (
+        main(["export", str(given), "--what", "asset", "--confidence", "--out", str(tmp_path), *SMALL]) == 0
+    )
+    said = capfd.readouterr()
+    assert said.err == ""
+    for words in (
+        "triangles were seen and stay",
+        "simplified: ",
+        "charts on",
+        f"written to {tmp_path / 'asset'}",
+    ):
+        assert words in said.out
+    out = tmp_path / "asset"
+    assert {path.name for path in tmp_path.iterdir()} == {"asset"}
+    assert {path.name for path in out.iterdir()} - {"asset.usda"} == FILES | MAPS | {"textures"}
+    for name in ("base_color", "metallic_roughness", "roughness", "metallic", "normal", "deviation"):
+        assert read_image(out / "textures" / f"{name}.png").pixels.shape[:2] == (128, 128)
+    shape = trimesh.load(out / "asset.glb", process=False).geometry["surface"]
+    assert len(shape.faces) <= 400
+    world = np.array(shape.vertices)[:, [0, 2, 1]] * [1, -1, 1]
+    np.testing.assert_allclose(np.linalg.norm(world - CENTRE, axis=1), RADIUS, atol=0.04)
+    # The texture holds what the run says.
+    run = load_run(given)
+    row = (1 - shape.visual.uv[:, 1]) * 128 - 0.5
+    column = shape.visual.uv[:, 0] * 128 - 0.5
+    texel = np.array(shape.visual.material.baseColorTexture)[
+        row.round().astype(int), column.round().astype(int)
+    ]
+    scene = torch.as_tensor((world - CENTRE) / SCALE, dtype=torch.float32)
+    truth = 255 * srgb(run.model.materials(scene).base_color.detach().numpy())
+    assert np.abs(texel - truth).mean() < 2
+    described = json.loads((out / "scene.json").read_text())
+    assert len(described["cameras"]) == 6
+    # Some points are surer than others, and none is certain.
+    deviation = read_image(out / "textures" / "deviation.png").pixels
+    assert 0 < deviation.min() < deviation.max()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--texture-size", "32"], ("a texture of 32 texels", "64 to 8192")),
+        (["--texture-size", "100000"], ("a texture of 100000 texels",)),
+        (["--faces", "3"], ("an asset of 3 triangles", "--faces")),
+        (["--error", "-1"], ("--error -1",)),
+        (["--error", "nan"], ("--error nan",)),
+        (["--out", "FILE/out"], ("cannot be written",)),
+    ],
+)
+def test_bad_options(given, tmp_path, capfd, options, words):
+    (tmp_path / "file").write_text("")
+    options = [option.replace("FILE", str(tmp_path / "file")) for option in options]
+    command = ["export", given, "--what", "asset", "--out", tmp_path / "out", "--device", "cpu", *options]
+    refused(capfd, command, *words, leaves=tmp_path)
+
+
+def test_a_run_without_a_material(tmp_path, capfd, monkeypatch):
+    monkeypatch.setitem(PRESETS, "tiny", small_config)
+    capture = make_capture(tmp_path / "capture", masks=True)
+    run = tmp_path / "run"
+    assert (
+        main(["train", "--data", str(capture), "--preset", "tiny", "--out", str(run), "--device", "cpu"]) == 0
+    )
+    command = ["export", run, "--what", "asset", "--checkpoint", "sdf_init", *SMALL]
+    refused(capfd, command, "no material yet at step 4", leaves=tmp_path)
+    # Later there is one, on the surface that the run has found; its light is free at every point, so there is
+    # no map.
+    assert main(["export", str(run), "--what", "asset", *SMALL]) == 0
+    out = run / "export" / "asset"
+    assert {path.name for path in out.iterdir()} - {"asset.usda"} == FILES | {"textures"}
+    shape = trimesh.load(out / "asset.glb", process=False).geometry["surface"]
+    world = np.array(shape.vertices)[:, [0, 2, 1]] * [1, -1, 1]
+    assert np.linalg.norm(world.mean(0) - CENTRE) < 0.4 * RADIUS

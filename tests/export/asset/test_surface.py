@@ -1,0 +1,165 @@
+"""What of a surface stays in an asset: what cameras saw, no crumbs, no small holes, and no more triangles
+than it takes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from neilfpp_method.data.views import Camera
+from neilfpp_method.errors import UserError
+from neilfpp_method.export.asset.clean import HOLE, clean, close_holes, keep_seen, without_crumbs
+from neilfpp_method.export.asset.simplify import distance_between, simplified
+from neilfpp_method.export.asset.surface import Surface, creased, first_hits, meet_along
+from neilfpp_method.export.asset.visible import seen_faces
+
+
+def surface(*shapes: trimesh.Trimesh) -> Surface:
+    whole = trimesh.util.concatenate(shapes) if len(shapes) > 1 else shapes[0]
+    return creased(np.array(whole.vertices, dtype=np.float64), np.array(whole.faces))
+
+
+def camera(height: float, size: int = 40) -> Camera:
+    """At (0, 0, height), looking down; 53° wide."""
+    w2c = np.diag([1.0, -1.0, -1.0, 1.0])
+    w2c[2, 3] = height
+    return Camera(float(size), float(size), size / 2, size / 2, size, size, w2c)
+
+
+def ball(centre: tuple[float, float, float], radius: float, subdivisions: int = 3) -> trimesh.Trimesh:
+    shape = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    shape.apply_translation(centre)
+    return shape
+
+
+# ------------------------------------------------------------------------------------------------- who saw it
+
+
+@pytest.mark.parametrize("size", [2, 40])
+def test_a_camera_above_sees_the_upper_part(size):
+    """Also where triangles are far smaller than its pixels."""
+    shape = surface(ball((0, 0, 0), 0.5))
+    seen = seen_faces(shape, [camera(2.0, size)])
+    # From 2 the horizon of a ball of radius 0.5 is at z = 0.5² / 2; triangles are 0.08 across.
+    middle = shape.mesh().triangles_center[:, 2]
+    assert seen[middle > 0.125 + 0.04].all()
+    assert not seen[middle < 0.125 - 0.04].any()
+
+
+def test_what_stands_behind_or_beside_the_picture_is_not_seen():
+    near, behind, beside = ball((0, 0, 0), 0.5), ball((0, 0, -0.9), 0.2), ball((3, 0, 0), 0.2)
+    seen = seen_faces(surface(near, behind, beside), [camera(2.0)])
+    first, second, third = np.split(seen, np.cumsum([len(near.faces), len(behind.faces)]))
+    assert first.any()
+    assert not second.any()
+    assert not third.any()
+
+
+def test_the_inside_of_a_surface_is_not_seen():
+    turned = ball((0, 0, 0), 0.5)
+    turned.invert()
+    assert not seen_faces(surface(turned), [camera(2.0)]).any()
+
+
+# ----------------------------------------------------------------------------------------------- what is kept
+
+
+def test_unseen_patches_go_unless_they_are_small():
+    shape = surface(ball((0, 0, 0), 0.5, 4))
+    z = shape.mesh().triangles_center[:, 2]
+    # A cap of 0.04 across that nobody saw stays; all below the equator goes, but for a ring.
+    top = shape.mesh().triangles_center[z.argmax()]
+    seen = (z > 0) & (np.linalg.norm(shape.mesh().triangles_center - top, axis=1) > 0.4 * HOLE)
+    kept = keep_seen(shape, seen).mesh()
+    assert kept.triangles_center[:, 2].min() > -0.1
+    assert 2 * np.pi * 0.25 < kept.area < 2 * np.pi * 0.25 + 2 * np.pi * 0.5 * 0.06
+    assert (np.linalg.norm(kept.triangles_center - top, axis=1) < 1e-9).any()
+
+
+def test_crumbs_go():
+    kept = without_crumbs(surface(ball((0, 0, 0), 0.5), ball((1, 0, 0), 0.1), ball((0, 1, 0), 0.01)))
+    assert kept.mesh().bounds[:, 0] == pytest.approx([-0.5, 1.1], abs=0.01)
+    assert kept.mesh().bounds[1, 1] < 0.6
+
+
+def test_small_holes_are_closed_and_large_ones_stay():
+    whole = surface(ball((0, 0, 0), 0.5, 5))
+    middle = whole.mesh().triangles_center
+    holes = (np.linalg.norm(middle - [0, 0, 0.5], axis=1) < 0.02) | (middle[:, 2] < -0.4)
+    closed = close_holes(whole.part(~holes))
+    added = closed.faces[(~holes).sum() :]
+    assert 5 <= len(added) < 40
+    mesh = trimesh.Trimesh(closed.vertices, closed.faces, process=False)
+    assert mesh.is_winding_consistent
+    # Over the small hole the surface is whole again, and faces up.
+    np.testing.assert_allclose(mesh.face_normals[-len(added) :, 2], 1, atol=0.02)
+    tracer = first_hits(closed)
+    for height, met in ((1.0, True), (-1.0, False)):
+        found = meet_along(
+            closed, tracer, np.array([[0.004, 0.003, height]]), np.array([[0.0, 0.0, np.sign(height)]]), 0.7
+        )
+        assert found.found[0] == met
+
+
+def test_nothing_seen_is_an_error():
+    shape = surface(ball((0, 0, 0), 0.5))
+    with pytest.raises(UserError, match="no training camera sees the surface"):
+        clean(shape, np.zeros(len(shape.faces), dtype=bool))
+
+
+# ------------------------------------------------------------------------------------------------ simplifying
+
+
+def test_points_come_down_on_the_surface_that_faces_their_way():
+    """Between two plates, above the lower one."""
+    plates = trimesh.util.concatenate([trimesh.creation.box((1, 1, 0.02)) for _ in range(2)])
+    plates.vertices[8:, 2] += 0.1
+    shape = surface(plates)
+    found = meet_along(
+        shape, first_hits(shape), np.array([[0.1, 0.2, 0.03]]), np.array([[0.0, 0.0, 1.0]]), 0.2
+    )
+    assert found.found.all()
+    np.testing.assert_allclose(found.position, [[0.1, 0.2, 0.01]], atol=1e-6)
+    np.testing.assert_allclose(found.distance, 0.02, atol=1e-6)
+    np.testing.assert_allclose(found.normal, [[0, 0, 1]], atol=1e-6)
+    short = meet_along(
+        shape, first_hits(shape), np.array([[0.1, 0.2, 0.03]]), np.array([[0.0, 0.0, 1.0]]), 0.015
+    )
+    assert not short.found.any()
+    np.testing.assert_allclose(short.position, [[0.1, 0.2, 0.03]], atol=1e-6)
+
+
+def test_an_error_decides_how_many_triangles():
+    fine = surface(ball((0, 0, 0), 0.5, 5))
+    sizes = []
+    for error in (0.0, 0.003, 0.02):
+        coarse = simplified(fine, 5000, error)
+        assert len(coarse.surface.faces) <= 5000
+        assert coarse.distance.near <= max(error, simplified(fine, 5000, 0.0).distance.near)
+        # The centre of a triangle with edges of length e lies e²/(6 r) below its corners: what all of them
+        # must keep.
+        sphere = np.linalg.norm(coarse.surface.mesh().triangles_center, axis=1)
+        assert np.abs(sphere - 0.5).mean() <= max(error, 0.001)
+        sizes.append(len(coarse.surface.faces))
+    assert sizes[0] > sizes[1] > sizes[2]
+
+
+def test_a_distance_is_that_of_the_surfaces():
+    one, other = surface(ball((0, 0, 0), 0.5, 5)), surface(ball((0, 0, 0), 0.51, 5))
+    assert distance_between(one, other).near == pytest.approx(0.01, abs=3e-4)
+    assert distance_between(one, one).near == pytest.approx(0, abs=1e-5)
+    assert distance_between(one, other).missed == 0
+    # Where half of the surface is not there, half is missed.
+    half = one.part(one.mesh().triangles_center[:, 2] > 0)
+    assert distance_between(one, half).missed == pytest.approx(0.5, abs=0.02)
+
+
+def test_few_triangles_stay_as_they_are():
+    box = surface(trimesh.creation.box((1, 1, 1)))
+    kept = simplified(box, 5000, 0.0)
+    assert len(kept.surface.faces) == 12
+    # Edges stay edges: each corner has the normal of its side.
+    np.testing.assert_allclose(
+        kept.surface.normals, np.repeat(box.mesh().face_normals[:, None], 3, axis=1), atol=1e-6
+    )
