@@ -10,8 +10,8 @@ from torch import Tensor
 
 from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.images import read_image, write_png
-from neilfpp_method.data.pixels import pixel_colors
+from neilfpp_method.data.images import write_png
+from neilfpp_method.data.view_pixels import read_colors
 from neilfpp_method.data.views import View, camera_rays
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage
@@ -42,7 +42,7 @@ def write_preview(model: NeilfModel, capture: Capture, stage: Stage, path: Path)
 
 
 def _photograph(view: View, hdr: bool) -> np.ndarray:
-    pixels = pixel_colors(view, read_image(view.image), hdr)
+    pixels = torch.from_numpy(read_colors(view, hdr))
     return (tone_map(pixels) if hdr else pixels).numpy()
 
 
