@@ -41,6 +41,8 @@ class Train:
     """Hold out every k-th view for testing; none: the capture's split.json, or every 8th."""
     response: Literal["auto", "linear", "srgb"] = "auto"
     """What the pixels are: linear radiance (HDR) or sRGB (LDR); auto: told from the files."""
+    scale: float | None = None
+    """Size of the images over that of their files, by area; 1: as they are. None: as large as the rays of the training can use."""
     device: Device = "auto"
     """Where to train; auto takes a GPU where there is one."""
     devices: int = 1
@@ -64,6 +66,7 @@ def run(options: Train) -> None:
             test_every=options.test_every,
             response=options.response,
             format=options.format,
+            scale=options.scale,
             device=options.device,
             devices=options.devices,
             console=terminal(),
@@ -105,6 +108,7 @@ COMMAND = Command(
         "neilfpp train --data captures/teapot --preset paper-ngp --out runs/teapot",
         "neilfpp train --data captures/teapot --host mesh --mesh scans/teapot.ply",
         "neilfpp train --data captures/teapot --light studio.exr",
+        "neilfpp train --data captures/teapot --scale 1   (images at their full size)",
         "neilfpp train --out runs/teapot --resume",
         "neilfpp train --data captures/teapot --config.train.joint-steps 0   (the separate pipeline)",
         "neilfpp train --data captures/teapot --config.inter-reflection.mode off",

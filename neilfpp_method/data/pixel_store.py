@@ -288,7 +288,7 @@ def border(store: PixelStore) -> tuple[Int[np.ndarray, " B"], Int[np.ndarray, " 
 # ------------------------------------------------------------------------------------------------------------ the files
 
 
-def _plane(path: Path | None, shape: tuple[int, ...], dtype: np.dtype) -> Shaped[np.ndarray, "..."]:
+def _plane(path: Path | None, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
     """An array of zeros, in memory or in a file whose room is taken at once: a full disk would kill who writes to a map."""
     if path is None:
         return np.zeros(shape, dtype)

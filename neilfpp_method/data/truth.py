@@ -1,8 +1,8 @@
 """The ground truth of a capture, where it is at hand: depth, normals, masks, materials, mesh and light field.
 
-Everything is optional and read when asked for. Where a view has fewer pixels than its files, a pixel shows a surface if all of
-its area does; its depth is that at its centre, all else the mean over its area. What belongs to a view is flat, row by row, as in `PixelDataset.view`;
-all positions, lengths and directions are in the scene frame.
+Everything is optional and read when asked for. What belongs to a view is flat, row by row, as in `PixelDataset.view`. Where a
+view has fewer pixels than its files, a pixel shows a surface if all of its area does; its depth is that at its centre, all else
+the mean over its area. All positions, lengths and directions are in the scene frame.
 
     <inputs>/depth_maps/<stem>.exr                     depth along the camera's axis, world units, 0: background
     <inputs>/normal_maps/<stem>.exr                    unit normals, world axes, 0: background
