@@ -42,7 +42,7 @@ class Train:
     response: Literal["auto", "linear", "srgb"] = "auto"
     """What the pixels are: linear radiance (HDR) or sRGB (LDR); auto: told from the files."""
     scale: float | None = None
-    """Size of the images over that of their files, by area; 1: as they are. None: as large as the rays of the training can use."""
+    """Size of the images over that of their files, 1: as they are; none: as large as the training's rays can use."""
     device: Device = "auto"
     """Where to train; auto takes a GPU where there is one."""
     devices: int = 1

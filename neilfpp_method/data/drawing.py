@@ -1,9 +1,9 @@
 """Which pixels a step learns from: most of them on the object or near its outline, where masks tell the object.
 
-What a pixel far off the object shows is known after a few steps, so a step that draws uniformly from pictures of one object
-under a sky spends most of its rays on nothing. Where the object is known, `NEAR_SHARE` of a step's pixels are drawn from those on
-it or near its outline, and the rest from all others; within each of the two every pixel is as likely as any other. Where nothing
-is known of the object, all valid pixels are alike.
+What a pixel far off the object shows is known after a few steps, so a step that draws uniformly from pictures of
+one object under a sky spends most of its rays on nothing. Where the object is known, `NEAR_SHARE` of a step's pixels are
+drawn from those on it or near its outline, and the rest from all others; within each of the two every pixel is as likely
+as any other. Where nothing is known of the object, all valid pixels are alike.
 
 The loss stays a plain mean over the pixels that are drawn: it is weighted towards the object on purpose, and no importance
 weights take that back.

@@ -18,8 +18,11 @@ __all__ = ["ENCODINGS", "Encoded", "Encoding", "encodings_for"]
 
 TOP = 32_768.0
 """What the brightest value of a view comes to in half precision, at most; half ends at 65 504."""
-LEAST_MEAN = 2.0**-4
-"""Mean value of a view that half precision is good for: a thousandth of it then still has all 11 bits, which end at 2⁻¹⁴."""
+LEAST_MEDIAN = 2.0**-4
+"""Median of a view's values that half precision is good for: a thousandth of it then still has all 11 bits, which end at
+2⁻¹⁴."""
+LOOKED_AT = 2**20
+"""Values of which the median is taken."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,9 @@ def _levels(bits: int) -> Encoding:
 def _half(color: Float32[np.ndarray, "H W 3"]) -> Encoded | None:
     brightest = float(color.max(initial=0.0))
     scale = 2.0 ** math.floor(math.log2(TOP / brightest)) if brightest > 0 else 1.0
-    if brightest > 0 and (not np.isfinite(np.float32(scale)) or float(color.mean(dtype=np.float64)) * scale < LEAST_MEAN):
+    some = color.reshape(-1)[:: -(-color.size // LOOKED_AT)]
+    lit = some[some > 0]
+    if len(lit) and (not np.isfinite(np.float32(scale)) or float(np.median(lit)) * scale < LEAST_MEDIAN):
         return None
     return Encoded((color * np.float32(scale)).astype(np.float16), scale)
 

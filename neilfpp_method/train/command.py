@@ -29,9 +29,9 @@ from neilfpp_method.train.build import build_model, scene_facts, show_known_ligh
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.light_record import in_words
 from neilfpp_method.train.loop import Training, seed_step, train
+from neilfpp_method.train.memory import check_training_memory
 from neilfpp_method.train.preview import write_preview
 from neilfpp_method.train.progress import Reporter, reporting
-from neilfpp_method.train.memory import check_training_memory
 from neilfpp_method.train.run import (
     PIXELS,
     CaptureSource,
