@@ -16,8 +16,6 @@ from lightning_fabric.strategies import DDPStrategy
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from neilfpp_method.config import NeilfConfig
-from neilfpp_method.config_check import check_config
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.environment_map import check_environment
 from neilfpp_method.data.pixels import PixelDataset
@@ -25,6 +23,8 @@ from neilfpp_method.data.scaling import at_scale, scale_for_rays
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, stage_steps
+from neilfpp_method.settings.check import check_config
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.light_record import in_words
@@ -116,7 +116,8 @@ def run_training(
     continue_with = _continue_with(command, out, device, devices)
     with reporting(out, console, fabric.is_global_zero) as reporter, _stop_request() as stopped:
         preview = _preview(out, capture, fabric, reporter)
-        training = Training(out, config, model, pixels, fabric, reporter, stopped, preview, continue_with)
+        solver = model.light_solver()
+        training = Training(out, config, model, pixels, fabric, reporter, stopped, preview, continue_with, solver)
         train(training)
     if fabric.is_global_zero and training.fits:
         console.print(f"light: {in_words(config.light, training.fits)}", soft_wrap=True)

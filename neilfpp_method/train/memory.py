@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.memory import check_memory
 from neilfpp_method.data.scaling import file_size
+from neilfpp_method.settings.types import NeilfConfig
 
 __all__ = ["check_training_memory", "training_bytes"]
 
