@@ -49,9 +49,7 @@ def has_material(run: Run) -> bool:
     return run.step > run.config.train.sdf_steps
 
 
-def render_view(
-    run: Run, view_index: int, on_progress: Callable[[float], None] = lambda share: None
-) -> RenderedView:
+def render_view(run: Run, view_index: int, on_progress: Callable[[float], None] = lambda share: None) -> RenderedView:
     """Render view `view_index` of `run.capture.views` at the size of its camera; the same picture every time.
 
     `config.train.eval_chunk` rays are in flight at once, from all over the view, so that each such part takes about as long

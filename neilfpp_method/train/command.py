@@ -96,7 +96,7 @@ def run_training(
         rays = config.train.rays * devices * sum(stage_steps(config.train).values())
         source = replace(source, scale=scale_for_rays(capture.train_views, rays) if scale is None else scale)
         capture = at_scale(capture, source.scale)
-    check_training_memory(capture, config)
+    check_training_memory(capture)
     fabric = _launch(place, devices)
     with _nothing_left_on_failure(out):
         pixels = _load_pixels(capture, out / PIXELS, fabric, console)

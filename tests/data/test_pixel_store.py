@@ -187,9 +187,7 @@ def negative_scale(folder: Path) -> None:
     (folder / "store.json").write_text(json.dumps(known | {"scales": [-1.0] * 6}))
 
 
-@pytest.mark.parametrize(
-    "damage", [cut_off, of_other_shape, pickled, without_description, foreign_description, negative_scale]
-)
+@pytest.mark.parametrize("damage", [cut_off, of_other_shape, pickled, without_description, foreign_description, negative_scale])
 def test_a_damaged_or_foreign_store_is_made_anew(tmp_path: Path, damage) -> None:
     capture = load_capture(make_capture(tmp_path / "c"))
     opened(capture, tmp_path / "pixels")
