@@ -27,7 +27,7 @@ BORDER_TOLERANCE = 0.02
 BORDER_SHARE = 0.5
 DARK = 1e-3
 MIDDLE_GREY = 0.18
-MOST_COUNTED = 2**22
+MOST_COUNTED = 2**20
 """Pixels of the object, evenly over all views, that statistics are taken of; all where there are no more."""
 
 

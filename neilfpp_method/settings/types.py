@@ -216,7 +216,7 @@ class VolumeConfig:
     sampler: Literal["error_bounded", "uniform"] = "error_bounded"
     """Algorithm 1 of VolSDF, or stratified samples alone."""
     skip_empty: bool = False
-    """In training, rays skip what a coarse grid of the SDF shows to be empty. Pictures skip the same, on a grid of their own."""
+    """Rays skip what a coarse grid of the SDF shows to be empty; pictures, too, on a grid of their own."""
     initial_samples: int = 128
     """SDF queries per ray of the first round; also those added in each refinement."""
     narrowed_samples: int = 64
