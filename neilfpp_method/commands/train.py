@@ -43,6 +43,8 @@ class Train:
     """What the pixels are: linear radiance (HDR) or sRGB (LDR); auto: told from the files."""
     scale: float | None = None
     """Size of the images over that of their files, 1: as they are; none: as large as the training's rays can use."""
+    strict: bool = False
+    """End with exit status 1 where the result is of no use: no surface, fog, nothing shaded (docs/health.md)."""
     device: Device = "auto"
     """Where to train; auto takes a GPU where there is one."""
     devices: int = 1
@@ -69,6 +71,7 @@ def run(options: Train) -> None:
             scale=options.scale,
             device=options.device,
             devices=options.devices,
+            strict=options.strict,
             console=terminal(),
         )
 
