@@ -23,7 +23,6 @@ __all__ = [
     "HeldOut",
     "KnownView",
     "RenderedView",
-    "has_material",
     "known_test_views",
     "mask_source",
     "mean_observed_color",
@@ -44,11 +43,6 @@ class RenderedView:
     maps: Mapping[str, Float[np.ndarray, "H W C"]]
 
 
-def has_material(run: Run) -> bool:
-    """Whether a step has moved the material and the light; before that they are what they start as."""
-    return run.step > run.config.train.sdf_steps
-
-
 def render_view(run: Run, view_index: int, on_progress: Callable[[float], None] = lambda share: None) -> RenderedView:
     """Render view `view_index` of `run.capture.views` at the size of its camera; the same picture every time.
 
@@ -63,7 +57,7 @@ def render_view(run: Run, view_index: int, on_progress: Callable[[float], None] 
     whole: dict[str, Tensor] = {}
     for k in range(parts):
         rows = torch.arange(k, len(rays), parts)
-        maps = run.model.maps(rays[rows].to(device), has_material(run))
+        maps = run.model.maps(rays[rows].to(device), run.has_material)
         for name in (f.name for f in fields(Maps)):
             values = getattr(maps, name).float().cpu()
             whole.setdefault(name, values.new_empty(len(rays), values.shape[1]))[rows] = values
