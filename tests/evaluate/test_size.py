@@ -73,4 +73,4 @@ def test_the_first_part_tells_how_long_all_takes(monkeypatch, capsys) -> None:
 
 
 def test_durations_are_for_people() -> None:
-    assert [duration(s) for s in (42.4, 200, 9000)] == ["42 s", "3 min", "2.5 h"]
+    assert [duration(s) for s in (42.4, 200.0, 9000.0)] == ["42 s", "3 min", "2.5 h"]
