@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,7 +11,10 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-__all__ = ["Checkpoint", "Command", "Device", "progress_bar", "terminal"]
+__all__ = ["Checkpoint", "Command", "Device", "duration", "progress_bar", "terminal"]
+
+SOON = 10.0
+"""Seconds; what takes no longer needs no word."""
 
 Device = Annotated[str, tyro.conf.arg(metavar="cpu|cuda|cuda:N|auto")]
 Checkpoint = Literal["last", "sdf_init", "material_init", "joint"]
@@ -47,10 +51,30 @@ def terminal() -> Console:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
-    """A bar that takes the share of the work that is done."""
+    """A bar that takes the share of the work that is done; at the first share it says how long all of it will take."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     share = TextColumn("{task.percentage:3.0f} %")
+    began = time.monotonic()
     with Progress(TextColumn(title), BarColumn(), share, TimeRemainingColumn()) as progress:
         task = progress.add_task(title, total=1.0)
-        yield lambda done: progress.update(task, completed=done)
+
+        def advance(done: float) -> None:
+            if progress.tasks[0].completed == 0 < done:
+                takes = (time.monotonic() - began) / done
+                if takes > SOON:
+                    progress.console.print(f"{title} takes about {duration(takes)}")
+            progress.update(task, completed=done)
+
+        yield advance
+
+
+def duration(seconds: float) -> str:
+    """A time for people: two digits are enough.
+
+    >>> duration(42.4), duration(200), duration(9000)
+    ('42 s', '3 min', '2.5 h')
+    """
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -32,6 +32,11 @@ class Render:
     """Render again what is there already."""
     confidence: bool = False
     """Add maps of how far off base colour, roughness and metallic may be (base_color_std, …); takes about twice as long."""
+    scale: float | None = None
+    """Size of the views over that of their files; 1: every pixel. None: 131 thousand pixels a view, about 420×310, and no
+    more than the run was trained at."""
+    width: int | None = None
+    """Width of the views in pixels, in place of --scale."""
     device: Device = "auto"
     """Where to compute."""
 
@@ -39,13 +44,16 @@ class Render:
 def run(options: Render) -> None:
     from neilfpp_method.evaluate.render_views import render_run
     from neilfpp_method.evaluate.report import write_light_picture
+    from neilfpp_method.evaluate.size import at_size, size_in_words
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.device import pick_device
     from neilfpp_method.train.run import check_writable, load_run
 
-    run = load_run(options.run, pick_device(options.device), options.checkpoint)
+    run = at_size(load_run(options.run, pick_device(options.device), options.checkpoint), options.scale, options.width)
     out = options.out or options.run / "renders"
     check_writable(out)
+    if size := size_in_words(run):
+        terminal().print(size, soft_wrap=True)
     if "maps" in options.what:
         with computing_fast(), progress_bar("rendering") as advance:
             render_run(run, out, options.views, options.overwrite, options.confidence, advance)

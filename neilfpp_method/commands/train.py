@@ -49,6 +49,8 @@ class Train:
     """Hold out every k-th view for testing; none: the capture's split.json, or every 8th."""
     response: Literal["auto", "linear", "srgb"] = "auto"
     """What the pixels are: linear radiance (HDR) or sRGB (LDR); auto: told from the files."""
+    scale: float | None = None
+    """Size of the images over that of their files, 1: as they are; none: as large as the training's rays can use."""
     strict: bool = False
     """End with exit status 1 where the result is of no use: no surface, fog, nothing shaded (docs/health.md)."""
     device: Device = "auto"
@@ -81,6 +83,7 @@ def run(options: TrainWithSettings) -> None:
             test_every=options.test_every,
             response=options.response,
             format=options.format,
+            scale=options.scale,
             device=options.device,
             devices=options.devices,
             strict=options.strict,
@@ -157,6 +160,7 @@ COMMAND = Command(
         "neilfpp train --data captures/teapot --config settings.yaml",
         "neilfpp train --data captures/teapot --host mesh --mesh scans/teapot.ply",
         "neilfpp train --data captures/teapot --light studio.exr",
+        "neilfpp train --data captures/teapot --scale 1   (images at their full size)",
         "neilfpp train --out runs/teapot --resume",
         "neilfpp train --data captures/teapot --config.train.joint-steps 0   (the separate pipeline)",
         "neilfpp train --data captures/teapot --config.inter-reflection.mode off",

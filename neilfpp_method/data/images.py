@@ -187,7 +187,7 @@ def read_image(path: Path) -> ImageFile:
             raise ValueError(f"{width}×{height} pixels where the header says {header.width}×{header.height}")
         if samples.dtype.name not in FULL_SCALE:
             raise ValueError(f"samples of type {samples.dtype.name}")
-    values = samples.astype(np.float32) / np.float32(FULL_SCALE[samples.dtype.name])
+    values = np.divide(samples, np.float32(FULL_SCALE[samples.dtype.name]), dtype=np.float32, casting="same_kind")
     colors = channels if channels in (1, 3) else channels - 1
     alpha = np.ascontiguousarray(values[..., colors]) if channels > colors else None
     opaque = alpha is None or bool((alpha == 1).all())

@@ -1,7 +1,8 @@
 """The ground truth of a capture, where it is at hand: depth, normals, masks, materials, mesh and light field.
 
-Everything is optional and read when asked for. What belongs to a view is flat, row by row, as in `PixelDataset.view`;
-all positions, lengths and directions are in the scene frame.
+Everything is optional and read when asked for. What belongs to a view is flat, row by row, as in `PixelDataset.view`. Where a
+view has fewer pixels than its files, a pixel shows a surface if all of its area does; its depth is that at its centre, all else
+the mean over its area. All positions, lengths and directions are in the scene frame.
 
     <inputs>/depth_maps/<stem>.exr                     depth along the camera's axis, world units, 0: background
     <inputs>/normal_maps/<stem>.exr                    unit normals, world axes, 0: background
@@ -23,6 +24,7 @@ from torch import Tensor
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.images import read_image
 from neilfpp_method.data.mesh import Mesh, read_mesh
+from neilfpp_method.data.scaling import area_average, area_share, file_size, nearest
 from neilfpp_method.data.views import View, inside
 from neilfpp_method.errors import UserError
 from neilfpp_method.structures import Material
@@ -58,7 +60,7 @@ class Truth:
 
     def depth(self, view: View) -> Float[Tensor, " P"] | None:
         """Depth along the camera's axis in scene units, 0 on the background."""
-        pixels = self._pixels(self.capture.inputs / "depth_maps" / f"{view.name}.exr", view, channels=1)
+        pixels = self._pixels(self.capture.inputs / "depth_maps" / f"{view.name}.exr", view, channels=1, mean=False)
         return None if pixels is None else pixels[:, 0] / self.capture.normalisation.scale
 
     def mask(self, view: View) -> Bool[Tensor, " P"] | None:
@@ -116,16 +118,20 @@ class Truth:
     def _file(self, path: Path) -> Path | None:
         return path if inside(self.capture.root, path).is_file() else None
 
-    def _pixels(self, path: Path, view: View, channels: int) -> Float[Tensor, "P C"] | None:
+    def _pixels(self, path: Path, view: View, channels: int, mean: bool = True) -> Float[Tensor, "P C"] | None:
         """The pixels of a file, flat."""
         if self._file(path) is None:
             return None
         pixels = read_image(path).pixels
         if channels == 1 and (pixels == pixels[..., :1]).all():
             pixels = pixels[..., :1]  # many programs write grey as three channels that are alike
-        wanted = (view.camera.height, view.camera.width, channels)
+        wanted = (*file_size(view)[::-1], channels)
         if pixels.shape != wanted:
             raise UserError(f"{path}: the shape {pixels.shape}, where the view needs {wanted}", "render it again")
         if not np.isfinite(pixels).all():
             raise UserError(f"{path}: a pixel is not finite", "render it again")
+        size = (view.camera.width, view.camera.height)
+        if size != file_size(view):
+            covered = area_share((pixels != 0).any(-1), *size) > 1 - 1e-6 if not mean else np.ones(size[::-1], bool)
+            pixels = np.where(covered[..., None], (area_average if mean else nearest)(pixels, *size), np.float32(0.0))
         return torch.from_numpy(pixels).reshape(-1, channels)

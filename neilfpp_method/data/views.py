@@ -38,6 +38,10 @@ __all__ = [
 
 MOST_BLIND = 0.6
 """A fisheye's circle fills 44 % of a picture of 16:9. A lens that shows less was calibrated for other images."""
+MOST_LOOKED_UP = 2**26
+"""Pixels of different lenses whose rays are kept: half a gigabyte."""
+PLANE_PART = 2**20
+"""Pixels whose rays are computed at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +103,9 @@ class View:
     `mask` is white on the object. `valid` is white where a pixel can be used and black where it is saturated or
     otherwise without meaning. Linear radiance = pixel / (`exposure` · `white_balance`), so that all images of a
     capture share one scale.
+
+    `file_size` is the width and height of the view's files where its camera is of another size (`scaling`); pixels are
+    brought to the size of the camera where they are read.
     """
 
     name: str
@@ -109,6 +116,7 @@ class View:
     valid: Path | None = None
     exposure: float = 1.0
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    file_size: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -210,8 +218,10 @@ class CameraRays:
     """Rays through the centres of pixels of many cameras, in the frame of their poses.
 
     The rays of a pinhole are computed when asked for; those of a lens are looked up, as its equations have no closed
-    inverse: 8 bytes a pixel, shared by cameras that differ in their pose alone. A pixel at which a lens shows nothing, as
-    in the corners of a fisheye, has a ray that leads backwards, away from what the camera sees.
+    inverse: 8 bytes a pixel, shared by cameras that differ in their pose alone. Where lenses have more than `MOST_LOOKED_UP`
+    pixels together, as when every photograph has been calibrated by itself, they are computed when asked for, too, which
+    takes longer. A pixel at which a lens shows nothing, as in the corners of a fisheye, has a ray that leads backwards, away
+    from what the camera sees.
 
     Raises:
         UserError: a lens shows nothing at most of its pixels.
@@ -223,23 +233,28 @@ class CameraRays:
         self._intrinsics = torch.tensor(np.stack([c.intrinsics for c in cameras]), dtype=dtype, device=device)
         self._c2w = torch.tensor(np.stack([c.c2w for c in cameras]), dtype=dtype, device=device)
         self._width = torch.tensor([camera.width for camera in cameras], device=device)
+        self._cameras = tuple(cameras)
         kinds = {_shape(camera): camera for camera in cameras if camera.lens is not None}
-        if kinds:
-            sizes = [camera.width * camera.height for camera in kinds.values()]
+        sizes = [camera.width * camera.height for camera in kinds.values()]
+        self._bent = torch.tensor([camera.lens is not None for camera in cameras], device=device)
+        self._lens_plane: Float[Tensor, "P 2"] | None = None
+        if kinds and sum(sizes) <= MOST_LOOKED_UP:
             starts = dict(zip(kinds, itertools.accumulate(sizes, initial=0), strict=False))
-            self._lens_start = torch.tensor([starts.get(_shape(camera), -1) for camera in cameras], device=device)
-            planes = np.concatenate([_straight_plane(camera) for camera in kinds.values()])
-            self._lens_plane = torch.tensor(planes, dtype=dtype, device=device)
-        else:
-            self._lens_plane = None
-        self._sizes = [camera.width * camera.height for camera in cameras]
+            self._lens_start = torch.tensor([starts.get(_shape(camera), 0) for camera in cameras], device=device)
+            planes = np.concatenate([_whole_plane(camera, dtype) for camera in kinds.values()])
+            self._lens_plane = torch.from_numpy(planes).to(device)
 
     def shown(self, i: int) -> Bool[Tensor, " P"]:
         """Which pixels of camera `i`, row by row, have a ray of their own; all but those where its lens shows nothing."""
-        if self._lens_plane is None or self._lens_start[i] < 0:
-            return torch.ones(self._sizes[i], dtype=torch.bool, device=self._width.device)
-        start = int(self._lens_start[i])
-        return ~self._lens_plane[start : start + self._sizes[i]].isnan().any(dim=-1)
+        camera = self._cameras[i]
+        size = camera.width * camera.height
+        if camera.lens is None:
+            return torch.ones(size, dtype=torch.bool, device=self._width.device)
+        if self._lens_plane is not None:
+            start = int(self._lens_start[i])
+            return ~self._lens_plane[start : start + size].isnan().any(dim=-1)
+        plane = torch.from_numpy(_whole_plane(camera, self._intrinsics.dtype))
+        return ~plane.isnan().any(dim=-1).to(self._width.device)
 
     def __call__(self, camera: Int[Tensor, " N"], pixel: Int[Tensor, " N"]) -> RayBatch:
         """Rays of cameras, by number, through pixels, counted row by row."""
@@ -247,14 +262,28 @@ class CameraRays:
         corner = torch.stack([pixel % width, pixel // width], dim=-1)
         plane = (corner.to(intrinsics.dtype) + 0.5 - intrinsics[:, 2:]) / intrinsics[:, :2]
         if self._lens_plane is not None:
-            start = self._lens_start[camera]
-            looked_up = self._lens_plane[torch.where(start < 0, 0, start + pixel)]
-            plane = torch.where((start < 0)[:, None], plane, looked_up)
+            bent = self._bent[camera]
+            looked_up = self._lens_plane[torch.where(bent, self._lens_start[camera] + pixel, 0)]
+            plane = torch.where(bent[:, None], looked_up, plane)
+        elif self._bent.any():
+            plane = self._computed(plane, camera, pixel)
         local = torch.nn.functional.pad(plane, (0, 1), value=1.0)
-        if self._lens_plane is not None:
+        if self._bent.any():
             local = torch.where(local.isnan().any(dim=-1, keepdim=True), local.new_tensor([0.0, 0.0, -1.0]), local)
         directions = torch.einsum("nij,nj->ni", c2w[:, :, :3], torch.nn.functional.normalize(local, dim=-1))
         return RayBatch(c2w[:, :, 3], directions)
+
+    def _computed(
+        self, plane: Float[Tensor, "N 2"], camera: Int[Tensor, " N"], pixel: Int[Tensor, " N"]
+    ) -> Float[Tensor, "N 2"]:
+        """The plane with what the lenses say, asked for these pixels alone."""
+        plane = plane.clone()
+        for i in camera.unique().tolist():
+            if self._cameras[i].lens is not None:
+                rows = torch.nonzero(camera == i)[:, 0]
+                straight = _straight_plane(self._cameras[i], pixel[rows].cpu().numpy())
+                plane[rows] = torch.from_numpy(straight).to(plane)
+        return plane
 
 
 def _shape(camera: Camera) -> tuple[Lens | None, float, float, float, float, int, int]:
@@ -262,15 +291,21 @@ def _shape(camera: Camera) -> tuple[Lens | None, float, float, float, float, int
     return (camera.lens, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
 
 
-def _straight_plane(camera: Camera) -> Float64[np.ndarray, "P 2"]:
-    """Where the rays through the pixels of a camera with a lens meet the plane at unit distance, row by row; NaN: no ray."""
-    rows, columns = np.mgrid[: camera.height, : camera.width].reshape(2, -1) + 0.5
-    bent = (np.stack([columns, rows], axis=1) - camera.intrinsics[2:]) / camera.intrinsics[:2]
-    plane = camera.lens.straighten(bent)
+def _whole_plane(camera: Camera, dtype: torch.dtype) -> Float[np.ndarray, "P 2"]:
+    """`_straight_plane` of all pixels of a camera, in the precision of rays; in parts, which take several times as much."""
+    count = camera.width * camera.height
+    parts = np.split(np.arange(count), range(PLANE_PART, count, PLANE_PART))
+    plane = np.concatenate([torch.from_numpy(_straight_plane(camera, part)).to(dtype).numpy() for part in parts])
     blind = int(np.isnan(plane).any(axis=1).sum())
-    if blind > MOST_BLIND * len(plane):
+    if blind > MOST_BLIND * count:
         raise UserError(
-            f"a camera of the lens {camera.lens.model} shows nothing at {blind} of its {len(plane)} pixels",
+            f"a camera of the lens {camera.lens.model} shows nothing at {blind} of its {count} pixels",
             "crop or undistort the images, or calibrate the camera again",
         )
     return plane
+
+
+def _straight_plane(camera: Camera, pixel: Int[np.ndarray, " N"]) -> Float64[np.ndarray, "N 2"]:
+    """Where the rays through pixels of a camera with a lens meet the plane at unit distance; NaN: no ray."""
+    centres = np.stack([pixel % camera.width, pixel // camera.width], axis=1) + 0.5
+    return camera.lens.straighten((centres - camera.intrinsics[2:]) / camera.intrinsics[:2])

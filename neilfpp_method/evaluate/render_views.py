@@ -19,6 +19,8 @@ from neilfpp_method.train.run import Run
 __all__ = ["render_run"]
 
 LAYERS = {"normal": "XYZ"}
+PART = 0.95
+"""Of the work on a view that rendering is."""
 
 
 def render_run(
@@ -41,7 +43,7 @@ def render_run(
         views: "test", "train", "all", or names of views.
         overwrite: render again what is there.
         confidence: also write how far off base colour, roughness and metallic may be (`confidence.with_deviation`).
-        on_progress: told the share that is done after each view.
+        on_progress: told the share that is done, as it goes.
 
     Returns:
         The EXR files, in the order of the capture.
@@ -60,7 +62,8 @@ def render_run(
         written.append(out / f"{view.name}.exr")
         complete = written[-1].exists() and (not confidence or _picture(out, "base_color_std", view.name).exists())
         if overwrite or not complete:
-            rendered = render_view(run, i)
+            done = len(written) - 1
+            rendered = render_view(run, i, lambda share, done=done: on_progress((done + PART * share) / len(names)))
             _write(rendered if evidence is None else with_deviation(run, evidence, rendered), out)
         on_progress(len(written) / len(names))
     return written

@@ -43,26 +43,30 @@ class RenderedView:
     maps: Mapping[str, Float[np.ndarray, "H W C"]]
 
 
-def render_view(run: Run, view_index: int) -> RenderedView:
-    """Render view `view_index` of `run.capture.views` in full size; the same picture every time.
+def render_view(run: Run, view_index: int, on_progress: Callable[[float], None] = lambda share: None) -> RenderedView:
+    """Render view `view_index` of `run.capture.views` at the size of its camera; the same picture every time.
 
-    `config.train.eval_chunk` rays are in flight at once. A run without a material has the host's colour for `rgb`, and
-    zeros for what a material would show.
+    `config.train.eval_chunk` rays are in flight at once, from all over the view, so that each such part takes about as long
+    as any other; the share that is done is reported after each. A run without a material has the host's colour for `rgb`,
+    and zeros for what a material would show.
     """
     view = run.capture.views[view_index]
     device = next(run.model.parameters()).device
     rays = camera_rays(run.capture.normalisation.camera(view.camera))
-    chunk = run.config.train.eval_chunk
-    parts: dict[str, list[Tensor]] = {f.name: [] for f in fields(Maps)}
-    for start in range(0, len(rays), chunk):
-        maps = run.model.maps(rays[start : start + chunk].to(device), run.has_material)
-        for name, rows in parts.items():
-            rows.append(getattr(maps, name).float().cpu())
-    return RenderedView(view.name, {name: _image(torch.cat(rows), view) for name, rows in parts.items()})
+    parts = -(-len(rays) // run.config.train.eval_chunk)
+    whole: dict[str, Tensor] = {}
+    for k in range(parts):
+        rows = torch.arange(k, len(rays), parts)
+        maps = run.model.maps(rays[rows].to(device), run.has_material)
+        for name in (f.name for f in fields(Maps)):
+            values = getattr(maps, name).float().cpu()
+            whole.setdefault(name, values.new_empty(len(rays), values.shape[1]))[rows] = values
+        on_progress((k + 1) / parts)
+    return RenderedView(view.name, {name: _image(values, view) for name, values in whole.items()})
 
 
 def render_test_views(run: Run, on_progress: Callable[[float], None] = lambda share: None) -> tuple[RenderedView, ...]:
-    """Render every view that is held out, in order; reports the share that is done after each.
+    """Render every view that is held out, in order; reports the share that is done as it goes.
 
     Raises:
         UserError: no view is held out.
@@ -72,8 +76,7 @@ def render_test_views(run: Run, on_progress: Callable[[float], None] = lambda sh
         raise UserError(f"{run.capture.root}: no view is held out for testing", "train with --test-every 8")
     rendered = []
     for i in held_out:
-        rendered.append(render_view(run, i))
-        on_progress(len(rendered) / len(held_out))
+        rendered.append(render_view(run, i, lambda share: on_progress((len(rendered) + share) / len(held_out))))
     return tuple(rendered)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -87,12 +87,20 @@ class VolSdfHost(nn.Module):
         # Kept in checkpoints, with its age: a resumed run must trace the very same grid.
         self.register_buffer("distance_grid", torch.zeros(resolution, resolution, resolution))
         self.grid_age: int | None = None
+        # Of pictures, not of training, so no part of a checkpoint: the versions of G's parameters, and their grid.
+        self._pictured: tuple[list[tuple[int, int]], EmptySpace] | None = None
 
     # -------------------------------------------------------------------------------------------------- the host contract
 
     def render(self, rays: RayBatch) -> SurfaceHits:
-        """Colour, position and normal of each ray, blended with the rendering weights (METHOD §3)."""
-        return self._march(rays).hits
+        """Colour, position and normal of each ray, blended with the rendering weights (METHOD §3).
+
+        In evaluation without gradients, with `volume.skip_empty`, only the parts of rays are looked at that may show
+        something, on a grid of the field as it is.
+        """
+        if self.training or torch.is_grad_enabled() or self.empty_space is None:
+            return self._march(rays).hits
+        return self._still(rays)
 
     def render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
         """As `render`, with those of eikonal, hessian, surface, point_cloud and mask that `names` holds."""
@@ -192,11 +200,37 @@ class VolSdfHost(nn.Module):
 
     # --------------------------------------------------------------------------------------------------------- rendering
 
-    def _march(self, rays: RayBatch) -> March:
+    def _still(self, rays: RayBatch) -> SurfaceHits:
+        """Rays through a field that stands still: those that pass everything by cost a few look-ups."""
+        versions = [(id(p), p._version) for p in self.sdf_field.parameters()]
+        if self._pictured is None or self._pictured[0] != versions:
+            self._pictured = versions, EmptySpace(self.config.volume.radius).to(rays.origins)
         interval = sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
-        volume = self.config.volume
+        span = self._pictured[1].may_show(self.sdf, rays, interval, self.surface_width())
+        nothing = torch.zeros_like(interval.far)
+        missed = SurfaceHits(
+            color=self._beyond(rays, torch.ones_like(nothing)),
+            position=rays.origins + interval.far[:, None] * rays.directions,
+            normal=torch.zeros_like(rays.origins),
+            opacity=nothing,
+            concentration=nothing,
+        )
+        rows = torch.nonzero(span.some)[:, 0]
+        if not len(rows):
+            return missed
+        part = Interval(span.interval.near[rows], span.interval.far[rows])
+        met = self._march(rays[rows], part).hits
+        return replace(
+            missed, **{f.name: getattr(missed, f.name).index_put((rows,), getattr(met, f.name)) for f in fields(met)}
+        )
+
+    def _march(self, rays: RayBatch, part: Interval | None = None) -> March:
+        """Samples of rays; `part`: the part of each that is looked at, where that is known."""
+        interval = part or sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
+        volume, narrowed = self.config.volume, part is not None
         if self.empty_space is not None and self.training:
-            interval = self.empty_space.narrow(self.sdf, rays, interval, self.surface_width())
+            interval, narrowed = self.empty_space.narrow(self.sdf, rays, interval, self.surface_width()), True
+        if narrowed:
             volume = replace(volume, initial_samples=max(volume.initial_samples // 2, 1))
         distances = self._sample(rays, interval, volume)
         points = rays.origins[:, None] + distances[..., None] * rays.directions[:, None]

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float32
 
 from neilfpp_method.data.images import ImageFile, read_image
-from neilfpp_method.data.pixels import pixel_colors
+from neilfpp_method.data.view_pixels import pixel_colors
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.color import linear_to_srgb, luminance, srgb_to_linear

@@ -15,7 +15,9 @@ from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
 from nerfstudio.model_components.ray_generators import RayGenerator
 from torch import Tensor
 
-from neilfpp_method.data.drawing import ValidPixels
+from neilfpp_method.data.drawing import BLOCK, PixelDraws
+from neilfpp_method.data.drawing import NEAR as NEAR_BIT
+from neilfpp_method.data.drawing import VALID as VALID_BIT
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.views import CameraRays
 from neilfpp_method.errors import UserError
@@ -31,6 +33,8 @@ PIXELS = "neilfpp_pixels"
 FACTS = {"object_mask": "mask", "mask_known": "mask_known", "image_gradient": "image_gradient"}
 VALID = "valid"
 """Key of a batch of pixels under which they say whether they count."""
+NEAR = "near_object"
+"""Key of a batch of pixels under which they say whether they are on the object or near it."""
 
 
 class CaptureDataset(InputDataset):
@@ -40,7 +44,7 @@ class CaptureDataset(InputDataset):
         UserError: the views differ in size, or are to be scaled.
     """
 
-    exclude_batch_keys_from_device: ClassVar = [*InputDataset.exclude_batch_keys_from_device, *FACTS, VALID]
+    exclude_batch_keys_from_device: ClassVar = [*InputDataset.exclude_batch_keys_from_device, *FACTS, VALID, NEAR]
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
         super().__init__(dataparser_outputs, scale_factor)
@@ -62,7 +66,7 @@ class CaptureDataset(InputDataset):
         i = data["image_idx"]
         pixels = self.pixels.view(i)
         facts = {key: self._image(i, getattr(pixels, name)) for key, name in FACTS.items()}
-        return facts | {VALID: self._image(i, self.pixels.valid(i))}
+        return facts | {VALID: self._image(i, self.pixels.valid(i)), NEAR: self._image(i, self.pixels.near(i))}
 
     def _image(self, i: int, values: Tensor) -> Shaped[Tensor, "H W C"]:
         camera = self.pixels.views[i].camera
@@ -77,13 +81,13 @@ def pixel_batch(origins: Tensor, directions: Tensor, batch: dict[str, Any]) -> P
 
 
 class CapturePixelSampler(PixelSampler):
-    """Draws what `PixelDataset.sample` would: one number a ray, that counts valid pixels view after view, row by row.
+    """Draws what `PixelDataset.sample` would (`data.drawing`), by the same random numbers.
 
     A step then learns from the same pixels as the same step of the standalone loop, with masks or without.
     """
 
     _valid: Tensor | None = None
-    _pixels: ValidPixels
+    _draws: PixelDraws
 
     def collate_image_dataset_batch(
         self, batch: dict[str, Any], num_rays_per_batch: int, keep_full_image: bool = False
@@ -94,11 +98,13 @@ class CapturePixelSampler(PixelSampler):
         # Nerfstudio has shuffled the images when it loaded them.
         order = batch["image_idx"].cpu().argsort()
         if self._valid is not batch[VALID]:
-            self._valid, self._pixels = batch[VALID], ValidPixels(batch[VALID].cpu()[order].flatten())
-        number = self._pixels.draw(num_rays_per_batch)
+            bits = VALID_BIT * batch[VALID].cpu()[order] + NEAR_BIT * batch[NEAR].cpu()[order]
+            padded = torch.nn.functional.pad(bits.flatten(), (0, -bits.numel() % BLOCK))
+            self._valid, self._draws = batch[VALID], PixelDraws(padded.to(torch.uint8).numpy(), bits.numel())
+        number = self._draws.draw(num_rays_per_batch)
         row, column = number // width % height, number % width
         place = order[number // (height * width)]
-        drawn = {key: values[place, row, column] for key, values in batch.items() if key not in ("image_idx", VALID)}
+        drawn = {key: values[place, row, column] for key, values in batch.items() if key not in ("image_idx", VALID, NEAR)}
         return drawn | {"indices": torch.stack([batch["image_idx"].cpu()[place], row, column], dim=-1)}
 
 

@@ -193,7 +193,7 @@ class VolumeConfig:
     beta_init: float = 0.1
     """Scale of the Laplace density at the start."""
     skip_empty: bool = False
-    """In training, rays skip what a coarse grid of the SDF shows to be empty. Evaluation takes whole rays."""
+    """Rays skip what a coarse grid of the SDF shows to be empty; pictures, too, on a grid of their own."""
     initial_samples: int = 128
     """SDF queries per ray of the first round; also those added in each refinement. Half as many for rays that skip empty space:
     what is left of them is short."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -17,6 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.environment_map import check_environment
 from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.scaling import at_scale, scale_for_rays
 from neilfpp_method.errors import Unsound, UserError
 from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.health.watch import LOOKED_AT, Watch
@@ -29,9 +32,11 @@ from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.health_record import in_words as health_in_words
 from neilfpp_method.train.light_record import in_words
 from neilfpp_method.train.loop import Training, seed_step, train
+from neilfpp_method.train.memory import check_training_memory
 from neilfpp_method.train.preview import write_preview
 from neilfpp_method.train.progress import Reporter, reporting
 from neilfpp_method.train.run import (
+    PIXELS,
     CaptureSource,
     Description,
     check_free,
@@ -55,6 +60,7 @@ def run_training(
     devices: int,
     console: Console,
     format: str | None = None,
+    scale: float | None = None,
     strict: bool = False,
     command: str = "neilfpp train",
 ) -> Path:
@@ -63,6 +69,7 @@ def run_training(
     Args:
         config: the settings; none, with `resume`: those of the run.
         format: the capture's format; none: told from what is in the folder.
+        scale: size of the images over that of their files; none: as large as the rays of the training can use.
         strict: end with an error where the result is of no use.
         command: what a person types to get here, for the line that says how a stopped run continues.
 
@@ -78,7 +85,7 @@ def run_training(
         if out is None:
             raise UserError("--resume needs the run's folder", "give it with --out RUN")
         described = read_description(out)
-        _refuse_changes(out, described, data, config, test_every, response, format)
+        _refuse_changes(out, described, data, config, test_every, response, format, scale)
         config, source = described.config, described.source
         if _is_finished(out, config):
             console.print(f"run folder {out}: finished already, nothing to continue", soft_wrap=True)
@@ -91,18 +98,26 @@ def run_training(
         out = out or Path("runs") / f"{data.resolve().name}-{config.preset}"
         check_free(out)
     capture = source.load_again(out) if resume else source.load()
+    if not resume:
+        rays = config.train.rays * devices * sum(stage_steps(config.train).values())
+        source = replace(source, scale=scale_for_rays(capture.train_views, rays) if scale is None else scale)
+        capture = at_scale(capture, source.scale)
+    check_training_memory(capture)
     fabric = _launch(place, devices)
-    pixels = _load_pixels(capture, fabric, console)
-    facts = described.facts if resume else scene_facts(capture, pixels, config)
-    seed_step(config.train.seed, step=-1)
-    model = build_model(capture, facts, config)
-    if not (out / "checkpoints" / "last.pt").exists():
-        show_known_light(model)
-    if fabric.is_global_zero:
-        if not resume:
-            create_run(out, config, source, facts)
-        console.print(capture.summary, soft_wrap=True)
-        console.print(f"run folder {out}", soft_wrap=True)
+    with _nothing_left_on_failure(out):
+        pixels = _load_pixels(capture, out / PIXELS, fabric, console)
+        facts = described.facts if resume else scene_facts(capture, pixels, config)
+        seed_step(config.train.seed, step=-1)
+        model = build_model(capture, facts, config)
+        if not (out / "checkpoints" / "last.pt").exists():
+            show_known_light(model)
+        if fabric.is_global_zero:
+            if not resume:
+                create_run(out, config, source, facts)
+            console.print(capture.summary, soft_wrap=True)
+            if source.scale < 1 and not resume:
+                console.print(_scaled(source.scale, len(pixels), rays), soft_wrap=True)
+            console.print(f"run folder {out}", soft_wrap=True)
     fabric.barrier()
     continue_with = _continue_with(command, out, device, devices)
     with reporting(out, console, fabric.is_global_zero) as reporter, _stop_request() as stopped:
@@ -133,6 +148,7 @@ def _refuse_changes(
     test_every: int | None,
     response: str,
     format: str | None,
+    scale: float | None,
 ) -> None:
     """That what is given beside --resume, where something is, is what the run was made of."""
     source = described.source
@@ -141,6 +157,7 @@ def _refuse_changes(
         source.test_every if test_every is None else test_every,
         source.response if response == "auto" else response,
         format or source.format,
+        source.scale if scale is None else scale,
     )
     if given != source or config not in (None, described.config):
         raise UserError(
@@ -186,12 +203,49 @@ def _check(config: NeilfConfig) -> None:
         raise UserError("--config.loss.volume is off, so nothing compares with the images", "set it above 0")
 
 
-def _load_pixels(capture: Capture, fabric: Fabric, console: Console) -> PixelDataset:
+def _scaled(scale: float, pixels: int, rays: int) -> str:
+    return (
+        f"images at {scale:.3g} of their size: {pixels / 1e6:.1f} million pixels for {rays / 1e6:.1f} million rays; "
+        "--scale 1 takes them whole"
+    )
+
+
+@contextmanager
+def _nothing_left_on_failure(out: Path) -> Iterator[None]:
+    """What fails before there is a run leaves no folder."""
+    was_there = out.exists()
+    try:
+        yield
+    except BaseException:
+        if not (out / "config.json").exists():
+            shutil.rmtree(out / PIXELS, ignore_errors=True)
+            with suppress(OSError):
+                if not was_there:
+                    out.rmdir()
+        raise
+
+
+def _load_pixels(capture: Capture, folder: Path, fabric: Fabric, console: Console) -> PixelDataset:
+    """One process reads the images, and all find them in the folder; what is wrong with them is wrong for all."""
+    problem: tuple[str, str] | None = None
+    if fabric.is_global_zero:
+        try:
+            pixels = _read_pixels(capture, folder, fabric, console)
+        except UserError as error:
+            problem = (error.problem, error.remedy)
+    problem = fabric.broadcast(problem)
+    if problem is not None:
+        raise UserError(*problem)
+    return pixels if fabric.is_global_zero else _read_pixels(capture, folder, fabric, console)
+
+
+def _read_pixels(capture: Capture, folder: Path, fabric: Fabric, console: Console) -> PixelDataset:
     columns = (TextColumn("reading images"), BarColumn(), MofNCompleteColumn())
     hidden = not (fabric.is_global_zero and console.is_terminal)
     with Progress(*columns, console=console, transient=True, disable=hidden) as progress:
         task = progress.add_task("", total=len(capture.train_views))
-        return PixelDataset(capture, capture.train_views, device=fabric.device, on_view=lambda _: progress.advance(task))
+        views = capture.train_views
+        return PixelDataset(capture, views, fabric.device, lambda _: progress.advance(task), folder)
 
 
 def _preview(out: Path, capture: Capture, fabric: Fabric, reporter: Reporter) -> Callable[[NeilfModel, Stage], None]:

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.images import read_image, write_png
-from neilfpp_method.data.pixels import pixel_colors
+from neilfpp_method.data.images import write_png
+from neilfpp_method.data.scaling import file_size, scaled_view
+from neilfpp_method.data.view_pixels import read_colors
 from neilfpp_method.data.views import View, camera_rays
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage
@@ -21,6 +22,7 @@ from neilfpp_method.structures import RayBatch
 __all__ = ["write_preview"]
 
 MOST_PIXELS = 160
+"""Longest side of a panel."""
 
 
 def write_preview(model: NeilfModel, capture: Capture, stage: Stage, path: Path) -> np.ndarray:
@@ -30,10 +32,10 @@ def write_preview(model: NeilfModel, capture: Capture, stage: Stage, path: Path)
     metallic.
     """
     view = (capture.test_views or capture.train_views)[0]
-    step = max(1, -(-max(view.camera.width, view.camera.height) // MOST_PIXELS))
-    shape = (len(range(0, view.camera.height, step)), len(range(0, view.camera.width, step)), 3)
-    panels = [_photograph(view, capture.hdr)[::step, ::step]]
-    rays = _rays(capture, view, step)
+    view = scaled_view(view, min(1.0, MOST_PIXELS / max(file_size(view))))
+    shape = (view.camera.height, view.camera.width, 3)
+    panels = [_photograph(view, capture.hdr)]
+    rays = camera_rays(capture.normalisation.camera(view.camera))
     panels += [p.reshape(shape) for p in _panels(model, rays, model.config, model.stages[stage].moves_material)]
     picture = np.concatenate([(p.clip(0.0, 1.0) * 255.0 + 0.5).astype(np.uint8) for p in panels], axis=1)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -42,14 +44,8 @@ def write_preview(model: NeilfModel, capture: Capture, stage: Stage, path: Path)
 
 
 def _photograph(view: View, hdr: bool) -> np.ndarray:
-    pixels = pixel_colors(view, read_image(view.image), hdr)
+    pixels = torch.from_numpy(read_colors(view, hdr))
     return (tone_map(pixels) if hdr else pixels).numpy()
-
-
-def _rays(capture: Capture, view: View, step: int) -> RayBatch:
-    camera = capture.normalisation.camera(view.camera)
-    kept = torch.arange(camera.height * camera.width).reshape(camera.height, camera.width)[::step, ::step].reshape(-1)
-    return camera_rays(camera)[kept]
 
 
 def _panels(model: NeilfModel, rays: RayBatch, config: NeilfConfig, with_material: bool) -> list[np.ndarray]:

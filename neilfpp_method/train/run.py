@@ -4,6 +4,7 @@ config.json       every setting               environment.json  versions, hardwa
 capture.json      where the images are        timing.json       seconds of each stage
 scene.json        what the images decided     checkpoints/      last.pt, and one at the end of each stage
 previews/         a picture per stage         tensorboard/      scalars and pictures
+pixels/           of the training views; can be deleted, and is made again when training goes on
 light.json        what spoke for lamps, fit by fit; not there where the settings had decided
 """
 
@@ -25,6 +26,7 @@ from torch import nn
 
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.images import replacing
+from neilfpp_method.data.scaling import at_scale
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import has_material
@@ -34,6 +36,7 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model
 
 __all__ = [
+    "PIXELS",
     "CaptureSource",
     "Description",
     "Run",
@@ -50,6 +53,8 @@ __all__ = [
 ]
 
 FORMAT = 2
+PIXELS = "pixels"
+"""Folder of a run in which the pixels of its training views are kept."""
 PACKAGES = (
     "neilfpp-method",
     "torch",
@@ -71,9 +76,11 @@ class CaptureSource:
     test_every: int | None = None
     response: str = "auto"
     format: str | None = None
+    scale: float = 1.0
 
     def load(self) -> Capture:
-        return load_capture(Path(self.root), self.format, self.test_every, response=self.response)
+        """The capture, its views at `scale` times the size of their files."""
+        return at_scale(load_capture(Path(self.root), self.format, self.test_every, response=self.response), self.scale)
 
     def load_again(self, run: Path) -> Capture:
         """The capture of a run that is there already.
@@ -125,9 +132,10 @@ def check_free(path: Path) -> None:
     """That a new run may take this folder.
 
     Raises:
-        UserError: the folder is there already and not empty, or cannot be made.
+        UserError: the folder is there already and holds more than the pixels of a training that never began, or cannot be
+            made.
     """
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+    if path.exists() and (not path.is_dir() or any(inner.name != PIXELS for inner in path.iterdir())):
         raise UserError(f"{path}: exists already", "choose another --out, or continue it with --resume")
     check_writable(path)
 

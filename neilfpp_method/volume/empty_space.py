@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,7 +20,7 @@ from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume.distance_grid import cell_size, look_up, sample_grid
 from neilfpp_method.volume.intersect import Interval
 
-__all__ = ["EmptySpace"]
+__all__ = ["EmptySpace", "Span"]
 
 LOOK_UPS = 128
 """Places along a ray at which the grid is read."""
@@ -29,10 +30,20 @@ MARGIN = 1.1
 """The field's slope over the largest between neighbouring vertices."""
 MISSED = 0.01
 """Most opacity that the density of skipped space may have."""
+HARDLY_MISSED = 1e-3
+"""The same in pictures: a quarter of a level of 8 bits."""
 OPAQUE = 8.0
 """Optical depth behind which nothing is seen."""
 LEAST_LIFE, MOST_LIFE = 20, 100
 """Steps in which the field moves before the grid may, and must, be sampled anew."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """Which rays have a part that is taken, and from where to where it is; the whole ray where it has none."""
+
+    some: Bool[Tensor, " N"]
+    interval: Interval
 
 
 class EmptySpace(nn.Module):
@@ -68,20 +79,31 @@ class EmptySpace(nn.Module):
         promise is noticed at once; elsewhere nobody waits for the answer, and the age of the grid alone decides.
         """
         self._renew(sdf)
-        edges, clearance = self._edges(interval), self._clearance(beta)
+        edges, clearance = self._edges(interval), self._clearance(beta, MISSED)
         empty, opaque = self._known(rays, edges, clearance, beta)
         if rays.origins.device.type == "cpu" and not self._holds(sdf, rays, edges, empty, clearance):
             if self.age is not None and self.age >= LEAST_LIFE:
                 self.age = None  # the next use samples it
             return interval
-        taken = ~empty & ~opaque
-        first = taken.to(torch.int8).argmax(dim=-1, keepdim=True)
-        last = LOOK_UPS - taken.flip(-1).to(torch.int8).argmax(dim=-1, keepdim=True)
-        some = taken.any(-1)
-        return Interval(
-            torch.where(some, edges.gather(-1, first)[:, 0], interval.near),
-            torch.where(some, edges.gather(-1, last)[:, 0], interval.far),
-        )
+        return _span(edges, ~empty & ~opaque, interval).interval
+
+    @torch.no_grad()
+    def may_show(
+        self,
+        sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]],
+        rays: RayBatch,
+        interval: Interval,
+        beta: Float[Tensor, ""],
+    ) -> Span:
+        """Which rays may show anything, and the part of each within which they do, for a field that stands still.
+
+        The grid must be that of the field as it is: it is sampled by the first who asks, and no promise is tested. What is
+        left out has an opacity of at most `HARDLY_MISSED`.
+        """
+        self._renew(sdf)
+        edges = self._edges(interval)
+        empty, opaque = self._known(rays, edges, self._clearance(beta, HARDLY_MISSED), beta)
+        return _span(edges, ~empty & ~opaque, interval)
 
     @torch.no_grad()
     def may_meet(
@@ -100,7 +122,7 @@ class EmptySpace(nn.Module):
         self._renew(sdf)
         edges = self._edges(interval)
         distance = self._read(rays, edges)
-        empty = distance - self._doubt(edges) > self._clearance(beta)
+        empty = distance - self._doubt(edges) > self._clearance(beta, MISSED)
         return ((distance.diff(dim=-1) < 0.0) & ~empty[:, 1:]).any(-1)
 
     def _renew(self, sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]) -> None:
@@ -139,9 +161,9 @@ class EmptySpace(nn.Module):
         reach = 0.5 * math.sqrt(3.0) * cell_size(self.distance, self.radius)
         return self.slope * (0.5 * edges.diff(dim=-1) + reach)
 
-    def _clearance(self, beta: Float[Tensor, ""]) -> Float[Tensor, ""]:
-        """The distance from which on a density of scale β adds up to no more than MISSED along a whole ray."""
-        return beta * math.log(self.radius / MISSED) - beta * beta.log()  # e^(−G/β) · 2 radius / 2β ≤ MISSED
+    def _clearance(self, beta: Float[Tensor, ""], missed: float) -> Float[Tensor, ""]:
+        """The distance from which on a density of scale β adds up to no more than `missed` along a whole ray."""
+        return beta * math.log(self.radius / missed) - beta * beta.log()  # e^(−G/β) · 2 radius / 2β ≤ missed
 
     def _holds(
         self,
@@ -165,3 +187,16 @@ class EmptySpace(nn.Module):
     def set_extra_state(self, state: dict[str, int | None]) -> None:
         """The inverse of `get_extra_state`."""
         self.age = state["age"]
+
+
+def _span(edges: Float[Tensor, "N E"], taken: Bool[Tensor, "N K"], interval: Interval) -> Span:
+    first = taken.to(torch.int8).argmax(dim=-1, keepdim=True)
+    last = LOOK_UPS - taken.flip(-1).to(torch.int8).argmax(dim=-1, keepdim=True)
+    some = taken.any(-1)
+    return Span(
+        some,
+        Interval(
+            torch.where(some, edges.gather(-1, first)[:, 0], interval.near),
+            torch.where(some, edges.gather(-1, last)[:, 0], interval.far),
+        ),
+    )

@@ -25,7 +25,49 @@ def _coarse(monkeypatch):
     monkeypatch.setattr(empty_space, "RESOLUTION", 24)
 
 
-def test_evaluation_takes_whole_rays():
+def test_pictures_skip_what_is_empty_and_show_what_whole_rays_do():
+    skipping, plain = host().eval(), host(skip=False).eval()
+    plain.load_state_dict(skipping.state_dict(), strict=False)
+    fine = dataclasses.replace(plain.config.volume, initial_samples=256, rounds=4, samples=128)
+    plain.config = dataclasses.replace(plain.config, volume=fine)
+    rays = sphere_batch(200, spread=1.2).rays
+    with torch.no_grad():
+        found, true = skipping.render(rays), plain.render(rays)
+        assert torch.equal(found.color, skipping.render(rays).color)
+    passes = true.opacity < 1e-6
+    assert 40 < passes.sum() < 160
+    assert torch.allclose(found.color[passes], true.color[passes], atol=1e-5)
+    assert (found.opacity - true.opacity).abs().mean() < 0.01
+    solid = true.opacity > 0.99
+    assert (found.position - true.position)[solid].norm(dim=-1).max() < 0.02
+
+
+def test_rays_that_pass_by_ask_nothing_of_the_field(monkeypatch):
+    skipping = host().eval()
+    rays = sphere_batch(200, spread=1.2).rays
+    with torch.no_grad():
+        whole = skipping._march(rays).hits
+        skipping.render(rays)  # samples the grid
+        asked = []
+        monkeypatch.setattr(skipping, "sdf", lambda x: asked.append(len(x)) or skipping.sdf_field(x))
+        skipping.render(rays)
+        skipping.render(rays[torch.nonzero(whole.opacity < 1e-9)[:, 0]])
+    met = int((whole.opacity > 1e-3).sum())
+    assert met * 16 <= sum(asked) < 200 * 24
+
+
+def test_pictures_follow_the_field_when_it_moves():
+    skipping = host().eval()
+    rays = sphere_batch(200, spread=1.2).rays
+    with torch.no_grad():
+        before = skipping.render(rays).opacity
+        skipping.sdf_field.mlp.layers[-1].bias[0] -= 0.3  # distances: the sphere grows
+        after, whole = skipping.render(rays).opacity, skipping._march(rays).hits.opacity
+    assert (before > 0.5).sum() + 10 < (after > 0.5).sum()
+    assert ((after > 0.5) == (whole > 0.5)).float().mean() > 0.98
+
+
+def test_evaluation_with_gradients_takes_whole_rays():
     skipping, plain = host().eval(), host(skip=False).eval()
     plain.load_state_dict(skipping.state_dict(), strict=False)
     rays = sphere_batch().rays

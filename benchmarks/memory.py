@@ -1,0 +1,116 @@
+"""Peak memory of a training over views × megapixels.
+
+    python -m benchmarks.memory --sizes 4x2 16x2
+    python -m benchmarks.memory --sizes 100x12 --scale 1 --data captures/teapot
+
+Each entry is a capture of so many views of so many megapixels, made by resampling the views of another one, and a process of
+its own that trains a few steps of the preset `fast` on it. Printed is the most that the process held (resident memory, pages of
+mapped files included), the size of the files that hold the pixels, and what 19 bytes a pixel of float32 planes would take.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import resource
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import tyro
+from rich.console import Console
+
+from benchmarks.measure import hardware
+from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.capture_folder import write_capture
+from neilfpp_method.data.images import read_image, write_exr, write_png
+from neilfpp_method.data.scaling import scaled_camera
+from neilfpp_method.demo.command import demo_scene
+from neilfpp_method.settings.presets import preset
+from neilfpp_method.train.command import run_training
+
+FLOAT_PLANES = 19
+"""Bytes to a pixel of colours, masks and gradients in float32 and bool, as they were held before."""
+
+
+@dataclass
+class Options:
+    """Measure peak memory."""
+
+    sizes: tuple[str, ...] = ("4x2", "16x2")
+    """VIEWSxMEGAPIXELS each."""
+    scale: float | None = 1.0
+    """Of the training, as `neilfpp train --scale`; none: its default."""
+    data: Path | None = None
+    """The capture whose views are resampled; none: the demo's."""
+    steps: int = 20
+    """Steps of the training."""
+
+
+def enlarged(source: Path, out: Path, views: int, megapixels: float) -> Path:
+    """A capture of `views` views of about `megapixels` million pixels: those of another one in turn, resampled."""
+    capture = load_capture(source, test_every=0)
+    listed = []
+    for i in range(views):
+        view = capture.views[i % len(capture.views)]
+        factor = math.sqrt(1e6 * megapixels / (view.camera.width * view.camera.height))
+        size = (round(view.camera.width * factor), round(view.camera.height * factor))
+        image = read_image(view.image)
+        pixels = cv2.resize(image.pixels, size, interpolation=cv2.INTER_LINEAR)
+        path = out / "images" / f"{i:04d}{'.exr' if image.hdr else '.png'}"
+        if image.hdr:
+            write_exr(path, {"RGB": pixels.astype(np.float16)})
+        else:
+            write_png(path, np.rint(255 * pixels).astype(np.uint8))
+        listed.append(replace(view, name=f"{i:04d}", index=i, camera=scaled_camera(view.camera, *size), image=path, mask=None))
+    made = replace(capture, root=out, inputs=out, views=tuple(listed), point_cloud=None)
+    write_capture(out, made, response="linear" if capture.hdr else "srgb", test=frozenset())
+    return out
+
+
+def train_small(data: Path, out: Path, scale: float | None, steps: int) -> None:
+    """Some steps of the preset `fast`, and the peak of this process, bytes, as the last line."""
+    config = preset("fast")
+    train = dataclasses.replace(config.train, sdf_steps=steps, material_steps=0, joint_steps=0)
+    run_training(
+        data=data,
+        out=out,
+        config=dataclasses.replace(config, train=train),
+        resume=False,
+        test_every=0,
+        response="auto",
+        device="cpu",
+        devices=1,
+        scale=scale,
+        console=Console(quiet=True),
+    )
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+
+
+def main(options: Options) -> None:
+    """Print a row of the table for each size."""
+    print(f"{hardware()}\n\n| views | megapixels | peak | files of pixels | float32 planes |\n|---|---|---|---|---|")
+    for size in options.sizes:
+        count, megapixels = int(size.split("x")[0]), float(size.split("x")[1])
+        with tempfile.TemporaryDirectory() as folder:
+            data = enlarged(options.data or demo_scene(), Path(folder) / "capture", count, megapixels)
+            run = Path(folder) / "run"
+            arguments = [str(data), str(run), "none" if options.scale is None else str(options.scale), str(options.steps)]
+            command = [sys.executable, "-m", "benchmarks.memory", "--child", *arguments]
+            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+            peak = int(done.stdout.splitlines()[-1])
+            files = sum(path.stat().st_size for path in (run / "pixels").iterdir())
+        planes = FLOAT_PLANES * count * megapixels * 1e6
+        print(f"| {count} | {megapixels:g} | {peak / 1e9:.2f} GB | {files / 1e9:.2f} GB | {planes / 1e9:.2f} GB |", flush=True)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--child"]:
+        data, out, scale, steps = sys.argv[2:]
+        train_small(Path(data), Path(out), None if scale == "none" else float(scale), int(steps))
+    else:
+        main(tyro.cli(Options))

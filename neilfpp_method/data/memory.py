@@ -1,0 +1,89 @@
+"""How much memory is free, and a word before more than that is taken: a process that takes too much is killed without one."""
+
+from __future__ import annotations
+
+import resource
+from pathlib import Path
+
+from neilfpp_method.errors import UserError
+
+__all__ = ["available_memory", "check_memory"]
+
+UNLIMITED = 2**60
+"""What a control group of version 1 says that has no limit is above this."""
+
+
+def available_memory(proc: Path = Path("/proc"), groups: Path = Path("/sys/fs/cgroup")) -> int | None:
+    """Bytes that this process may still take: the least of what the system has left, what its control group leaves it (both
+    versions, with the groups above), and what its limit of address space does; none where nothing of that is known.
+
+    Pages of files that the system would give up for it count as free.
+    """
+    known = [_system(proc), _group(proc, groups), _group_1(groups), _address_space(proc)]
+    return min((free for free in known if free is not None), default=None)
+
+
+def check_memory(needed: int, what: str, remedy: str, free: int | None = None) -> None:
+    """That there is memory for something; nothing is said where it is not known how much there is.
+
+    Args:
+        needed: bytes.
+        what: needs them, for the message: "the pixels of 40 views".
+        free: bytes that there are; none: `available_memory`.
+
+    Raises:
+        UserError: there is not enough.
+    """
+    free = available_memory() if free is None else free
+    if free is not None and needed > free:
+        raise UserError(f"{what} need about {needed / 1e9:.1f} GB of memory, and {max(free, 0) / 1e9:.1f} GB are free", remedy)
+
+
+def _system(proc: Path) -> int | None:
+    return _entry(proc / "meminfo", "MemAvailable:", 1024)
+
+
+def _group(proc: Path, groups: Path) -> int | None:
+    """Of control groups, version 2; each group is bound by those above it."""
+    path = next((line[3:].strip("/") for line in _lines(proc / "self" / "cgroup") if line.startswith("0::")), "")
+    folder, free = groups / path, []
+    while folder.is_relative_to(groups):
+        limit, used = _number(folder / "memory.max"), _number(folder / "memory.current")
+        if limit is not None and used is not None:
+            free.append(limit - used + (_entry(folder / "memory.stat", "inactive_file", 1) or 0))
+        folder = folder.parent
+    return min(free, default=None)
+
+
+def _group_1(groups: Path) -> int | None:
+    """Of control groups, version 1, as a container sees its own."""
+    folder = groups / "memory"
+    limit, used = _number(folder / "memory.limit_in_bytes"), _number(folder / "memory.usage_in_bytes")
+    if limit is None or used is None or limit > UNLIMITED:
+        return None
+    return limit - used + (_entry(folder / "memory.stat", "total_inactive_file", 1) or 0)
+
+
+def _address_space(proc: Path) -> int | None:
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    used = _entry(proc / "self" / "status", "VmSize:", 1024)
+    return None if limit == resource.RLIM_INFINITY or used is None else limit - used
+
+
+def _number(path: Path) -> int | None:
+    """The number that a file holds; none where it says "max", or is not there."""
+    text = "".join(_lines(path)[:1]).strip()
+    return int(text) if text.isdigit() else None
+
+
+def _entry(path: Path, name: str, unit: int) -> int | None:
+    """What a line "NAME NUMBER" of a file says, times the unit."""
+    found = [line.split()[1] for line in _lines(path) if line.split()[:1] == [name]]
+    return int(found[0]) * unit if found else None
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text("ascii", "replace").splitlines()
+    except OSError:
+        return []

@@ -1,0 +1,358 @@
+"""The pixels of many views, one after another and row by row: in memory, or in a folder of memory-mapped files.
+
+    color.npy    (P, 3) codes of `pixel_encoding`: 3 bytes a pixel for 8-bit images, 6 for 16 bits and for radiance
+    bits.npy     (P,) one byte: valid, mask, mask known, near the object (`drawing`); padded to whole blocks
+    store.json   what they were made from, written last: a folder without it holds no store
+
+Views are read one at a time, so building takes the memory of one view, whatever their number. A store is used again when it
+was made from the very same files (name, size, time of the last change), cameras and factors; else it is made anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import mmap
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int, Shaped, UInt8
+
+from neilfpp_method.data.drawing import BLOCK, KNOWN, MASK, NEAR, VALID, near_object
+from neilfpp_method.data.images import replacing
+from neilfpp_method.data.pixel_encoding import ENCODINGS, Encoding, encodings_for
+from neilfpp_method.data.scaling import area_average, file_size, scaled_camera
+from neilfpp_method.data.silhouettes import Outline
+from neilfpp_method.data.view_pixels import read_view
+from neilfpp_method.data.views import View
+from neilfpp_method.errors import UserError
+
+__all__ = ["PixelStore", "border", "expect_draws", "load_pixels", "store_bytes"]
+
+FORMAT, VERSION = "neilfpp-pixels", 1
+BORDER_SHARE = 0.5
+REPAIR = "repair the images, or mark the pixels in a validity mask"
+MOST_MAPPED = 2**29
+"""Bytes of the files that draws may leave mapped; a page that holds one drawn pixel brings 16 of them along."""
+BYTES_OF_A_DRAW = 2 * 16 * 4096
+SPARE = 2**28
+"""Bytes that a disk should keep free."""
+
+
+@dataclass
+class PixelStore:
+    """P pixels of some views. Numbers count them view after view, row by row.
+
+    Attributes:
+        views: in order.
+        encoding: of `codes`.
+        scales: of each view's codes.
+        codes: (P, 3).
+        bits: of each pixel, and zeros up to a whole number of blocks.
+    """
+
+    views: tuple[View, ...]
+    encoding: Encoding
+    scales: Float64[np.ndarray, " V"]
+    codes: Shaped[np.ndarray, "P 3"]
+    bits: UInt8[np.ndarray, " B"]
+
+    def __post_init__(self) -> None:
+        sizes = [view.camera.width * view.camera.height for view in self.views]
+        self.starts = np.array(list(itertools.accumulate(sizes, initial=0)))
+        self._drawn = 0
+
+    def __len__(self) -> int:
+        return int(self.starts[-1])
+
+    def rows(self, i: int) -> slice:
+        """The numbers of the pixels of view `i`."""
+        return slice(int(self.starts[i]), int(self.starts[i + 1]))
+
+    def colors(self, numbers: Int[np.ndarray, "*N"], view: Int[np.ndarray, "*N"]) -> Float32[np.ndarray, "*N 3"]:
+        """Colours of single pixels of views; kept in a folder, only the pages that hold them are read."""
+        self._drawn += numbers.size
+        if self._drawn * BYTES_OF_A_DRAW > MOST_MAPPED:
+            self.release()
+        return self.encoding.decode(self.codes[numbers], self.scales[view])
+
+    def view_colors(self, i: int) -> Float32[np.ndarray, "N 3"]:
+        """The colours of a view."""
+        return self.encoding.decode(np.asarray(self.codes[self.rows(i)]), self.scales[i])
+
+    def masks(self, max_side: int = 256) -> tuple[Outline, ...]:
+        """The silhouettes of the views in which the object is known, at no more than `max_side` pixels a side.
+
+        A pixel of a silhouette is inside where half of its area is. The view of an outline has a camera of the mask's size.
+
+        >>> store.masks(128)[0].inside.shape  # doctest: +SKIP
+        (96, 128)
+        """
+        outlines = []
+        for i, view in enumerate(self.views):
+            bits = self.bits[self.rows(i)]
+            if not (bits & KNOWN).any():
+                continue
+            height, width = view.camera.height, view.camera.width
+            share = min(1.0, max_side / max(height, width))
+            size = (max(1, round(width * share)), max(1, round(height * share)))
+            inside = ((bits & MASK) > 0).reshape(height, width).astype(np.float32)
+            small = View(view.name, view.index, scaled_camera(view.camera, *size), view.image, file_size=file_size(view))
+            outlines.append(Outline(small, area_average(inside, *size) >= 0.5))
+        return tuple(outlines)
+
+    def release(self) -> None:
+        """Give pages of the files that are mapped back; what is read next is mapped again."""
+        self._drawn = 0
+        for array in (self.codes, self.bits):
+            _advise(array, "MADV_DONTNEED")
+
+
+def store_bytes(views: Sequence[View], hdr: bool) -> int:
+    """About how many bytes the pixels of views take in a store."""
+    pixels = sum(view.camera.width * view.camera.height for view in views)
+    narrow = not hdr and all(view.file_size is None for view in views)
+    return pixels * (4 if narrow else 7)
+
+
+def load_pixels(
+    views: Sequence[View],
+    hdr: bool,
+    shown: Callable[[int], Bool[np.ndarray, " N"]],
+    folder: Path | None = None,
+    on_view: Callable[[str], None] | None = None,
+) -> PixelStore:
+    """The pixels of views: those of a folder, if it was made from the same, or else read from their files.
+
+    Args:
+        views: at least one.
+        hdr: whether pixels are linear radiance; else display values.
+        shown: which pixels of a view its lens reaches.
+        folder: where the pixels are kept; none: in memory.
+        on_view: called with the name of each view that has been read.
+
+    Raises:
+        UserError: an image cannot be used (see `PixelDataset`), or the folder cannot be written.
+    """
+    if folder is None:
+        return _in_any_encoding(views, hdr, shown, None, on_view)
+    made_from = _made_from(views, hdr)
+    known = _open(folder, views, made_from)
+    if known is not None:
+        return known
+    _check_room(folder, store_bytes(views, hdr))
+    (folder / "store.json").unlink(missing_ok=True)
+    with ExitStack() as files:
+        paths = {name: files.enter_context(replacing(folder / f"{name}.npy")) for name in ("color", "bits")}
+        store = _in_any_encoding(views, hdr, shown, paths, on_view)
+        description = {
+            "format": FORMAT,
+            "version": VERSION,
+            "made_from": made_from,
+            "encoding": store.encoding.name,
+            "scales": store.scales.tolist(),
+        }
+        store.release()
+    with replacing(folder / "store.json") as temporary:
+        temporary.write_text(json.dumps(description) + "\n", "utf-8")
+    opened = _open(folder, views, made_from)
+    if opened is None:
+        raise UserError(f"{folder}: changed while it was written", "let one training at a time write there")
+    return opened
+
+
+# --------------------------------------------------------------------------------------------------------------- making
+
+
+def _in_any_encoding(
+    views: Sequence[View],
+    hdr: bool,
+    shown: Callable[[int], Bool[np.ndarray, " N"]],
+    paths: dict[str, Path] | None,
+    on_view: Callable[[str], None] | None,
+) -> PixelStore:
+    """In the smallest encoding that holds every view; when one turns out to need more, all are read once more."""
+    ladder = encodings_for(hdr)
+    if not hdr and any(view.file_size is not None for view in views):
+        ladder = ladder[1:]  # means of bytes are no bytes
+    told: set[str] = set()
+
+    def tell_once(name: str) -> None:
+        if on_view and name not in told:
+            told.add(name)
+            on_view(name)
+
+    stores = (_filled(views, hdr, encoding, shown, paths, tell_once) for encoding in ladder)
+    return next(store for store in stores if store is not None)
+
+
+def _filled(
+    views: Sequence[View],
+    hdr: bool,
+    encoding: Encoding,
+    shown: Callable[[int], Bool[np.ndarray, " N"]],
+    paths: dict[str, Path] | None,
+    on_view: Callable[[str], None],
+) -> PixelStore | None:
+    """The store in one encoding; none where a view does not fit in it."""
+    total = sum(view.camera.width * view.camera.height for view in views)
+    codes = _plane(paths and paths["color"], (total, 3), encoding.dtype)
+    bits = _plane(paths and paths["bits"], (-(-total // BLOCK) * BLOCK,), np.dtype(np.uint8))
+    store = PixelStore(tuple(views), encoding, np.ones(len(views)), codes, bits)
+    broken: list[tuple[View, int]] = []
+    unknown = []
+    for i, view in enumerate(views):
+        pixels = read_view(view, hdr)
+        if pixels.broken:
+            broken.append((view, pixels.broken))
+        elif not broken:
+            encoded = encoding.encode(pixels.color)
+            if encoded is None:
+                return None
+            codes[store.rows(i)], store.scales[i] = encoded.codes.reshape(-1, 3), encoded.scale
+            bits[store.rows(i)] = _bits(pixels.mask, pixels.valid.reshape(-1) & shown(i))
+            if pixels.mask is None:
+                unknown.append(i)
+            store.release()
+        on_view(view.name)
+    if broken:
+        view, count = broken[0]
+        others = f", and {len(broken) - 1} more images have such pixels" if len(broken) > 1 else ""
+        raise UserError(f"{view.image}: {count} pixels are NaN, infinite or negative{others}", REPAIR)
+    if len(unknown) == len(views):
+        _mask_from_background(store)
+    else:
+        for i in unknown:  # as good as any other pixel near the object
+            bits[store.rows(i)] |= NEAR
+    return store
+
+
+def _bits(mask: Bool[np.ndarray, "H W"] | None, valid: Bool[np.ndarray, " N"]) -> UInt8[np.ndarray, " N"]:
+    bits = np.where(valid, VALID, 0).astype(np.uint8)
+    if mask is None:
+        return bits | np.uint8(MASK)
+    return bits | np.uint8(KNOWN) | np.where(mask.reshape(-1), MASK, 0).astype(np.uint8) | _near(mask)
+
+
+def _near(mask: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, " N"]:
+    return np.where(near_object(mask).reshape(-1), NEAR, 0).astype(np.uint8)
+
+
+def _mask_from_background(store: PixelStore) -> None:
+    """Without masks, pixels of exactly the colour of most of the border are off the object; of the others nothing is known.
+
+    Rendered captures, and clipped backdrops, have such pixels; in front of a noisy backdrop hardly any pixel is exact.
+    """
+    numbers, view = border(store)
+    colors = store.colors(numbers, view)
+    if not len(colors):
+        return
+    color = _median(colors)
+    if (colors == color).all(axis=-1).mean() < BORDER_SHARE:
+        return
+    if all((store.view_colors(i) == color).all() for i in range(len(store.views))):
+        return
+    for i, view in enumerate(store.views):
+        background = (store.view_colors(i) == color).all(axis=-1)
+        bits = store.bits[store.rows(i)] & np.uint8(VALID)
+        bits |= np.where(background, KNOWN, MASK).astype(np.uint8)
+        shape = (view.camera.height, view.camera.width)
+        store.bits[store.rows(i)] = bits | _near(~background.reshape(shape))
+        store.release()
+
+
+def _median(values: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, " C"]:
+    """One of the values: of two in the middle the lower, so that a colour that most share is met exactly."""
+    return np.partition(values, (len(values) - 1) // 2, axis=0)[(len(values) - 1) // 2]
+
+
+def border(store: PixelStore) -> tuple[Int[np.ndarray, " B"], Int[np.ndarray, " B"]]:
+    """The numbers of the valid pixels on the borders of all images, and their views."""
+    numbers, views = [], []
+    for i, view in enumerate(store.views):
+        width, height = view.camera.width, view.camera.height
+        row, left = np.arange(width), np.arange(1, height - 1) * width
+        edge = store.starts[i] + np.concatenate([row, (height - 1) * width + row, left, left + width - 1])
+        edge = edge[(store.bits[edge] & VALID) > 0]
+        numbers.append(edge)
+        views.append(np.full(len(edge), i))
+    return np.concatenate(numbers), np.concatenate(views)
+
+
+# ------------------------------------------------------------------------------------------------------------ the files
+
+
+def _plane(path: Path | None, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """An array of zeros, in memory or in a file whose room is taken at once: a full disk would kill who writes to a map."""
+    if path is None:
+        return np.zeros(shape, dtype)
+    array = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
+    if hasattr(os, "posix_fallocate"):
+        with path.open("r+b") as file:
+            os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
+    return array
+
+
+def _check_room(folder: Path, needed: int) -> None:
+    above = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    free = shutil.disk_usage(above).free
+    if needed + SPARE > free:
+        raise UserError(
+            f"{folder}: the pixels of the training views take {needed / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free there",
+            "make room, choose another --out, or take smaller images with --scale",
+        )
+
+
+def _made_from(views: Sequence[View], hdr: bool) -> str:
+    """A hash of all that decides what is stored."""
+    parts: list[object] = [VERSION, hdr]
+    for view in views:
+        camera = view.camera
+        lens = camera.lens and (camera.lens.model, camera.lens.coefficients)
+        parts.append([view.name, camera.width, camera.height, camera.intrinsics.tolist(), lens])
+        parts.append([view.exposure, view.white_balance, list(file_size(view))])
+        parts += [_state(path) for path in (view.image, view.mask, view.valid)]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+def _state(path: Path | None) -> tuple[str, int, int] | None:
+    if path is None or not path.is_file():
+        return None
+    known = path.stat()
+    return path.name, known.st_size, known.st_mtime_ns
+
+
+def _open(folder: Path, views: Sequence[View], made_from: str) -> PixelStore | None:
+    """The store of a folder; none where it was made from something else, is damaged, or is none."""
+    try:
+        description = json.loads((folder / "store.json").read_text("utf-8"))
+        kind = [description[name] for name in ("format", "version", "made_from")]
+        encoding, scales = ENCODINGS[description["encoding"]], np.array(description["scales"], np.float64)
+        arrays = [np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ("color", "bits")]
+    except (OSError, ValueError, EOFError, KeyError, TypeError, RecursionError):
+        return None
+    store = PixelStore(tuple(views), encoding, scales, *arrays)
+    shapes = [(len(store), 3), (-(-len(store) // BLOCK) * BLOCK,)]
+    types = [encoding.dtype, np.dtype(np.uint8)]
+    fits = kind == [FORMAT, VERSION, made_from] and scales.shape == (len(views),) and bool((scales > 0).all())
+    if not fits or [a.shape for a in arrays] != shapes or [a.dtype for a in arrays] != types:
+        return None
+    return store
+
+
+def expect_draws(store: PixelStore) -> None:
+    """Tell the system that single pixels will be asked for: it then reads pages, and not what follows them."""
+    for array in (store.codes, store.bits):
+        _advise(array, "MADV_RANDOM")
+
+
+def _advise(array: np.ndarray, what: str) -> None:
+    mapped = getattr(array, "_mmap", None)
+    if mapped is not None and hasattr(mmap, what):
+        mapped.madvise(getattr(mmap, what))

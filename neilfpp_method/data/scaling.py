@@ -1,0 +1,143 @@
+"""Views at another size than that of their files: cameras to match, and pixels averaged over their area.
+
+A pixel of a smaller image is the mean, over its area, of the linear radiance of the pixels that it covers (display values are
+made linear, averaged, and encoded again). An image point (u, v) of the file is then at (u · w/W, v · h/H), as pixel centres
+are at +0.5: focal lengths and principal points are multiplied by the same factors, and a lens keeps its coefficients, which
+apply to the plane at unit distance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Shaped
+
+from neilfpp_method.data.capture import Capture
+from neilfpp_method.data.views import Camera, View
+from neilfpp_method.errors import UserError
+
+__all__ = [
+    "PIXELS_OF_A_VIEW",
+    "area_average",
+    "area_share",
+    "at_scale",
+    "file_size",
+    "nearest",
+    "scale_for_pixels",
+    "scale_for_rays",
+    "scale_for_width",
+    "scaled_camera",
+    "scaled_view",
+]
+
+PIXELS_OF_A_VIEW = 2**17
+"""Pixels of a view that are enough to look at it and to measure it, where nobody asks for more: about 420 × 310."""
+PIXELS_OF_A_RAY = 4
+"""Pixels of the training views to a ray of the whole training. With more, most pixels are never drawn, and a smaller image
+holds what they had to say, with less noise."""
+SAME = 0.98
+"""A scale this close to 1 is 1: what is left out is not worth resampling for."""
+
+
+def file_size(view: View) -> tuple[int, int]:
+    """Width and height of the view's files, pixels."""
+    return view.file_size or (view.camera.width, view.camera.height)
+
+
+def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
+    """The camera with the same field of view and another number of pixels.
+
+    >>> camera = Camera(500.0, 500.0, 200.0, 150.0, 400, 300, np.eye(4))
+    >>> half = scaled_camera(camera, 200, 150)
+    >>> half.fx, half.cx, half.cy
+    (250.0, 100.0, 75.0)
+    """
+    right, down = width / camera.width, height / camera.height
+    return replace(
+        camera,
+        fx=camera.fx * right,
+        fy=camera.fy * down,
+        cx=camera.cx * right,
+        cy=camera.cy * down,
+        width=width,
+        height=height,
+    )
+
+
+def scaled_view(view: View, scale: float) -> View:
+    """The view at `scale` times the size of its files.
+
+    Raises:
+        UserError: the scale is not above 0 and at most 1.
+    """
+    if not 0.0 < scale <= 1.0:
+        raise UserError(f"images cannot be scaled by {scale:g}", "give a factor above 0 and at most 1")
+    width, height = file_size(view)
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    if size == (view.camera.width, view.camera.height):
+        return view
+    return replace(
+        view, camera=scaled_camera(view.camera, *size), file_size=None if size == (width, height) else (width, height)
+    )
+
+
+def at_scale(capture: Capture, scale: float) -> Capture:
+    """The capture with all views at `scale` times the size of their files."""
+    return replace(capture, views=tuple(scaled_view(view, scale) for view in capture.views))
+
+
+# -------------------------------------------------------------------------------------------------------- which scale
+
+
+def scale_for_rays(views: Sequence[View], rays: int) -> float:
+    """The largest scale at which a training of so many rays can use the pixels of the views.
+
+    That is `PIXELS_OF_A_RAY` pixels to a ray, and `PIXELS_OF_A_VIEW` pixels of a view at least, so that many views
+    do not make for tiny ones.
+    """
+    return scale_for_pixels(views, max(PIXELS_OF_A_RAY * rays, PIXELS_OF_A_VIEW * len(views)))
+
+
+def scale_for_pixels(views: Sequence[View], pixels: int) -> float:
+    """The largest scale at which the views have at most so many pixels together."""
+    total = sum(math.prod(file_size(view)) for view in views)
+    scale = math.sqrt(pixels / max(total, 1))
+    return 1.0 if scale >= SAME else round(scale, 4)
+
+
+def scale_for_width(views: Sequence[View], width: int) -> float:
+    """The scale at which the widest view has this width, in pixels; 1 where none is as wide.
+
+    Raises:
+        UserError: the width is not positive.
+    """
+    if width < 1:
+        raise UserError(f"images cannot be {width} pixels wide", "give a width of 1 or more")
+    return min(1.0, width / max(file_size(view)[0] for view in views))
+
+
+# ---------------------------------------------------------------------------------------------------------- resampling
+
+
+def area_average(values: Float32[np.ndarray, "H W *C"], width: int, height: int) -> Float32[np.ndarray, "h w *C"]:
+    """Means over the areas of fewer pixels; parts of pixels count in part. The image itself where the size is the same."""
+    if values.shape[:2] == (height, width):
+        return values
+    averaged = cv2.resize(np.ascontiguousarray(values), (width, height), interpolation=cv2.INTER_AREA)
+    return averaged.reshape(height, width, *values.shape[2:])
+
+
+def area_share(marked: Bool[np.ndarray, "H W"], width: int, height: int) -> Float32[np.ndarray, "h w"]:
+    """The share of the area of each pixel that is marked."""
+    return area_average(marked.astype(np.float32), width, height)
+
+
+def nearest(values: Shaped[np.ndarray, "H W *C"], width: int, height: int) -> Shaped[np.ndarray, "h w *C"]:
+    """What is at the centres of fewer pixels: for values that have no mean, as depths across an edge."""
+    rows = ((np.arange(height) + 0.5) * values.shape[0] / height).astype(np.int64)
+    columns = ((np.arange(width) + 0.5) * values.shape[1] / width).astype(np.int64)
+    return values[rows[:, None], columns]

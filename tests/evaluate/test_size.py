@@ -1,0 +1,76 @@
+"""The size at which views are rendered, and what is said about the time that takes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from neilfpp_method.commands import command
+from neilfpp_method.commands.command import duration, progress_bar
+from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.scaling import PIXELS_OF_A_VIEW, at_scale
+from neilfpp_method.errors import UserError
+from neilfpp_method.evaluate import metrics
+from neilfpp_method.evaluate.size import at_size, size_in_words
+from neilfpp_method.evaluate.views import known_test_views, render_test_views
+from neilfpp_method.train.run import Run
+from tests.data.large_capture import make_large_capture
+from tests.data.make_capture import make_capture
+from tests.evaluate.test_protocols import make_run
+
+
+def sizes(run: Run) -> set[tuple[int, int]]:
+    return {(view.camera.width, view.camera.height) for view in run.capture.views}
+
+
+def test_views_are_no_larger_than_it_takes_unless_asked_for(tmp_path: Path) -> None:
+    run = make_run(load_capture(make_large_capture(tmp_path, views=3, size=(800, 600)), test_every=2))
+    ((width, height),) = sizes(at_size(run))
+    assert width * height == pytest.approx(PIXELS_OF_A_VIEW, rel=0.01)
+    assert width / height == pytest.approx(4 / 3, abs=0.01)
+    assert sizes(at_size(run, scale=1.0)) == {(800, 600)}
+    assert sizes(at_size(run, width=100)) == {(100, 75)}
+    told = size_in_words(at_size(run, width=100))
+    assert told == "views of 100×75 pixels, files of 800×600; --width or --scale for another size"
+    assert size_in_words(run) is None
+    with pytest.raises(UserError, match="both say how large"):
+        at_size(run, scale=1.0, width=100)
+
+
+def test_a_run_that_was_trained_small_is_shown_as_it_was_trained(tmp_path: Path) -> None:
+    capture = at_scale(load_capture(make_large_capture(tmp_path, views=2, size=(800, 600)), test_every=2), 0.25)
+    run = make_run(capture)
+    assert sizes(at_size(run)) == {(200, 150)}
+    assert sizes(at_size(run, scale=0.5)) == {(400, 300)}
+
+
+def test_a_true_estimate_is_true_at_half_the_size(tmp_path: Path) -> None:
+    """Maps of the sphere that made the images, against images and masks that are averaged."""
+    root = make_capture(tmp_path, size=(160, 120), views=4, test=(0, 2), masks=True)
+    run = at_size(make_run(load_capture(root)), scale=0.5)
+    shares: list[float] = []
+    rendered = render_test_views(run, shares.append)
+    assert shares == sorted(shares)
+    assert shares[0] == pytest.approx(1 / 10)  # two views of five parts each: 4800 rays by 1000
+    assert shares[-1] == 1.0
+    for view, known in zip(rendered, known_test_views(run, rendered).views, strict=True):
+        assert view.maps["rgb"].shape == known.image.shape == (60, 80, 3)
+        assert 0.2 < known.mask.mean() < 0.6
+        assert metrics.psnr(view.maps["rgb"], known.image, known.mask) > 40
+        assert np.abs(view.maps["depth"][..., 0] > 0)[known.mask].all()
+
+
+def test_the_first_part_tells_how_long_all_takes(monkeypatch, capsys) -> None:
+    times = iter([100.0, 102.0])
+    monkeypatch.setattr(command.time, "monotonic", lambda: next(times))
+    with progress_bar("evaluating") as advance:
+        advance(0.0)
+        advance(0.01)
+        advance(0.02)
+    assert capsys.readouterr().out.count("evaluating takes about 3 min") == 1
+
+
+def test_durations_are_for_people() -> None:
+    assert [duration(s) for s in (42.4, 200.0, 9000.0)] == ["42 s", "3 min", "2.5 h"]
