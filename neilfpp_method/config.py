@@ -53,6 +53,8 @@ class SdfConfig:
     """Length of the feature handed to R."""
     sphere_radius: float = 0.6
     """Radius of the sphere that the field starts as."""
+    start: Literal["sphere", "silhouettes"] = "sphere"
+    """silhouettes: before SDF init the field is brought to the visual hull of the masks, where the capture has masks."""
 
 
 @dataclass(frozen=True)

@@ -151,7 +151,8 @@ class NeilfModel(nn.Module):
         with torch.set_grad_enabled(torch.is_grad_enabled() and plan.moves_host):
             hits, terms = self._render_host(batch, names)
         if "volume" in names:
-            terms["volume"] = losses.photometric(hits.color, batch.color, self.facts.response, self.units.volume)
+            unit, relative = self.units.volume, self.units.relative
+            terms["volume"] = losses.photometric(hits.color, batch.color, self.facts.response, unit, relative)
         if self.seen_places is not None and self.training:
             self.seen_places.remember(hits.position[hits.is_hit(self.config.shading.hit_share)])
         if not plan.moves_material:

@@ -54,7 +54,13 @@ def fast() -> NeilfConfig:
         preset="fast",
         # The surface is all of a scene that is seen, and a table without collisions costs no more to read.
         sdf=SdfConfig(
-            encoding="hash", grid=dataclasses.replace(grid, log2_entries=18), layers=1, width=64, skip=None, feature_width=15
+            encoding="hash",
+            grid=dataclasses.replace(grid, log2_entries=18),
+            layers=1,
+            width=64,
+            skip=None,
+            feature_width=15,
+            start="silhouettes",
         ),
         radiance=OutgoingRadianceConfig(
             encoding="hash",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from neilfpp_method.config import NeilfConfig
@@ -39,15 +40,15 @@ def scene_facts(capture: Capture, pixels: PixelDataset, config: NeilfConfig) -> 
     """What the training images decide before training; see `SceneFacts`."""
     response = "linear" if capture.hdr else "srgb"
     scale, median = config.radiance.scale, pixels.median_radiance()
+    bright, usual = pixels.radiance_quantile(BRIGHT_QUANTILE), HDR_MEDIANS * median
     if scale is None:
-        hdr = max(HDR_MEDIANS * median, pixels.radiance_quantile(BRIGHT_QUANTILE))
-        scale = LDR_SCALE if response == "srgb" else hdr
+        scale = LDR_SCALE if response == "srgb" else max(usual, bright)
     kind, color = config.background.kind, config.background.color
     if kind == "auto":
         kind = "inverted_sphere" if color is None and pixels.border_color() is None else "constant"
     if color is None and kind != "none":
         color = tuple(pixels.border_median().tolist())
-    return SceneFacts(response, median, scale, kind, color or (0.0, 0.0, 0.0))
+    return SceneFacts(response, median, scale, kind, color or (0.0, 0.0, 0.0), capture.hdr and bright > usual)
 
 
 def build_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> NeilfModel:
@@ -73,7 +74,9 @@ def show_known_light(model: NeilfModel) -> None:
 
 def _volsdf(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> VolSdfHost:
     scale, start, points = facts.radiance_scale, facts.median_radiance, _points(capture, config)
-    return VolSdfHost(config, scale, facts.background, facts.background_color, points, start)
+    poses = [capture.normalisation.camera(view.camera).c2w for view in capture.train_views]
+    cameras = torch.from_numpy(np.stack(poses)[:, :, 3]).float()
+    return VolSdfHost(config, scale, facts.background, facts.background_color, points, start, cameras)
 
 
 def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
@@ -109,4 +112,9 @@ def _points(capture: Capture, config: NeilfConfig) -> OrientedPoints | None:
             f"{capture.root}: the point-cloud loss is on, and the capture has no oriented point cloud",
             "add inputs/model/oriented_pcd.ply or set --config.loss.point-cloud 0",
         )
-    return load_point_cloud(capture.point_cloud, capture.normalisation)
+    points = load_point_cloud(capture.point_cloud, capture.normalisation)
+    # What lies beyond the scene sphere is no business of G.
+    within = points[points.position.norm(dim=-1) < config.volume.radius]
+    if not len(within):
+        raise UserError(f"{capture.point_cloud}: no point lies in the scene", "check the scene box, or make the points again")
+    return within

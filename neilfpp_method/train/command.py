@@ -36,6 +36,7 @@ from neilfpp_method.train.run import (
     load_checkpoint,
     read_description,
 )
+from neilfpp_method.train.start import start_geometry
 
 __all__ = ["run_training"]
 
@@ -90,13 +91,18 @@ def run_training(
     facts = described.facts if resume else scene_facts(capture, pixels, config)
     seed_step(config.train.seed, step=-1)
     model = build_model(capture, facts, config)
-    if not (out / "checkpoints" / "last.pt").exists():
+    begins = not (out / "checkpoints" / "last.pt").exists()
+    if begins:
         show_known_light(model)
     if fabric.is_global_zero:
         if not resume:
             create_run(out, config, source, facts)
         console.print(capture.summary, soft_wrap=True)
         console.print(f"run folder {out}", soft_wrap=True)
+    # Every process fits the same geometry for itself.
+    started = start_geometry(model, capture, config) if begins else None
+    if started and fabric.is_global_zero:
+        console.print(started.text, style="yellow" if started.warning else None, soft_wrap=True)
     fabric.barrier()
     continue_with = _continue_with(command, out, device, devices)
     with reporting(out, console, fabric.is_global_zero) as reporter, _stop_request() as stopped:
