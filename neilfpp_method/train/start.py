@@ -24,7 +24,7 @@ __all__ = ["GeometryStart", "fit_distance", "start_geometry"]
 
 HULL_VIEWS = 64
 """Masks that are asked at most, evenly chosen."""
-STEPS = 200
+STEPS = 300
 """Steps of the fit."""
 POINTS = 2048
 """Points of a step."""
@@ -34,9 +34,10 @@ NEAR_SURFACE = 0.1
 """How far from the surface these lie, scene units, standard deviation."""
 RATE = 1e-2
 """Adam's rate for grids and networks of the preset `fast`; it falls to a tenth. Networks with waves take a tenth of it."""
-DAMPING = 1e-4
+DAMPING = 1e-3
 """Adam's ε. An entry of a fine grid that one point alone asks for has a gradient far below this, and hardly moves. With the
-usual 1e-15 it leaps by the whole rate: normals at the surface were then 12.5° off those of the hull, in place of 6°."""
+usual 1e-15 it leaps by the whole rate: normals at the surface were then 12.5° off those of the hull, in place of 6°, and second
+derivatives four times as large."""
 POOL = 65_536
 """Points of the cube among which those near the surface are sought."""
 
