@@ -12,13 +12,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.silhouettes import Outline, read_outlines
 from neilfpp_method.data.visual_hull import DistanceCube, find_hull
 from neilfpp_method.fields.sdf import SdfField
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.settings.types import NeilfConfig
 
 __all__ = ["GeometryStart", "fit_distance", "start_geometry"]
 
@@ -61,7 +61,7 @@ class GeometryStart:
 
 
 def start_geometry(model: NeilfModel, capture: Capture, config: NeilfConfig) -> GeometryStart | None:
-    """Give a new model the geometry that `config.sdf.start` names, and say which it is.
+    """Give a new model the geometry that `config.host.sdf.start` names, and say which it is.
 
     None where there is nothing to start: geometry is given, or belongs to another trainer. Only views to train on are
     asked. The outcome follows from `config.train.seed` and the masks alone, and no other random number is moved by it.
@@ -71,7 +71,7 @@ def start_geometry(model: NeilfModel, capture: Capture, config: NeilfConfig) -> 
     """
     if not isinstance(model.host, VolSdfHost):
         return None
-    if config.sdf.start == "sphere":
+    if config.host.sdf.start == "sphere":
         return GeometryStart(reason="as the settings say")
     outlines = [_in_scene(outline, capture) for outline in read_outlines(capture.train_views, HULL_VIEWS)]
     if not outlines:
@@ -135,4 +135,4 @@ def _in_scene(outline: Outline, capture: Capture) -> Outline:
 
 
 def _rate(config: NeilfConfig) -> float:
-    return RATE if config.sdf.encoding == "hash" else RATE / 10
+    return RATE if config.encoding.kind == "hash" else RATE / 10

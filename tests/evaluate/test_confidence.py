@@ -12,21 +12,21 @@ import torch
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import confidence
-from neilfpp_method.evaluate.arriving import arriving_light, by_patch, patch_count
 from neilfpp_method.evaluate.confidence import (
-    LEAST_NOISE,
+    MIN_NOISE,
     gather_evidence,
     material_deviation,
     shown_surface,
     with_deviation,
 )
 from neilfpp_method.evaluate.metrics import confidence_ratio
+from neilfpp_method.evaluate.patches import by_patch, light_by_patch, patch_count
 from neilfpp_method.evaluate.protocols import confidence_metrics
 from neilfpp_method.evaluate.render_views import render_run
 from neilfpp_method.evaluate.sightings import TrainingViews
 from neilfpp_method.evaluate.views import known_test_views, render_test_views
-from neilfpp_method.facts import SceneFacts
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.structures import RayBatch, SurfaceHits
 from neilfpp_method.train.run import Run
 from tests.data.make_capture import RADIUS, SCALE, make_capture
@@ -105,7 +105,7 @@ def test_the_first_views_are_far_from_one_another(run: Run):
 def test_patches_add_up_to_all_light(run: Run):
     normal = on_sphere(20)
     material = run.model.materials(SPHERE * normal)
-    arriving = arriving_light(run.model, SPHERE * normal, normal, normal[:, None], material)
+    arriving = light_by_patch(run.model, SPHERE * normal, normal, normal[:, None], material)
     parts = by_patch(arriving.light, arriving.patch, patch_count(run.model))
     torch.testing.assert_close(parts.sum(-1), arriving.light.sum(1))
     assert ((parts > 0).any(1).sum(-1) > 5).all()
@@ -143,7 +143,7 @@ def test_what_no_view_sees_is_a_guess(run: Run, evidence):
 
 def test_the_better_the_images_are_explained_the_less_is_left_to_guess(run: Run, evidence):
     normal = on_sphere(60)
-    hopeless = replace(evidence, noise=1e4, misfit=LEAST_NOISE)
+    hopeless = replace(evidence, noise=1e4, misfit=MIN_NOISE)
     doubt = [
         material_deviation(run.model, believed, SPHERE * normal, normal).roughness.var().item()
         for believed in (hopeless, replace(evidence, noise=0.05))

@@ -12,12 +12,12 @@ import pytest
 import torch
 from rich.console import Console
 
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.images import write_png
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.visual_hull import find_hull
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.settings.types import NeilfConfig, VolSdfConfig
 from neilfpp_method.train import command, start
 from neilfpp_method.train.build import build_model, scene_facts
 from neilfpp_method.train.loop import make_optimizer, seed_step
@@ -47,7 +47,7 @@ def masked(tmp_path: Path) -> Path:
 
 def settings(begin: str = "silhouettes") -> NeilfConfig:
     config = small_config()
-    return dataclasses.replace(config, sdf=dataclasses.replace(config.sdf, start=begin))
+    return dataclasses.replace(config, host=VolSdfConfig(sdf=dataclasses.replace(config.host.sdf, start=begin)))
 
 
 def started(root: Path, config: NeilfConfig) -> tuple[NeilfModel, GeometryStart]:
@@ -126,7 +126,7 @@ def test_training_says_how_it_starts_and_a_resumed_run_does_not_start_again(mask
         path = run.path / "checkpoints" / "last.pt"
         if not path.exists():
             path.parent.mkdir(exist_ok=True)
-            save_checkpoint(path, run.model, make_optimizer(run.model, run.config.optimizer), 1)
+            save_checkpoint(path, run.model, run.light_solver, make_optimizer(run.model, run.config.optimizer), 1)
 
     monkeypatch.setattr(command, "train", first_step)
     said = []
