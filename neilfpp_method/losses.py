@@ -25,22 +25,44 @@ __all__ = [
     "surface",
 ]
 
+RELATIVE_FLOOR = 0.3
+"""Share of the unit that is added to a pixel's brightness where errors are relative to it: what is darker than that counts
+by its error alone, and noise in the dark does not come to weigh without bound."""
+
 
 def photometric(
     radiance: Float[Tensor, "N 3"],
     pixel: Float[Tensor, "N 3"],
     response: str,
     unit: float = 1.0,
+    relative: bool = False,
 ) -> LossTerm:
     """L_vol and L_phys: L1 between a render and the pixel.
+
+    Without `relative` all pixels count alike. With it a pixel of brightness p, the mean of its channels, has the weight
+    1 / (p / unit + `RELATIVE_FLOOR`): about 3.3 where it is black, 0.77 at the unit, 0.01 at a hundred units. Highlights of
+    hundreds of units would otherwise be most of the loss, and most of its gradient, though they are few pixels (Mildenhall et
+    al. 2022, "NeRF in the Dark", which divides by the render; the pixel is what is known from the first step on). The
+    weights are constants, and their sum is divided out (`LossTerm.mean`), so L_vol keeps its size beside the other losses.
 
     Args:
         radiance: what the model sees, linear.
         pixel: what the file holds, in the capture's `response`.
         response: "linear" compares radiance; "srgb" clips the render and encodes it first (METHOD §6).
         unit: what the difference is measured in: with the range of an output activation, the gradient keeps its size.
+        relative: whether an error counts beside the brightness of its pixel.
+
+    Example:
+        >>> render, pixel = torch.tensor([[1.1] * 3, [22.0] * 3]), torch.tensor([[1.0] * 3, [20.0] * 3])
+        >>> round(photometric(render, pixel, "linear").mean().item(), 3)  # (0.1 + 2) / 2
+        1.05
+        >>> round(photometric(render, pixel, "linear", relative=True).mean().item(), 3)  # weights 1 / 1.3 and 1 / 20.3
+        0.214
     """
-    return LossTerm((apply_response(radiance, response) - pixel).abs() / unit)
+    error = (apply_response(radiance, response) - pixel).abs() / unit
+    if not relative:
+        return LossTerm(error)
+    return LossTerm(error, 1.0 / (pixel.mean(-1, keepdim=True) / unit + RELATIVE_FLOOR))
 
 
 def mask(

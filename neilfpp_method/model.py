@@ -139,7 +139,8 @@ class NeilfModel(nn.Module):
         # 1. The host renders colour, hit position and normal.
         hits, terms = self._render_host(batch, plan, names)
         if "volume" in names:
-            terms["volume"] = losses.photometric(hits.color, batch.color, self.facts.response, self.units.volume)
+            unit, relative = self.units.volume, self.units.relative
+            terms["volume"] = losses.photometric(hits.color, batch.color, self.facts.response, unit, relative)
         if not plan.moves_material:
             return StepResult.of(terms, SurfacePixels.none_of(batch), batch[:0])
 

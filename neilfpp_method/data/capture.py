@@ -20,12 +20,14 @@ from neilfpp_method.data.raw import RAW_SUFFIXES
 from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, SceneSource, View, check_camera, inside, plain_name
 from neilfpp_method.errors import UserError
 
-__all__ = ["READERS", "Camera", "Capture", "Normalisation", "Reader", "View", "load_capture"]
+__all__ = ["FOUND", "READERS", "Camera", "Capture", "Normalisation", "Reader", "View", "load_capture"]
 
 TEST_EVERY = 8
+# How a line about the scene box ends.
 FOUND: Mapping[SceneSource, str] = {
-    "box": "",
+    "box": ", as the capture says",
     "points": ", told by the points",
+    "focus": ", told by the cameras' focus, as the points reach far beyond it",
     "masks": ", told by the masks",
     "cameras": ", guessed from the cameras alone: add masks, points or a scene box where it is wrong",
 }

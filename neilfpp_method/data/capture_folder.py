@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 
 from neilfpp_method.data.json_entry import Entry, write_json
 from neilfpp_method.data.lens import Lens
-from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, View, inside
+from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, SceneSource, View, inside
 from neilfpp_method.errors import UserError
 
 __all__ = ["FILE", "LAYOUT", "Writable", "read", "read_scene", "recognise", "write_capture"]
@@ -51,6 +51,7 @@ def read(root: Path) -> CaptureFiles:
         point_cloud=_file(root, entry, "point_cloud"),
         test=None if test is None else frozenset(name.word() for name in test.items()),
         hdr=entry["response"].word("linear", "srgb") == "linear",
+        scene_from=_source(entry["scene"]),
     )
 
 
@@ -65,6 +66,12 @@ def read_scene(entry: Entry) -> Normalisation:
     if radius <= 0:
         raise UserError(f"{entry.name('radius')}: not positive", "give half the largest extent of the scene's box")
     return Normalisation(radius, (x, y, z))
+
+
+def _source(scene: Entry) -> SceneSource:
+    """What told the scene box when the folder was made."""
+    source = scene.get("source")
+    return "box" if source is None else source.word(*get_args(SceneSource))
 
 
 def _view(root: Path, index: int, entry: Entry) -> View:
@@ -126,6 +133,9 @@ class Writable(Protocol):
     @property
     def point_cloud(self) -> Path | None: ...
 
+    @property
+    def scene_from(self) -> SceneSource: ...
+
 
 def write_capture(root: Path, files: Writable, *, response: Literal["linear", "srgb"], test: Collection[str] = ()) -> Path:
     """Write `capture.json` into a folder whose images, masks and points are there already; returns its path.
@@ -146,7 +156,11 @@ def write_capture(root: Path, files: Writable, *, response: Literal["linear", "s
         "format": FORMAT,
         "version": VERSION,
         "response": response,
-        "scene": {"centre": list(files.normalisation.centre), "radius": files.normalisation.scale},
+        "scene": {
+            "centre": list(files.normalisation.centre),
+            "radius": files.normalisation.scale,
+            "source": files.scene_from,
+        },
         "test": [name for name in names if name in test],
         "point_cloud": _relative(root, files.point_cloud),
         "views": [_described(root, view) for view in files.views],

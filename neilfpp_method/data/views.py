@@ -141,7 +141,9 @@ class Normalisation:
         return replace(camera, w2c=w2c)
 
 
-SceneSource = Literal["box", "points", "masks", "cameras"]
+SceneSource = Literal["box", "points", "focus", "masks", "cameras"]
+"""What told where the scene is: the capture itself; points; what the cameras look at, as the points reach beyond it; the visual
+hull of the masks; the cameras alone."""
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from neilfpp_method.volume.compositing import Weights, composite, optical_depth,
 from neilfpp_method.volume.density import LaplaceDensity, laplace_density
 from neilfpp_method.volume.distance_grid import cell_size, sample_grid, trace_grid
 from neilfpp_method.volume.empty_space import EmptySpace
+from neilfpp_method.volume.free_space import FreeSpace, cameras_within
 from neilfpp_method.volume.intersect import Interval, sphere_interval
 from neilfpp_method.volume.samplers import error_bounded_samples
 
@@ -54,6 +55,7 @@ class VolSdfHost(nn.Module):
         background_color: linear RGB of a constant background, and what an inverted sphere starts as.
         points: oriented cloud on the surface, scene frame, for L_pcd.
         radiance_start: what R starts near.
+        cameras: where cameras stand, scene frame: nothing can be close to them (`volume.free_space`).
     """
 
     def __init__(
@@ -64,6 +66,7 @@ class VolSdfHost(nn.Module):
         background_color: tuple[float, float, float] = (0.0, 0.0, 0.0),
         points: OrientedPoints | None = None,
         radiance_start: float = MID_GREY,
+        cameras: Float[Tensor, "V 3"] | None = None,
     ) -> None:
         super().__init__()
         self.config = config
@@ -81,6 +84,8 @@ class VolSdfHost(nn.Module):
         self.density = LaplaceDensity(config.volume.beta_init)
         self.register_buffer("background_color", torch.tensor(background_color))
         self.background = field_beyond(background, config.background, radius, radiance_scale, self.background_color)
+        within = torch.empty(0, 3) if cameras is None else cameras_within(cameras, radius)
+        self.free_space = FreeSpace(within, radius) if len(within) else None
         self.empty_space = EmptySpace(radius) if config.volume.skip_empty else None
         hard = config.inter_reflection.mode == "hard"
         resolution = config.inter_reflection.grid_resolution if hard else 0
@@ -172,18 +177,31 @@ class VolSdfHost(nn.Module):
 
     def _grid(self) -> Float[Tensor, "R R R"]:
         if self.grid_age is None or self.grid_age >= GRID_LIFE:
-            fresh = sample_grid(self.sdf_field, self.config.volume.radius, self.distance_grid.shape[0], self.distance_grid)
+            fresh = sample_grid(self._solid, self.config.volume.radius, self.distance_grid.shape[0], self.distance_grid)
             self.distance_grid.copy_(fresh)
             self.grid_age = 0
         return self.distance_grid
 
     def sdf(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-        """Signed distance of the scene's surface; with no background model the scene sphere closes it (VolSDF §3.1)."""
-        distance = self.sdf_field(x)
+        """Signed distance of the scene's surface: G, with free space cut out of it; with no background model the scene sphere
+        closes it (VolSDF §3.1)."""
+        distance = self._solid(x)
         return torch.minimum(distance, self._to_sphere(x)) if self.background_kind == "none" else distance
+
+    def _solid(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
+        distance = self.sdf_field(x)
+        return distance if self.free_space is None else torch.maximum(distance, self.free_space(x).depth.to(distance.dtype))
 
     def _surface(self, x: Float[Tensor, "P 3"]) -> SdfSample:
         sample = self.sdf_field.with_gradient(x)
+        if self.free_space is not None:
+            free = self.free_space(x)
+            within = free.depth > sample.distance
+            sample = SdfSample(
+                torch.where(within, free.depth, sample.distance),
+                torch.where(within[:, None], free.gradient, sample.gradient),
+                sample.feature,
+            )
         if self.background_kind != "none":
             return sample
         to_sphere = self._to_sphere(x)

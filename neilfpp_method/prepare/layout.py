@@ -16,7 +16,7 @@ from neilfpp_method.data.capture_folder import FILE, recognise, write_capture
 from neilfpp_method.data.formats.write_sfm_scene import write_sfm_scene
 from neilfpp_method.data.formats.write_transforms import write_transforms
 from neilfpp_method.data.point_cloud import WorldPoints, read_oriented_ply, write_oriented_ply
-from neilfpp_method.data.scene_box import find_box
+from neilfpp_method.data.scene_box import SceneBox, find_box
 from neilfpp_method.data.views import CaptureFiles, View
 from neilfpp_method.prepare.dense_cloud import dense_cloud
 from neilfpp_method.prepare.options import Prepare
@@ -63,8 +63,8 @@ def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
     known = source.points.position[reliable(source.points)] if source.points is not None and len(source.points) else None
     if step.result is None:
         views = write_views(posed, step.folder, options.undistort, open_bar("writing images", len(posed.views)).advance)
-        box = posed.normalisation or find_box(views, known).normalisation
-        files = CaptureFiles(step.folder, views, box)
+        box = SceneBox(posed.normalisation, posed.scene_from) if posed.normalisation else find_box(views, known)
+        files = CaptureFiles(step.folder, views, box.normalisation, scene_from=box.source)
         write_capture(step.folder, files, response="linear" if posed.linear else "srgb")
         step.complete({})
     prepared = load_capture(step.folder)
@@ -108,11 +108,12 @@ def _publish(source: Source, prepared: Capture, cloud: WorldPoints, kind: str, o
         points=len(cloud.position),
         cloud=kind,
         radius=box.scale,
+        scene_from=prepared.scene_from,
         remarks=source.remarks,
     )
     write_summary(out / "summary.json", summary)
     write_picture(out / "summary.png", views, test, cloud, box, source.placed)
-    files = CaptureFiles(out, views, box, points)
+    files = CaptureFiles(out, views, box, points, scene_from=prepared.scene_from)
     write_capture(out, files, response="linear" if prepared.hdr else "srgb", test=test)
     for name in options.also:
         WRITERS[name](load_capture(out, format="neilfpp"), out / name)

@@ -14,7 +14,7 @@ from neilfpp_method.data.formats.colmap import camera_of
 from neilfpp_method.data.formats.copies import copy_view
 from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.data.raw import RAW_SUFFIXES
-from neilfpp_method.data.views import Normalisation, View
+from neilfpp_method.data.views import Normalisation, SceneSource, View
 from neilfpp_method.prepare.matching_copies import relative_exposures
 from neilfpp_method.prepare.photos import Photos, read_photo
 
@@ -23,13 +23,15 @@ __all__ = ["Posed", "posed_by_capture", "posed_by_model", "write_views"]
 
 @dataclass(frozen=True)
 class Posed:
-    """Views whose files lie where they were taken from; `normalisation` and `cloud` where the source knows them."""
+    """Views whose files lie where they were taken from; `normalisation`, with what told it, and `cloud` where the source knows
+    them."""
 
     views: tuple[View, ...]
     linear: bool
     normalisation: Normalisation | None = None
     cloud: Path | None = None
     test: frozenset[str] | None = None
+    scene_from: SceneSource = "box"
 
 
 def posed_by_model(photos: Photos, model: pycolmap.Reconstruction) -> Posed:
@@ -48,7 +50,7 @@ def posed_by_model(photos: Photos, model: pycolmap.Reconstruction) -> Posed:
 def posed_by_capture(capture: Capture) -> Posed:
     """The views of a capture that has poses."""
     known = capture.normalisation if capture.scene_from != "cameras" else None
-    return Posed(capture.views, capture.hdr, known, capture.point_cloud, capture.test)
+    return Posed(capture.views, capture.hdr, known, capture.point_cloud, capture.test, capture.scene_from)
 
 
 def write_views(posed: Posed, folder: Path, straight: bool, advance: Callable[[], None]) -> tuple[View, ...]:

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from neilfpp_method.data.capture import FOUND
 from neilfpp_method.data.colmap_library import pycolmap
 from neilfpp_method.data.images import replacing
+from neilfpp_method.data.views import SceneSource
 
 __all__ = ["Placement", "Summary", "describe_cameras", "placements", "remarks_on", "write_summary"]
 
@@ -41,6 +43,7 @@ class Summary:
     points: int
     cloud: str
     radius: float
+    scene_from: SceneSource
     remarks: tuple[str, ...]
 
     @property
@@ -58,7 +61,8 @@ class Summary:
         else:
             lines.append(f"{self.views} views, with the poses that they came with")
         lines += [f"camera {camera['model']}: {camera['images']} images, {_parameters(camera)}" for camera in self.cameras]
-        lines.append(f"point cloud: {self.points} points with normals ({self.cloud}); radius of the scene {self.radius:.4g}")
+        lines.append(f"point cloud: {self.points} points with normals ({self.cloud})")
+        lines.append(f"radius of the scene: {self.radius:.4g}{FOUND[self.scene_from]}")
         return [*lines, *(f"note: {remark}" for remark in self.remarks)]
 
 

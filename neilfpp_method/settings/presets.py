@@ -57,6 +57,7 @@ FAST: Mapping[str, Any] = {
     "encoding.sdf_log2_entries": 18,
     "encoding.max_resolution": 256,
     "host.sdf.layers": 1,
+    "host.sdf.start": "silhouettes",
     "radiance.direction": "mirrored",
     "radiance.layers": 2,
     "brdf.initial_base_color": 0.3,

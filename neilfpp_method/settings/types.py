@@ -54,6 +54,8 @@ class SdfConfig:
     """Units of a hidden layer."""
     feature_width: int = 256
     """Length of the feature handed to R."""
+    start: Literal["sphere", "silhouettes"] = "sphere"
+    """silhouettes: before SDF init the field is brought to the visual hull of the masks, where the capture has masks."""
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,7 @@ from neilfpp_method.train.run import (
     load_checkpoint,
     read_description,
 )
+from neilfpp_method.train.start import start_geometry
 
 __all__ = ["run_training"]
 
@@ -109,7 +110,8 @@ def run_training(
         facts = described.facts if resume else scene_facts(capture, pixels, config)
         seed_step(config.train.seed, step=-1)
         model = build_model(capture, facts, config)
-        if not (out / "checkpoints" / "last.pt").exists():
+        begins = not (out / "checkpoints" / "last.pt").exists()
+        if begins:
             show_known_light(model)
         if fabric.is_global_zero:
             if not resume:
@@ -118,6 +120,10 @@ def run_training(
             if source.scale < 1 and not resume:
                 console.print(_scaled(source.scale, len(pixels), rays), soft_wrap=True)
             console.print(f"run folder {out}", soft_wrap=True)
+        # Every process fits the same geometry for itself.
+        started = start_geometry(model, capture, config) if begins else None
+        if started and fabric.is_global_zero:
+            console.print(started.text, style="yellow" if started.warning else None, soft_wrap=True)
     fabric.barrier()
     continue_with = _continue_with(command, out, device, devices)
     with reporting(out, console, fabric.is_global_zero) as reporter, _stop_request() as stopped:

@@ -29,12 +29,13 @@ def test_remarks_name_the_images():
 
 
 def test_lines_have_the_figures():
-    lines = Summary(PLACED, (2, 1), (CAMERA,), 2, 77, "sparse", 1.5, ("careful",)).lines
+    lines = Summary(PLACED, (2, 1), (CAMERA,), 2, 77, "sparse", 1.5, "focus", ("careful",)).lines
     assert "2 of 3 images placed, reprojection error 1.15 pixels" in lines[0]
     assert "fx 500" in lines[1]
     assert "77 points" in lines[2]
-    assert lines[3] == "note: careful"
-    assert "with the poses" in Summary((), (), (), 5, 0, "none", 1.0, ()).lines[0]
+    assert lines[3] == "radius of the scene: 1.5, told by the cameras' focus, as the points reach far beyond it"
+    assert lines[4] == "note: careful"
+    assert "with the poses" in Summary((), (), (), 5, 0, "none", 1.0, "box", ()).lines[0]
 
 
 def test_a_small_part_is_refused_with_what_to_do():

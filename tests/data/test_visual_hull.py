@@ -1,0 +1,147 @@
+"""The visual hull of a sphere's silhouettes against the sphere, and silhouettes that make no hull."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from neilfpp_method.data.images import write_png
+from neilfpp_method.data.silhouettes import Outline, agreement, read_outlines, sightings
+from neilfpp_method.data.views import Camera, View
+from neilfpp_method.data.visual_hull import DistanceCube, find_hull, signed_distance, visual_hull
+
+BALL = 0.6
+SIZE = 120
+CELL = 2 * 1.3 / 96
+
+
+def camera_at(eye: Sequence[float], focal: float = 1.5 * SIZE, size: int = SIZE) -> Camera:
+    """A camera that looks at the origin."""
+    eye = np.asarray(eye, float)
+    forward = -eye / np.linalg.norm(eye)
+    right = np.cross(forward, [0.1, 0.2, 1.0])
+    right /= np.linalg.norm(right)
+    w2c = np.eye(4)
+    w2c[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    w2c[:3, 3] = -w2c[:3, :3] @ eye
+    return Camera(focal, focal, size / 2, size / 2, size, size, w2c)
+
+
+def disc(camera: Camera, centre: Sequence[float] = (0.0, 0.0, 0.0), radius: float = BALL) -> np.ndarray:
+    """The silhouette of a ball, from the angle between rays and its centre; apart from the package's projection."""
+    rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
+    local = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=-1)
+    rays = local @ camera.w2c[:3, :3] / np.linalg.norm(local, axis=-1, keepdims=True)
+    to = np.asarray(centre) - camera.c2w[:, 3]
+    distance = np.linalg.norm(to)
+    return rays @ to / distance > np.sqrt(1 - (radius / distance) ** 2)
+
+
+def ring(count: int, distance: float = 4.0, **camera) -> list[Outline]:
+    """Silhouettes of the ball from directions that are spread evenly over the sphere."""
+    k = np.arange(count) + 0.5
+    z, azimuth = 1 - 2 * k / count, k * np.pi * (3 - np.sqrt(5))
+    eyes = distance * np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], axis=1)
+    cameras = [camera_at(eye, **camera) for eye in eyes]
+    return [Outline(View(f"{i}", i, c, Path()), disc(c)) for i, c in enumerate(cameras)]
+
+
+def random_points(count: int, reach: float) -> torch.Tensor:
+    return reach * (2 * torch.rand(count, 3, generator=torch.Generator().manual_seed(0)) - 1)
+
+
+@pytest.fixture(scope="module")
+def hull() -> DistanceCube:
+    found = find_hull(ring(40))
+    assert isinstance(found, DistanceCube)
+    return found
+
+
+def test_the_hull_of_a_ball_is_the_ball(hull):
+    x = random_points(4000, 1.2)
+    truth = x.norm(dim=-1) - BALL
+    found = hull.at(x)
+    clear = truth.abs() > 1.5 * CELL
+    assert torch.equal(found[clear] < 0, truth[clear] < 0)
+    # A hull is no smaller than the body, up to a cell, and 40 cones leave little beside a ball.
+    assert (found - truth).abs().mean() < CELL
+    assert (found - truth).max() < 1.5 * CELL
+
+
+def test_the_distance_goes_on_outside_the_cube(hull):
+    far = torch.tensor([[3.0, 0.0, 0.0], [0.0, -2.0, 0.0]])
+    assert hull.at(far).tolist() == pytest.approx([3.0 - BALL, 2.0 - BALL], abs=2 * CELL)
+
+
+def test_a_few_wrong_masks_do_not_matter_and_many_do():
+    outlines = ring(40)
+    broken = [replace(outline, inside=np.roll(outline.inside, SIZE // 2, axis=1)) for outline in outlines]
+    whole = visual_hull(outlines, 1.3, 32)
+    two = visual_hull([*broken[:2], *outlines[2:]], 1.3, 32)
+    assert (two & whole).sum() > 0.95 * whole.sum(), "two of forty may err; at the rim a third is off by a pixel"
+    assert (two & ~whole).sum() == 0
+    assert find_hull([*broken[:20], *outlines[20:]], resolution=32) == "the masks have next to no place in common"
+
+
+def test_views_that_do_not_see_a_place_have_no_say_about_it():
+    # Half of the views are close-ups, whose pictures end within the ball: white all over.
+    close = ring(20, focal=6.0 * SIZE)
+    assert not any(outline.complete for outline in close)
+    hull = find_hull([*ring(20), *close], resolution=32)
+    x = random_points(2000, 1.1)
+    truth = x.norm(dim=-1) - BALL
+    assert (hull.at(x) - truth).abs().mean() < 2 * CELL
+    # And with close-ups alone nobody sees where the ball ends, nor what is beside the pictures.
+    alone = visual_hull(close, 1.3, 32)
+    centre = (np.arange(32) + 0.5) * 2.6 / 32 - 1.3
+    assert np.linalg.norm(np.stack(np.meshgrid(centre, centre, centre, indexing="ij"), -1)[alone], axis=-1).max() < 1.3
+
+
+def test_a_hole_that_views_look_through_is_open():
+    # A bore along z, which the six views near that axis see through.
+    along = [camera_at([0.2 * np.cos(a), 0.2 * np.sin(a), 4.0]) for a in np.arange(6.0)]
+    bored = [Outline(View("bore", 0, c, Path()), disc(c) & ~disc(c, radius=0.2)) for c in along]
+    hull = find_hull([*ring(30), *bored], resolution=48)
+    assert hull.at(torch.zeros(1, 3)) > 0
+    assert (hull.at(torch.tensor([[0.4, 0.0, 0.0], [0.0, -0.4, 0.0]])) < -0.05).all()
+
+
+def test_what_is_no_body_is_told():
+    outlines = ring(10)
+    white = [replace(outline, inside=np.ones_like(outline.inside)) for outline in outlines]
+    assert find_hull(white, resolution=32) == "what the masks show reaches beyond the scene box"
+    black = [replace(outline, inside=np.zeros_like(outline.inside)) for outline in outlines]
+    assert find_hull(black, resolution=32) == "the masks have next to no place in common"
+
+
+def test_the_signed_distance_of_a_slab():
+    inside = np.zeros((20, 20, 20), bool)
+    inside[:10] = True
+    distance = signed_distance(inside, 0.1)
+    # The surface lies between the centres of rows 9 and 10; far from the ends the blur changes nothing.
+    assert distance[5:15, 10, 10] == pytest.approx(0.1 * (np.arange(5, 15) - 9.5), abs=1e-3)
+
+
+def test_agreement_is_the_share_of_those_that_can_tell():
+    outlines = ring(8)
+    points = np.array([[0.0, 0.0, 0.0], [5.0, 5.0, 5.0]])
+    found = sightings(outlines, points)
+    assert found.seen.tolist() == [8, 8]
+    assert found.inside.tolist() == [8, 0]
+    assert agreement(outlines, points).tolist() == [1.0, 0.0]
+
+
+def test_large_masks_are_read_small_with_cameras_to_match(tmp_path):
+    camera = camera_at([0.0, 0.0, 4.0], focal=1.5 * 400, size=400)
+    mask = disc(camera, centre=(0.2, 0.1, 0.0))
+    write_png(tmp_path / "mask.png", np.where(mask, 255, 0).astype(np.uint8))
+    view = View("0", 0, camera, tmp_path / "image.png", tmp_path / "mask.png")
+    (outline,) = read_outlines([view], longest=100)
+    assert outline.inside.shape == (100, 100)
+    assert outline.inside.mean() == pytest.approx(mask.mean(), rel=0.02)
+    assert sightings([outline], np.array([[0.2, 0.1, 0.0], [0.2, 0.1 + BALL + 0.1, 0.0]])).inside.tolist() == [1, 0]

@@ -1,0 +1,148 @@
+"""What the distance field starts as: the hull of the masks, or the sphere and why."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.images import write_png
+from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.visual_hull import find_hull
+from neilfpp_method.model import NeilfModel
+from neilfpp_method.settings.types import NeilfConfig, VolSdfConfig
+from neilfpp_method.train import command, start
+from neilfpp_method.train.build import build_model, scene_facts
+from neilfpp_method.train.loop import make_optimizer, seed_step
+from neilfpp_method.train.run import save_checkpoint
+from neilfpp_method.train.start import GeometryStart, start_geometry
+from tests.data.make_capture import RADIUS, SCALE, make_capture
+from tests.train.small_runs import small_config
+
+BALL = RADIUS / SCALE
+SIZE = (64, 48)
+
+
+@pytest.fixture(autouse=True)
+def cheap(monkeypatch) -> None:
+    """A coarser hull and a shorter fit, enough for tiny fields."""
+    monkeypatch.setattr(start, "find_hull", functools.partial(find_hull, resolution=40))
+    monkeypatch.setattr(start, "STEPS", 100)
+    monkeypatch.setattr(start, "POINTS", 512)
+    monkeypatch.setattr(start, "POOL", 8192)
+
+
+@pytest.fixture
+def masked(tmp_path: Path) -> Path:
+    """Twelve views of a ball of radius 0.8 scene units, the first of them held out."""
+    return make_capture(tmp_path / "capture", views=12, size=SIZE, masks=True)
+
+
+def settings(begin: str = "silhouettes") -> NeilfConfig:
+    config = small_config()
+    return dataclasses.replace(config, host=VolSdfConfig(sdf=dataclasses.replace(config.host.sdf, start=begin)))
+
+
+def started(root: Path, config: NeilfConfig) -> tuple[NeilfModel, GeometryStart]:
+    """An untrained model of the capture after its start."""
+    capture = load_capture(root)
+    seed_step(config.train.seed, -1)
+    model = build_model(capture, scene_facts(capture, PixelDataset(capture, capture.train_views), config), config)
+    return model, start_geometry(model, capture, config)
+
+
+def off_the_ball(model: NeilfModel) -> torch.Tensor:
+    """G at points of the ball's surface: 0 where it is right."""
+    direction = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    with torch.no_grad():
+        return model.host.sdf_field(BALL * direction)
+
+
+def weights(model: NeilfModel) -> list[torch.Tensor]:
+    return [parameter.detach().clone() for parameter in model.host.sdf_field.parameters()]
+
+
+def test_the_field_starts_as_the_hull_of_the_masks(masked):
+    sphere, plain = started(masked, settings("sphere"))
+    hull, told = started(masked, settings())
+    assert plain.text == "geometry starts as a sphere: as the settings say"
+    assert told.text.startswith("geometry starts as the visual hull of 11 masks, to 0.0")
+    assert told.error < 0.02
+    # Eleven views from a ring leave a hull that is a little larger than the ball: G is negative on the ball.
+    assert off_the_ball(sphere).abs().mean() > 0.1
+    assert off_the_ball(hull).abs().mean() < 0.05
+    with torch.no_grad():
+        inside, outside = (hull.host.sdf_field(torch.tensor([[0.0, 0.0, z], [z, 0.0, 0.0]])) for z in (0.2, 1.3))
+    assert (inside < -0.3).all()
+    assert (outside > 0.2).all()
+
+
+def test_the_start_follows_from_the_seed_and_moves_no_other_draw(masked):
+    config = settings()
+    first, _ = started(masked, config)
+    state = torch.get_rng_state()
+    again, _ = started(masked, config)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert all(torch.equal(a, b) for a, b in zip(weights(first), weights(again), strict=True))
+    started(masked, settings("sphere"))
+    assert torch.equal(torch.get_rng_state(), state), "training draws the same whatever it started as"
+
+
+def test_masks_that_are_held_out_are_not_asked(masked):
+    first, _ = started(masked, settings())
+    write_png(masked / "inputs" / "masks" / "000.png", np.full(SIZE[::-1], 255, np.uint8))
+    again, _ = started(masked, settings())
+    assert all(torch.equal(a, b) for a, b in zip(weights(first), weights(again), strict=True))
+
+
+def test_without_masks_it_is_the_sphere_and_says_so(tmp_path):
+    root = make_capture(tmp_path, views=4)
+    plain, _ = started(root, settings("sphere"))
+    model, told = started(root, settings())
+    assert told == GeometryStart(reason="the capture has no masks")
+    assert all(torch.equal(a, b) for a, b in zip(weights(plain), weights(model), strict=True))
+
+
+def test_masks_that_make_no_body_are_a_warning(masked):
+    for path in sorted((masked / "inputs" / "masks").iterdir()):
+        write_png(path, np.full(SIZE[::-1], 255, np.uint8))
+    plain, _ = started(masked, settings("sphere"))
+    model, told = started(masked, settings())
+    assert told.text == "warning: geometry starts as a sphere: what the masks show reaches beyond the scene box"
+    assert all(torch.equal(a, b) for a, b in zip(weights(plain), weights(model), strict=True))
+
+
+def test_training_says_how_it_starts_and_a_resumed_run_does_not_start_again(masked, tmp_path, monkeypatch):
+    """The loop is left out: what it finds is saved as it is after the first step."""
+
+    def first_step(run: command.Training) -> None:
+        path = run.path / "checkpoints" / "last.pt"
+        if not path.exists():
+            path.parent.mkdir(exist_ok=True)
+            save_checkpoint(path, run.model, run.light_solver, make_optimizer(run.model, run.config.optimizer), 1)
+
+    monkeypatch.setattr(command, "train", first_step)
+    said = []
+    for resume in (False, True):
+        console = Console(file=io.StringIO(), width=200)
+        command.run_training(
+            data=None if resume else masked,
+            out=tmp_path / "run",
+            config=None if resume else settings(),
+            resume=resume,
+            test_every=None,
+            response="auto",
+            device="cpu",
+            devices=1,
+            console=console,
+        )
+        said.append(console.file.getvalue())
+    assert "geometry starts as the visual hull of 11 masks" in said[0]
+    assert "geometry starts" not in said[1]

@@ -1,0 +1,78 @@
+"""Free space about cameras: how far it reaches, its depth against the definition, and what it does to the reference host."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from neilfpp_method.hosts.volsdf import VolSdfHost
+from neilfpp_method.structures import RayBatch
+from neilfpp_method.volume.free_space import FreeSpace, cameras_within, free_radius
+from tests.scenes import tiny_config
+
+
+def ring(count: int, distance: float) -> torch.Tensor:
+    angle = torch.arange(count) / count * 2 * torch.pi
+    return distance * torch.stack([angle.cos(), angle.sin(), torch.zeros(count)], -1)
+
+
+def test_no_ball_reaches_the_unit_sphere_and_none_is_larger_than_a_quarter_of_the_way():
+    distance = torch.linspace(0.0, 10.0, 1001)
+    free = free_radius(distance)
+    assert (distance - free)[distance >= 1].min() >= 1.0 - 1e-6
+    assert (free[distance < 1] == 0).all(), "cameras among the objects say nothing"
+    assert (free <= 0.25 * distance).all()
+    assert free_radius(torch.tensor([1.2, 2.0])).tolist() == pytest.approx([0.2, 0.5])
+
+
+def test_cameras_far_away_leave_the_scene_as_it_is():
+    near, far = ring(6, 1.8), ring(6, 2.4)  # 2.4 − 0.6 = 1.8 lies beyond the scene sphere
+    assert torch.equal(cameras_within(torch.cat([near, far]), 1.75), near)
+    config = tiny_config()
+    assert VolSdfHost(config, 3.0, "constant", cameras=far).free_space is None
+    assert VolSdfHost(config, 3.0, "constant", cameras=0.5 * near).free_space is None
+
+
+def test_the_depth_is_that_of_the_deepest_ball():
+    cameras = torch.cat([ring(9, 1.5), ring(5, 1.9) + torch.tensor([0.0, 0.0, 0.4])])
+    space = FreeSpace(cameras, 1.75)
+    x = 1.75 * (2 * torch.rand(3000, 3, generator=torch.Generator().manual_seed(0)) - 1)
+    truth = (free_radius(cameras.norm(dim=-1)) - (x[:, None] - cameras).norm(dim=-1)).amax(dim=-1)
+    found = space(x)
+    cell = 3.5 / 63
+    assert (found.depth <= truth + 1e-6).all()
+    assert (truth - found.depth).max() < 1.5 * 3**0.5 * cell
+    assert (truth - found.depth).mean() < 0.05 * cell
+    assert found.gradient.norm(dim=-1) == pytest.approx(torch.ones(3000))
+    step = 1e-3
+    ahead = space(x + step * found.gradient).depth
+    assert (ahead - found.depth).median().item() == pytest.approx(step, rel=0.01)
+
+
+def test_fog_before_a_lens_is_cut_out_and_the_object_is_not():
+    config = tiny_config()
+    cameras = ring(12, 1.5)
+    torch.manual_seed(0)
+    cut, whole = (VolSdfHost(config, 3.0, "constant", cameras=places).eval() for places in (cameras, None))
+    cut.load_state_dict(whole.state_dict())
+    with torch.no_grad():
+        # The object first: both see the ball, more or less, that fields start as.
+        rays = RayBatch(cameras, torch.nn.functional.normalize(-cameras, dim=-1))
+        seen, also = whole.render(rays), cut.render(rays)
+        assert (seen.position - also.position).abs().max() < 0.02
+        assert also.position.norm(dim=-1).max() < 0.9
+        # Then a field that is solid everywhere, as fog before the lens is.
+        for host in (cut, whole):
+            host.sdf_field.forward = lambda x: torch.full_like(x[:, 0], -0.2)
+            exact = host.sdf_field.with_gradient
+            host.sdf_field.with_gradient = lambda x, exact=exact: dataclasses.replace(
+                exact(x), distance=torch.full_like(x[:, 0], -0.2)
+            )
+        assert (whole.render(rays).position - cameras).norm(dim=-1).max() < 0.1
+        first = (cut.render(rays).position - cameras).norm(dim=-1)
+        assert first.min() > 0.9 * 0.375, "a quarter of the distance is free"
+        # Rays from the object to a camera come to its ball, too: free space is where it is, whoever looks.
+        assert (cut.sdf(0.8 * cameras) > 0).all()
+        assert (whole.sdf(0.8 * cameras) < 0).all()
