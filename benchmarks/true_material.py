@@ -25,7 +25,7 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.protocols import light_metrics
 from neilfpp_method.evaluate.views import known_test_views, render_test_views
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.lighting.memory import Observed
+from neilfpp_method.structures import Observed
 from neilfpp_method.lighting.solve import solve_light
 from neilfpp_method.structures import Material
 from neilfpp_method.train.run import Run, load_run

@@ -12,7 +12,7 @@ import torch
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import confidence
-from neilfpp_method.evaluate.arriving import arriving_light, by_patch, patch_count
+from neilfpp_method.evaluate.patches import by_patch, light_by_patch, patch_count
 from neilfpp_method.evaluate.confidence import (
     LEAST_NOISE,
     gather_evidence,
@@ -105,7 +105,7 @@ def test_the_first_views_are_far_from_one_another(run: Run):
 def test_patches_add_up_to_all_light(run: Run):
     normal = on_sphere(20)
     material = run.model.materials(SPHERE * normal)
-    arriving = arriving_light(run.model, SPHERE * normal, normal, normal[:, None], material)
+    arriving = light_by_patch(run.model, SPHERE * normal, normal, normal[:, None], material)
     parts = by_patch(arriving.light, arriving.patch, patch_count(run.model))
     torch.testing.assert_close(parts.sum(-1), arriving.light.sum(1))
     assert ((parts > 0).any(1).sum(-1) > 5).all()

@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.shading.rendering_equation import shade
-from neilfpp_method.structures import Material
+from neilfpp_method.structures import Incident, Material
 
 
 def lamps() -> Lamps:
@@ -34,7 +34,7 @@ def test_a_lambertian_surface_shows_cosine_and_inverse_square():
     rays = light.rays_from(x)
     material = Material(torch.tensor([[0.5, 0.5, 0.5]]), torch.ones(1, 1), torch.zeros(1, 1))
     radiance = light.arriving(rays)
-    color = shade(material, up, up, rays.samples(), radiance, GGX, specular=False).color[0]
+    color = shade(material, up, up, Incident.of(rays.samples(), radiance), None).color[0]
     expected = 0.5 / math.pi * (0.8 * torch.tensor([0.3, 0.6, 0.9]) + 0.2)
     torch.testing.assert_close(color, expected)
 

@@ -12,7 +12,7 @@ from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.factorised_light import FactorisedLightField
 from neilfpp_method.fields.lamps import LampPlaces, Lamps
 from neilfpp_method.lighting.fit import Light, fit_light
-from neilfpp_method.lighting.memory import Observed
+from neilfpp_method.structures import Observed
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.transport import from_lamps, from_texels, in_sight, lamp_kernel
 from neilfpp_method.shading.brdf import GGX, SPHERICAL_GAUSSIAN

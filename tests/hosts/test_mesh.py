@@ -21,7 +21,7 @@ from neilfpp_method.facts import SceneFacts
 from neilfpp_method.hosts import mesh_tracing
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.hosts.mesh_tracing import build_tree, embree_tracer, tree_tracer
-from neilfpp_method.inter_reflection import trace_light
+from neilfpp_method.incident.traced import trace_light
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.presets import PRESETS, fixed_geometry
 from neilfpp_method.schedule import Stage, active_losses, weigh

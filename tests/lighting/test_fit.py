@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 from neilfpp_method.config import LightFitConfig
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.fit import Evidence, Light, fit_light
-from neilfpp_method.lighting.memory import Observed
+from neilfpp_method.structures import Incident, Observed
 from neilfpp_method.lighting.objective import Objective, Target, nearest_points, total_variation, unevenness
 from neilfpp_method.lighting.transport import Transport, from_texels
 from neilfpp_method.shading.brdf import GGX
@@ -60,7 +60,7 @@ def test_transport_agrees_with_the_estimator_under_a_map_and_a_wall():
     drawn = sample_directions("mis", seen.normal, seen.wo, of.roughness, 16_384, GGX, stochastic=True)
     arriving = environment.radiance(seen.position, drawn.wi)
     arriving = torch.where(drawn.wi[..., 2:] < 0, 0.7, arriving)
-    expected = shade(of, seen.normal, seen.wo, drawn, arriving, GGX).color
+    expected = shade(of, seen.normal, seen.wo, Incident.of(drawn, arriving), GGX).color
     torch.testing.assert_close(carried, expected, rtol=0.06, atol=0.02)
 
 
