@@ -18,7 +18,7 @@ from dataclasses import replace
 from functools import partial
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -103,9 +103,7 @@ class PlainLight(nn.Module):
         super().__init__()
         self.field = field
 
-    def radiance(
-        self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"], asked: Bool[Tensor, "N S"] | None = None
-    ) -> Float[Tensor, "N S 3"]:
+    def radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
         points = x[:, None].expand_as(wi).reshape(-1, 3)
         return self.field.radiance(points, wi.reshape(-1, 1, 3)).view(wi.shape)
 

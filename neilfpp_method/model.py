@@ -183,9 +183,7 @@ class NeilfModel(nn.Module):
             image_gradient=pixels.image_gradient,
         )
 
-    def _material_and_priors(
-        self, surface: SurfacePixels, names: Mapping[str, float], terms: dict[str, LossTerm]
-    ) -> Material:
+    def _material_and_priors(self, surface: SurfacePixels, names: Mapping[str, float], terms: dict[str, LossTerm]) -> Material:
         if "smoothness" in names:
             sample = self.brdf.with_gradients(surface.position)
             material, slopes = sample.material, (sample.roughness_gradient, sample.metallic_gradient)

@@ -167,9 +167,7 @@ class Incident(Indexable):
     source: Int[Tensor, "N S"]
 
     @staticmethod
-    def of(
-        drawn: IncidentSamples, radiance: Float[Tensor, "#N S 3"], source: Int[Tensor, "N S"] | None = None
-    ) -> Incident:
+    def of(drawn: IncidentSamples, radiance: Float[Tensor, "#N S 3"], source: Int[Tensor, "N S"] | None = None) -> Incident:
         """What arrives along drawn directions: each stands for 1/(S · pdf). No `source`: all comes from the light."""
         weight = 1 / (drawn.pdf.clamp_min(PDF_FLOOR) * drawn.pdf.shape[1])
         if source is None:

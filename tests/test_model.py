@@ -275,7 +275,7 @@ def test_the_tracing_grid_is_renewed_as_the_geometry_moves_and_survives_a_checkp
 
 
 @pytest.mark.parametrize("kind", ["free", "distant", "auto"])
-@pytest.mark.parametrize("sampler", ["fibonacci", "cosine"])
+@pytest.mark.parametrize("sampler", ["fibonacci", "mis"])
 def test_every_light_goes_with_every_kind_of_sampling(kind, sampler):
     """Under light of one radiance from everywhere, a surface shows the same by each."""
     config = tiny_config()

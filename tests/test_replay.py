@@ -10,8 +10,8 @@ import torch
 from neilfpp_method import replay
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.replay import Replay
-from neilfpp_method.structures import SurfacePixels
 from neilfpp_method.schedule import Stage
+from neilfpp_method.structures import SurfacePixels
 from tests.scenes import sphere_batch, sphere_model, tiny_config
 from tests.test_model import count_queries
 

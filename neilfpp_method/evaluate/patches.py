@@ -11,7 +11,7 @@ from torch import Tensor
 from neilfpp_method.incident import arriving, directions_for_viewers
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading.frame import dot
-from neilfpp_method.shading.sampling import lattice_of_sphere
+from neilfpp_method.shading.sampling import sphere_lattice
 from neilfpp_method.structures import Indexable, Material, Source
 
 __all__ = ["PATCHES", "PatchLight", "by_patch", "light_by_patch", "patch_count"]
@@ -53,7 +53,7 @@ def light_by_patch(
 
 def _nearest_patch(wi: Float[Tensor, "N S 3"]) -> Int[Tensor, "N S"]:
     """Patches are about the directions of a lattice over the sphere."""
-    return (wi @ lattice_of_sphere(PATCHES).to(wi).T).argmax(-1)
+    return (wi @ sphere_lattice(PATCHES, wi).to(wi).T).argmax(-1)
 
 
 def patch_count(model: NeilfModel) -> int:

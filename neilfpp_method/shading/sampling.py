@@ -29,12 +29,12 @@ __all__ = [
     "combine",
     "cosine",
     "fibonacci",
-    "lattice_of_sphere",
     "pdf_cosine",
     "pdf_fibonacci",
     "pdf_specular_lobe",
     "sample_directions",
     "specular_lobe",
+    "sphere_lattice",
 ]
 
 GOLDEN_TURN = (3 - math.sqrt(5)) / 2
@@ -161,9 +161,9 @@ def combine(techniques: Sequence[tuple[Technique, int]], stochastic: bool) -> In
     return IncidentSamples(wi, pdf)
 
 
-def lattice_of_sphere(count: int) -> Float[Tensor, "S 3"]:
-    """A Fibonacci lattice over the whole sphere."""
-    up = torch.tensor([[0.0, 0.0, 1.0]])
+def sphere_lattice(count: int, like: Tensor) -> Float[Tensor, "S 3"]:
+    """`count` directions spread evenly over the whole sphere, on the device and of the type of `like` (float32 at least)."""
+    up = at_least_float32(like).new_tensor([[0.0, 0.0, 1.0]])
     lattice = _lattice(up, count, stochastic=False)
     return _about(up, 1 - 2 * lattice.u, lattice.v)[0]
 

@@ -12,7 +12,6 @@ import torch
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import confidence
-from neilfpp_method.evaluate.patches import by_patch, light_by_patch, patch_count
 from neilfpp_method.evaluate.confidence import (
     LEAST_NOISE,
     gather_evidence,
@@ -21,6 +20,7 @@ from neilfpp_method.evaluate.confidence import (
     with_deviation,
 )
 from neilfpp_method.evaluate.metrics import confidence_ratio
+from neilfpp_method.evaluate.patches import by_patch, light_by_patch, patch_count
 from neilfpp_method.evaluate.protocols import confidence_metrics
 from neilfpp_method.evaluate.render_views import render_run
 from neilfpp_method.evaluate.sightings import TrainingViews

@@ -58,22 +58,6 @@ def test_directions_can_be_shared_between_points(shape):
     assert seen == [7, 35]
 
 
-@pytest.mark.parametrize("shared", [False, True])
-def test_only_the_pairs_that_are_asked_are_computed(shared):
-    field = IncidentLightField(preset("fast").light, 10.0, 1.0)
-    x, wi = rays()
-    asked = torch.rand(5, 7) > 0.6
-    expected = field.radiance(x, wi[:1] if shared else wi) * asked[..., None]
-    rows = []
-    field.tail.register_forward_hook(lambda module, inputs, output: rows.append(len(output)))
-    radiance = field.radiance(x, wi[:1] if shared else wi, asked)
-    torch.testing.assert_close(radiance, expected)
-    assert rows == [asked.sum().item()]
-    radiance.sum().backward()
-    assert field.position_part.weight.grad.abs().sum() > 0
-    assert not field.radiance(x, wi, torch.zeros_like(asked)).any()
-
-
 def test_monochrome_light_is_grey():
     light = IncidentLightField(IncidentLightConfig(monochrome=True), 2.718281828, 1.0).radiance(*rays())
     assert light.shape == (5, 7, 3)

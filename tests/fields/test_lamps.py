@@ -9,7 +9,6 @@ import torch
 from torch.nn.functional import normalize
 
 from neilfpp_method.fields.lamps import Lamps
-from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.shading.rendering_equation import shade
 from neilfpp_method.structures import Incident, Material
 

@@ -118,7 +118,9 @@ def test_importance_samples_of_a_mirror_do_not_sparkle(kind, lobe):
     single = IncidentSamples(samples.wi.reshape(-1, 1, 3), samples.pdf.reshape(-1, 1))
     many = Material(*(t.repeat_interleave(4096, 0) for t in (material.base_color, r, material.metallic)))
     light = torch.ones_like(single.wi)
-    color = shade(many, n[:1].expand(len(light), 3), wo[:1].expand(len(light), 3), Incident.of(single, light), LOBES[lobe]).color
+    color = shade(
+        many, n[:1].expand(len(light), 3), wo[:1].expand(len(light), 3), Incident.of(single, light), LOBES[lobe]
+    ).color
     assert color.max() < 2.5
     # The mirror under unit light sends out 1, whatever its roughness.
     assert (color[:, 0].reshape(3, -1).mean(1) - 1).abs().max() < 0.02

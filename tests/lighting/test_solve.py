@@ -14,13 +14,12 @@ from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import LampPlaces, Lamps
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.candidates import merge, propose
-from neilfpp_method.structures import Observed
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.objective import Objective
 from neilfpp_method.lighting.solve import solve_light
 from neilfpp_method.lighting.transport import from_lamps, from_texels
 from neilfpp_method.shading.brdf import GGX
-from neilfpp_method.structures import Material
+from neilfpp_method.structures import Material, Observed
 from tests.lighting.surfaces import material, patches
 
 CONFIG = IncidentLightConfig(kind="auto", environment_height=12, fit=LightFitConfig(points=800, steps=150))

@@ -8,7 +8,7 @@ import torch
 
 from neilfpp_method.shading.brdf import GGX, LOBES, SPHERICAL_GAUSSIAN, evaluate
 from neilfpp_method.shading.rendering_equation import shade
-from neilfpp_method.shading.sampling import combine, fibonacci, sample_directions, shared_sphere
+from neilfpp_method.shading.sampling import combine, fibonacci, sample_directions
 from neilfpp_method.structures import Incident, IncidentSamples, Material
 from tests import oracles
 
@@ -134,7 +134,9 @@ def test_gradient_of_the_estimate_is_the_gradient_of_the_integral(truth):
     roughness = rows([r], count).clone().requires_grad_()
     samples = sample_directions("lobe", n, wo, roughness, 32, GGX, stochastic=True)
     light = sky(samples.wi)[..., None].expand_as(samples.wi)
-    specular = shade(Material(rows(B, count), roughness, rows([M], count)), n, wo, Incident.of(samples, light), GGX).specular[:, 0]
+    specular = shade(Material(rows(B, count), roughness, rows([M], count)), n, wo, Incident.of(samples, light), GGX).specular[
+        :, 0
+    ]
     (gradient,) = torch.autograd.grad(specular.sum(), roughness)
 
     def integral(r: float) -> float:
@@ -160,12 +162,3 @@ def test_half_precision_is_summed_in_float32():
         shading = shade(material, n, n, Incident.of(samples, light), None)
     assert shading.color.dtype == torch.float32
     assert shading.color.allclose(torch.ones(1, 3), atol=1e-5)
-
-
-def test_shared_directions_shade_as_their_copies_do():
-    material, n, wo, _, _ = random_scene()
-    samples = shared_sphere(n, 64, stochastic=False)
-    light = sky(samples.wi)[..., None].expand(-1, -1, 3)
-    copies = IncidentSamples(samples.wi.expand(5, -1, -1), samples.pdf.expand(5, -1))
-    shared = shade(material, n, wo, Incident.of(samples, light), GGX)
-    assert shared.color.allclose(shade(material, n, wo, Incident.of(copies, light.expand(5, -1, -1)), GGX).color)
