@@ -79,6 +79,7 @@ def _takes(z: Tensor) -> bool:
 
 
 @lru_cache(maxsize=1)
+@torch.compiler.disable
 def _loops() -> ModuleType | None:
     try:
         return importlib.import_module("neilfpp_method.kernels.compiled")
