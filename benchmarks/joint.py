@@ -24,14 +24,14 @@ from torch.nn.functional import normalize
 
 from benchmarks.measure import Measurement, clock, device
 from benchmarks.straightforward import straightforward
-from neilfpp_method.config import NeilfConfig
-from neilfpp_method.facts import SceneFacts
 from neilfpp_method.fields.sdf import SdfField
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.kernels.process import computing_fast
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.presets import preset
 from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.presets import preset
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import PixelBatch
 from neilfpp_method.train.loop import make_optimizer, seed_step
 
@@ -106,7 +106,7 @@ def step_on(model: NeilfModel, batch: PixelBatch) -> Callable[[], None]:
 
     def step() -> None:
         optimizer.zero_grad(set_to_none=True)
-        loss = weigh(model(batch, Stage.JOINT), weights).loss
+        loss = weigh(model.losses(batch, Stage.JOINT), weights).loss
         loss.backward()
         optimizer.step()
 

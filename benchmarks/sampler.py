@@ -18,7 +18,7 @@ from benchmarks.joint import SHARP, fitted_model, rays_at_the_table
 from benchmarks.measure import Measurement, median_seconds
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.kernels.process import computing_fast
-from neilfpp_method.presets import free_light, preset
+from neilfpp_method.settings.presets import free_light, preset
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume.empty_space import MOST_LIFE, RESOLUTION
 
@@ -78,7 +78,8 @@ def measurements() -> Iterator[Measurement]:
 
 
 def with_cuts(host: VolSdfHost, cuts: int) -> VolSdfHost:
-    """The host with so many first and further cuts a ray."""
-    volume = dataclasses.replace(host.config.volume, initial_samples=cuts, narrowed_samples=cuts)
+    """The host with so many first and further cuts a ray; where it skips empty space it takes half of those that are set."""
+    cuts = cuts if host.empty_space is None else 2 * cuts
+    volume = dataclasses.replace(host.config.volume, initial_samples=cuts)
     host.config = dataclasses.replace(host.config, volume=volume)
     return host

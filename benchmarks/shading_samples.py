@@ -27,7 +27,7 @@ from benchmarks.charts import Chart, Line, draw_charts
 from benchmarks.measure import Measurement, hardware, in_yardsticks
 from benchmarks.true_light import TrueLight, read_light, true_light
 from neilfpp_method.data.truth import LightField
-from neilfpp_method.demo import demo_scene
+from neilfpp_method.demo.command import demo_scene
 from neilfpp_method.fields.direction_map import map_directions
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.shading.brdf import SPHERICAL_GAUSSIAN

@@ -22,16 +22,17 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from neilfpp_method.config import NeilfConfig, VolumeConfig
 from neilfpp_method.fields.brdf import BrdfField, BrdfSample
 from neilfpp_method.fields.incident_light import IncidentLightField
 from neilfpp_method.fields.mlp import SOFTPLUS_SHARPNESS, Mlp
 from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.settings.types import NeilfConfig, VolumeConfig
 from neilfpp_method.structures import Material, RayBatch
 from neilfpp_method.volume.intersect import Interval
 from neilfpp_method.volume.samplers import (
+    OPACITY_ERROR,
     bound_shares,
     bounded_beta,
     first_cuts,
@@ -73,7 +74,7 @@ class PlainSdf(nn.Module):
             sample = SdfSample(outputs[:, 0], gradient_of(outputs[:, 0], x, trains), outputs[:, 1:])
         return sample if trains else SdfSample(sample.distance.detach(), sample.gradient, sample.feature.detach())
 
-    def hessian(self, x: Float[Tensor, "N 3"], method: str) -> Float[Tensor, "N 3 3"]:
+    def hessian(self, x: Float[Tensor, "N 3"], method: str | None = None) -> Float[Tensor, "N 3 3"]:
         x = x.detach().requires_grad_()
         gradient = self.with_gradient(x).gradient
         return torch.stack([gradient_of(gradient[:, axis], x, differentiable=True) for axis in range(3)], 1)
@@ -107,6 +108,10 @@ class PlainLight(nn.Module):
         points = x[:, None].expand_as(wi).reshape(-1, 3)
         return self.field.radiance(points, wi.reshape(-1, 1, 3)).view(wi.shape)
 
+    def technique(self, normal: Float[Tensor, "N 3"]) -> None:
+        """None: a network cannot be sampled."""
+        return None
+
 
 class PlainHost(VolSdfHost):
     """VolSDF with its sampler as published: a batch of rays takes a round more as long as one of them asks for it."""
@@ -119,10 +124,10 @@ class PlainHost(VolSdfHost):
     def _sample(self, rays: RayBatch, interval: Interval, volume: VolumeConfig) -> Float[Tensor, "N M"]:
         beta = self.density.beta().reshape(1, 1)
         partition = first_cuts(self.sdf, rays, interval.near, interval.far, volume.initial_samples, self.training)
-        worst = partition.width.square().sum(dim=-1, keepdim=True).div(4.0 * math.log1p(volume.epsilon)).sqrt()
+        worst = partition.width.square().sum(dim=-1, keepdim=True).div(4.0 * math.log1p(OPACITY_ERROR)).sqrt()
         wide = torch.maximum(worst, beta)
         for number in range(volume.rounds + 1):
-            converged = log_error_bound(partition, beta) <= math.log(volume.epsilon)
+            converged = log_error_bound(partition, beta) <= math.log(OPACITY_ERROR)
             wide = torch.where(converged, beta, bounded_beta(partition, beta, wide, volume))
             if number == volume.rounds or converged.all():
                 break

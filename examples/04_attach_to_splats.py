@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 
 from neilfpp_method import attach_neilf, preset
 from neilfpp_method.attach import pixel_batch
-from neilfpp_method.config import LightFitConfig
+from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.data.views import Camera, camera_rays
 from neilfpp_method.hosts.image import image_hits
 

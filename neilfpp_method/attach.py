@@ -20,11 +20,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.environment_map import read_environment
 from neilfpp_method.errors import UserError
-from neilfpp_method.facts import SceneFacts
-from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.data.views import Camera
 from neilfpp_method.hosts.answers import Rendered, as_hits
 from neilfpp_method.hosts.base import HasParameterGroups, Host, ImageHost, KnowsRadiance, LightsItself
@@ -34,8 +31,10 @@ from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
 from neilfpp_method.model import Maps, NeilfModel
-from neilfpp_method.presets import preset
 from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, stage_at, weigh
+from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.presets import preset
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import Material, PixelBatch, RayBatch, Shading, SurfaceHits
 
 __all__ = ["AttachedNeilf", "CallableHost", "attach_neilf", "missing_capabilities", "pixel_batch"]
@@ -255,8 +254,8 @@ def attach_neilf(
         proxy = _proxy(adapted, config)
         whole = adapted if isinstance(adapted, LightsItself) else ForeignHost(adapted, borrowed, proxy)
         attached = AttachedNeilf(NeilfModel(whole, config, facts, borrowed=borrowed), proxy)
-    if config.light.map is not None and isinstance(attached.model.light, EnvironmentLight):
-        attached.model.light.show(read_environment(Path(config.light.map)))
+    if config.known_map is not None:
+        attached.model.light.show(read_environment(Path(config.known_map)))
     log.warning("NeILF++ attached to %s: %s", host_name(adapted), _what_comes(attached, borrowed))
     return attached
 

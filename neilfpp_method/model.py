@@ -14,9 +14,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from neilfpp_method import losses
-from neilfpp_method.config import NeilfConfig
-from neilfpp_method.config_check import check_config
-from neilfpp_method.facts import SceneFacts, radiance_units
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.light import LightModel, make_light
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised, SmoothsNormals
@@ -29,9 +26,12 @@ from neilfpp_method.incident import (
     scene_tracer,
     trace_light,
 )
+from neilfpp_method.lighting.replay import Replay
 from neilfpp_method.lighting.solver import LightSolver, make_light_solver
-from neilfpp_method.replay import Replay
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, StagePlan, active_losses
+from neilfpp_method.settings.check import check_config
+from neilfpp_method.settings.facts import SceneFacts, radiance_units
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading import LOBES, initial_albedo, shade
 from neilfpp_method.structures import (
     LossTerm,
@@ -94,7 +94,7 @@ class NeilfModel(nn.Module):
         observers: called with the rays of every training step and what the host says of them, before anything is shaded.
 
     Raises:
-        UserError: settings that do not go together (`config_check`).
+        UserError: settings that do not go together (`settings.check`).
     """
 
     def __init__(self, host: Host, config: NeilfConfig, facts: SceneFacts, borrowed: bool = False) -> None:
@@ -111,7 +111,7 @@ class NeilfModel(nn.Module):
         self.observers: list[Callable[[PixelBatch, SurfaceHits], None]] = []
         lobe = LOBES[config.shading.lobe]
         self.lobe = lobe if config.shading.specular else None
-        self.brdf = BrdfField(config.brdf, config.volume.radius)
+        self.brdf = BrdfField(config.brdf, config.encoding, config.volume.radius)
         albedo = initial_albedo(config.brdf.initial_base_color, config.brdf.initial_metallic, self.lobe)
         parts = make_light(config.light, facts.response, facts.median_radiance / albedo)
         self.light, self.lamps = parts.light, parts.lamps
@@ -134,7 +134,7 @@ class NeilfModel(nn.Module):
         the host has rendered of the batch already; none: it is asked."""
         plan, names = self.stages[stage], active_losses(stage, self.config, self.stages)
         if not names:
-            return StepResult({}, SurfacePixels.none_of(batch), batch[:0])
+            return StepResult.of({}, SurfacePixels.none_of(batch), batch[:0])
         replays = self.training and not plan.moves_host
         if replays:
             fresh = slice(math.ceil(self.replay.share * len(batch)))
@@ -145,7 +145,7 @@ class NeilfModel(nn.Module):
         if "volume" in names:
             terms["volume"] = losses.photometric(hits.color, batch.color, self.facts.response, self.units.volume)
         if not plan.moves_material:
-            return StepResult(terms, SurfacePixels.none_of(batch), batch[:0])
+            return StepResult.of(terms, SurfacePixels.none_of(batch), batch[:0])
 
         # 2. Rays that meet one surface, on the object, are shaded; a scaled gradient goes back to where they met it.
         rows = torch.nonzero(hits.is_hit(self.config.shading.hit_share) & (batch.mask > 0.5))[:, 0]
@@ -162,7 +162,7 @@ class NeilfModel(nn.Module):
         # 6. What arrives from another surface is what that surface sends.
         if "inter_reflection" in names:
             terms["inter_reflection"] = self._inter_reflection(surface.position, surface.normal)
-        return StepResult(terms, rendered.detach(), self._beyond(batch, hits))
+        return StepResult.of(terms, rendered, self._beyond(batch, hits))
 
     def _render_host(
         self, batch: PixelBatch, plan: StagePlan, names: Mapping[str, float], hits: SurfaceHits | None

@@ -248,12 +248,27 @@ class SurfacePixels(Observed):
 class StepResult(NamedTuple):
     """What a training step computed: its losses, and constants for those who solve for the light.
 
+    Wrappers of data-parallel training change no frozen dataclass, so points and pixels travel as the rows of tensors.
+
     Attributes:
         terms: the losses that count in the stage, before their weights.
-        surface: the surface points that the step rendered, as they are shaded; none before the material stages.
-        beyond: the pixels whose rays pass the scene by; none before the material stages.
+        surface_rows: position, normal, wo and pixel of the surface points that the step rendered; none before the material
+            stages.
+        beyond_rows: direction and pixel of the rays that pass the scene by; none before the material stages.
     """
 
     terms: LossTerms
-    surface: Observed
-    beyond: PixelBatch
+    surface_rows: Float[Tensor, "P 12"]
+    beyond_rows: Float[Tensor, "Q 6"]
+
+    @staticmethod
+    def of(terms: LossTerms, surface: Observed, beyond: PixelBatch) -> StepResult:
+        """The result of a step that rendered these surface points, and these pixels beyond the scene."""
+        points = (surface.position, surface.normal, surface.wo, surface.pixel)
+        pixels = (beyond.directions, beyond.color)
+        return StepResult(terms, torch.cat(points, -1).detach(), torch.cat(pixels, -1))
+
+    @property
+    def surface(self) -> Observed:
+        """The surface points that the step rendered, as they are shaded."""
+        return Observed(*self.surface_rows.split(3, -1))

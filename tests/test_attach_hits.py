@@ -14,7 +14,7 @@ from neilfpp_method.data.views import Camera, camera_rays
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.image import image_hits
-from neilfpp_method.presets import preset
+from neilfpp_method.settings.presets import preset
 from neilfpp_method.schedule import Stage
 from neilfpp_method.structures import PixelBatch, RayBatch, SurfaceHits
 from tests.hosts.balls import Ball, BallHost, ball_rays

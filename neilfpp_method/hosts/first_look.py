@@ -98,6 +98,7 @@ class FirstLook:
         self.any_hit = self.any_hit or bool(hit.any())
         if hit.any():
             self._look_at_surface(batch, hits.detach(), hit)
+            self._look_at_median(batch.color[hit])
         elif not self.any_hit:
             self._say(
                 "no hit",
@@ -116,6 +117,8 @@ class FirstLook:
                 f"pixels reach {color.max():.3g}, and display values end at 1",
                 "divide 8-bit pixels by 255, or attach with response='linear' if these are radiance",
             )
+
+    def _look_at_median(self, color: Tensor) -> None:
         median = color.mean(-1).median().item()
         told = apply_response(torch.tensor(self.median_radiance), self.response).item()
         if median > 0 and not 1 / SIZES < median / told < SIZES:

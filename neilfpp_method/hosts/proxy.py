@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from neilfpp_method.ring import Ring
+from neilfpp_method.lighting.ring import Ring
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import RayBatch, SceneLight, SurfaceHits
 from neilfpp_method.volume.distance_grid import GridHits, look_up, trace_grid

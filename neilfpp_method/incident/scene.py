@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.config import InterReflectionConfig
 from neilfpp_method.hosts.base import HasSurfaceWidth, Host, LightsItself
+from neilfpp_method.settings.types import InterReflectionConfig
 from neilfpp_method.structures import RayBatch, SceneLight, SceneTracer
 
 __all__ = ["off_surface", "scene_light", "scene_tracer"]

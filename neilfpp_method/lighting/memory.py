@@ -7,7 +7,7 @@ import math
 import torch
 from torch import nn
 
-from neilfpp_method.ring import Ring
+from neilfpp_method.lighting.ring import Ring
 from neilfpp_method.structures import Observed
 
 __all__ = ["SurfaceMemory"]

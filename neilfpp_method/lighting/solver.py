@@ -15,8 +15,6 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import nn
 
-from neilfpp_method.config import IncidentLightConfig
-from neilfpp_method.facts import RadianceUnits, SceneFacts
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.fit import Evidence
@@ -24,6 +22,8 @@ from neilfpp_method.lighting.memory import SurfaceMemory
 from neilfpp_method.lighting.objective import Objective
 from neilfpp_method.lighting.sky import SkySightings
 from neilfpp_method.lighting.solve import solve_light
+from neilfpp_method.settings.facts import RadianceUnits, SceneFacts
+from neilfpp_method.settings.types import FreeLightConfig, MapLightConfig
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import SceneTracer, StepResult
 
@@ -37,6 +37,11 @@ class LightSolver(Protocol):
     @property
     def due(self) -> bool:
         """Whether `solve` would solve now."""
+        ...
+
+    @property
+    def points(self) -> int:
+        """How many surface points are remembered."""
         ...
 
     def observe(self, step: StepResult) -> None:
@@ -59,7 +64,7 @@ class LightSolver(Protocol):
 class NothingToSolve(nn.Module):
     """The solver of a light that is learned by gradients, or known."""
 
-    due = False
+    due, points = False, 0
 
     def observe(self, step: StepResult) -> None:
         """Nothing is remembered."""
@@ -79,14 +84,14 @@ class MapSolver(nn.Module):
     """
 
     def __init__(
-        self, config: IncidentLightConfig, facts: SceneFacts, units: RadianceUnits, light: LightModel, lobe: Lobe | None
+        self, config: MapLightConfig, facts: SceneFacts, units: RadianceUnits, light: LightModel, lobe: Lobe | None
     ) -> None:
         super().__init__()
         self.config, self.response, self.unit = config, facts.response, units.physical
         self.light, self.lobe = light, lobe
         self.memory = SurfaceMemory(config.fit.points, config.fit.every)
         # Only a background that is no backdrop shows the light, and only a map that is sought has to keep to it.
-        sightings = config.map is None and facts.background == "inverted_sphere" and config.fit.sky > 0
+        sightings = config.map is None and facts.background == "inverted_sphere"
         self.sky = SkySightings(config.environment_height, facts.response) if sightings else None
 
     @property
@@ -94,13 +99,18 @@ class MapSolver(nn.Module):
         """Whether `solve` would solve now."""
         return self.memory.due
 
+    @property
+    def points(self) -> int:
+        """How many surface points are remembered."""
+        return self.memory.points.filled
+
     def observe(self, step: StepResult) -> None:
         """As of `LightSolver`."""
-        if not len(step.surface) and not len(step.beyond):
+        if not len(step.surface_rows) and not len(step.beyond_rows):
             return
         self.memory.remember(step.surface)
         if self.sky is not None:
-            self.sky.remember(step.beyond.directions, step.beyond.color)
+            self.sky.remember(*step.beyond_rows.split(3, -1))
 
     @torch.no_grad()
     def solve(self, brdf: BrdfField, scene: SceneTracer | None) -> Evidence | None:
@@ -114,8 +124,9 @@ class MapSolver(nn.Module):
 
 
 def make_light_solver(
-    config: IncidentLightConfig, facts: SceneFacts, units: RadianceUnits, light: LightModel, lobe: Lobe | None
+    config: FreeLightConfig | MapLightConfig, facts: SceneFacts, units: RadianceUnits, light: LightModel, lobe: Lobe | None
 ) -> MapSolver | NothingToSolve:
     """The solver that a light needs; arguments as of `MapSolver`."""
-    known = config.map is not None and config.kind == "distant"
-    return NothingToSolve() if config.kind == "free" or known else MapSolver(config, facts, units, light, lobe)
+    if isinstance(config, FreeLightConfig) or (config.map is not None and config.kind == "distant"):
+        return NothingToSolve()
+    return MapSolver(config, facts, units, light, lobe)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import torch
 
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.environment_map import read_environment
 from neilfpp_method.data.mesh import read_mesh
@@ -16,11 +15,12 @@ from neilfpp_method.data.point_cloud import load_point_cloud
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.errors import UserError
-from neilfpp_method.facts import SceneFacts
 from neilfpp_method.hosts.base import Host
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import OrientedPoints
 
 __all__ = ["build_model", "scene_facts", "show_known_light"]
@@ -38,10 +38,9 @@ SEEN_EVERY = 67
 def scene_facts(capture: Capture, pixels: PixelDataset, config: NeilfConfig) -> SceneFacts:
     """What the training images decide before training; see `SceneFacts`."""
     response = "linear" if capture.hdr else "srgb"
-    scale, median = config.radiance.scale, pixels.median_radiance()
-    if scale is None:
-        hdr = max(HDR_MEDIANS * median, pixels.radiance_quantile(BRIGHT_QUANTILE))
-        scale = LDR_SCALE if response == "srgb" else hdr
+    median = pixels.median_radiance()
+    hdr = max(HDR_MEDIANS * median, pixels.radiance_quantile(BRIGHT_QUANTILE))
+    scale = LDR_SCALE if response == "srgb" else hdr
     kind, color = config.background.kind, config.background.color
     if kind == "auto":
         kind = "inverted_sphere" if color is None and pixels.border_color() is None else "constant"
@@ -56,7 +55,7 @@ def build_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> Nei
     Raises:
         UserError: the settings ask for a point cloud or a mesh that the capture does not have.
     """
-    return NeilfModel(HOSTS[config.host](capture, facts, config), config, facts)
+    return NeilfModel(HOSTS[config.host.kind](capture, facts, config), config, facts)
 
 
 def show_known_light(model: NeilfModel) -> None:
@@ -67,8 +66,8 @@ def show_known_light(model: NeilfModel) -> None:
     Raises:
         UserError: the map cannot be used.
     """
-    if model.config.light.map is not None:
-        model.light.show(read_environment(Path(model.config.light.map)))
+    if model.config.known_map is not None:
+        model.light.show(read_environment(Path(model.config.known_map)))
 
 
 def _volsdf(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> VolSdfHost:
@@ -77,7 +76,7 @@ def _volsdf(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> VolSdfH
 
 
 def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
-    path = config.mesh.path
+    path = config.host.path
     mesh = Truth(capture).mesh() if path is None else read_mesh(Path(path), capture.normalisation)
     if mesh is None:
         raise UserError(f"{capture.root}: no inputs/model/mesh.ply for the mesh host", "name a mesh with --mesh PATH")

@@ -69,8 +69,8 @@ def test_without_a_scene_the_light_comes_from_everywhere():
 def test_directions_stand_for_the_whole_sphere_and_lamps_for_their_discs():
     wi = directions(1, 50)
     incident = arriving(Sources(Sky(), lamps((0.0, 0.0, 2.0)), None), POINT, even(wi))
-    assert incident.weight[0, :50].sum().item() == torch.tensor(4 * math.pi).item()
-    torch.testing.assert_close(incident.weight[0, 50].item(), math.pi * 0.05**2 / 4, rtol=1e-5, atol=0.0)
+    assert math.isclose(incident.weight[0, :50].sum().item(), 4 * math.pi, rel_tol=1e-6)
+    assert math.isclose(incident.weight[0, 50].item(), math.pi * 0.05**2 / 4, rel_tol=1e-5)
     # Radiance times solid angle is intensity over the squared distance.
     torch.testing.assert_close(incident.radiance[0, 50] * incident.weight[0, 50], torch.full((3,), 1 / 4))
 

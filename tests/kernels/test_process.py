@@ -45,7 +45,7 @@ def test_memory_that_is_freed_is_kept():
     ("words", "does"),
     [
         (["train", "--data", "x"], "train.command.run_training"),
-        (["demo"], "demo.run_demo"),
+        (["demo"], "demo.command.run_demo"),
         (["eval", "x"], "evaluate.protocols.evaluate"),
     ],
 )

@@ -9,13 +9,13 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from neilfpp_method.config import LightFitConfig
 from neilfpp_method.fields.direction_map import map_directions
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.fit import Light, fit_light
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.sky import HALF_WEIGHT_SPREAD, SkySightings
 from neilfpp_method.lighting.transport import from_texels
+from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.shading.color import linear_to_srgb
 from tests.lighting.surfaces import material, points
 
@@ -70,7 +70,7 @@ def test_a_clipped_pixel_makes_its_texel_unseen():
 
 def test_nothing_seen_is_nothing_known():
     sky = SkySightings(HEIGHT, "linear")
-    sky.remember(looks(100), torch.zeros(100, 3), torch.zeros(100, dtype=torch.bool))
+    sky.remember(looks(100)[:0], torch.zeros(0, 3))
     known = sky.known()
     assert not known.weight.any()
     assert known.log_radiance.isfinite().all()

@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 
 from neilfpp_method.attach import attach_neilf
-from neilfpp_method.config import NeilfConfig
-from neilfpp_method.config_check import check_config
 from neilfpp_method.errors import UserError
-from neilfpp_method.presets import PRESETS, fixed_geometry, free_light, preset
+from neilfpp_method.settings.check import check_config
+from neilfpp_method.settings.presets import PRESETS, fixed_geometry, free_light, preset
+from neilfpp_method.settings.types import NeilfConfig
 from tests.scenes import tiny_config
 
 
@@ -22,7 +22,6 @@ WRONG = {
     "no rays are fresh": (preset("fast"), "train", {"fresh": 0.0}, "train.fresh is 0"),
     "more than all are fresh": (preset("fast"), "train", {"fresh": 1.5}, "train.fresh is 1.5"),
     "a map that L_ref cannot teach": (preset("fast"), "inter_reflection", {"mode": "soft"}, "L_ref"),
-    "a map for a light that has none": (preset("paper-mlp"), "light", {"map": "sky.exr"}, "takes no map"),
 }
 
 

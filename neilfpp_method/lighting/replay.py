@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from neilfpp_method.ring import Ring
+from neilfpp_method.lighting.ring import Ring
 from neilfpp_method.structures import SurfacePixels
 
 __all__ = ["Replay"]
