@@ -3,14 +3,16 @@
 Three lines, the last one in every step:
 
     neilf = attach_neilf(host)
-    optimizer.add_param_group({"params": neilf.parameters()})
+    for group in neilf.param_groups(): optimizer.add_param_group(group)
     loss = loss + neilf.losses(batch, step).loss
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Mapping
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +22,22 @@ from torch import Tensor, nn
 
 from neilfpp_method.data.environment_map import read_environment
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.base import HasParameterGroups, Host, LightsItself
-from neilfpp_method.hosts.outputs import check_tensors, host_name
-from neilfpp_method.model import NeilfModel
+from neilfpp_method.data.views import Camera
+from neilfpp_method.hosts.answers import Rendered, as_hits
+from neilfpp_method.hosts.base import HasParameterGroups, Host, ImageHost, KnowsRadiance, LightsItself
+from neilfpp_method.hosts.first_look import FirstLook, check_batch, check_points, check_rows
+from neilfpp_method.hosts.foreign import ForeignHost, answers_secondary_rays
+from neilfpp_method.hosts.function import CallableHost
+from neilfpp_method.hosts.outputs import host_name
+from neilfpp_method.hosts.proxy import SurfaceProxy
+from neilfpp_method.model import Maps, NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, stage_at, weigh
 from neilfpp_method.settings.facts import SceneFacts
-from neilfpp_method.settings.presets import free_light, preset
+from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import Material, PixelBatch, RayBatch, Shading, SurfaceHits
 
 __all__ = ["AttachedNeilf", "CallableHost", "attach_neilf", "missing_capabilities", "pixel_batch"]
-
-RenderFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 
 RADIANCE_SCALE = {"linear": 3.0, "srgb": 1.0}
 """METHOD §5: how far R's sigmoid reaches for HDR and for LDR images."""
@@ -41,40 +47,11 @@ WITHOUT = {
     "surface_width": "rays for L_ref start at a fixed distance from the surface",
     "parameter_groups": "its own trainer moves it",
     "sdf": "no mesh to export",
-    "scene_light": "hard inter-reflection renders every ray",
+    "scene_light": "hard inter-reflection is traced by a proxy",
 }
 """The optional methods of a host, and what is lost without each."""
 
 log = logging.getLogger(__name__)
-
-
-class CallableHost:
-    """A function (origins, directions) → (color, position, normal) as a host.
-
-    A ray misses where its normal is shorter than one half or not finite. This is no `nn.Module`: a function that is one
-    stays where it belongs.
-    """
-
-    def __init__(self, function: RenderFunction) -> None:
-        self.function = function
-        self.name = getattr(function, "__qualname__", type(function).__name__)
-
-    def render(self, rays: RayBatch) -> SurfaceHits:
-        """The function's answer; opacity and concentration are 1 for a hit, 0 for a miss.
-
-        Raises:
-            UserError: it does not return three tensors of the right shape on the device of the rays.
-        """
-        answer = self.function(rays.origins, rays.directions)
-        if not isinstance(answer, tuple | list) or len(answer) != 3:
-            kind = f"{len(answer)} values" if isinstance(answer, tuple | list) else f"a {type(answer).__name__}"
-            raise UserError(f"{self.name}: returns {kind}", "return color, position and normal, each (N, 3)")
-        check_tensors(self.name, rays, dict(zip(("color", "position", "normal"), answer, strict=True)))
-        color, position, normal = answer
-        hit = normal.detach().square().sum(-1) > 0.25  # not so for NaN
-        position = torch.where(hit[:, None], position, rays.origins)
-        share = hit.to(color.dtype)
-        return SurfaceHits(color, position, torch.where(hit[:, None], normal, 0.0), share, share)
 
 
 class AttachedNeilf(nn.Module):
@@ -86,43 +63,89 @@ class AttachedNeilf(nn.Module):
     without gradients. In the joint stage gradients reach it.
 
     Attributes:
-        model: the method itself; `model.maps(rays)` gives every map of a view.
+        model: the method itself.
+        proxy: stands in for the surface where the host cannot trace it cheaply; `proxy.report()` says how well. None: the
+            host traces, or the settings ask for no rays between surfaces.
         light_solver: remembers what steps showed, and solves for the light now and then.
         missing: the optional methods that the host does not have, and what is lost without each.
     """
 
-    def __init__(self, model: NeilfModel) -> None:
+    def __init__(self, model: NeilfModel, proxy: SurfaceProxy | None = None) -> None:
         super().__init__()
         self.model = model
+        self.proxy = proxy
         self.light_solver = model.light_solver()
-        self.missing = missing_capabilities(model.host)
+        self.missing = missing_capabilities(_inner(model.host))
+        facts = model.facts
+        hit_share = model.config.shading.hit_share
+        self.first_look = FirstLook(host_name(model.host), hit_share, facts.response, facts.median_radiance)
+        model.observers.append(self._observe)
 
-    def forward(self, batch: PixelBatch, step: int | Stage) -> Total:
+    def forward(self, batch: PixelBatch, step: int | Stage | str, hits: Rendered | None = None) -> Total:
         """`losses`, under the name that data-parallel wrappers call."""
-        return self.losses(batch, step)
+        return self.losses(batch, step, hits)
 
-    def losses(self, batch: PixelBatch, step: int | Stage) -> Total:
+    def losses(self, batch: PixelBatch, step: int | Stage | str, hits: Rendered | None = None) -> Total:
         """The weighted sum of what counts in a step, to add to a loss of your own, and each term before its weight.
 
         Args:
             batch: pixels with their rays in the scene frame; see `pixel_batch`.
-            step: the number of the step, from 0, which `config.train` places in its stage; or a stage by name.
+            step: the number of the step, from 0, which `config.train` places in its stage; or a stage by name, "joint" say.
+            hits: what the host has rendered of these rays already, in any form that `hosts.answers` reads: the rays are then
+                not rendered again. In the joint stage gradients go back through it.
 
         Raises:
-            UserError: the host returned what cannot be used, or the batch is on another device.
+            UserError: the host returned what cannot be used, or the batch cannot be, or is on another device.
         """
-        place, own = batch.origins.device, next(self.model.brdf.parameters()).device
-        if place != own:
-            raise UserError(f"rays on {place}, material and light on {own}", "move one of them: neilf.to(device)")
-        position = StagePosition(step, 0, 1) if isinstance(step, Stage) else stage_at(step, self.model.config.train)
-        computed = self.model(batch, position.stage)
-        if not computed.terms:
+        check_batch(batch)
+        self._check_place(batch.rays)
+        self.first_look.pixels(batch)
+        position = self._position(step)
+        weights = active_losses(position.stage, self.model.config, self.model.stages, position.share)
+        if not weights:
             # A loop without a loss of its own may still call backward.
-            return Total(torch.zeros((), device=place, requires_grad=True), {})
+            return Total(torch.zeros((), device=batch.origins.device, requires_grad=True), {})
+        moves_host = self.model.stages[position.stage].moves_host
+        computed = self.model(batch, position.stage, self._rendered(batch.rays, hits, moves_host))
         if self.training:
             self.light_solver.observe(computed)
             self.light_solver.solve(self.model.brdf, self.model.scene)
-        return weigh(computed.terms, active_losses(position.stage, self.model.config, self.model.stages, position.share))
+        return weigh(computed.terms, weights)
+
+    def maps(self, rays: RayBatch | Camera, hits: Rendered | None = None) -> Maps:
+        """Every map of a view, a row per ray: material, shading, normal, depth (`model.Maps`).
+
+        Args:
+            rays: in the scene frame; bound the memory by their number. Or a camera, of a host that draws whole images.
+            hits: what the host has rendered of them already.
+
+        Raises:
+            UserError: as of `losses`.
+        """
+        if isinstance(rays, Camera):
+            if not isinstance(self.model.host, ForeignHost):
+                raise UserError(f"{host_name(self.model.host)} takes rays", "give data.views.camera_rays(camera)")
+            with torch.no_grad():
+                rays, hits = self.model.host.image_hits(rays, next(self.model.brdf.parameters()))
+        self._check_place(rays)
+        rendered = self._rendered(rays, hits, moves_host=False)
+        if rendered is None:
+            return self.model.maps(rays)
+        at_once = self.model.config.train.eval_chunk
+        starts = range(0, max(len(rays), 1), at_once)
+        parts = [self.model.maps(rays[i : i + at_once], hits=rendered[i : i + at_once]) for i in starts]
+        return Maps(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Maps)))
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        """Groups for `optimizer.add_param_group`, a field each with its learning rate of `config.optimizer`.
+
+        Example:
+            >>> for group in neilf.param_groups():
+            ...     optimizer.add_param_group(group)
+        """
+        rates = self.model.config.optimizer
+        groups = self.parameter_groups().items()
+        return [{"params": p, "lr": getattr(rates, name, rates.geometry), "name": name} for name, p in groups if p]
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
         """The parameters by field, for a learning rate each (`config.optimizer`)."""
@@ -130,10 +153,13 @@ class AttachedNeilf(nn.Module):
 
     def materials(self, x: Float[Tensor, "N 3"]) -> Material:
         """Base colour, roughness and metallic at points of the scene frame."""
+        check_points("x", x)
         return self.model.materials(x)
 
     def incident_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
         """Linear radiance that arrives at x from wi."""
+        check_points("x", x)
+        check_points("wi", wi, axes=3)
         return self.model.incident_light(x, wi)
 
     def shade(self, hits: SurfaceHits, wo: Float[Tensor, "N 3"]) -> Shading:
@@ -146,6 +172,45 @@ class AttachedNeilf(nn.Module):
         nothing = torch.zeros_like(wo)
         return Shading(*(nothing.index_put((rows,), part) for part in (shading.color, shading.diffuse, shading.specular)))
 
+    # -------------------------------------------------------------------------------------------------------- inside a step
+
+    def _position(self, step: int | Stage | str) -> StagePosition:
+        if not isinstance(step, str):
+            if step < 0:
+                raise UserError(f"step {step}", "count steps from 0")
+            return stage_at(int(step), self.model.config.train)
+        names = [stage.value for stage in Stage]
+        if step not in names:
+            raise UserError(f"'{step}' is no stage", f"give the number of the step, or one of {', '.join(names)}")
+        return StagePosition(Stage(step), 0, 1)
+
+    def _check_place(self, rays: RayBatch) -> None:
+        own = next(self.model.brdf.parameters())
+        if rays.origins.device != own.device:
+            places = f"rays on {rays.origins.device}, material and light on {own.device}"
+            raise UserError(places, "move one of them: neilf.to(device)")
+        if rays.origins.dtype != own.dtype:
+            types = f"rays are {rays.origins.dtype}, material and light {own.dtype}"
+            raise UserError(types, "give rays.float(), or compute in the other: neilf.double()")
+
+    def _rendered(self, rays: RayBatch, hits: Rendered | None, moves_host: bool) -> SurfaceHits | None:
+        """What the host says of camera rays, where the model is not to ask it; none: it is."""
+        host = self.model.host
+        if hits is not None:
+            return host.read(rays, hits) if isinstance(host, ForeignHost) else as_hits(host, rays, hits)
+        if not isinstance(host, ForeignHost) or answers_secondary_rays(host.inner):
+            return None
+        with torch.set_grad_enabled(torch.is_grad_enabled() and moves_host):
+            return host.camera_hits(rays)
+
+    def _observe(self, batch: PixelBatch, hits: SurfaceHits) -> None:
+        self.first_look.hits(batch, hits)
+        if self.proxy is None or len(batch) == 0:
+            return
+        if self.proxy.steps == 0 and answers_secondary_rays(_inner(self.model.host)):
+            self.proxy.look_around(self.model.host.render, batch.rays, hits)
+        self.proxy.observe(batch.rays, hits)
+
 
 def attach_neilf(
     host: Any,
@@ -156,33 +221,42 @@ def attach_neilf(
     radiance_scale: float | None = None,
     open_scene: bool = False,
 ) -> AttachedNeilf:
-    """Put the material field, the light field and their losses on top of a host.
+    """Put the material field, the light and their losses on top of a host. One line of the log says what the host lacks, and
+    when its material starts. The global random state stays as it is.
 
     Args:
-        host: an object with `render(rays) -> SurfaceHits`; a function (origins, directions) → (color, position,
-            normal); or a nerfstudio model. In a frame where the object lies in the unit sphere.
-        config: the settings; none: the preset `fast`, with the free light field on a host that cannot trace cheaply. For
-            a host that is trained already, set `train.sdf_steps` to 0.
+        host: an object with `render(rays) -> SurfaceHits`, or `render_image(camera) -> SurfaceHits` where it draws whole
+            images; a function (origins, directions) → (color, position, normal); or a nerfstudio model. In a frame where the
+            object lies in the unit sphere. docs/hosts.md has a recipe for each.
+        config: the settings; none: the preset `fast`, and for a host that belongs to another trainer material from step 0.
         response: what the pixels are: "linear" (HDR) or "srgb" (LDR).
         median_radiance: median linear luminance of the object in the images; sets the light's first guess.
         radiance_scale: the range of the host's radiance; none: 3 for HDR, 1 for LDR.
         open_scene: pixels of rays that meet nothing show the light from far away, not a backdrop; a map keeps to them.
 
     Raises:
-        UserError: the host is none of the three, or the environment map that the settings name cannot be used.
+        UserError: the host is none of these, a fact cannot be right, or the environment map that the settings name cannot be
+            used.
     """
-    adapted = _adapt(host, response)
+    if response not in RADIANCE_SCALE:
+        raise UserError(f"response '{response}'", "choose linear (pixels are radiance) or srgb (8-bit images, divided by 255)")
+    scale = RADIANCE_SCALE[response] if radiance_scale is None else radiance_scale
+    for name, value in {"median_radiance": median_radiance, "radiance_scale": scale}.items():
+        if not 0 < value < math.inf:
+            raise UserError(f"{name} is {value}", "give the median linear luminance of the object, or of the host's largest")
     borrowed = not isinstance(host, HasParameterGroups)
-    background = "inverted_sphere" if open_scene else "constant"
-    facts = SceneFacts(response, median_radiance, radiance_scale or RADIANCE_SCALE[response], background)
     if config is None:
-        config = preset("fast") if isinstance(adapted, LightsItself) else free_light(preset("fast"))
-    attached = AttachedNeilf(NeilfModel(adapted, config, facts, borrowed=borrowed))
+        config = preset("fast")
+        config = replace(config, train=replace(config.train, sdf_steps=0)) if borrowed else config
+    adapted = _adapt(host, response)
+    facts = SceneFacts(response, median_radiance, scale, "inverted_sphere" if open_scene else "constant")
+    with torch.random.fork_rng(range(torch.cuda.device_count()) if torch.cuda.is_initialized() else []):
+        proxy = _proxy(adapted, config)
+        whole = adapted if isinstance(adapted, LightsItself) else ForeignHost(adapted, borrowed, proxy)
+        attached = AttachedNeilf(NeilfModel(whole, config, facts, borrowed=borrowed), proxy)
     if config.known_map is not None:
         attached.model.light.show(read_environment(Path(config.known_map)))
-    if attached.missing:
-        lost = "; ".join(f"no {name}: {loss}" for name, loss in attached.missing.items())
-        log.warning("NeILF++ attached to %s, which has %s", host_name(adapted), lost)
+    log.warning("NeILF++ attached to %s: %s", host_name(adapted), _what_comes(attached, borrowed))
     return attached
 
 
@@ -191,13 +265,16 @@ def missing_capabilities(host: object) -> Mapping[str, str]:
     return {name: loss for name, loss in WITHOUT.items() if not hasattr(host, name)}
 
 
-def pixel_batch(
-    origins: Float[Tensor, "N 3"],
-    directions: Float[Tensor, "N 3"],
-    color: Float[Tensor, "N 3"],
-    mask: Float[Tensor, " N"] | None = None,
-) -> PixelBatch:
-    """Pixels of a loop that knows rays and colours, and perhaps where the object is."""
+def pixel_batch(origins: Tensor, directions: Tensor, color: Tensor, mask: Tensor | None = None) -> PixelBatch:
+    """Pixels of a loop that knows rays and colours, and perhaps where the object is: 1 on it and 0 off it.
+
+    Raises:
+        UserError: something has another shape, or integers.
+    """
+    for name, rows in {"origins": origins, "directions": directions, "color": color}.items():
+        check_rows(name, rows, len(origins), 3)
+    if mask is not None:
+        check_rows("mask", mask, len(origins))
     nothing = torch.zeros_like(origins[:, 0])
     return PixelBatch(
         origins=origins,
@@ -210,16 +287,44 @@ def pixel_batch(
     )
 
 
-def _adapt(host: object, response: str) -> Host:
+def _proxy(host: object, config: NeilfConfig) -> SurfaceProxy | None:
+    """What traces rays between surfaces for a host that does not, or not cheaply, where the settings ask for them."""
+    settings = config.inter_reflection
+    asked = settings.mode != "off" and not answers_secondary_rays(host)
+    if isinstance(host, LightsItself) or not (asked or settings.mode == "hard"):
+        return None
+    radiance = host.radiance if isinstance(host, KnowsRadiance) else None
+    return SurfaceProxy(config.volume.radius, settings.grid_resolution, config.shading.hit_share, radiance)
+
+
+def _what_comes(attached: AttachedNeilf, borrowed: bool) -> str:
+    """What a person must know of an attachment, in one line."""
+    train = attached.model.config.train
+    parts = []
+    if borrowed:
+        start = train.sdf_steps
+        parts += [f"nothing is computed before step {start} (train.sdf_steps)"] if start else ["material from step 0"]
+        parts += [f"the host moves with it from step {start + train.material_steps}"] if train.joint_steps else []
+    if attached.proxy is not None:
+        parts += ["a proxy of its surface, gathered from the training rays, traces the light between surfaces"]
+    parts += [f"no {name}: {loss}" for name, loss in attached.missing.items()]
+    return "; ".join(parts) or "it has all that a host can have"
+
+
+def _inner(host: object) -> object:
+    return host.inner if isinstance(host, ForeignHost) else host
+
+
+def _adapt(host: object, response: str) -> Host | ImageHost:
     if isinstance(host, nn.Module) and hasattr(host, "get_outputs") and hasattr(host, "config"):
         from neilfpp_method.hosts.nerfstudio import NerfstudioHost
 
         return NerfstudioHost(host, response=response)
-    if isinstance(host, Host):
+    if isinstance(host, Host | ImageHost):
         return host
     if callable(host):
         return CallableHost(host)
     raise UserError(
         f"{type(host).__name__} is no host",
-        "give an object with render(rays) -> SurfaceHits, or a function of (origins, directions)",
+        "give an object with render(rays) or render_image(camera), or a function of (origins, directions)",
     )

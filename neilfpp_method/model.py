@@ -6,7 +6,7 @@ One training step reads top to bottom in `NeilfModel.step`, in the order of the 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -91,6 +91,7 @@ class NeilfModel(nn.Module):
         units: what errors of radiance are measured in.
         replay: surface points of earlier steps, for stages in which no surface moves.
         check_outputs: refuses what a host must not return.
+        observers: called with the rays of every training step and what the host says of them, before anything is shaded.
 
     Raises:
         UserError: settings that do not go together (`settings.check`).
@@ -107,6 +108,7 @@ class NeilfModel(nn.Module):
         self.units = radiance_units(config, facts)
         self.stages = host.stages if isinstance(host, HasStages) else BORROWED_HOST if borrowed else STAGES
         self.check_outputs = OutputCheck(host, config.shading.hit_share)
+        self.observers: list[Callable[[PixelBatch, SurfaceHits], None]] = []
         lobe = LOBES[config.shading.lobe]
         self.lobe = lobe if config.shading.specular else None
         self.brdf = BrdfField(config.brdf, config.encoding, config.volume.radius)
@@ -119,25 +121,27 @@ class NeilfModel(nn.Module):
 
     # -------------------------------------------------------------------------------------------------------- one step
 
-    def forward(self, batch: PixelBatch, stage: Stage) -> StepResult:
+    def forward(self, batch: PixelBatch, stage: Stage, hits: SurfaceHits | None = None) -> StepResult:
         """`step`, under the name that data-parallel wrappers call."""
-        return self.step(batch, stage)
+        return self.step(batch, stage, hits)
 
-    def losses(self, batch: PixelBatch, stage: Stage) -> LossTerms:
+    def losses(self, batch: PixelBatch, stage: Stage, hits: SurfaceHits | None = None) -> LossTerms:
         """The losses of a step alone, before their weights."""
-        return self.step(batch, stage).terms
+        return self.step(batch, stage, hits).terms
 
-    def step(self, batch: PixelBatch, stage: Stage) -> StepResult:
-        """The losses that count in a stage, for a batch of pixels, and what the step showed of surface and sky."""
+    def step(self, batch: PixelBatch, stage: Stage, hits: SurfaceHits | None = None) -> StepResult:
+        """The losses that count in a stage, for a batch of pixels, and what the step showed of surface and sky. `hits` are what
+        the host has rendered of the batch already; none: it is asked."""
         plan, names = self.stages[stage], active_losses(stage, self.config, self.stages)
         if not names:
             return StepResult.of({}, SurfacePixels.none_of(batch), batch[:0])
         replays = self.training and not plan.moves_host
         if replays:
-            batch = batch[: math.ceil(self.replay.share * len(batch))]
+            fresh = slice(math.ceil(self.replay.share * len(batch)))
+            batch, hits = batch[fresh], None if hits is None else hits[fresh]
 
         # 1. The host renders colour, hit position and normal.
-        hits, terms = self._render_host(batch, plan, names)
+        hits, terms = self._render_host(batch, plan, names, hits)
         if "volume" in names:
             unit, relative = self.units.volume, self.units.relative
             terms["volume"] = losses.photometric(hits.color, batch.color, self.facts.response, unit, relative)
@@ -162,16 +166,21 @@ class NeilfModel(nn.Module):
         return StepResult.of(terms, rendered, self._beyond(batch, hits))
 
     def _render_host(
-        self, batch: PixelBatch, plan: StagePlan, names: Mapping[str, float]
+        self, batch: PixelBatch, plan: StagePlan, names: Mapping[str, float], hits: SurfaceHits | None
     ) -> tuple[SurfaceHits, dict[str, LossTerm]]:
         """Hits, and the host's own losses; constants in a stage that does not move the host."""
         with torch.set_grad_enabled(torch.is_grad_enabled() and plan.moves_host):
-            if isinstance(self.host, Regularised):
+            if hits is not None:
+                hits, terms = hits if torch.is_grad_enabled() else hits.detach(), {}
+            elif isinstance(self.host, Regularised):
                 rendered = self.host.render_regularised(batch, names)
                 hits, terms = rendered.hits, dict(rendered.terms)
             else:
                 hits, terms = self.host.render(batch.rays), {}
             self.check_outputs(batch.rays, hits, color_moves="volume" in names and torch.is_grad_enabled())
+        if self.training:
+            for observe in self.observers:
+                observe(batch, hits)
         return hits, terms
 
     def _surface_pixels(self, hits: SurfaceHits, pixels: PixelBatch) -> SurfacePixels:
@@ -254,12 +263,13 @@ class NeilfModel(nn.Module):
         return shade(material, normal, wo, arriving(self.sources, position, drawn), self.lobe)
 
     @torch.no_grad()
-    def maps(self, rays: RayBatch, with_material: bool = True) -> Maps:
+    def maps(self, rays: RayBatch, with_material: bool = True, hits: SurfaceHits | None = None) -> Maps:
         """Everything that the rays show, for pictures and metrics. Bound the memory by the number of rays.
 
-        `with_material` off asks neither the BRDF nor the light: `rgb` is then the host's colour.
+        `with_material` off asks neither the BRDF nor the light: `rgb` is then the host's colour. `hits` are
+        what the host has rendered of the rays already; none: it is asked.
         """
-        hits = self.host.render(rays)
+        hits = self.host.render(rays) if hits is None else hits.detach()
         size = len(rays)
         surfaces = torch.zeros(size, 11, dtype=hits.color.dtype, device=hits.color.device)
         rgb, normals = hits.color.clone(), hits.normal.clone()

@@ -236,7 +236,7 @@ def test_a_nerfstudio_model_is_told_by_its_shape(monkeypatch):
     monkeypatch.setitem(sys.modules, stub.__name__, stub)
     model = Model()
     neilf = attach_neilf(model, tiny_config(), response="srgb")
-    assert neilf.model.host.adapted == (model, "srgb")
+    assert neilf.model.host.inner.adapted == (model, "srgb")
     assert set(neilf.parameter_groups()) == {"brdf", "light"}  # its own trainer moves it
 
 

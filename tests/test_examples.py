@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("0[12]_*.py"))  # the third needs nerfstudio
+EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("0[124]_*.py"))  # the third needs nerfstudio
 
 
 @pytest.fixture(params=EXAMPLES, ids=lambda path: path.stem)
@@ -17,7 +17,7 @@ def example(request) -> Path:
 
 
 def test_an_example_is_short(example):
-    assert len(example.read_text().splitlines()) < 60
+    assert len(example.read_text().splitlines()) < 75
 
 
 def test_an_example_trains_a_material(example, capsys):

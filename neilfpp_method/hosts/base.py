@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import Parameter
 
+from neilfpp_method.data.views import Camera
 from neilfpp_method.schedule import StageTable
 from neilfpp_method.structures import LossTerms, PixelBatch, RayBatch, SceneLight, SurfaceHits
 
@@ -22,8 +23,11 @@ __all__ = [
     "HasStages",
     "HasSurfaceWidth",
     "Host",
+    "ImageHost",
     "KnowsMisses",
+    "KnowsRadiance",
     "LightsItself",
+    "ReadsOutputs",
     "Regularised",
     "RegularisedHits",
     "SmoothsNormals",
@@ -32,10 +36,21 @@ __all__ = [
 
 @runtime_checkable
 class Host(Protocol):
-    """Geometry and radiance of a scene."""
+    """Geometry and radiance of a scene. One that cannot answer rays that leave a surface says so by the attribute
+    `answers_secondary_rays = False`; `render` is then asked with camera rays alone."""
 
     def render(self, rays: RayBatch) -> SurfaceHits:
         """Colour, hit position and normal of each ray, differentiable with respect to the host's parameters."""
+        ...
+
+
+@runtime_checkable
+class ImageHost(Protocol):
+    """Geometry and radiance that come as whole images: splats and other rasterisers. It answers no secondary rays; what a
+    surface sends to another is asked of a proxy (`hosts.proxy`), and the hits of a training step are handed to `losses`."""
+
+    def render_image(self, camera: Camera) -> SurfaceHits:
+        """What the camera sees in the scene frame, a row per pixel, row by row; `hosts.image.image_hits` makes it from maps."""
         ...
 
 
@@ -71,6 +86,25 @@ class KnowsMisses(Protocol):
 
     def may_meet(self, rays: RayBatch) -> Bool[Tensor, " N"]:
         """Which of the rays, which leave a surface, may meet one: the others are not worth rendering."""
+        ...
+
+
+@runtime_checkable
+class KnowsRadiance(Protocol):
+    """A host that knows what a point of its surface sends, without a ray. Without: the proxy of a host that traces no rays
+    brings the mean of what the training rays saw there."""
+
+    def radiance(self, x: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """Linear radiance that leaves surface points x towards wo."""
+        ...
+
+
+@runtime_checkable
+class ReadsOutputs(Protocol):
+    """A host whose renderer returns a dictionary of its own. Without: the names of `hosts.answers` are looked for."""
+
+    def read_outputs(self, rays: RayBatch, outputs: Mapping[str, Tensor]) -> SurfaceHits:
+        """The hits of the rays, from what the host's renderer returned for them."""
         ...
 
 

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from neilfpp_method import losses
 from neilfpp_method.data.views import Normalisation
 from neilfpp_method.errors import UserError
+from neilfpp_method.hosts.answers import no_hits
 from neilfpp_method.hosts.base import RegularisedHits
 from neilfpp_method.shading.color import srgb_to_linear
 from neilfpp_method.shading.frame import safe_normalize
@@ -83,7 +84,9 @@ class NerfstudioHost(nn.Module):
         Raises:
             UserError: the model has no output for the colour, the depth, the normal or the opacity.
         """
-        return self._hits(rays, self._ask(rays, torch.zeros_like(rays.origins[:, 0], dtype=torch.long)))
+        if len(rays) == 0:  # some models cannot be asked for nothing
+            return no_hits(rays)
+        return self.read_outputs(rays, self._ask(rays, torch.zeros_like(rays.origins[:, 0], dtype=torch.long)))
 
     def render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
         """As `render`, with `eikonal` or `own` where the model has them and a gradient flows.
@@ -91,6 +94,8 @@ class NerfstudioHost(nn.Module):
         `eikonal` is asked for by its name, and counts the gradients that a `SurfaceModel` hands out in training. With
         `own_losses` the model's own, with its own weights, stands in for it.
         """
+        if len(batch) == 0:
+            return RegularisedHits(no_hits(batch.rays), {})
         outputs = self._ask(batch.rays, batch.view)
         terms = {}
         if torch.is_grad_enabled() and self.training:
@@ -98,7 +103,7 @@ class NerfstudioHost(nn.Module):
                 terms[OWN_LOSSES] = self._own_losses(outputs, batch)
             elif "eikonal" in names and "eik_grad" in outputs:
                 terms["eikonal"] = losses.eikonal(outputs["eik_grad"].reshape(-1, 3))
-        return RegularisedHits(self._hits(batch.rays, outputs), terms)
+        return RegularisedHits(self.read_outputs(batch.rays, outputs), terms)
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
         """All that the model would train, as `geometry`: a nerfstudio field holds shape and colour in one."""
@@ -118,7 +123,12 @@ class NerfstudioHost(nn.Module):
         )
         return self.model(bundle)
 
-    def _hits(self, rays: RayBatch, outputs: Outputs) -> SurfaceHits:
+    def read_outputs(self, rays: RayBatch, outputs: Outputs) -> SurfaceHits:
+        """The hits of rays, from what the model returned for them.
+
+        Raises:
+            UserError: an output is missing.
+        """
         depth = outputs[self._first(outputs, DEPTHS, "use a model that renders its depth")] / self.frame.scale
         name = self._first(outputs, NORMALS, "switch its normals on (nerfacto: predict_normals=True), or use a surface model")
         normal = 2.0 * outputs[name] - 1.0 if name in COLOR_CODED else outputs[name]

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -49,6 +50,7 @@ def encode(x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpe
 
 
 @lru_cache(maxsize=8)
+@torch.compiler.disable  # nor into what imports them
 def _kernels(backend: str, device: str) -> Kernels | None:
     """The kernels of a backend, loaded when first asked for; none: the reference."""
     name = FASTEST.get(device, "reference") if backend == "auto" else backend
@@ -67,6 +69,7 @@ def _kernels(backend: str, device: str) -> Kernels | None:
 
 
 @lru_cache(maxsize=8)
+@torch.compiler.disable
 def ray_tracer(device: str) -> Callable[..., None] | None:
     """`tracing.sphere_trace`, where it runs on a device of this kind."""
     if device != "cpu":

@@ -46,6 +46,7 @@ def fits(x01: Tensor, table: Tensor) -> bool:
     return x01.dtype == table.dtype and table.dtype in (torch.float32, torch.float64)
 
 
+@torch.compiler.disable  # a compiler cannot look into kernels, and need not
 def encode_with(
     kernels: Kernels, x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpec, jacobian: bool
 ) -> Encoded:

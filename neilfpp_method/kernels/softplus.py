@@ -36,7 +36,7 @@ def softplus(z: Float[Tensor, "*S"], sharpness: float) -> Float[Tensor, "*S"]:
     if not _takes(z):
         return functional.softplus(z, beta=sharpness)
     if differentiated:
-        return _Softplus.apply(z, sharpness)[0]
+        return _differentiable(z, sharpness).value
     value = torch.empty_like(z, memory_format=torch.contiguous_format)
     _run("softplus", sharpness, z, value)
     return value
@@ -46,6 +46,11 @@ def softplus_and_slope(z: Float[Tensor, "*S"], sharpness: float) -> UnitSample:
     """Value and slope; both can be differentiated any number of times."""
     if not _takes(z):
         return UnitSample(functional.softplus(z, beta=sharpness), torch.sigmoid(sharpness * z))
+    return _differentiable(z, sharpness)
+
+
+@torch.compiler.disable  # a compiler cannot look into the loops, and need not
+def _differentiable(z: Float[Tensor, "*S"], sharpness: float) -> UnitSample:
     return UnitSample(*_Softplus.apply(z, sharpness))
 
 
@@ -74,6 +79,7 @@ def _takes(z: Tensor) -> bool:
 
 
 @lru_cache(maxsize=1)
+@torch.compiler.disable
 def _loops() -> ModuleType | None:
     try:
         return importlib.import_module("neilfpp_method.kernels.compiled")
@@ -81,6 +87,7 @@ def _loops() -> ModuleType | None:
         return None
 
 
+@torch.compiler.disable
 def _run(loop: str, sharpness: float, *tensors: Tensor) -> None:
     work, arrays = getattr(_loops(), loop), [_flat(tensor) for tensor in tensors]
     for_each(lambda start, stop: work(*arrays, sharpness, start, stop), shares(tensors[0].numel(), MIN_VALUES_PER_THREAD))

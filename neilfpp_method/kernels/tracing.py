@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -14,6 +15,7 @@ MIN_RAYS_PER_THREAD = 2048
 """Rays that are worth waking a thread for."""
 
 
+@torch.compiler.disable  # a compiler cannot look into the loops, and need not
 def sphere_trace(
     grid: Float[Tensor, "R R R"],
     radius: float,

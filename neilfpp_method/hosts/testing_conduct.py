@@ -1,0 +1,113 @@
+"""Checks of the contract suite on how a host behaves: the same for every batch, and leaving alone what is not its own."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import torch
+from torch import Tensor
+
+from neilfpp_method.hosts.testing_case import Case
+from neilfpp_method.structures import RayBatch, SurfaceHits
+
+__all__ = ["CONDUCT_CHECKS"]
+
+RESTLESS = 0.005
+"""Most that half of the positions may move between two calls, scene units; a soft layer adds its width."""
+SPREAD = 3.0
+"""Answers to a part of a batch may differ by so many times what two calls differ by."""
+
+
+def _one_ray(case: Case) -> None:
+    row = int(case.hit.nonzero()[0])
+    try:
+        case.constants(case.rays[row : row + 1])  # shapes are looked at
+    except AssertionError as error:
+        raise type(error)(f"{error} (asked with one ray)") from error
+    except Exception as error:
+        case.require(False, f"cannot render a single ray ({error})")
+
+
+def _one_camera(case: Case) -> None:
+    row = int(case.hit.nonzero()[0])
+    shared = RayBatch(case.rays.origins[row].expand(4, 3), case.rays.directions[row].expand(4, 3))
+    try:
+        case.constants(shared)
+    except Exception as error:
+        case.require(False, f"cannot render rays that share their origin in memory ({error})")
+
+
+def _alone_as_together(case: Case) -> None:
+    whole, other = case.constants(case.rays), case.constants(case.rays, seed=1)
+    for rows in (slice(0, None, 3), torch.arange(len(case.rays), device=case.hit.device).flip(0)):
+        part = case.constants(case.rays[rows])
+        for name in ("color", "position", "normal", "opacity"):
+            together = getattr(whole, name)[rows]
+            noise = (getattr(whole, name) - getattr(other, name)).abs().mean()
+            room = SPREAD * noise + 1e-4 + 1e-3 * together.abs().mean()
+            off = (getattr(part, name) - together).abs().mean()
+            case.require(off <= room, f"its {name} of a ray depends on which other rays are in the batch")
+
+
+def _repeatable(case: Case) -> None:
+    first, second = case.constants(case.rays), case.constants(case.rays)
+    for field in fields(SurfaceHits):
+        same = torch.allclose(getattr(first, field.name), getattr(second, field.name), rtol=1e-4, atol=1e-6, equal_nan=True)
+        what = f"renders differently after the same seed ({field.name})"
+        case.require(same, f"{what}: draw from torch's global generator")
+    other = case.constants(case.rays, seed=1)
+    moved = (other.position - first.position)[case.hit].norm(dim=-1).median().item()
+    broken = f"half of its positions move by {moved:.2g} and more from call to call: less noise, or more samples"
+    case.require(moved <= RESTLESS + case.width, broken)
+
+
+def _same_without_gradient(case: Case) -> None:
+    with torch.enable_grad():
+        kept = case.seeded(case.rays).detach()
+    for name in ("color", "position", "normal"):
+        same = torch.allclose(getattr(kept, name), getattr(case.constants(case.rays), name), rtol=1e-3, atol=1e-4)
+        case.require(same, f"its {name} is another one under torch.no_grad")
+
+
+def _keeps_what_it_gave(case: Case) -> None:
+    first = case.constants(case.rays)
+    kept = [getattr(first, field.name).clone() for field in fields(SurfaceHits)]
+    case.constants(RayBatch(case.rays.origins, case.rays.directions.roll(1, dims=0)))
+    for field, before in zip(fields(SurfaceHits), kept, strict=True):
+        same = torch.equal(getattr(first, field.name), before)
+        case.require(same, f"its {field.name} changes when it is asked again: hand out a copy, not a buffer")
+
+
+def _leaves_modes_alone(case: Case) -> None:
+    now = case.now()
+    case.require(now.training == case.before.training, "rendering calls train() or eval(): its mode is its owner's")
+    case.require(now.moves == case.before.moves, "rendering freezes or frees its parameters")
+    grad, dtype = torch.is_grad_enabled(), torch.get_default_dtype()
+    case.host.render(case.rays)
+    left = torch.is_grad_enabled() == grad and torch.get_default_dtype() == dtype
+    torch.set_grad_enabled(grad)
+    torch.set_default_dtype(dtype)
+    case.require(left, "rendering leaves torch's gradient mode or default type changed: use a context")
+
+
+def _leaves_randomness_alone(case: Case) -> None:
+    case.require(not torch.equal(_next_draw(case, 1), _next_draw(case, 2)), "calls torch.manual_seed: seeds are the loop's")
+
+
+def _next_draw(case: Case, seed: int) -> Tensor:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        case.host.render(case.rays)
+        return torch.rand(4)
+
+
+CONDUCT_CHECKS = (
+    _leaves_modes_alone,
+    _one_ray,
+    _one_camera,
+    _repeatable,
+    _alone_as_together,
+    _same_without_gradient,
+    _keeps_what_it_gave,
+    _leaves_randomness_alone,
+)

@@ -1,0 +1,94 @@
+"""Checks of the contract suite that look at a surface twice: from elsewhere, from close by, and beside.
+
+A surface stays where it is, whoever looks. That tells a depth that is none, a normal that is none, and rays that do not arrive.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from neilfpp_method.hosts.testing_case import HIT_SHARE, Case
+from neilfpp_method.structures import RayBatch
+
+__all__ = ["GEOMETRY_CHECKS"]
+
+APART = 0.01
+"""How far the hits of two views of one place may lie apart, scene units; a soft layer adds twice its width."""
+AGREE = 0.6
+"""Least share of places that look the same from elsewhere. Others may be hidden from there, or lie on a silhouette."""
+NEAR = 0.05
+"""Distance from which light between surfaces may see a place, scene units."""
+ASIDE = 0.6
+"""Tangent of the angle between both views."""
+BESIDE = 0.01
+"""Distance of neighbouring rays, scene units."""
+STEEP = 8.0
+"""Neighbouring hits further apart than this many times their rays lie on two surfaces."""
+TILTED = 10.0
+"""Most that half of the normals may differ from what neighbouring hits say, degrees."""
+SPHERE = 1.5
+"""Where hits are outside the unit sphere, scene units; a little room for what an object stands on."""
+
+
+def _in_the_sphere(case: Case) -> None:
+    reach = case.hits.position.detach()[case.hit].norm(dim=-1).median().item()
+    broken = f"half of its hits lie {reach:.3g} and more from the origin: scale the scene into the unit sphere"
+    case.require(reach < SPHERE, broken)
+
+
+def _another_view(case: Case) -> None:
+    position, distance, aside = _places(case)
+    _look_again(case, position, normalize(aside, dim=-1), distance, "another view")
+
+
+def _from_afar(case: Case) -> None:
+    position, distance, _ = _places(case)
+    _look_again(case, position, -case.rays.directions[case.hit], 2 * distance, "twice the distance", "a far plane?")
+
+
+def _from_close_by(case: Case) -> None:
+    position, distance, aside = _places(case)
+    broken = "light between surfaces would not see it (a near plane?)"
+    _look_again(case, position, normalize(aside, dim=-1), torch.full_like(distance, NEAR), f"{NEAR} away", broken)
+
+
+def _normals_of_neighbours(case: Case) -> None:
+    """The cross product of the differences between hits of four rays around each ray."""
+    d = case.rays.directions[case.hit]
+    side = normalize(torch.linalg.cross(d, d.roll(1, dims=-1) + torch.tensor([0.3, 0.1, -0.2]).to(d)), dim=-1)
+    up = torch.linalg.cross(d, side)
+    origins = case.rays.origins[case.hit]
+    found = [case.constants(RayBatch(origins + sign * BESIDE * axis, d)) for axis in (side, up) for sign in (1, -1)]
+    across, along = (a.position - b.position for a, b in (found[:2], found[2:]))
+    seen = torch.stack([f.is_hit(HIT_SHARE) for f in found]).all(0)
+    near = torch.stack([across.norm(dim=-1), along.norm(dim=-1)]).amax(0) < 2 * STEEP * BESIDE
+    rows = seen & near
+    if rows.sum() < 8:
+        return  # too small or too rough a surface to tell
+    implied = normalize(torch.linalg.cross(across, along), dim=-1)[rows]
+    normal = case.hits.normal.detach()[case.hit][rows]
+    angle = (implied * normal).sum(-1).abs().clamp_max(1.0).acos().rad2deg().median().item()
+    broken = f"half of its normals are {angle:.0f}° and more off what neighbouring hits say"
+    case.require(angle < TILTED, f"{broken}: take the gradient of the field that is rendered")
+
+
+def _places(case: Case) -> tuple[Tensor, Tensor, Tensor]:
+    """Hits, their distances, and directions from which they can be seen as well."""
+    position, normal = case.hits.position.detach()[case.hit], case.hits.normal.detach()[case.hit]
+    back = -case.rays.directions[case.hit]
+    tangent = normalize(torch.linalg.cross(normal, back.roll(1, dims=-1)), dim=-1)
+    return position, (position - case.rays.origins[case.hit]).norm(dim=-1), normal + back + ASIDE * tangent
+
+
+def _look_again(case: Case, position: Tensor, way: Tensor, distance: Tensor, whence: str, broken: str = "") -> None:
+    start = position + distance[:, None] * way
+    again = case.constants(RayBatch(start, -way))
+    apart = (again.position - position).norm(dim=-1)
+    same = (again.is_hit(HIT_SHARE) & (apart <= APART + 2 * case.width)).float().mean().item()
+    lost = f"{1 - same:.0%} of its hits are not where they were when looked at from {whence}"
+    case.require(same >= AGREE, f"{lost}: {broken or 'is the depth a distance along the ray?'}")
+
+
+GEOMETRY_CHECKS = (_in_the_sphere, _another_view, _from_afar, _from_close_by, _normals_of_neighbours)

@@ -1,0 +1,134 @@
+"""What goes wrong first is said at the first batch, once, with the remedy."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+
+import pytest
+import torch
+
+from neilfpp_method.attach import attach_neilf, pixel_batch
+from neilfpp_method.errors import UserError
+from neilfpp_method.hosts.first_look import BATCHES, check_points
+from neilfpp_method.structures import RayBatch
+from tests.hosts.balls import Ball, BallHost, ball_rays
+from tests.scenes import tiny_config
+
+SAYS = "neilfpp_method.hosts.first_look"
+
+
+def batch(rays: RayBatch, color: float = 0.4):
+    return pixel_batch(rays.origins, rays.directions, torch.full((len(rays), 3), color))
+
+
+def shifted(x: torch.Tensor, by: torch.Tensor) -> RayBatch:
+    return RayBatch(x.origins + by, x.directions)
+
+
+def beside(rays: RayBatch, outputs: dict) -> dict:
+    return {"position": outputs["position"] + torch.tensor([0.0, 5.0, 0.0])}
+
+
+def first_nan(rays: RayBatch, outputs: dict, name: str) -> dict:
+    return {name: torch.where(torch.arange(len(rays))[:, None] == 0, torch.nan, outputs[name])}
+
+
+ERRORS = [
+    (lambda r, o: first_nan(r, o, "position"), "BallHost: its position is not finite for 1 of 64 rays; return zeros"),
+    (lambda r, o: first_nan(r, o, "color"), "BallHost: its color is not finite for 1 of 64 rays"),
+    (lambda r, o: {"normal": -o["normal"]}, "BallHost: 100% of its normals point away from the viewer; turn them outwards"),
+    (beside, "BallHost: 100% of its hits do not lie on their rays; return positions in the frame of the rays"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "message"), ERRORS, ids=[message[10:40] for _, message in ERRORS])
+def test_hits_that_cannot_be_used_are_an_error(spoil, message):
+    neilf = attach_neilf(BallHost(spoil), tiny_config())
+    with pytest.raises(UserError, match=message):
+        neilf.losses(batch(ball_rays(64)), "material_init")
+
+
+def test_the_whole_host_is_let_pass_without_a_word(caplog):
+    neilf = attach_neilf(BallHost(), tiny_config())
+    with caplog.at_level(logging.WARNING, SAYS):
+        for seed in range(BATCHES + 2):
+            neilf.losses(batch(ball_rays(64, seed=seed)), "joint")
+    assert not [record for record in caplog.records if record.name == SAYS]
+
+
+def test_no_hit_in_a_batch_is_said_once(caplog):
+    rays = ball_rays(64)
+    away = RayBatch(rays.origins, -rays.directions)
+    neilf = attach_neilf(Ball(), tiny_config())
+    with caplog.at_level(logging.WARNING, SAYS):
+        for _ in range(3):
+            neilf.losses(batch(away), "material_init")
+    (record,) = (record for record in caplog.records if record.name == SAYS)
+    assert "Ball: none of 64 rays meets a surface, so nothing is learned of them; is the frame" in record.message
+
+
+def test_a_scene_far_outside_the_unit_sphere_is_said_once(caplog):
+    by, ball = torch.tensor([6.0, 0.0, 0.0]), Ball()
+
+    def far(origins, directions):
+        color, position, normal = ball(origins - by, directions)
+        return color, position + by, normal
+
+    neilf = attach_neilf(far, tiny_config())
+    with caplog.at_level(logging.WARNING, SAYS):
+        for _ in range(3):
+            neilf.losses(batch(shifted(ball_rays(64), by)), "material_init")
+    (record,) = (record for record in caplog.records if record.name == SAYS)
+    assert "half of its hits lie" in record.message
+    assert "move and scale cameras and host so that the object lies in the unit sphere" in record.message
+
+
+def test_directions_that_are_not_unit_are_an_error():
+    rays = ball_rays(8)
+    neilf = attach_neilf(Ball(), tiny_config())
+    with pytest.raises(UserError, match=r"directions of rays are no unit vectors: the lengths go from 2 to 2; divide them"):
+        neilf.losses(batch(RayBatch(rays.origins, 2.0 * rays.directions)), "joint")
+
+
+def test_pixels_that_are_not_finite_are_an_error():
+    spoiled = batch(ball_rays(8))
+    spoiled = dataclasses.replace(spoiled, color=torch.where(torch.arange(8)[:, None] < 2, torch.inf, spoiled.color))
+    with pytest.raises(UserError, match="color of 2 of 8 pixels are not finite; leave those pixels out"):
+        attach_neilf(Ball(), tiny_config()).losses(spoiled, "joint")
+
+
+def test_display_values_above_one_are_an_error_and_a_wrong_median_a_warning(caplog):
+    with pytest.raises(UserError, match=r"pixels reach 128, and display values end at 1; divide 8-bit pixels by 255"):
+        attach_neilf(Ball(), tiny_config(), response="srgb").losses(batch(ball_rays(8), 128.0), "joint")
+    neilf = attach_neilf(Ball(), tiny_config())
+    with caplog.at_level(logging.WARNING, SAYS):
+        for _ in range(2):
+            neilf.losses(batch(ball_rays(8), 128.0), "material_init")
+    (record,) = (record for record in caplog.records if record.name == SAYS)
+    assert "the median of the pixels is 128, median_radiance says 0.5" in record.message
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"color": torch.zeros(4, 3, dtype=torch.uint8)}, "color of the batch is torch.uint8; divide 8-bit pixels by 255"),
+        ({"mask": torch.ones(4, 1)}, r"mask of the batch has the shape \(4, 1\); give \(4,\): a number per pixel"),
+        ({"color": torch.zeros(4)}, r"color of the batch has the shape \(4,\); give \(4, 3\)"),
+        ({"directions": torch.zeros(2, 2, 3)}, r"the shape \(2, 2, 3\); give \(4, 3\): a row per pixel, reshape\(-1, 3\)"),
+    ],
+)
+def test_pixels_of_another_form_are_named(change, message):
+    rays = ball_rays(4)
+    parts = {"origins": rays.origins, "directions": rays.directions, "color": torch.rand(4, 3), "mask": torch.ones(4)}
+    with pytest.raises(UserError, match=message):
+        pixel_batch(**(parts | change))
+
+
+def test_points_of_an_image_are_named():
+    with pytest.raises(UserError, match=r"x has the shape \(2, 2, 3\), not \(N, 3\); give x.reshape\(-1, 3\)"):
+        check_points("x", torch.zeros(2, 2, 3))
+    with pytest.raises(UserError, match=r"wi has the shape \(4, 3\), not \(N, S, 3\)"):
+        check_points("wi", torch.zeros(4, 3), axes=3)
+    with pytest.raises(UserError, match="x is torch.int64; give floats"):
+        check_points("x", torch.zeros(2, 3, dtype=torch.long))

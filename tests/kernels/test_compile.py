@@ -1,0 +1,43 @@
+"""A compiler of whole steps goes around the loops that are compiled already.
+
+In a process of its own: the checkers of types that tests run with are themselves more than torch.compile looks into.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+STEP = """
+import torch
+from torch._dynamo.utils import counters
+from neilfpp_method.settings.types import HashGridConfig
+from neilfpp_method.kernels import encode, grid_spec
+from neilfpp_method.kernels.softplus import softplus, softplus_and_slope
+from neilfpp_method.volume.distance_grid import sample_grid, trace_grid
+
+spec = grid_spec(HashGridConfig(levels=2, log2_entries=8, max_resolution=32))
+table = torch.rand(spec.entries, spec.features)
+ball = sample_grid(lambda x: x.norm(dim=-1) - 0.5, 1.0, 12, torch.zeros(1))
+start, up = torch.tensor([0.0, 0.0, -0.9]), torch.eye(3)[2].expand(6, 3)
+
+def step(x):
+    units = softplus_and_slope(x, 100.0)
+    features = encode(x, table, spec, True)
+    traced = trace_grid(ball, 1.0, 0.1 * x.detach() + start, up).distance
+    return (units.value * units.slope).sum() + softplus(x.detach(), 100.0).sum() + features.features.sum() + traced.sum()
+
+x = torch.rand(6, 3).requires_grad_()
+compiled, plain = torch.compile(step, backend="eager")(x), step(x)
+torch.testing.assert_close(compiled, plain)
+torch.testing.assert_close(torch.autograd.grad(compiled, x), torch.autograd.grad(plain, x))
+print(counters["stats"]["unique_graphs"], *counters["graph_break"])
+"""
+
+
+def test_a_compiled_step_does_not_look_into_numba():
+    done = subprocess.run([sys.executable, "-c", STEP], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert int(done.stdout.split()[0]) > 0
+    for into in ("CPUDispatcher", "numba", "llvmlite", "ThreadPoolExecutor", "get_num_threads"):
+        assert into not in done.stdout
