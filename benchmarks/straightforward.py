@@ -74,7 +74,7 @@ class PlainSdf(nn.Module):
             sample = SdfSample(outputs[:, 0], gradient_of(outputs[:, 0], x, trains), outputs[:, 1:])
         return sample if trains else SdfSample(sample.distance.detach(), sample.gradient, sample.feature.detach())
 
-    def hessian(self, x: Float[Tensor, "N 3"], method: str) -> Float[Tensor, "N 3 3"]:
+    def hessian(self, x: Float[Tensor, "N 3"], method: str | None = None) -> Float[Tensor, "N 3 3"]:
         x = x.detach().requires_grad_()
         gradient = self.with_gradient(x).gradient
         return torch.stack([gradient_of(gradient[:, axis], x, differentiable=True) for axis in range(3)], 1)
