@@ -11,9 +11,9 @@ from torch.nn.functional import normalize
 
 from neilfpp_method import attach_neilf, preset
 from neilfpp_method.attach import pixel_batch
-from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.data.views import Camera, camera_rays
 from neilfpp_method.hosts.image import image_hits
+from neilfpp_method.settings.types import LightFitConfig
 
 
 class Surfels(nn.Module):
@@ -56,7 +56,9 @@ cameras = [camera_at(2.5 * np.array([np.cos(a), np.sin(a), 0.4])) for a in np.ar
 settings = preset("fast")
 settings = dataclasses.replace(  # a small map, seldom fitted, for an example of seconds
     settings,
-    light=dataclasses.replace(settings.light, kind="distant", environment_height=8, fit=LightFitConfig(points=128, every=30, steps=20)),
+    light=dataclasses.replace(
+        settings.light, kind="distant", environment_height=8, fit=LightFitConfig(points=128, every=30, steps=20)
+    ),
     shading=dataclasses.replace(settings.shading, train_samples=16),
     train=dataclasses.replace(settings.train, sdf_steps=0, material_steps=60),
 )

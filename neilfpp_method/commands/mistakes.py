@@ -28,9 +28,7 @@ def mistake(complaint: str, arguments: Sequence[str]) -> tuple[str, str | None]:
         complaint: the box as tyro prints it; its paragraphs are separated by rules.
         arguments: the words of the command line.
     """
-    lines = [
-        line.strip("│ ") for line in complaint.splitlines() if line.startswith("│")
-    ] or complaint.splitlines()
+    lines = [line.strip("│ ") for line in complaint.splitlines() if line.startswith("│")] or complaint.splitlines()
     paragraphs: list[list[str]] = [[]]
     for line in lines:
         if line.strip("─ "):
