@@ -1,11 +1,11 @@
 """A relit run against true images of the same views under the same light.
 
-    relight_psnr, relight_ssim    both tone-mapped as a display shows them, masked, mean over views
-    relight_psnr_linear           the same on linear radiance, peak 1
-    *_scaled                      with one factor per channel for all views, by least squares on linear radiance: base colour
-                                  and light share a factor that images do not tell
-    *_frame                       the same over the whole frame, the background counted as free of error
-    baseline_*                    the capture's own image of the view, taken for the relit one
+relight_psnr, relight_ssim    both tone-mapped as a display shows them, masked, mean over views
+relight_psnr_linear           the same on linear radiance, peak 1
+*_scaled                      with one factor per channel for all views, by least squares on linear radiance: base colour
+                              and light share a factor that images do not tell
+*_frame                       the same over the whole frame, the background counted as free of error
+baseline_*                    the capture's own image of the view, taken for the relit one
 """
 
 from __future__ import annotations
@@ -60,7 +60,9 @@ def find_truth(folder: Path, views: Sequence[View]) -> dict[str, Path]:
     for view in views:
         files = [path for suffix in IMAGE_SUFFIXES if (path := folder / f"{view.name}{suffix}").is_file()]
         if not files:
-            raise UserError(f"{folder}: no true image of the view {view.name}", f"name it {view.name}.exr, or .png")
+            raise UserError(
+                f"{folder}: no true image of the view {view.name}", f"name it {view.name}.exr, or .png"
+            )
         header = image_header(files[0])
         if (header.width, header.height) != (view.camera.width, view.camera.height):
             size = f"{header.width}×{header.height} pixels where the view has {view.camera.width}×{view.camera.height}"
@@ -94,7 +96,9 @@ def read_truth(capture: Capture, view: View, path: Path) -> TrueImage:
 
 
 def compare(
-    relit: Sequence[Float[np.ndarray, "H W 3"]], opacity: Sequence[Float[np.ndarray, "H W"]], truth: Sequence[TrueImage]
+    relit: Sequence[Float[np.ndarray, "H W 3"]],
+    opacity: Sequence[Float[np.ndarray, "H W"]],
+    truth: Sequence[TrueImage],
 ) -> Compared:
     """Figures of relit views, linear radiance over black, each against the true image of the same view.
 
@@ -104,7 +108,9 @@ def compare(
     pairs = zip(opacity, truth, strict=True)
     masks = [seen > 0.5 if true.mask is None else true.mask for seen, true in pairs]
     if not any(mask.any() for mask in masks):
-        raise UserError("no pixel of the true images shows a surface", "give images of the views, with their masks")
+        raise UserError(
+            "no pixel of the true images shows a surface", "give images of the views, with their masks"
+        )
     images, names = [true.image for true in truth], [true.name for true in truth]
     figures, views, scale = _figures("relight", relit, images, masks, names)
     baseline, _, _ = _figures("baseline", [true.photograph for true in truth], images, masks, names)
@@ -120,7 +126,10 @@ def _figures(
     names: Sequence[str],
 ) -> tuple[dict[str, float], dict[str, float], tuple[float, ...]]:
     """Means over the views that have pixels, the scaled PSNR of each, and the factors."""
-    pooled = [np.concatenate([image[mask] for image, mask in zip(side, masks, strict=True)]) for side in (estimates, images)]
+    pooled = [
+        np.concatenate([image[mask] for image, mask in zip(side, masks, strict=True)])
+        for side in (estimates, images)
+    ]
     scale = metrics.align_scale(*pooled)
     scores: dict[str, list[float]] = {}
     views = {}
@@ -140,12 +149,16 @@ def _figures(
                 scores.setdefault(f"{title}_{key}{suffix}", []).append(value)
             if suffix:
                 views[name] = values["psnr"]
-    return {key: float(np.mean(values)) for key, values in scores.items()}, views, tuple(float(s) for s in scale)
+    return (
+        {key: float(np.mean(values)) for key, values in scores.items()},
+        views,
+        tuple(float(s) for s in scale),
+    )
 
 
 def _linear(pixels: Float[np.ndarray, "H W C"], linear: bool) -> Float[np.ndarray, "H W 3"]:
     values = pixels if linear else srgb_to_linear(torch.from_numpy(pixels)).numpy()
-    return np.broadcast_to(values, (*values.shape[:2], 3))
+    return np.repeat(values, 3, axis=-1) if values.shape[-1] == 1 else values
 
 
 def _shown(linear: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:

@@ -71,7 +71,9 @@ def power_heuristic(own: Float[Tensor, " N"], other: Float[Tensor, " N"]) -> Flo
 
 
 @torch.no_grad()
-def trace_paths(scene: Scene, rays: RayBatch, numbers: Numbers, bounces: int, first_dimension: int = 0) -> Traced:
+def trace_paths(
+    scene: Scene, rays: RayBatch, numbers: Numbers, bounces: int, first_dimension: int = 0
+) -> Traced:
     """The light that arrives along camera rays; its mean over samples is unbiased up to `bounces`.
 
     Args:
@@ -143,7 +145,9 @@ def _from_sky(scene: Scene, at: Vertices, u: Float[Tensor, "N 2"]) -> Float[Tens
     return torch.zeros_like(drawn.wi).index_put((rows,), light)
 
 
-def _from_lamps(scene: Scene, lamps: Lamplight, at: Vertices, u: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+def _from_lamps(
+    scene: Scene, lamps: Lamplight, at: Vertices, u: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N 3"]:
     """Light of a lamp along a direction towards it."""
     origins = at.position + OFFSET * at.flat
     drawn = lamps.sample(origins, u)

@@ -57,11 +57,15 @@ def surface_of_run(run: Run, resolution: int) -> Surface:
             normals = smooth.view_as(triangles)
         return Surface(triangles, normals)
     if not isinstance(host, HasSdf):
-        raise UserError(f"{run.path}: the host of this run has no surface to trace", "relight a run of the VolSDF or mesh host")
+        raise UserError(
+            f"{run.path}: the host of this run has no surface to trace",
+            "relight a run of the VolSDF or mesh host",
+        )
     volume = run.config.volume
     mesh = extract_mesh(host.sdf, volume.radius - volume.hit_radius, resolution, device=device)
     vertices, normals = (
-        torch.from_numpy(np.asarray(part, dtype=np.float32)).to(device) for part in (mesh.vertices, mesh.vertex_normals)
+        torch.from_numpy(np.asarray(part, dtype=np.float32)).to(device)
+        for part in (mesh.vertices, mesh.vertex_normals)
     )
     if isinstance(host, SmoothsNormals):
         normals = _smoothed(host, vertices, normals)

@@ -58,7 +58,9 @@ class Sky:
         height, width = self.radiance.shape[:2]
         column, row = self._place(wi)
         at = torch.stack((2 * (column + 1) / (width + 1) - 1, 2 * row / (height - 1) - 1), -1)
-        found = functional.grid_sample(self._closed, at[None, None], padding_mode="border", align_corners=True)
+        found = functional.grid_sample(
+            self._closed, at[None, None], padding_mode="border", align_corners=True
+        )
         return found[0, :, 0].T
 
     def sample(self, u: Float[Tensor, "N 2"]) -> SkySample:
@@ -137,7 +139,10 @@ def sky_of_run(light: EnvironmentLight) -> Sky:
 
 
 def _invert(
-    cumulated: Float[Tensor, " K"], value: Float[Tensor, " N"], first: Int[Tensor, " N"] | int, end: Int[Tensor, " N"] | int
+    cumulated: Float[Tensor, " K"],
+    value: Float[Tensor, " N"],
+    first: Int[Tensor, " N"] | int,
+    end: Int[Tensor, " N"] | int,
 ) -> tuple[Int[Tensor, " N"], Float[Tensor, " N"]]:
     """Which of the entries first … end − 1 a cumulated value falls into, and how far, in [0, 1)."""
     found = torch.searchsorted(cumulated, value, right=True)

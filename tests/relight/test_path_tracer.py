@@ -24,7 +24,9 @@ EVEN = Sky(torch.ones(8, 16, 3), rows_at_poles=True, start=0.0)
 
 
 def made_of(base: float, roughness: float = 0.5, metallic: float = 0.0):
-    return lambda x: Material(*(torch.full_like(x[:, :k], v) for k, v in ((3, base), (1, roughness), (1, metallic))))
+    return lambda x: Material(
+        *(torch.full_like(x[:, :k], v) for k, v in ((3, base), (1, roughness), (1, metallic)))
+    )
 
 
 def ball(subdivisions: int = 3, inside_out: bool = False) -> Surface:
@@ -61,11 +63,15 @@ def looking_at(points, eye=(0.0, 0.0, 3.0)) -> RayBatch:
 
 def scattered_targets(count: int, radius: float = 0.5) -> torch.Tensor:
     generator = torch.Generator().manual_seed(4)
-    return torch.cat((radius * (2 * torch.rand(count, 2, generator=generator) - 1), torch.zeros(count, 1)), -1)
+    return torch.cat(
+        (radius * (2 * torch.rand(count, 2, generator=generator) - 1), torch.zeros(count, 1)), -1
+    )
 
 
 def test_a_white_ball_in_white_light_cannot_be_seen():
-    found = trace(Scene(ball(), made_of(1.0), None, EVEN), looking_at(scattered_targets(500, 0.35)), 256, bounces=1)
+    found = trace(
+        Scene(ball(), made_of(1.0), None, EVEN), looking_at(scattered_targets(500, 0.35)), 256, bounces=1
+    )
     assert found.mean().item() == pytest.approx(1, abs=1e-3)
 
 
@@ -74,7 +80,9 @@ def test_a_white_bowl_in_white_light_cannot_be_seen():
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.6)
     kept = mesh.triangles[mesh.triangles_center[:, 2] < 0.2]
     bowl = Surface(torch.tensor(np.array(kept), dtype=torch.float32).flip(1))
-    found = trace(Scene(bowl, made_of(1.0), None, EVEN), looking_at(scattered_targets(100, 0.2)), 512, bounces=64)
+    found = trace(
+        Scene(bowl, made_of(1.0), None, EVEN), looking_at(scattered_targets(100, 0.2)), 512, bounces=64
+    )
     assert found.mean().item() == pytest.approx(1, abs=4e-3)
 
 
@@ -117,7 +125,9 @@ def gradient() -> Sky:
     return Sky(radiance, rows_at_poles=True, start=0.3)
 
 
-def quadrature(sky: Sky, normal: np.ndarray, wo: np.ndarray, base: float, roughness: float, metallic: float) -> np.ndarray:
+def quadrature(
+    sky: Sky, normal: np.ndarray, wo: np.ndarray, base: float, roughness: float, metallic: float
+) -> np.ndarray:
     """What a convex surface sends: the rendering equation by an even spread of a quarter of a million directions."""
     count = 500_000
     k = np.arange(count) + 0.5
@@ -145,7 +155,10 @@ def test_a_ball_under_a_map_is_that_of_quadrature(gradient, roughness, metallic)
 def test_both_techniques_and_each_alone_agree(gradient, lobe, monkeypatch):
     """A light drawn by the map and one met by chance: their weighted sum is what either gives by itself."""
     scene = Scene(
-        squares(((-0.5, -0.5, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), ((-0.5, 0.2, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 0.4))),
+        squares(
+            ((-0.5, -0.5, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+            ((-0.5, 0.2, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 0.4)),
+        ),
         made_of(0.7, 0.5, 0.3),
         lobe,
         gradient,
@@ -178,7 +191,10 @@ def test_weights_of_both_techniques_add_up_to_one():
 
 
 def test_a_lamp_casts_a_shadow():
-    floor, lid = ((-2.0, -2.0, 0.0), (4.0, 0.0, 0.0), (0.0, 4.0, 0.0)), ((-0.3, -0.3, 0.5), (0.6, 0.0, 0.0), (0.0, 0.6, 0.0))
+    floor, lid = (
+        ((-2.0, -2.0, 0.0), (4.0, 0.0, 0.0), (0.0, 4.0, 0.0)),
+        ((-0.3, -0.3, 0.5), (0.6, 0.0, 0.0), (0.0, 0.6, 0.0)),
+    )
     black = Sky(torch.full((4, 8, 3), 1e-9), True, 0.0)
     lamps = Lamplight(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 3), torch.ones(1, 3), 0.05)
     scene = Scene(squares(floor, lid), made_of(0.5), None, black, lamps)
@@ -200,7 +216,10 @@ def test_cameras_see_neither_lamps_nor_sky():
 
 # ------------------------------------------------------------------------------------------------- light between planes
 
-FACING = (((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)))
+FACING = (
+    ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)),
+)
 """Unit squares that look at one another across a distance of 1."""
 
 

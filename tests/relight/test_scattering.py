@@ -13,10 +13,14 @@ from neilfpp_method.shading.brdf import GGX, LOBES, SPHERICAL_GAUSSIAN
 from neilfpp_method.structures import Material
 from tests import oracles
 
-CASES = [(name, r, m) for name in ("ggx", "spherical_gaussian") for r, m in ((0.35, 0.0), (0.35, 1.0), (1.0, 0.3))]
+CASES = [
+    (name, r, m) for name in ("ggx", "spherical_gaussian") for r, m in ((0.35, 0.0), (0.35, 1.0), (1.0, 0.3))
+]
 
 
-def at(count: int, lobe, roughness: float, metallic: float, cosine: float = 0.6, base: float = 0.7) -> Vertices:
+def at(
+    count: int, lobe, roughness: float, metallic: float, cosine: float = 0.6, base: float = 0.7
+) -> Vertices:
     wo = torch.tensor([[math.sqrt(1 - cosine**2), 0.0, cosine]]).expand(count, 3)
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3)
     one = torch.ones(count, 1)
@@ -29,7 +33,10 @@ def test_directions_have_the_density_that_is_said(name, roughness, metallic):
     lobe = LOBES[name]
     u = torch.rand(100_000, 3, generator=torch.Generator().manual_seed(5))
     # χ² cells meet at the poles, so the viewer, against whom the density of the lobe is infinite, is one: turn all to it.
-    points, one = at(len(u), lobe, roughness, metallic, cosine=1.0), at(1, lobe, roughness, metallic, cosine=1.0)
+    points, one = (
+        at(len(u), lobe, roughness, metallic, cosine=1.0),
+        at(1, lobe, roughness, metallic, cosine=1.0),
+    )
     result = oracles.chi2_test(
         lambda: scatter(points, u, lobe).numpy(),
         lambda wi: scattering_pdf(spread(one, len(wi)), torch.from_numpy(wi).float(), lobe).double().numpy(),
@@ -76,6 +83,8 @@ def test_a_lambertian_surface_has_the_weight_of_its_colour():
 def test_nothing_is_scattered_into_the_triangle(lobe):
     points = at(1, lobe, 0.5, 0.5)
     tilted = Vertices(**{**vars(points), "flat": torch.tensor([[0.6, 0.0, 0.8]])})
-    wi = torch.nn.functional.normalize(torch.tensor([[-1.0, 0.0, 0.5]]), dim=-1)  # above the normal, within the triangle
+    wi = torch.nn.functional.normalize(
+        torch.tensor([[-1.0, 0.0, 0.5]]), dim=-1
+    )  # above the normal, within the triangle
     assert scattered(points, wi, lobe).amin() > 0
     assert not scattered(tilted, wi, lobe).any()
