@@ -32,7 +32,7 @@ from torch import Tensor
 
 from benchmarks.measure import hardware
 from benchmarks.mitsuba_scene import Part, load_mitsuba, render
-from neilfpp_method.config import NeilfConfig
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.data.truth import Truth

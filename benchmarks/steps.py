@@ -14,13 +14,13 @@ from functools import cache
 from pathlib import Path
 
 from benchmarks.measure import Measurement, device, in_yardsticks
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.demo import demo_scene
+from neilfpp_method.demo.command import demo_scene
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.presets import PRESETS, preset
 from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.settings.presets import PRESETS, preset
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts
 from neilfpp_method.train.loop import make_optimizer, seed_step
 
@@ -70,7 +70,7 @@ def step_of(model: NeilfModel, stage: Stage, rays: int = RAYS) -> Callable[[], N
     def step() -> None:
         seed_step(0, 1)
         model.freeze_for(stage)
-        total = weigh(model(batch, stage), weights)
+        total = weigh(model.losses(batch, stage), weights)
         optimizer.zero_grad(set_to_none=True)
         total.loss.backward()
         optimizer.step()
@@ -80,7 +80,7 @@ def step_of(model: NeilfModel, stage: Stage, rays: int = RAYS) -> Callable[[], N
 
 def warm_up(model: NeilfModel, step: Callable[[], None]) -> None:
     """Take steps of a material stage until it renders no more than it does in the long run."""
-    while model.replay is not None and model.replay.share == 1.0:
+    while model.replay.share > model.replay.fresh:
         step()
 
 

@@ -12,14 +12,16 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor
 
-from neilfpp_method.config import NeilfConfig, OptimizerConfig
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.errors import Diverged, Stopped, UserError
-from neilfpp_method.facts import RadianceUnits
-from neilfpp_method.kernels.process import rounded_products
+from neilfpp_method.health.watch import Watch
+from neilfpp_method.lighting.solver import LightSolver
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, stage_at, stage_steps, weigh
-from neilfpp_method.structures import LossTerms
+from neilfpp_method.settings.facts import RadianceUnits
+from neilfpp_method.settings.types import NeilfConfig, OptimizerConfig
+from neilfpp_method.structures import LossTerms, StepResult
+from neilfpp_method.train.health_record import read_findings, write_findings
 from neilfpp_method.train.light_record import LightFit, note_fit, read_fits, write_fits
 from neilfpp_method.train.progress import Reporter
 from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, save_checkpoint, write_json
@@ -43,6 +45,8 @@ class Training:
     should_stop: Callable[[], bool]
     preview: Callable[[NeilfModel, Stage], None]
     continue_with: str
+    light_solver: LightSolver
+    watch: Watch
     fits: list[LightFit] = field(default_factory=list)
     skipped: int = 0
     skipped_in_a_row: int = 0
@@ -58,6 +62,7 @@ def train(run: Training) -> None:
     """
     settings = run.config.train
     model = run.model.to(run.fabric.device).train()
+    run.light_solver.to(run.fabric.device)
     optimizer = make_optimizer(model, run.config.optimizer)
     step = _restore(run, optimizer)
     total = sum(stage_steps(settings).values())
@@ -65,6 +70,8 @@ def train(run: Training) -> None:
     while step < total:
         position = stage_at(step, settings)
         step = _train_stage(run, model, optimizer, step, position)
+        if run.fabric.is_global_zero:
+            run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
         _save(run, optimizer, step, also=position.stage.value)
         model.eval()
         run.preview(model, position.stage)
@@ -86,10 +93,11 @@ def _train_stage(run: Training, model: NeilfModel, optimizer: torch.optim.Optimi
         share = number / position.length
         set_rates(optimizer, run.config.optimizer, stage, share)
         batch = run.pixels.sample(settings.rays)
-        terms = wrapped(batch, stage)
-        note_fit(run.fits, model, step)
-        total = weigh(terms, active_losses(stage, run.config, model.stages, share))
-        stop = _update(run, model, optimizer, terms, total, step)
+        computed = wrapped(batch, stage)
+        total = weigh(computed.terms, active_losses(stage, run.config, model.stages, share))
+        stop = _update(run, model, optimizer, computed.terms, total, step)
+        _solve_light(run, model, computed, step)
+        run.watch.after_step(model.stages[stage], computed, step)
         step += 1
         run.seconds[stage.value] = before + time.perf_counter() - started
         if number + 1 == position.length:
@@ -101,6 +109,21 @@ def _train_stage(run: Training, model: NeilfModel, optimizer: torch.optim.Optimi
     return step
 
 
+def _solve_light(run: Training, model: NeilfModel, computed: StepResult, step: int) -> None:
+    """Show the light solver what a step showed; when it is time, it sets the light. The first process does it for all."""
+    fabric, solver = run.fabric, run.light_solver
+    if fabric.is_global_zero:
+        solver.observe(computed)
+    if not fabric.broadcast(solver.due):
+        return
+    if fabric.is_global_zero:
+        run.watch.after_fit(solver.points, step)
+        note_fit(run.fits, solver.solve(model.brdf, model.scene), model.lamps.lit, step)
+    if fabric.world_size > 1:
+        for part in (model.light, model.lamps):
+            part.load_state_dict(fabric.broadcast(part.state_dict()))
+
+
 def _update(
     run: Training, model: NeilfModel, optimizer: torch.optim.Optimizer, terms: LossTerms, total: Total, step: int
 ) -> bool:
@@ -110,8 +133,7 @@ def _update(
     """
     optimizer.zero_grad(set_to_none=True)
     if total.loss.requires_grad:
-        with rounded_products(run.config.train.gradients == "rounded"):
-            run.fabric.backward(total.loss)
+        run.fabric.backward(total.loss)
     norms = _gradient_norms(model)
     psnr = _psnr(terms, run.model.units)
     stop = torch.full_like(psnr, run.should_stop())
@@ -206,10 +228,11 @@ def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
 def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str | None = None) -> None:
     if run.fabric.is_global_zero:
         try:
-            # Before the checkpoint: what it knows too much is left out when a run continues, and what it lacks would be lost.
+            # Fits first: extra ones are dropped on resume, gaps cannot be recovered.
             write_fits(run.path, run.fits)
+            write_findings(run.path, run.watch)
             for name in filter(None, (also, "last")):
-                save_checkpoint(run.path / "checkpoints" / f"{name}.pt", run.model, optimizer, step)
+                save_checkpoint(run.path / "checkpoints" / f"{name}.pt", run.model, run.light_solver, optimizer, step)
             write_json(run.path / "timing.json", run.seconds)
         except UserError as error:
             raise UserError(error.problem, f"make room, and continue with: {run.continue_with}") from error
@@ -221,11 +244,13 @@ def _restore(run: Training, optimizer: torch.optim.Optimizer) -> int:
     if not path.exists():
         return 0
     saved = load_checkpoint(path)
-    load_weights(run.model, saved, run.path)
+    load_weights(run.model, saved["model"], run.path)
+    load_weights(run.light_solver, saved["light_solver"], run.path)
     optimizer.load_state_dict(saved["optimizer"])
     if (run.path / "timing.json").exists():
         run.seconds.update(read_json(run.path / "timing.json"))
     run.fits += read_fits(run.path, saved["step"])
+    run.watch.findings |= {finding.case: finding for finding in read_findings(run.path) or ()}
     return saved["step"]
 
 

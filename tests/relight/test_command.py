@@ -11,7 +11,7 @@ import pytest
 
 from neilfpp_method.cli import main
 from neilfpp_method.data.images import read_image, write_exr
-from neilfpp_method.presets import PRESETS
+from neilfpp_method.settings.presets import PRESETS
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import small_config, solved_light
 

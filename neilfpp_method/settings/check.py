@@ -1,0 +1,32 @@
+"""Settings that contradict each other, or that nothing can be built from: told in one line, before anything is built."""
+
+from __future__ import annotations
+
+from neilfpp_method.errors import UserError
+from neilfpp_method.settings.types import InterReflectionConfig, NeilfConfig
+
+__all__ = ["check_config"]
+
+
+def check_config(config: NeilfConfig) -> None:
+    """Refuse what no model can be made of, whoever trains it.
+
+    Raises:
+        UserError: a share that is none, or two settings that exclude each other.
+    """
+    if not 0 < config.train.fresh <= 1:
+        raise UserError(f"--config.train.fresh is {config.train.fresh}", "set it above 0 and to 1 at most")
+    _check_scene(config.inter_reflection, config.light.kind)
+    if config.light.map is not None and config.light.kind == "free":
+        raise UserError(
+            f"{config.light.map}: a light that is free at every point takes no map",
+            "add --config.light.kind distant, or auto to look for lamps before the map as well",
+        )
+
+
+def _check_scene(settings: InterReflectionConfig, light: str) -> None:
+    if settings.mode == "soft" and light != "free":
+        raise UserError(
+            f"soft inter-reflection with the light '{light}', which L_ref cannot teach",
+            "set --config.inter-reflection.mode hard, or --config.light.kind free",
+        )

@@ -1,0 +1,376 @@
+"""Every setting, one dataclass per room; `settings.presets` has the sets of them.
+
+Lengths are in scene units (the object lies in the unit sphere). A setting with `kind`, `mode` or a `bool` is a switch: an
+effect that is switched off asks no network and traces no ray.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+__all__ = ["NeilfConfig"]
+
+
+# ---------------------------------------------------------------------------------------------------------------- fields
+
+
+@dataclass(frozen=True)
+class HashGridConfig:
+    """Multiresolution hash grid (Müller et al. 2022)."""
+
+    levels: int = 16
+    """Number of grids, coarse to fine."""
+    features: int = 2
+    """Features per grid vertex."""
+    log2_entries: int = 19
+    """Table size of one level, as a power of two."""
+    base_resolution: int = 16
+    """Cells along an edge of the scene's cube at the coarsest level."""
+    max_resolution: int = 4096
+    """Cells along an edge at the finest level."""
+    backend: Literal["auto", "reference", "cpu", "triton"] = "auto"
+    """Who computes it. auto: the fastest that runs on the device. reference: plain torch. cpu: Numba. triton: CUDA."""
+
+
+@dataclass(frozen=True)
+class SdfConfig:
+    """G: position → signed distance and a feature for R (METHOD §5)."""
+
+    encoding: Literal["frequency", "hash"] = "frequency"
+    """How positions are encoded."""
+    frequencies: int = 6
+    """Octaves of the frequency encoding."""
+    grid: HashGridConfig = field(default_factory=HashGridConfig)
+    """The grid, where `encoding` is hash."""
+    layers: int = 8
+    """Hidden layers."""
+    width: int = 256
+    """Units of a hidden layer."""
+    skip: int | None = 4
+    """The layer that sees the encoded position again."""
+    feature_width: int = 256
+    """Length of the feature handed to R."""
+    sphere_radius: float = 0.6
+    """Radius of the sphere that the field starts as."""
+
+
+@dataclass(frozen=True)
+class OutgoingRadianceConfig:
+    """R: position, direction, normal and feature of G → linear RGB (METHOD §5)."""
+
+    encoding: Literal["raw", "frequency", "hash"] = "raw"
+    """How positions are encoded."""
+    frequencies: int = 6
+    """Octaves of the frequency encoding of positions."""
+    grid: HashGridConfig = field(default_factory=HashGridConfig)
+    """The grid, where `encoding` is hash."""
+    direction: Literal["outgoing", "mirrored"] = "outgoing"
+    """Which direction is encoded: the outgoing one, as in the paper, or the one that it mirrors about the normal. What a shiny
+    surface sends changes evenly with the latter, so its normals are found (Verbin et al. 2022, "Ref-NeRF")."""
+    direction_encoding: Literal["frequency", "spherical_harmonics"] = "frequency"
+    """How directions are encoded."""
+    direction_degree: int = 4
+    """Octaves of the frequency encoding, or bands of the spherical harmonics."""
+    layers: int = 4
+    """Hidden layers."""
+    width: int = 256
+    """Units of a hidden layer."""
+    scale: float | None = None
+    """Largest radiance that the sigmoid can reach; none: 1 for LDR; for HDR twenty times the median of the images, or more
+    where they hold more."""
+
+
+@dataclass(frozen=True)
+class BrdfConfig:
+    """B: position → base colour, roughness, metallic (METHOD §5)."""
+
+    encoding: Literal["frequency", "hash"] = "frequency"
+    """How positions are encoded."""
+    initial_base_color: float = 0.5
+    """What the base colour starts as. Light and base colour share a scale that images hardly tell, so it stays near this."""
+    initial_metallic: float = 0.5
+    """What metallic starts as. Most surfaces are no metals, and a light that is found under metals is too weak for others."""
+    frequencies: int = 6
+    """Octaves of the frequency encoding."""
+    grid: HashGridConfig = field(default_factory=HashGridConfig)
+    """The grid, where `encoding` is hash."""
+    activation: Literal["sine", "relu"] = "sine"
+    """Hidden units; sine is SIREN's, with ω = 30."""
+    layers: int = 8
+    """Hidden layers."""
+    width: int = 512
+    """Units of a hidden layer."""
+    skip: int | None = 4
+    """The layer that sees the encoded position again."""
+
+
+@dataclass(frozen=True)
+class LightFitConfig:
+    """How an environment map, and lamps before it, are solved for (`lighting`)."""
+
+    points: int = 1024
+    """Surface points that the light is fitted to; memory and time grow with points · texels."""
+    every: int = 100
+    """Steps between two fits."""
+    steps: int = 100
+    """Steps of a fit."""
+    rate: float = 0.1
+    """Rate of log radiance at the start of a fit."""
+    smoothness: float = 0.03
+    """Weight of the total variation of log radiance, per texel, against the relative error."""
+    sky: float = 1.0
+    """Weight of the difference between the map's log radiance and what cameras saw beyond the scene, per texel, against the
+    relative error. It counts where there is a background to see (`background.kind` inverted_sphere)."""
+    whiteness: float = 0.05
+    """Weight of the tint of all light that reaches the points, against the relative error: images hardly tell the tint of the
+    light from that of the surfaces."""
+    evenness: float = 0.3
+    """Weight of the mean difference of log base colour between neighbouring points, against the relative error. The base colour
+    of every point is free while light is fitted; 0: it is what surfaces have learned, up to a factor per channel."""
+    sparsity: float = 0.001
+    """Weight of the lamps, by the logarithm of their shares of all light, against the relative error."""
+    candidates: int = 256
+    """Places for lamps that one fit tries."""
+    lamps: int = 8
+    """Most lamps."""
+    lamp_radius: float = 0.06
+    """Of every lamp, scene units."""
+    floor: float = 0.1
+    """Errors are relative to the pixel and this share of a typical one."""
+    outlier: float = 0.1
+    """Relative errors beyond this count by their size rather than by their square."""
+
+
+@dataclass(frozen=True)
+class IncidentLightConfig:
+    """L: position, direction → linear RGB that arrives (METHOD §5): sharp in direction, smooth in position."""
+
+    kind: Literal["free", "distant", "distant_near", "auto"] = "free"
+    """free: the paper's field, its own light at every point. distant: an environment map. distant_near: a map, and lamps
+    close to the scene. auto: a map, and lamps where points that were kept back from the fit ask for them. All but free go
+    with inter-reflection hard or off."""
+    environment_height: int = 32
+    """Rows of the environment map; it has twice as many columns."""
+    map: str | None = None
+    """An environment map that is known, a linear EXR in the layout of docs/light.md; none: the map is recovered. Lamps
+    before it are sought where `kind` says so."""
+    fit: LightFitConfig = field(default_factory=LightFitConfig)
+    """How the map is found."""
+    activation: Literal["sine", "relu"] = "sine"
+    """Hidden units; sine is SIREN's, with ω = 30."""
+    direction_encoding: Literal["frequency", "spherical_harmonics"] = "frequency"
+    """How directions are encoded."""
+    direction_degree: int = 6
+    """Octaves of the frequency encoding, or bands of the spherical harmonics."""
+    layers: int = 8
+    """Hidden layers; the position enters at the middle one."""
+    width: int = 128
+    """Units of a hidden layer."""
+    monochrome: bool = False
+    """One channel for all three colours, for LDR input."""
+    base: float | None = None
+    """Base of the exponential at the end; none: e for LDR, 10 for HDR captures (METHOD §5)."""
+
+
+@dataclass(frozen=True)
+class BackgroundConfig:
+    """What a ray sees beyond the scene."""
+
+    kind: Literal["auto", "none", "constant", "inverted_sphere"] = "auto"
+    """none: the scene sphere is a surface that closes the scene (VolSDF). constant: one colour. inverted_sphere: a NeRF++
+    field. auto: constant where one colour is all that the borders of the images show behind the scene, else inverted_sphere."""
+    color: tuple[float, float, float] | None = None
+    """Linear RGB of a constant background, and what an inverted_sphere starts as; none: read from the borders of the images."""
+    layers: int = 8
+    """Hidden layers of the NeRF++ field."""
+    width: int = 256
+    """Units of a hidden layer of the NeRF++ field."""
+    samples: int = 32
+    """Samples per ray beyond the scene sphere."""
+
+
+# ---------------------------------------------------------------------------------------------------------------- hosts
+
+
+@dataclass(frozen=True)
+class MeshConfig:
+    """The mesh host: geometry is given."""
+
+    path: str | None = None
+    """The triangle mesh, in the world frame of the capture; none: the capture's inputs/model/mesh.ply."""
+    smooth_normals: bool = True
+    """Normals interpolated between the vertices, edges kept; off: those of the triangles."""
+
+
+@dataclass(frozen=True)
+class VolumeConfig:
+    """Volume rendering of the VolSDF host (METHOD §3)."""
+
+    radius: float = 3.0
+    """Where the scene ends."""
+    beta_init: float = 0.1
+    """Scale of the Laplace density at the start."""
+    beta_floor: float = 1e-4
+    """Its smallest value."""
+    sampler: Literal["error_bounded", "uniform"] = "error_bounded"
+    """Algorithm 1 of VolSDF, or stratified samples alone."""
+    skip_empty: bool = False
+    """In training, rays skip what a coarse grid of the SDF shows to be empty. Evaluation takes whole rays."""
+    initial_samples: int = 128
+    """SDF queries per ray of the first round; also those added in each refinement."""
+    narrowed_samples: int = 64
+    """The same for rays that skip empty space: what is left of them is short."""
+    rounds: int = 5
+    """Most refinement rounds."""
+    bisections: int = 10
+    """Bisection steps on β."""
+    epsilon: float = 0.1
+    """Bound on the opacity's error."""
+    samples: int = 64
+    """Final samples per ray."""
+    normal_radius: float = 0.0
+    """Surfaces are shaded with the normal of a neighbourhood of this radius, edges kept; 0: with that of the hit alone."""
+    hit_radius: float = 0.05
+    """The blending weight within this distance of the blended hit is its concentration: a sharp surface has nearly all."""
+
+
+# --------------------------------------------------------------------------------------------------------------- shading
+
+
+@dataclass(frozen=True)
+class ShadingConfig:
+    """The rendering equation (METHOD §1)."""
+
+    lobe: Literal["spherical_gaussian", "ggx"] = "spherical_gaussian"
+    """Distribution and masking of the specular lobe."""
+    specular: bool = True
+    """Off: a Lambertian surface; roughness and metallic are not asked for."""
+    sampler: Literal["fibonacci", "cosine", "lobe", "mis"] = "fibonacci"
+    """Who draws the incident directions: the paper's lattice, a cosine, the specular lobe, or cosine, lobe and (where it can
+    be sampled) light together by the balance heuristic."""
+    train_samples: int = 128
+    """Incident directions per point in training."""
+    eval_samples: int = 256
+    """Incident directions per point in evaluation."""
+    hit_share: float = 0.8
+    """Least concentration of a ray's blending weight that makes its hit a surface point; the others are not shaded."""
+
+
+@dataclass(frozen=True)
+class InterReflectionConfig:
+    """L_ref: what arrives from another surface is what that surface sends (METHOD §2)."""
+
+    mode: Literal["off", "soft", "hard"] = "soft"
+    """soft: the paper's loss. hard: a direction that meets the scene brings R from there; only the others ask the light."""
+    grid_resolution: int = 96
+    """Vertices along an edge of the grid that hard inter-reflection traces in a distance field."""
+    rays_per_point: float = 1.0
+    """Traced directions per surface point and step, in expectation."""
+    radiance_gradient: float = 0.0
+    """Scale of the gradient that reaches R; 0 detaches it, 0.7 suits fixed geometry."""
+    max_angle_deg: float = 80.0
+    """Largest angle from the normal at which a direction is traced."""
+    offset: float = 0.02
+    """Least displacement off the surface; it grows with β and as 1/cos towards grazing."""
+
+
+# -------------------------------------------------------------------------------------------------------------- training
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the losses (METHOD §4); `schedule.py` says in which stage each counts. 0 switches a loss off."""
+
+    unit: Literal["activation", "median"] = "activation"
+    """What radiance is measured in. activation: L_vol in the range of R's output, all else absolute, as the paper has it.
+    median: all in the median of the images, so that the weights depend neither on the exposure nor on what cameras store."""
+    volume: float = 1.0
+    physical: float = 1.0
+    eikonal: float = 0.1
+    hessian: float = 1e-3
+    hessian_growth: float = 1.0
+    """Weight of L_Hess at the end of SDF init over that at its start: early, shapes must be free to fold; late, ripples are
+    noise."""
+    hessian_joint: float = 1e-4
+    surface: float = 1e-3
+    surface_joint: float = 1e-4
+    point_cloud: float = 0.0
+    inter_reflection: float = 0.1
+    smoothness: float = 5e-4
+    lambertian: float = 5e-4
+    mask: float = 0.0
+    """Opacity against the object mask, where the capture has masks or shows exactly its background."""
+    hessian_method: Literal["analytic", "finite_difference"] = "analytic"
+    """How second derivatives of G are taken."""
+    surface_epsilon: float = 0.05
+    """Width of the smoothed delta of L_surf."""
+    position_gradient: float = 0.1
+    """Scale of the gradient from the material into the hit position, joint stage."""
+    normal_gradient: float = 1.0
+    """Scale of the gradient from the material into the hit normal, joint stage."""
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """Adam, one learning rate per field; each falls exponentially to `final` of its start over a stage."""
+
+    geometry: float = 5e-4
+    radiance: float = 5e-4
+    brdf: float = 5e-4
+    light: float = 5e-4
+    background: float = 5e-4
+    beta: float = 5e-4
+    joint: float = 0.5
+    """Factor on all rates in the joint stage."""
+    final: float = 0.1
+    """Rate at the end of a stage over its start."""
+    background_from: float = 0.0
+    """Share of SDF init that is over when the field beyond the scene starts to move. Until then it is the colour that it starts
+    as, so that what lies within the scene is made of surfaces: a field that is seen from everywhere can paint it as well."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """The loop."""
+
+    sdf_steps: int = 40_000
+    """Steps of the stage SDF init."""
+    material_steps: int = 20_000
+    """Steps of the stage material init."""
+    joint_steps: int = 20_000
+    """Steps of the joint stage; 0 is the paper's separate pipeline ("Sep.")."""
+    rays: int = 4096
+    """Rays per step and process."""
+    fresh: float = 1.0
+    """Share of a step's rays that are rendered while the surface stands still; the other points are those of earlier steps."""
+    seed: int = 0
+    """Every random number of step k follows from seed and k alone."""
+    checkpoint_every: int = 500
+    """Steps between checkpoints."""
+    log_every: int = 50
+    """Steps between TensorBoard scalars."""
+    eval_chunk: int = 2048
+    """Rays rendered at once in evaluation; bounds the memory."""
+
+
+@dataclass(frozen=True)
+class NeilfConfig:
+    """Everything that decides a run, besides the capture."""
+
+    preset: str = "paper-mlp"
+    """The preset that the settings started from; a label."""
+    host: Literal["volsdf", "mesh"] = "volsdf"
+    """Where geometry comes from: volsdf trains a distance field; mesh takes triangles as they are."""
+    sdf: SdfConfig = field(default_factory=SdfConfig)
+    radiance: OutgoingRadianceConfig = field(default_factory=OutgoingRadianceConfig)
+    brdf: BrdfConfig = field(default_factory=BrdfConfig)
+    light: IncidentLightConfig = field(default_factory=IncidentLightConfig)
+    background: BackgroundConfig = field(default_factory=BackgroundConfig)
+    volume: VolumeConfig = field(default_factory=VolumeConfig)
+    mesh: MeshConfig = field(default_factory=MeshConfig)
+    shading: ShadingConfig = field(default_factory=ShadingConfig)
+    inter_reflection: InterReflectionConfig = field(default_factory=InterReflectionConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)

@@ -1,0 +1,46 @@
+"""Settings that nothing can be built from are refused by whoever builds: the command, the plugin and `attach_neilf` alike."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from neilfpp_method.attach import attach_neilf
+from neilfpp_method.errors import UserError
+from neilfpp_method.settings.check import check_config
+from neilfpp_method.settings.presets import PRESETS, fixed_geometry, free_light, preset
+from neilfpp_method.settings.types import NeilfConfig
+from tests.scenes import tiny_config
+
+
+def with_setting(config: NeilfConfig, room: str, **settings: object) -> NeilfConfig:
+    return replace(config, **{room: replace(getattr(config, room), **settings)})
+
+
+WRONG = {
+    "no rays are fresh": (preset("fast"), "train", {"fresh": 0.0}, "train.fresh is 0"),
+    "more than all are fresh": (preset("fast"), "train", {"fresh": 1.5}, "train.fresh is 1.5"),
+    "a map that L_ref cannot teach": (preset("fast"), "inter_reflection", {"mode": "soft"}, "L_ref"),
+    "a map for a light that has none": (preset("paper-mlp"), "light", {"map": "sky.exr"}, "takes no map"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_excludes_itself_is_refused(case):
+    config, room, settings, message = WRONG[case]
+    with pytest.raises(UserError, match=message):
+        check_config(with_setting(config, room, **settings))
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_and_what_is_made_of_them_pass(name):
+    for config in (preset(name), fixed_geometry(preset(name))):
+        check_config(config)
+    check_config(free_light(preset("fast")))
+
+
+def test_attaching_asks_as_well():
+    config = with_setting(tiny_config(), "train", fresh=2.0)
+    with pytest.raises(UserError, match="fresh is 2"):
+        attach_neilf(lambda origins, directions: (origins, origins, origins), config=config)
