@@ -1,15 +1,19 @@
-"""The path tracer of `neilfpp relight` against Mitsuba 3, and against pictures of a capture under another light.
+"""The path tracer of `neilfpp relight` against Mitsuba 3, and against pictures of a capture under another
+light.
 
     python -m benchmarks.relight
     python -m benchmarks.relight --variant llvm_ad_rgb --width 160 --spp 1024
     python -m benchmarks.relight --capture DATA/tabletop_env --under DATA/tabletop_relight
 
-Without a capture: a ball of metal and one of paint in a corner, under a map with a sun, direct light alone and with six
-bounces. `mean error` is the mean |ours − Mitsuba's| over the mean radiance, `noise` that of two pictures by Mitsuba itself
-with other random numbers, `bias` the difference of the means.
+Without a capture: a ball of metal and one of paint in a corner, under a map with a sun, direct light alone
+    and with six
+bounces. `mean error` is the mean |ours − Mitsuba's| over the mean radiance, `noise` that of two pictures by
+Mitsuba itself with other random numbers, `bias` the difference of the means.
 
-With a capture: its mesh, and the true material of its test views, carried to all points by the nearest pixel, under
-`<under>/envmap.exr`; PSNR against `<under>/images`. What is missing to perfect is the tracer's own error and the noise.
+With a capture: its mesh, and the true material of its test views, carried to all points by the nearest pixel,
+    under
+`<under>/envmap.exr`; PSNR against `<under>/images`. What is missing to perfect is the tracer's own error and
+the noise.
 """
 
 from __future__ import annotations
@@ -32,7 +36,6 @@ from torch import Tensor
 
 from benchmarks.measure import hardware
 from benchmarks.mitsuba_scene import Part, load_mitsuba, render
-from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.data.truth import Truth
@@ -45,6 +48,7 @@ from neilfpp_method.relight.maps import read_map
 from neilfpp_method.relight.path_tracer import Scene
 from neilfpp_method.relight.sky import Sky
 from neilfpp_method.relight.surface import Surface
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.brdf import SPHERICAL_GAUSSIAN
 from neilfpp_method.structures import Material
 
@@ -96,7 +100,9 @@ def corner_parts() -> list[Part]:
 
 def sunny_map(height: int = 32) -> Float[Tensor, "H W 3"]:
     """A sky that darkens downwards, with a sun of three texels."""
-    sky = torch.linspace(1.0, 0.2, height)[:, None, None].expand(height, 2 * height, 3) * torch.tensor([0.7, 0.9, 1.2])
+    sky = torch.linspace(1.0, 0.2, height)[:, None, None].expand(height, 2 * height, 3) * torch.tensor(
+        [0.7, 0.9, 1.2]
+    )
     sky[height // 5, height : height + 3] = torch.tensor([120.0, 100.0, 70.0])
     return sky.contiguous()
 
@@ -138,7 +144,9 @@ def agreement(variant: str, width: int, spp: int, bounces: int) -> Agreement:
     seconds = time.perf_counter() - begun
     with tempfile.TemporaryDirectory() as folder:
         begun = time.perf_counter()
-        theirs = [render(mi, parts, radiance.numpy(), camera, Path(folder), spp, bounces, seed) for seed in (1, 2)]
+        theirs = [
+            render(mi, parts, radiance.numpy(), camera, Path(folder), spp, bounces, seed) for seed in (1, 2)
+        ]
         seconds_of_mitsuba = (time.perf_counter() - begun) / 2
     mean = theirs[0].mean()
     return Agreement(
@@ -150,7 +158,7 @@ def agreement(variant: str, width: int, spp: int, bounces: int) -> Agreement:
     )
 
 
-# ------------------------------------------------------------------------------------------------- under another light
+# ---------------------------------------------------------------------------------------- under another light
 
 
 def true_materials(capture: Capture):
@@ -198,7 +206,9 @@ def relit_truth(options: Options, console: Console) -> None:
     scene = Scene(true_surface(capture), true_materials(capture), SPHERICAL_GAUSSIAN, read.sky)
     relit, truths = [], []
     for view in capture.test_views:
-        relit.append(take_picture(scene, capture.normalisation.camera(view.camera), Budget(options.spp), BOUNCES))
+        relit.append(
+            take_picture(scene, capture.normalisation.camera(view.camera), Budget(options.spp), BOUNCES)
+        )
         truths.append(read_truth(capture, view, files[view.name]))
     found = compare([p.radiance.numpy() for p in relit], [p.alpha[..., 0].numpy() for p in relit], truths)
     for name, value in found.figures.items():
@@ -210,13 +220,17 @@ def main(options: Options, console: Console) -> None:
     """Measure, and print."""
     console.print(hardware(), markup=False)
     if (options.capture is None) != (options.under is None):
-        raise UserError("--capture and --under go together", "give both, or none for the comparison with Mitsuba")
+        raise UserError(
+            "--capture and --under go together", "give both, or none for the comparison with Mitsuba"
+        )
     if options.capture is not None:
         relit_truth(options, console)
         return
     for title, bounces in (("direct", 1), ("six bounces", BOUNCES)):
         found = agreement(options.variant, options.width, options.spp, bounces)
-        shares = ", ".join(f"{name} {100 * getattr(found, name):.2f} %" for name in ("error", "noise", "bias"))
+        shares = ", ".join(
+            f"{name} {100 * getattr(found, name):.2f} %" for name in ("error", "noise", "bias")
+        )
         times = f"{found.seconds:.1f} s, Mitsuba {found.seconds_of_mitsuba:.1f} s"
         console.print(f"{title}: {shares}; {times}", highlight=False)
 

@@ -1,1 +1,1 @@
-"""A finished run under other light: a path tracer on the surface that was found, with the material that was found."""
+"""A finished run under other light, by path tracing on the surface and with the material that it has found."""

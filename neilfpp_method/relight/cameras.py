@@ -26,8 +26,8 @@ MOST_SIDE = 8192
 
 @dataclass(frozen=True)
 class Shot:
-    """A picture to take: its name, which is a plain file name, the camera in the scene frame, and the capture's view that it
-    shows, if it shows one in full size."""
+    """A picture to take: its name, which is a plain file name, the camera in the scene frame, and the
+    capture's view that it shows, if it shows one in full size."""
 
     name: str
     camera: Camera
@@ -52,10 +52,11 @@ def view_shots(capture: Capture, views: Sequence[View], scale: float | None, wid
 
 
 def turntable(capture: Capture, frames: int, scale: float | None, width: int | None) -> list[Shot]:
-    """Cameras on a circle about the scene's +z, which look at its centre; height, distance and lens are those of the capture.
+    """Cameras on a circle about the scene's +z, which look at its centre; height, distance and lens are those
+    of the capture.
 
-    Distance and elevation are the medians of the capture's cameras; the lens is that of the view whose distance is nearest to
-    the median, straightened.
+    Distance and elevation are the medians of the capture's cameras; the lens is that of the view whose
+    distance is nearest to the median, straightened.
 
     Raises:
         UserError: fewer than 2 or more than 9999 frames, or a size that is not possible.
@@ -96,8 +97,8 @@ def resized(camera: Camera, factor: float) -> Camera:
 
 
 def rays_through(camera: Camera, points: Float[Tensor, "N 2"]) -> tuple[RayBatch, Bool[Tensor, " N"]]:
-    """Rays through image points (column + ½ at a pixel's centre), in the frame of the pose, and which of them there are:
-    a lens may show nothing at a point."""
+    """Rays through image points (column + ½ at a pixel's centre), in the frame of the pose, and which of them
+    there are: a lens may show nothing at a point."""
     plane = (points.double().cpu().numpy() - camera.intrinsics[2:]) / camera.intrinsics[:2]
     if camera.lens is not None:
         plane = camera.lens.straighten(plane)

@@ -80,7 +80,7 @@ def relight(
     say: Callable[[str], None] = lambda text: None,
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> Path:
-    """Render what is asked for, and return the folder. Views that are there already, made the same way, are skipped.
+    """Render what is asked for, and return the folder. Views that are there, made the same way, are skipped.
 
     Args:
         request: what.
@@ -116,7 +116,7 @@ def relight(
     return out
 
 
-# ---------------------------------------------------------------------------------------------------- what is asked for
+# ------------------------------------------------------------------------------------------ what is asked for
 
 
 def _check(request: Request) -> None:
@@ -215,7 +215,7 @@ def _with_lamps(request: Request) -> bool:
     return request.lamps == "keep" or (request.lamps == "auto" and not request.env)
 
 
-# --------------------------------------------------------------------------------------------------------------- doing
+# ------------------------------------------------------------------------------------------------------ doing
 
 
 def _materials(request: Request, run: Run) -> Materials:

@@ -2,8 +2,8 @@
 
 relight_psnr, relight_ssim    both tone-mapped as a display shows them, masked, mean over views
 relight_psnr_linear           the same on linear radiance, peak 1
-*_scaled                      with one factor per channel for all views, by least squares on linear radiance: base colour
-                              and light share a factor that images do not tell
+*_scaled                      with one factor per channel for all views, by least squares on linear
+                              radiance: base colour and light share a factor that images do not tell
 *_frame                       the same over the whole frame, the background counted as free of error
 baseline_*                    the capture's own image of the view, taken for the relit one
 """
@@ -31,7 +31,8 @@ __all__ = ["Compared", "TrueImage", "compare", "find_truth", "read_truth"]
 
 @dataclass(frozen=True)
 class TrueImage:
-    """The true image of a view, linear; the pixels that count, and what decided that; the capture's image, linear."""
+    """The true image of a view, linear; the pixels that count, and what decided that; the capture's image,
+    linear."""
 
     name: str
     image: Float[np.ndarray, "H W 3"]
@@ -65,14 +66,16 @@ def find_truth(folder: Path, views: Sequence[View]) -> dict[str, Path]:
             )
         header = image_header(files[0])
         if (header.width, header.height) != (view.camera.width, view.camera.height):
-            size = f"{header.width}×{header.height} pixels where the view has {view.camera.width}×{view.camera.height}"
+            wanted = f"{view.camera.width}×{view.camera.height}"
+            size = f"{header.width}×{header.height} pixels where the view has {wanted}"
             raise UserError(f"{files[0]}: {size}", "render the true image again in the size of the view")
         found[view.name] = files[0]
     return found
 
 
 def read_truth(capture: Capture, view: View, path: Path) -> TrueImage:
-    """A true image, and which of its pixels count: by its alpha, else by true depth, else by the mask of the view.
+    """A true image, and which of its pixels count: by its alpha, else by true depth, else by the mask of the
+    view.
 
     Raises:
         UserError: an image cannot be read, or has values that are not finite.

@@ -1,4 +1,5 @@
-"""Open Image Denoise (Áfra, Intel), where `pyoidn` is installed: it takes the noise of few samples for a little blur."""
+"""Open Image Denoise (Áfra, Intel), where `pyoidn` is installed: it takes the noise of few samples for a
+little blur."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From paths to a picture: samples are added pass by pass, until there are enough of them or the time is over."""
+"""From paths to a picture: samples are added pass by pass, until there are enough or the time is over."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ PLACE_IN_PIXEL = 2
 
 @dataclass(frozen=True)
 class Budget:
-    """When a picture is done: after so many samples per pixel, or at the end of the pass in which the seconds are over;
-    whichever comes first. Each pixel has one sample at least."""
+    """When a picture is done: after so many samples per pixel, or at the end of the pass in which the seconds
+    are over; whichever comes first. Each pixel has one sample at least."""
 
     samples: int | None
     seconds: float | None = None
@@ -36,8 +36,8 @@ class Budget:
 
 @dataclass(frozen=True)
 class Picture:
-    """Linear radiance, premultiplied: 0 where no surface is; the share of a pixel that a surface covers; reflectance and
-    normal for a denoiser; and how many samples each pixel had."""
+    """Linear radiance, premultiplied: 0 where no surface is; the share of a pixel that a surface covers;
+    reflectance and normal for a denoiser; and how many samples each pixel had."""
 
     radiance: Float[Tensor, "H W 3"]
     alpha: Float[Tensor, "H W 1"]

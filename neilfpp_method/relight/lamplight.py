@@ -16,13 +16,15 @@ from neilfpp_method.shading.frame import local_frame, safe_normalize
 __all__ = ["LampSample", "Lamplight", "lamps_of_run"]
 
 EVEN_SHARE = 0.05
-"""Of the probability of lamps, without regard to where they send: an axis is asked at the middle of a lamp alone."""
+"""Of the probability of lamps, without regard to where they send: an axis is asked at the middle of a lamp
+alone."""
 
 
 @dataclass(frozen=True)
 class LampSample:
-    """Unit directions towards a lamp each, their density per steradian (with the choice of the lamp), the distance of the
-    lamp's surface, and the radiance that arrives where nothing is in the way. A density of 0: nothing was drawn."""
+    """Unit directions towards a lamp each, their density per steradian (with the choice of the lamp), the
+    distance of the lamp's surface, and the radiance that arrives where nothing is in the way. A density of 0:
+    nothing was drawn."""
 
     wi: Float[Tensor, "N 3"]
     pdf: Float[Tensor, " N"]
@@ -40,7 +42,8 @@ class Lamplight:
     radius: float
 
     def sample(self, x: Float[Tensor, "N 3"], u: Float[Tensor, "N 3"]) -> LampSample:
-        """A direction within the cone of one lamp, for numbers in [0, 1); the lamp by about what it brings."""
+        """A direction within the cone of one lamp, for numbers in [0, 1); the lamp by about what it
+        brings."""
         chosen = self._shares(x)
         lamp = torch.searchsorted(chosen.cumsum(-1), u[:, 2:].contiguous()).clamp_max(len(self.position) - 1)
         offset = self.position[lamp[:, 0]] - x
@@ -56,11 +59,13 @@ class Lamplight:
         return LampSample(wi, torch.where(distance.isfinite(), pdf, 0.0), distance, radiance)
 
     def pdf(self, x: Float[Tensor, "N 3"], lamp: int) -> Float[Tensor, " N"]:
-        """Density of `sample` at directions that meet one of the lamps, per steradian, when it is this lamp that is drawn."""
+        """Density of `sample` at directions that meet one of the lamps, per steradian, when it is this lamp
+        that is drawn."""
         return self._shares(x)[:, lamp] * _density(self._one_less_cosine(self.position[lamp] - x))
 
     def meet(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N 3"], lamp: int) -> tuple[Tensor, Tensor]:
-        """The distance (N,) at which directions meet a lamp, infinite where they do not, and the radiance (N, 3) from there."""
+        """The distance (N,) at which directions meet a lamp, infinite where they do not, and the radiance
+        (N, 3) from there."""
         return self._met(x, wi, torch.full_like(x[:, 0], lamp, dtype=torch.int64))
 
     def _met(

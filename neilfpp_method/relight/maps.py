@@ -1,4 +1,5 @@
-"""Environment maps in, as people have them: EXR, Radiance HDR, or a picture, in this package's layout or in the common one."""
+"""Environment maps in, as people have them: EXR, Radiance HDR, or a picture, in this package's layout or in
+the common one."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ FEWEST_ROWS, MOST_ROWS = 4, 4096
 RINGING = 0.01
 """Of a map's mean: filters that sharpen leave negative texels as small as this; they count as 0."""
 QUARTER_TURN = math.pi / 2
-"""The common layout has +x in the middle of its columns and goes to −y on the right; ours has +y at its left edge."""
+"""The common layout has +x in the middle of its columns and goes to −y on the right; ours has +y at its left
+edge."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,8 @@ def read_map(path: Path, layout: Layout, rotate: float = 0.0, exposure: float = 
 
     Args:
         path: linear radiance where the file holds floats; other images are decoded from sRGB.
-        layout: "ours" (docs/light.md), or "common": rows at pixel centres, as Blender and most programs have them.
+        layout: "ours" (docs/light.md), or "common": rows at pixel centres, as Blender and most programs have
+            them.
         rotate: degrees by which the light is turned about +z, counter-clockwise seen from above.
         exposure: stops by which the light is made brighter.
 
@@ -90,7 +93,8 @@ def read_map(path: Path, layout: Layout, rotate: float = 0.0, exposure: float = 
 
 
 def map_names(paths: Sequence[Path]) -> list[str]:
-    """A folder name for each map: its stem, and before it the name of its folder where two maps have one stem.
+    """A folder name for each map: its stem, and before it the name of its folder where two maps have one
+    stem.
 
     Raises:
         UserError: two maps cannot be told apart, or a name cannot be that of a folder.

@@ -1,9 +1,10 @@
-"""Light along paths, from the camera over the surface to the lights (Kajiya 1986), all paths of a block side by side.
+"""Light along paths, from the camera over the surface to the lights (Kajiya 1986), all paths of a block side
+by side.
 
-At every vertex the light is asked in two ways, and both are weighed by the power heuristic (Veach 1997, §9.2): a direction
-drawn by the light (the map, and one lamp), and the direction in which the path goes on, where it meets a light. Paths of
-little throughput end by chance (Russian roulette), and those that live on make up for them: nothing is cut off but what lies
-beyond `bounces`.
+At every vertex the light is asked in two ways, and both are weighed by the power heuristic (Veach 1997,
+§9.2): a direction drawn by the light (the map, and one lamp), and the direction in which the path goes on,
+where it meets a light. Paths of little throughput end by chance (Russian roulette), and those that live on
+make up for them: nothing is cut off but what lies beyond `bounces`.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from neilfpp_method.structures import Material, RayBatch
 __all__ = ["DIMENSIONS", "Scene", "Traced", "power_heuristic", "trace_paths"]
 
 DIMENSIONS = 9
-"""Numbers of a vertex: three for the next direction, two for the map, three for a lamp, one for the roulette."""
+"""Numbers of a vertex: three for the next direction, two for the map, three for a lamp, one for the
+roulette."""
 ROULETTE_FROM = 3
 """Vertices of a path before it may end by chance: the first ones carry most of the light."""
 LONGEST_LIFE = 0.95
@@ -54,8 +56,8 @@ class Scene:
 
 @dataclass(frozen=True)
 class Traced:
-    """What N camera rays see: radiance from the surface (0 where they meet nothing), 1 or 0 for meeting it, and what a
-    denoiser is helped by: reflectance and normal of the surface that is met first."""
+    """What N camera rays see: radiance from the surface (0 where they meet nothing), 1 or 0 for meeting it,
+    and what a denoiser is helped by: reflectance and normal of the surface that is met first."""
 
     radiance: Float[Tensor, "N 3"]
     alpha: Float[Tensor, " N"]
@@ -64,8 +66,10 @@ class Traced:
 
 
 def power_heuristic(own: Float[Tensor, " N"], other: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """The weight of a direction that one of two techniques has drawn, own² / (own² + other²); 0 where `own` is."""
-    # By the quotient: the square of the density of a smooth lobe is beyond float32's precision, not its range.
+    """The weight of a direction that one of two techniques has drawn, own² / (own² + other²); 0 where `own`
+    is."""
+    # By the quotient: the square of the density of a smooth lobe is beyond float32's precision, not its
+    # range.
     ratio = other / torch.where(own > 0, own, 1.0)
     return torch.where(own > 0, 1 / (1 + ratio.square()), 0.0)
 
@@ -131,7 +135,7 @@ def _reflectance(at: Vertices, lobe: Lobe | None) -> Float[Tensor, "N 3"]:
     return (diffuse if lobe is None else diffuse + normal_reflectance(at.material)).clamp(0, 1)
 
 
-# ------------------------------------------------------------------------------------------------ directions by the light
+# ------------------------------------------------------------------------------------ directions by the light
 
 
 def _from_sky(scene: Scene, at: Vertices, u: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
@@ -170,7 +174,7 @@ def _scattering(
     return value[rows], rows
 
 
-# ------------------------------------------------------------------------------------------- directions by the surface
+# ---------------------------------------------------------------------------------- directions by the surface
 
 
 def _met_light(

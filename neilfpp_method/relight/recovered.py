@@ -38,9 +38,11 @@ def lobe_of_run(run: Run) -> Lobe | None:
 
 @torch.no_grad()
 def surface_of_run(run: Run, resolution: int) -> Surface:
-    """The mesh that the run was given, or the one that its distance field has, as `neilfpp export --what mesh` extracts it.
+    """The mesh that the run was given, or the one that its distance field has, as `neilfpp export --what
+    mesh` extracts it.
 
-    Surfaces are shaded with the normals that the material was found with: those of the host, smoothed where it smooths.
+    Surfaces are shaded with the normals that the material was found with: those of the host, smoothed where
+    it smooths.
 
     Args:
         run: the trained run.

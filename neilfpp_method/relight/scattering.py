@@ -1,7 +1,8 @@
-"""Where a path goes on at a surface: the package's BRDF (METHOD §1), and directions drawn in proportion to its parts.
+"""Where a path goes on at a surface: the package's BRDF (METHOD §1), and directions drawn in proportion to
+its parts.
 
-A direction comes from the specular lobe with the probability `share`, else in proportion to the cosine; its density is that
-of the mixture, so every direction of the BRDF can be drawn and weights stay bounded.
+A direction comes from the specular lobe with the probability `share`, else in proportion to the cosine; its
+density is that of the mixture, so every direction of the BRDF can be drawn and weights stay bounded.
 """
 
 from __future__ import annotations
@@ -21,13 +22,14 @@ from neilfpp_method.structures import Indexable, Material
 __all__ = ["Vertices", "scatter", "scattered", "scattering_pdf", "vertices"]
 
 LEAST_SHARE = 0.1
-"""Of either technique: what the estimate of the lobe's share has wrong costs no more than ten times the variance."""
+"""Of either technique: what the estimate of the lobe's share has wrong costs no more than ten times the
+variance."""
 
 
 @dataclass(frozen=True)
 class Vertices(Indexable):
-    """Points of paths: unit `normal` and `wo` away from the surface, the triangle's own normal `flat`, what the surface is
-    made of there, and the probability that the next direction comes from the specular lobe."""
+    """Points of paths: unit `normal` and `wo` away from the surface, the triangle's own normal `flat`, what
+    the surface is made of there, and the probability that the next direction comes from the specular lobe."""
 
     position: Float[Tensor, "N 3"]
     normal: Float[Tensor, "N 3"]
@@ -51,7 +53,8 @@ def vertices(
     material: Material,
     lobe: Lobe | None,
 ) -> Vertices:
-    """Points of paths with their `share`: what the lobe sends of constant light, about, over what both parts do."""
+    """Points of paths with their `share`: what the lobe sends of constant light, about, over what both parts
+    do."""
     if lobe is None:
         share = torch.zeros_like(position[:, 0])
     else:

@@ -1,7 +1,9 @@
-"""The numbers in [0, 1) that paths are made of: a Sobol sequence, shifted by chance for every pixel and dimension.
+"""The numbers in [0, 1) that paths are made of: a Sobol sequence, shifted by chance for every pixel and
+dimension.
 
-The samples of a pixel cover the square of each pair of dimensions evenly, which brings down noise faster than independent
-numbers do; the shift (Cranley and Patterson 1976) makes each estimate unbiased and the errors of neighbours independent.
+The samples of a pixel cover the square of each pair of dimensions evenly, which brings down noise faster than
+independent numbers do; the shift (Cranley and Patterson 1976) makes each estimate unbiased and the errors of
+neighbours independent.
 """
 
 from __future__ import annotations

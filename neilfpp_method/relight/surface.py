@@ -15,7 +15,8 @@ from neilfpp_method.structures import Indexable
 __all__ = ["OFFSET", "Crossings", "Surface"]
 
 OFFSET = 1e-4
-"""How far above a triangle a ray leaves it, scene units: far above the rounding of a hit, 1e-6, and far below any relief."""
+"""How far above a triangle a ray leaves it, scene units: far above the rounding of a hit, 1e-6, and far below
+any relief."""
 TINY = 1e-18
 """Length under which a sum of edge products has no direction."""
 
@@ -24,8 +25,8 @@ TINY = 1e-18
 class Crossings(Indexable):
     """The rays that meet the surface: which they are, where, and the surface there.
 
-    `normal` is for shading, interpolated where that faces the ray; `flat` is the triangle's own; `outside` is false where a
-    ray comes from within.
+    `normal` is for shading, interpolated where that faces the ray; `flat` is the triangle's own; `outside` is
+    false where a ray comes from within.
     """
 
     rows: Int[Tensor, " K"]

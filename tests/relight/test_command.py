@@ -1,4 +1,5 @@
-"""`neilfpp relight` from end to end on tiny runs: with a surface that was found, and with a mesh that was given."""
+"""`neilfpp relight` from end to end on tiny runs: with a surface that was found, and with a mesh that was
+given."""
 
 from __future__ import annotations
 
@@ -9,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from neilfpp_method.cli import main
+from neilfpp_method.cli import COMMANDS, main
+from neilfpp_method.commands.command import Command
 from neilfpp_method.data.images import read_image, write_exr
 from neilfpp_method.settings.presets import PRESETS
 from tests.data.make_capture import make_capture
@@ -199,7 +201,7 @@ def test_a_time_per_view_is_kept(given, sky, tmp_path):
     assert made["took"] < 20
 
 
-# ------------------------------------------------------------------------------------------------------------ bad input
+# -------------------------------------------------------------------------------------------------- bad input
 
 
 @pytest.mark.parametrize(
@@ -247,3 +249,15 @@ def test_without_a_denoiser_it_says_so(found, sky, capfd, monkeypatch):
 
 def test_truths_for_each_map(found, sky, capfd):
     refused(capfd, found, "--env", sky, "--truth", "a", "b", words=("2 folders",))
+
+
+def test_the_commands_of_the_docs_parse(monkeypatch):
+    """Every command line of docs/relighting.md is one that the parser takes."""
+    text = (Path(__file__).parents[2] / "docs" / "relighting.md").read_text()
+    lines = [line.strip() for line in text.splitlines() if line.startswith("    neilfpp relight")]
+    assert len(lines) >= 5
+    for line in lines:
+        taken = []
+        monkeypatch.setitem(COMMANDS, "relight", Command(COMMANDS["relight"].options, taken.append, []))
+        assert main(line.split()[1:]) == 0, line
+        assert taken[0].run == Path("RUN")

@@ -38,7 +38,8 @@ def test_a_picture_is_the_same_however_it_is_cut_up(scene, monkeypatch):
 def test_alpha_is_the_share_of_a_pixel_that_is_covered(scene):
     size = 40
     picture = take_picture(scene, camera(size, size), Budget(64), bounces=1)
-    # A ball of radius 0.6 at the distance 3: its outline has the tangent r/√(d² − r²) = 0.2041, in pixels 4.08.
+    # A ball of radius 0.6 at the distance 3: its outline has the tangent r/√(d² − r²) = 0.2041, in pixels
+    # 4.08.
     assert picture.alpha.sum().item() == pytest.approx(np.pi * (20 * 0.6 / np.sqrt(9 - 0.36)) ** 2, rel=0.02)
     assert picture.alpha[size // 2, size // 2] == 1
     assert picture.alpha[0, 0] == 0

@@ -50,7 +50,8 @@ def brightest(path: Path, layout: str, rotate: float = 0.0) -> str:
     ],
 )
 def test_where_columns_are(tmp_path, layout, column, axis):
-    """docs/light.md: ours has +x at a quarter of the width; Blender has +x in the middle and +y a quarter to its left."""
+    """docs/light.md: ours has +x at a quarter of the width; Blender has +x in the middle and +y a quarter to
+    its left."""
     write_exr(tmp_path / "sun.exr", {"RGB": with_spot(8, column)})
     assert brightest(tmp_path / "sun.exr", layout) == axis
 

@@ -58,7 +58,7 @@ def looking_at(points, eye=(0.0, 0.0, 3.0)) -> RayBatch:
     return RayBatch(origins, normalize(targets - origins, dim=-1))
 
 
-# --------------------------------------------------------------------------------------------------------- the furnace
+# ------------------------------------------------------------------------------------------------ the furnace
 
 
 def scattered_targets(count: int, radius: float = 0.5) -> torch.Tensor:
@@ -114,7 +114,7 @@ def directional_albedo(name: str, roughness: float, metallic: float, cosine: flo
     return float((integrand * area).sum() + (1 - metallic))
 
 
-# -------------------------------------------------------------------------------------------------------- direct light
+# ----------------------------------------------------------------------------------------------- direct light
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +128,8 @@ def gradient() -> Sky:
 def quadrature(
     sky: Sky, normal: np.ndarray, wo: np.ndarray, base: float, roughness: float, metallic: float
 ) -> np.ndarray:
-    """What a convex surface sends: the rendering equation by an even spread of a quarter of a million directions."""
+    """What a convex surface sends: the rendering equation by an even spread of a quarter of a million
+    directions."""
     count = 500_000
     k = np.arange(count) + 0.5
     wi = oracles.spherical(1 - 2 * k / count, np.pi * (3 - 5**0.5) * k)
@@ -214,7 +215,7 @@ def test_cameras_see_neither_lamps_nor_sky():
     assert traced.alpha.tolist() == [1.0, 0.0]
 
 
-# ------------------------------------------------------------------------------------------------- light between planes
+# --------------------------------------------------------------------------------------- light between planes
 
 FACING = (
     ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
@@ -224,10 +225,11 @@ FACING = (
 
 
 def series(albedo: float, lit: float, point: np.ndarray, terms: int) -> list[float]:
-    """What the upper square sends from a point, by the number of times that light has bounced off either square.
+    """What the upper square sends from a point, by the number of times that light has bounced off either
+    square.
 
-    The lower one is lit evenly and sends `lit` · albedo / π; each further term is the integral of the one before over
-    the other square with the kernel cos cos / (π d²) of form factors, by Gauss-Legendre nodes.
+    The lower one is lit evenly and sends `lit` · albedo / π; each further term is the integral of the one
+    before over the other square with the kernel cos cos / (π d²) of form factors, by Gauss-Legendre nodes.
     """
     nodes, weights = np.polynomial.legendre.leggauss(24)
     x, w = (nodes + 1) / 2, weights / 2
@@ -259,7 +261,8 @@ def test_light_between_two_planes_is_the_series_of_form_factors():
     for bounces, terms in ((1, 0), (2, 1), (4, 2), (8, 4)):
         found = trace(scene, rays, 256, bounces).mean().item()
         assert found == pytest.approx(sum(expected[:terms]), rel=0.01, abs=1e-6), bounces
-    # The first term is the form factor of a differential area and a parallel square (Howell's catalogue, B-3).
+    # The first term is the form factor of a differential area and a parallel square (Howell's catalogue,
+    # B-3).
     assert expected[0] == pytest.approx(0.8 * 0.8 * lit / math.pi * point_form_factor(*point), rel=1e-6)
 
 

@@ -32,7 +32,8 @@ def at(
 def test_directions_have_the_density_that_is_said(name, roughness, metallic):
     lobe = LOBES[name]
     u = torch.rand(100_000, 3, generator=torch.Generator().manual_seed(5))
-    # χ² cells meet at the poles, so the viewer, against whom the density of the lobe is infinite, is one: turn all to it.
+    # χ² cells meet at the poles, so the viewer, against whom the density of the lobe is infinite, is one:
+    # turn all to it.
     points, one = (
         at(len(u), lobe, roughness, metallic, cosine=1.0),
         at(1, lobe, roughness, metallic, cosine=1.0),

@@ -44,7 +44,8 @@ def test_directions_have_the_density_that_is_said(layout):
     assert sky.pdf(wi).double().mean().item() * 4 * math.pi == pytest.approx(1, abs=0.02)
     drawn = sky.sample(u)
     assert torch.equal(drawn.pdf, sky.pdf(drawn.wi))
-    # Importance sampling of a function that is not the radiance: ∫ (1 + z) L dw by light directions and by even ones.
+    # Importance sampling of a function that is not the radiance: ∫ (1 + z) L dw by light directions and by
+    # even ones.
     by_light = ((1 + drawn.wi[:, 2:]) * sky.look(drawn.wi) / drawn.pdf[:, None]).double().mean(0)
     evenly = 4 * math.pi * ((1 + wi[:, 2:]) * sky.look(wi)).double().mean(0)
     assert by_light.numpy() == pytest.approx(evenly.numpy(), rel=0.03)
@@ -95,5 +96,6 @@ def test_the_mean_of_a_cell_is_that_of_its_bilinear_radiance():
     sky = Sky(radiance, False, 0.0)
     drawn = sky.sample(torch.rand(200_000, 2, generator=torch.Generator().manual_seed(0)))
     ratio = sky.look(drawn.wi)[:, 0] / drawn.pdf
-    # Bilinear within a texel is no constant: the weight varies about its mean, 4/3 of an even cell at most nine-fold.
+    # Bilinear within a texel is no constant: the weight varies about its mean, 4/3 of an even cell at most
+    # nine-fold.
     assert ratio.mean().item() == pytest.approx(math.pi / 32 * 2 * math.pi / 64, rel=0.02)
