@@ -62,13 +62,18 @@ def _run(name: str, arguments: Sequence[str]) -> None:
 
 def _parse(name: str, command: Command, arguments: Sequence[str]) -> Any:
     description = f"{command.summary}\n\nExamples:\n" + "\n".join(f"  {example}" for example in command.examples)
-    known: dict[str, Any] = {"args": arguments, "prog": f"neilfpp {name}", "description": description}
+    known: dict[str, Any] = {"prog": f"neilfpp {name}", "description": description}
+    if command.usual is not None:
+        known["description"] += f"\n\nEvery setting: neilfpp {name} --help-all"
+        if {"-h", "--help"} & set(arguments):
+            tyro.cli(command.usual, args=["--help"], **known)
+        arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
     if command.default is not None:
         known["default"] = command.default(arguments)
     complaint = io.StringIO()
     try:
         with redirect_stderr(complaint):
-            return tyro.cli(command.options, **known)
+            return tyro.cli(command.options, args=arguments, **known)
     except SystemExit as end:
         if not complaint.getvalue():  # --help
             raise

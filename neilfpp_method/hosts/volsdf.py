@@ -23,10 +23,12 @@ from neilfpp_method.volume.density import LaplaceDensity, laplace_density
 from neilfpp_method.volume.distance_grid import cell_size, sample_grid, trace_grid
 from neilfpp_method.volume.empty_space import EmptySpace
 from neilfpp_method.volume.intersect import Interval, sphere_interval
-from neilfpp_method.volume.samplers import error_bounded_samples, uniform_samples
+from neilfpp_method.volume.samplers import error_bounded_samples
 
 __all__ = ["VolSdfHost"]
 
+HIT_RADIUS = 0.05
+"""Scene units: the blending weight within this distance of the blended hit is its concentration (METHOD §2)."""
 GRID_LIFE = 100
 """Steps in which the geometry moves before the distance grid is sampled again."""
 
@@ -71,11 +73,12 @@ class VolSdfHost(nn.Module):
         self.register_buffer("point_position", None if points is None else points.position, persistent=False)
         self.register_buffer("point_normal", None if points is None else points.normal, persistent=False)
         radius = config.volume.radius
-        self.sdf_field = SdfField(config.sdf, radius)
+        sdf = config.host.sdf
+        self.sdf_field = SdfField(sdf, config.encoding, radius)
         self.radiance_field = OutgoingRadianceField(
-            config.radiance, config.sdf.feature_width, radius, radiance_scale, radiance_start
+            config.radiance, config.encoding, sdf.feature_width, radius, radiance_scale, radiance_start
         )
-        self.density = LaplaceDensity(config.volume.beta_init, config.volume.beta_floor)
+        self.density = LaplaceDensity(config.volume.beta_init)
         self.register_buffer("background_color", torch.tensor(background_color))
         self.background = field_beyond(background, config.background, radius, radiance_scale, self.background_color)
         self.empty_space = EmptySpace(radius) if config.volume.skip_empty else None
@@ -194,7 +197,7 @@ class VolSdfHost(nn.Module):
         volume = self.config.volume
         if self.empty_space is not None and self.training:
             interval = self.empty_space.narrow(self.sdf, rays, interval, self.surface_width())
-            volume = replace(volume, initial_samples=volume.narrowed_samples)
+            volume = replace(volume, initial_samples=max(volume.initial_samples // 2, 1))
         distances = self._sample(rays, interval, volume)
         points = rays.origins[:, None] + distances[..., None] * rays.directions[:, None]
         surface = self._surface(points.reshape(-1, 3))
@@ -208,8 +211,6 @@ class VolSdfHost(nn.Module):
 
     def _sample(self, rays: RayBatch, interval: Interval, volume: VolumeConfig) -> Float[Tensor, "N M"]:
         near, far = interval.near, interval.far
-        if volume.sampler == "uniform":
-            return uniform_samples(near, far, volume.samples, self.training)
         with torch.no_grad():
             beta = self.density.beta()
             found = error_bounded_samples(self.sdf, rays.origins, rays.directions, near, far, beta, volume, self.training)
@@ -230,7 +231,7 @@ class VolSdfHost(nn.Module):
         # A ray without weight ends at its last sample: a position that is finite and far from every surface.
         spare = 1e-6
         depth = ((surface_weights * distances).sum(-1) + spare * distances[:, -1]) / (opacity + spare)
-        near_hit = (distances - depth[:, None]).abs() <= self.config.volume.hit_radius
+        near_hit = (distances - depth[:, None]).abs() <= HIT_RADIUS
         return SurfaceHits(
             color=color,
             position=rays.origins + depth[:, None] * rays.directions,
@@ -243,7 +244,7 @@ class VolSdfHost(nn.Module):
         """The sphere that closes a scene without background is painted by R, but it is no surface of the object."""
         if self.background_kind != "none":
             return 1.0
-        return self._to_sphere(points.flatten(0, 1)).view(points.shape[:2]) > self.config.volume.hit_radius
+        return self._to_sphere(points.flatten(0, 1)).view(points.shape[:2]) > HIT_RADIUS
 
     def _beyond(self, rays: RayBatch, transmittance: Float[Tensor, " N"]) -> Float[Tensor, "N 3"]:
         """What still arrives from beyond the scene sphere."""
@@ -261,7 +262,7 @@ class VolSdfHost(nn.Module):
         if "surface" in names:
             terms["surface"] = losses.surface(march.surface.distance, settings.surface_epsilon)
         if "hessian" in names:
-            hessian = self.sdf_field.hessian(self._near_surface(march.hits), settings.hessian_method)
+            hessian = self.sdf_field.hessian(self._near_surface(march.hits))
             terms["hessian"] = losses.hessian(hessian)
         if "point_cloud" in names and self.point_position is not None:
             rows = torch.randint(len(self.point_position), (len(batch),), device=self.point_position.device)
@@ -278,4 +279,4 @@ class VolSdfHost(nn.Module):
 
     def _near_surface(self, hits: SurfaceHits) -> Float[Tensor, "N 3"]:
         """One point per ray, scattered about its hit: where second derivatives shape the surface."""
-        return hits.position.detach() + self.config.volume.hit_radius * torch.randn_like(hits.position)
+        return hits.position.detach() + HIT_RADIUS * torch.randn_like(hits.position)

@@ -1,8 +1,8 @@
-"""What speaks against a light: points that look otherwise than their pixels, and what light and surfaces mostly are.
+"""The objective of a light fit: the error of remembered points against their pixels, and priors on light and base colour.
 
-What they mostly are takes no side in the factor between light and base colour: the total variation of the map is of
-logarithms, and so is the unevenness of base colour; lamps pay for their share of all light, and the tint is of ratios. A price
-per amount of light would make the light dimmer and surfaces brighter at every fit, as the base colour follows.
+The priors are of ratios, so that none prefers a dimmer light and brighter surfaces: the total variation of the map's log
+radiance, differences of log base colour, lamps by their share of all light, and the tint. A price per amount of light would
+dim the light at every fit, as the base colour follows.
 """
 
 from __future__ import annotations
@@ -20,16 +20,25 @@ from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.shading.color import apply_response, response_slope
 from neilfpp_method.structures import Indexable, Material
 
-__all__ = ["Objective", "Target", "nearest_points", "tint", "total_variation", "unevenness"]
+__all__ = ["FLOOR", "Objective", "Target", "error_unit", "nearest_points", "tint", "total_variation", "unevenness"]
 
-SMOOTHED = 1e-2
-"""Differences of logarithms below this count by their square, so that they have a gradient everywhere."""
-SMALL_SHARE = 0.02
-"""Of all light: a lamp that brings less pays for what it brings, one that brings much more hardly for more than being there."""
+FLOOR = 0.1
+"""Errors are relative to the pixel and this share of a typical one, so that dark pixels do not count for their noise."""
+OUTLIER = 0.1
+"""Relative errors beyond this count by their size rather than by their square: some points no light explains."""
+SKY = 1.0
+"""Weight of the difference between the map's log radiance and what cameras saw beyond the scene, per texel, against the
+relative error: that much is certain, and the scale of light and base colour hangs on it."""
+SPARSITY = 0.001
+"""Weight of the lamps, by the logarithm of their shares of all light, against the relative error."""
+QUADRATIC_BELOW = 1e-2
+"""Differences of logarithms below this count by their square, so that the gradient has no jump at 0."""
+LINEAR_SHARE = 0.02
+"""Share of all light below which a lamp's price is linear; above it, logarithmic."""
 NEIGHBOURS = 4
 """Points whose base colour a point is compared with."""
-DARKEST = 0.02
-"""Base colours below this count as this where their logarithms are compared."""
+DARK_FLOOR = 0.02
+"""Base colours are raised to this before their logarithms are compared."""
 
 
 @dataclass(frozen=True)
@@ -69,21 +78,21 @@ class Objective:
         material = target.material
         tinted = Material((material.base_color * gain).clamp(0, 1), material.roughness, material.metallic)
         shown = apply_response(carried.outgoing(tinted, strength), self.response)
-        return (shown - target.pixel) / (response_slope(target.pixel, self.response) + self.config.floor * self.unit)
+        return (shown - target.pixel) / error_unit(target.pixel, self.response, self.unit)
 
     def misfit(
         self, strength: Float[Tensor, "T 3"], carried: Transport, target: Target, gain: Float[Tensor, "#N 3"]
     ) -> Float[Tensor, ""]:
         """The relative error in the mean: by its square where it is small, by its size where it is large."""
         error = self.relative_error(strength, carried, target, gain)
-        return functional.smooth_l1_loss(error, torch.zeros_like(error), beta=self.config.outlier)
+        return functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER)
 
     def unlikely(self, log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, ""]:
         """What speaks against a map by itself: that it is uneven, and that it is not what cameras saw of it."""
         uneven = self.config.smoothness * total_variation(log_radiance)
         if self.sky is None or not log_radiance.numel():
             return uneven
-        return uneven + self.config.sky * self.sky.misfit(log_radiance)
+        return uneven + SKY * self.sky.misfit(log_radiance)
 
     def price(self, brought: Float[Tensor, " M"], all_light: Float[Tensor, " 3"]) -> Float[Tensor, ""]:
         """Of lamps, by the light that each brings to the points, and of the tint of all light that reaches them.
@@ -91,8 +100,19 @@ class Objective:
         Σ ln(1 + share/s) over the lamps' shares of all light is concave: one strong lamp is cheaper than two half as strong.
         """
         share = brought / all_light.mean()
-        lamps = self.config.sparsity * (share / SMALL_SHARE).log1p().sum()
+        lamps = SPARSITY * (share / LINEAR_SHARE).log1p().sum()
         return lamps + self.config.whiteness * tint(all_light)
+
+
+def error_unit(pixel: Float[Tensor, "*B 3"], response: str, typical: float) -> Float[Tensor, "*B 3"]:
+    """What a pixel may change by for a relative error of 1.
+
+    Args:
+        pixel: in the capture's response.
+        response: "linear" or "srgb".
+        typical: what a pixel of typical brightness changes by per unit of log radiance (`response_slope`).
+    """
+    return response_slope(pixel, response) + FLOOR * typical
 
 
 def total_variation(values: Float[Tensor, "C H W"]) -> Float[Tensor, ""]:
@@ -111,13 +131,13 @@ def nearest_points(position: Float[Tensor, "N 3"]) -> Int[Tensor, "N K"]:
 
 def unevenness(base_color: Float[Tensor, "N 3"], nearest: Int[Tensor, "N K"]) -> Float[Tensor, ""]:
     """Mean |difference of log base colour| between neighbours: an edge costs what it is, in however many steps it comes."""
-    logarithm = base_color.clamp_min(DARKEST).log()
+    logarithm = base_color.clamp_min(DARK_FLOOR).log()
     apart = logarithm[:, None] - logarithm[nearest]
     return _size(apart).sum() / max(1, apart.numel())
 
 
 def _size(difference: Float[Tensor, ...]) -> Float[Tensor, ...]:
-    return (difference.square() + SMOOTHED**2).sqrt()
+    return (difference.square() + QUADRATIC_BELOW**2).sqrt()
 
 
 def tint(light: Float[Tensor, " 3"]) -> Float[Tensor, ""]:

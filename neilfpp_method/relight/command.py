@@ -32,7 +32,7 @@ from neilfpp_method.relight.maps import Layout, check_map, map_names, read_map
 from neilfpp_method.relight.movie import write_movie
 from neilfpp_method.relight.path_tracer import Scene
 from neilfpp_method.relight.picture_folder import PictureFolder
-from neilfpp_method.relight.recovered import check_material, lobe_of_run, surface_of_run
+from neilfpp_method.relight.recovered import check_material, surface_of_run
 from neilfpp_method.relight.sky import Sky, sky_of_run
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.run import Run, check_writable, load_run, write_json
@@ -104,9 +104,9 @@ def relight(
         name: [s for s in shots if request.force or not folder.has(s)] for name, folder in folders.items()
     }
     if any(missing.values()):
-        surface, lobe = surface_of_run(run, request.resolution), lobe_of_run(run)
+        surface = surface_of_run(run, request.resolution)
         lamps = lamps_of_run(run.model.lamps) if _with_lamps(request) else None
-        scenes = {name: Scene(surface, materials, lobe, sky, lamps) for name, sky in lights.items()}
+        scenes = {name: Scene(surface, materials, run.model.lobe, sky, lamps) for name, sky in lights.items()}
         _render(request, scenes, folders, missing, on_progress)
     for k, folder in enumerate(folders.values()):
         if request.views == "turntable":

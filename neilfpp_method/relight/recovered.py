@@ -11,11 +11,11 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.export.mesh import HasSdf, extract_mesh
 from neilfpp_method.hosts.base import SmoothsNormals
 from neilfpp_method.hosts.mesh import MeshHost
+from neilfpp_method.hosts.volsdf import HIT_RADIUS
 from neilfpp_method.relight.surface import Surface
-from neilfpp_method.shading.brdf import LOBES, Lobe
 from neilfpp_method.train.run import Run
 
-__all__ = ["check_material", "lobe_of_run", "surface_of_run"]
+__all__ = ["check_material", "surface_of_run"]
 
 NORMALS_AT_ONCE = 2**14
 """Points whose neighbourhood is asked together: bounds the memory."""
@@ -27,13 +27,8 @@ def check_material(run: Run) -> None:
     Raises:
         UserError: no stage has moved the material yet.
     """
-    if run.step <= run.config.train.sdf_steps:
+    if not run.has_material:
         raise UserError(f"{run.path}: there is no material at step {run.step}", "train the next stage")
-
-
-def lobe_of_run(run: Run) -> Lobe | None:
-    """The specular lobe that the material was found with; none for a Lambertian run."""
-    return LOBES[run.config.shading.lobe] if run.config.shading.specular else None
 
 
 @torch.no_grad()
@@ -63,8 +58,7 @@ def surface_of_run(run: Run, resolution: int) -> Surface:
             f"{run.path}: the host of this run has no surface to trace",
             "relight a run of the VolSDF or mesh host",
         )
-    volume = run.config.volume
-    mesh = extract_mesh(host.sdf, volume.radius - volume.hit_radius, resolution, device=device)
+    mesh = extract_mesh(host.sdf, run.config.volume.radius - HIT_RADIUS, resolution, device=device)
     vertices, normals = (
         torch.from_numpy(np.asarray(part, dtype=np.float32)).to(device)
         for part in (mesh.vertices, mesh.vertex_normals)

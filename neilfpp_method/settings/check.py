@@ -17,11 +17,6 @@ def check_config(config: NeilfConfig) -> None:
     if not 0 < config.train.fresh <= 1:
         raise UserError(f"--config.train.fresh is {config.train.fresh}", "set it above 0 and to 1 at most")
     _check_scene(config.inter_reflection, config.light.kind)
-    if config.light.map is not None and config.light.kind == "free":
-        raise UserError(
-            f"{config.light.map}: a light that is free at every point takes no map",
-            "add --config.light.kind distant, or auto to look for lamps before the map as well",
-        )
 
 
 def _check_scene(settings: InterReflectionConfig, light: str) -> None:

@@ -27,6 +27,7 @@ from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.images import replacing
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.schedule import has_material
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.plain import from_dict, to_dict
 from neilfpp_method.settings.types import NeilfConfig
@@ -96,6 +97,11 @@ class Run:
     facts: SceneFacts
     model: NeilfModel
     step: int
+
+    @property
+    def has_material(self) -> bool:
+        """Whether a step has moved the material and the light; before that they are what they start as."""
+        return has_material(self.step, self.config.train)
 
 
 def check_free(path: Path) -> None:
