@@ -7,7 +7,6 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stderr
-from itertools import takewhile
 from typing import Any
 
 import tyro
@@ -15,6 +14,7 @@ from rich.console import Console
 
 from neilfpp_method.commands import COMMANDS
 from neilfpp_method.commands.command import Command
+from neilfpp_method.commands.mistakes import closest, mistake
 from neilfpp_method.errors import EarlyEnd, Stopped, UserError
 
 __all__ = ["main"]
@@ -50,7 +50,9 @@ def _run(name: str, arguments: Sequence[str]) -> None:
         print(f"neilfpp {__version__}")
         return
     if name not in COMMANDS:
-        raise UserError(f"unknown command '{name}'", f"choose one of {', '.join(COMMANDS)}")
+        meant = closest(name, COMMANDS)
+        remedy = f"did you mean neilfpp {meant}?" if meant else f"choose one of {', '.join(COMMANDS)}"
+        raise UserError(f"unknown command '{name}'", remedy)
     command = COMMANDS[name]
     try:
         command.run(_parse(name, command, arguments))
@@ -77,13 +79,9 @@ def _parse(name: str, command: Command, arguments: Sequence[str]) -> Any:
     except SystemExit as end:
         if not complaint.getvalue():  # --help
             raise
-        raise UserError(_first_paragraph(complaint.getvalue()), f"see neilfpp {name} --help") from end
-
-
-def _first_paragraph(boxed: str) -> str:
-    """What a complaint says first, as one line, without the box around it."""
-    lines = [line.strip("│ ") for line in boxed.splitlines() if line.startswith("│")] or boxed.split("\n")
-    return " ".join(takewhile(lambda line: line.strip("─"), lines)).rstrip(".")
+        what, meant = mistake(complaint.getvalue(), arguments)
+        see = f"see neilfpp {name} --help"
+        raise UserError(what, f"did you mean {meant}? Otherwise {see}" if meant else see) from end
 
 
 def _overview() -> str:
@@ -92,7 +90,7 @@ def _overview() -> str:
         "",
         "usage: neilfpp COMMAND [options]        neilfpp COMMAND --help",
         "",
-        *(f"  {name:8} {command.summary}" for name, command in COMMANDS.items()),
+        *(f"  {name:10} {command.summary}" for name, command in COMMANDS.items()),
         "",
         "examples:",
         "  neilfpp demo",

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +41,15 @@ def trained(tmp_path_factory: pytest.TempPathFactory, capture: Path) -> Path:
         patch.setitem(PRESETS, "tiny", small_config)
         assert train("--data", capture, "--out", out) == 0
     return out
+
+
+@pytest.fixture(scope="module")
+def completion() -> str:
+    """What `neilfpp completion bash` prints."""
+    printed = io.StringIO()
+    with redirect_stdout(printed):
+        assert main(["completion", "bash"]) == 0
+    return printed.getvalue()
 
 
 def train(*options: object) -> int:
@@ -164,6 +175,26 @@ def test_help_and_mistyped_options_do_not_wait_for_torch(arguments):
     assert subprocess.run([sys.executable, "-c", asks], capture_output=True, timeout=60, check=False).returncode == 0
 
 
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [
+        ("tr", "train"),
+        ("train --da", "--data"),
+        ("eval --check", "--checkpoint"),
+        ("train --config.train.ra", "--config.train.rays"),
+    ],
+)
+def test_bash_completes(completion, words, completed):
+    """As bash asks: its variables are set, the registered function is called, and `COMPREPLY` is the answer."""
+    before = ["neilfpp", *words.split()]
+    ask = f"COMP_WORDS=({' '.join(before)}); COMP_CWORD={len(before) - 1}; COMP_LINE='neilfpp {words}'"
+    call = "eval \"$(complete -p neilfpp | sed 's/.*-F \\([^ ]*\\).*/\\1/')\" neilfpp; echo ${COMPREPLY[@]}"
+    script = f"{completion}\n{ask}; COMP_POINT=${{#COMP_LINE}}\n{call}"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.split() == [completed]
+
+
 def test_version(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("neilfpp 0.")
@@ -191,11 +222,15 @@ def refused(capfd, arguments: list[object], *words: object, leaves: Path) -> Non
     ("arguments", "words"),
     [
         (["paint"], ("unknown command 'paint'", "train", "eval")),
+        (["tran", "--data", "x"], ("unknown command 'tran'", "did you mean neilfpp train?")),
+        (["train", "--dta", "x"], ("--dta", "did you mean --data?", "neilfpp train --help")),
+        (["train", "--data", "x", "--config.shading.specular", "False"], ("did you mean --config.shading.no-specular?",)),
+        (["train", "--data", "x", "--config.shading.specular", "true"], ("did you mean --config.shading.specular?",)),
         (["train", "--preset", "slow"], ("unknown preset 'slow'", "fast", "paper-ngp")),
         (["train", "--preset=slow"], ("unknown preset 'slow'",)),
         (["train", "--preset"], ("--preset", "neilfpp train --help")),
         (["train", "--data", "x", "--colour", "red"], ("--colour", "neilfpp train --help")),
-        (["train", "--data", "x", "--config.train.rayss", "3"], ("--config.train.rayss", "neilfpp train --help")),
+        (["train", "--data", "x", "--config.train.rayss", "3"], ("did you mean --config.train.rays?",)),
         (["train", "--data", "x", "--config.train.rays", "few"], ("--config.train.rays", "'few'")),
         (["train", "--response", "hdr"], ("--response", "linear", "srgb")),
         (["train", "--test-every", "often"], ("--test-every", "'often'")),
@@ -294,6 +329,17 @@ def test_a_capture_that_cannot_be_used(tmp_path, capfd, capture, case):
     spoil(root)
     command = ["train", "--data", root, "--out", tmp_path / "runs" / "new", "--preset", "tiny", "--device", "cpu"]
     refused(capfd, command, root, complaint, leaves=tmp_path)
+
+
+@pytest.mark.parametrize("folder", ["", "front", "inputs"])
+def test_a_folder_of_photographs_has_to_be_prepared(tmp_path, capfd, folder):
+    """Nothing but pictures: no cameras are known yet, and `neilfpp prepare` finds them."""
+    photos = tmp_path / "photos"
+    (photos / folder).mkdir(parents=True)
+    for name in ("001.jpg", "002.JPG", "003.dng", ".004.jpg", "notes.txt"):
+        (photos / folder / name).write_bytes(b"")
+    words = (f"{photos}: 3 photographs and no cameras", f"run neilfpp prepare {photos} --out CAPTURE")
+    refused(capfd, ["train", "--data", photos], *words, leaves=tmp_path)
 
 
 def test_a_point_cloud_that_the_settings_need(tmp_path, capfd, capture):
