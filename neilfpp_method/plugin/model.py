@@ -31,7 +31,7 @@ from neilfpp_method.settings.presets import free_light, preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.color import apply_response, tone_map
 from neilfpp_method.shading.sampling import sample_directions
-from neilfpp_method.structures import RayBatch
+from neilfpp_method.structures import RayBatch, StepResult
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.loop import adam, seed_step, set_rates
 
@@ -102,6 +102,7 @@ class NeilfMethod(Model):
             )
             self.neilf = NeilfModel(host, settings, facts)
         self.light_solver = self.neilf.light_solver()
+        self.computed: StepResult | None = None
         self.evidence: Evidence | None = None
         self.step = -1
         self.set_up_for: Stage | None = None
@@ -136,6 +137,7 @@ class NeilfMethod(Model):
         return [
             *theirs,
             TrainingCallback(before, self._begin_step, args=[optimizers]),
+            TrainingCallback(after, self._solve_light),
             TrainingCallback(after, self._end_after_last, args=[trainer]),
         ]
 
@@ -149,6 +151,14 @@ class NeilfMethod(Model):
         for optimizer in optimizers.optimizers.values():
             set_rates(optimizer, self.rates, position.stage, position.step / position.length)
         seed_step(settings.seed, step)
+
+    def _solve_light(self, step: int) -> None:
+        """After the optimiser, as the standalone loop does."""
+        if self.computed is None:
+            return
+        self.light_solver.observe(self.computed)
+        self.evidence = self.light_solver.solve(self.neilf.brdf, self.neilf.scene) or self.evidence
+        self.computed = None
 
     def _end_after_last(self, trainer: Trainer, step: int) -> None:
         """Nerfstudio counts iterations from where it resumes; the stages end where they end."""
@@ -170,8 +180,7 @@ class NeilfMethod(Model):
         pixels = pixel_batch(outputs["origins"], outputs["directions"], batch)
         computed = self.neilf.step(pixels, self.stage)
         terms = computed.terms
-        self.light_solver.observe(computed)
-        self.evidence = self.light_solver.solve(self.neilf.brdf, self.neilf.scene) or self.evidence
+        self.computed = computed
         share = stage_at(self.step, self.config.neilf.train).share
         weights = {
             **active_losses(self.stage, self.neilf.config, self.neilf.stages, share),

@@ -1,0 +1,94 @@
+"""The pictures of one light on disk: what is there, what it was made with, and never half of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from neilfpp_method.data.images import read_image, write_exr, write_png
+from neilfpp_method.errors import UserError
+from neilfpp_method.relight.cameras import Shot
+from neilfpp_method.relight.film import Picture
+from neilfpp_method.shading.color import tone_map
+from neilfpp_method.train.run import read_json, write_json
+
+__all__ = ["PictureFolder", "StoredPicture"]
+
+
+@dataclass(frozen=True)
+class StoredPicture:
+    """Linear radiance, premultiplied, and alpha."""
+
+    radiance: Float[np.ndarray, "H W 3"]
+    alpha: Float[np.ndarray, "H W"]
+
+
+@dataclass(frozen=True)
+class PictureFolder:
+    """A folder of pictures that are made with the same `settings`, as JSON has them.
+
+    Of each there is an EXR, a PNG, and a JSON record, which is written last: without it a picture was not
+    finished.
+    """
+
+    path: Path
+    settings: Mapping[str, Any]
+
+    def has(self, shot: Shot) -> bool:
+        """Whether a picture is there.
+
+        Raises:
+            UserError: there is one that was made in another way.
+        """
+        record = self._file(shot, ".json")
+        if not record.is_file():
+            return False
+        made = read_json(record)
+        for key, value in self._made_with(shot).items():
+            if made.get(key) != value:
+                problem = f"{record}: was made with {key} {made.get(key)}, not {value}"
+                raise UserError(problem, "choose another --out, or render again with --force")
+        return all(self._file(shot, suffix).is_file() for suffix in (".exr", ".png"))
+
+    def write(self, shot: Shot, picture: Picture, seconds: float) -> None:
+        """Put a picture in place of what was there.
+
+        Raises:
+            UserError: it cannot be written.
+        """
+        record = self._file(shot, ".json")
+        record.unlink(missing_ok=True)
+        rgba = torch.cat((picture.radiance, picture.alpha), -1).cpu()
+        write_exr(self._file(shot, ".exr"), {"RGBA": rgba.numpy()})
+        write_png(self.png(shot), _displayed(rgba))
+        write_json(record, {**self._made_with(shot), "samples": picture.samples, "took": round(seconds, 2)})
+
+    def read(self, shot: Shot) -> StoredPicture:
+        """A picture that was written, as it is in the EXR."""
+        file = read_image(self._file(shot, ".exr"))
+        opaque = np.ones(file.pixels.shape[:2], np.float32)
+        return StoredPicture(file.pixels, opaque if file.alpha is None else file.alpha)
+
+    def png(self, shot: Shot) -> Path:
+        """Where the picture is that people look at."""
+        return self._file(shot, ".png")
+
+    def _file(self, shot: Shot, suffix: str) -> Path:
+        return self.path / f"{shot.name}{suffix}"
+
+    def _made_with(self, shot: Shot) -> dict[str, Any]:
+        return {**self.settings, "width": shot.camera.width, "height": shot.camera.height}
+
+
+def _displayed(rgba: Float[Tensor, "H W 4"]) -> UInt8[np.ndarray, "H W 4"]:
+    """8-bit sRGB with alpha, which PNG has not premultiplied."""
+    color, alpha = rgba.split([3, 1], dim=-1)
+    straight = torch.where(alpha > 0, color / alpha.clamp_min(1e-6), 0.0)
+    return (torch.cat((tone_map(straight), alpha), -1) * 255).round().byte().numpy()

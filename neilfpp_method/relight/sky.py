@@ -1,0 +1,160 @@
+"""Light from far away for path tracing: radiance of a latitude-longitude map, and directions in proportion to
+it.
+
+Two layouts of rows, and any azimuth of the first column, so that a map is never resampled: its texels are the
+    light.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from neilfpp_method.fields.environment import EnvironmentLight
+from neilfpp_method.shading.color import luminance
+
+__all__ = ["Sky", "SkySample", "sky_of_run"]
+
+MEAN_OF_CELL = (1 / 8, 3 / 4)
+"""Bilinear radiance has this mean within a texel: shares of either neighbour, and of the texel itself, along
+an axis."""
+
+
+@dataclass(frozen=True)
+class SkySample:
+    """Unit directions towards the light, away from the surface, and their density per steradian of the
+    sphere."""
+
+    wi: Float[Tensor, "N 3"]
+    pdf: Float[Tensor, " N"]
+
+
+@dataclass(frozen=True)
+class Sky:
+    """An environment map about +z, bilinear between its texels; linear RGB ≥ 0, not black.
+
+    Column i shows the azimuth φ = start + 2π(i + ½)/W, and the direction there is (sin φ sin θ, cos φ sin θ,
+    cos θ).
+
+    Attributes:
+        radiance: the texels, rows from +z down.
+        rows_at_poles: the first and the last row are the poles, θ = πj/(H − 1), as in this package's files;
+            else rows lie at θ = π(j + ½)/H, as most programs have them.
+        start: azimuth of the left edge of column 0, radians.
+
+    Example:
+        >>> sky = Sky(torch.ones(8, 16, 3), rows_at_poles=True, start=0.0)
+        >>> sky.sample(torch.rand(5, 2)).pdf.shape
+        torch.Size([5])
+    """
+
+    radiance: Float[Tensor, "H W 3"]
+    rows_at_poles: bool
+    start: float
+
+    def look(self, wi: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """Radiance that arrives from unit directions."""
+        height, width = self.radiance.shape[:2]
+        column, row = self._place(wi)
+        at = torch.stack((2 * (column + 1) / (width + 1) - 1, 2 * row / (height - 1) - 1), -1)
+        found = functional.grid_sample(
+            self._closed, at[None, None], padding_mode="border", align_corners=True
+        )
+        return found[0, :, 0].T
+
+    def sample(self, u: Float[Tensor, "N 2"]) -> SkySample:
+        """Directions for numbers in [0, 1), in proportion to the luminance of texels and their solid
+        angle."""
+        height, width = self.radiance.shape[:2]
+        by_row, by_texel = self._cumulated
+        u = u.double()
+        # First the row, then the column within it: an even spread of u stays one.
+        row, down = _invert(by_row, u[:, 0] * by_row[-1], 0, height)
+        before = torch.where(row > 0, by_texel[(row * width - 1).clamp_min(0)], 0.0)
+        mass = by_texel[row * width + width - 1] - before
+        texel, across = _invert(by_texel, before + u[:, 1] * mass, row * width, row * width + width)
+        cos_theta = torch.lerp(self._cos_edges[row], self._cos_edges[row + 1], down)
+        phi = self.start + 2 * math.pi * (texel - row * width + across) / width
+        sine = ((1 - cos_theta) * (1 + cos_theta)).clamp_min(0).sqrt()
+        wi = torch.stack((phi.sin() * sine, phi.cos() * sine, cos_theta), -1).float()
+        return SkySample(wi, self.pdf(wi))
+
+    def pdf(self, wi: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+        """Density of `sample` at unit directions, per steradian of the sphere; constant on a texel."""
+        height, width = self.radiance.shape[:2]
+        column, row = self._place(wi)
+        row = (row + 0.5).long().clamp(0, height - 1)
+        return self._density[row * width + (column + 0.5).floor().long() % width]
+
+    def _place(self, wi: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
+        """Where directions lie, in texels: column in [−½, W − ½), row in [−½, H − ½]."""
+        height, width = self.radiance.shape[:2]
+        turn = (torch.atan2(wi[:, 0], wi[:, 1]) - self.start) / (2 * math.pi)
+        # Not acos, which has no digits left near the poles.
+        share = torch.atan2(wi[:, :2].norm(dim=-1), wi[:, 2]) / math.pi
+        row = share * (height - 1) if self.rows_at_poles else share * height - 0.5
+        return (turn - turn.floor()) * width - 0.5, row
+
+    @cached_property
+    def _closed(self) -> Float[Tensor, "1 3 H C"]:
+        """The map with one column more on each side, which closes it in azimuth."""
+        planes = self.radiance.permute(2, 0, 1)
+        return torch.cat((planes[..., -1:], planes, planes[..., :1]), -1)[None].contiguous()
+
+    @cached_property
+    def _cos_edges(self) -> Float[Tensor, " E"]:
+        """cos θ of the edges between rows, float64."""
+        height = len(self.radiance)
+        edge = torch.arange(height + 1, dtype=torch.float64, device=self.radiance.device)
+        theta = (edge - 0.5).clamp(0, height - 1) / (height - 1) if self.rows_at_poles else edge / height
+        return (math.pi * theta).cos()
+
+    @cached_property
+    def _mass(self) -> Float[Tensor, "H W"]:
+        """What texels bring: the mean luminance of bilinear radiance within each, times its solid angle;
+        float64."""
+        mean = luminance(self.radiance.double())
+        mean = MEAN_OF_CELL[0] * (mean.roll(1, 1) + mean.roll(-1, 1)) + MEAN_OF_CELL[1] * mean
+        above, below = torch.cat((mean[:1], mean[:-1])), torch.cat((mean[1:], mean[-1:]))
+        mean = MEAN_OF_CELL[0] * (above + below) + MEAN_OF_CELL[1] * mean
+        return mean * self._solid_angles[:, None]
+
+    @cached_property
+    def _solid_angles(self) -> Float[Tensor, " H"]:
+        return (self._cos_edges[:-1] - self._cos_edges[1:]) * 2 * math.pi / self.radiance.shape[1]
+
+    @cached_property
+    def _cumulated(self) -> tuple[Float[Tensor, " H"], Float[Tensor, " T"]]:
+        """Cumulated masses of rows and of texels, in float64: a float32 has no room for a map's eight million
+        texels."""
+        texels = self._mass.reshape(-1).cumsum(0)
+        return texels[self.radiance.shape[1] - 1 :: self.radiance.shape[1]].contiguous(), texels
+
+    @cached_property
+    def _density(self) -> Float[Tensor, " T"]:
+        return (self._mass / self._mass.sum() / self._solid_angles[:, None]).reshape(-1).float()
+
+
+def sky_of_run(light: EnvironmentLight) -> Sky:
+    """The environment map that a run has found, as it is."""
+    return Sky(light.log_radiance.detach().exp().permute(1, 2, 0).contiguous(), rows_at_poles=True, start=0.0)
+
+
+def _invert(
+    cumulated: Float[Tensor, " K"],
+    value: Float[Tensor, " N"],
+    first: Int[Tensor, " N"] | int,
+    end: Int[Tensor, " N"] | int,
+) -> tuple[Int[Tensor, " N"], Float[Tensor, " N"]]:
+    """Which of the entries first … end − 1 a cumulated value falls into, and how far, in [0, 1)."""
+    found = torch.searchsorted(cumulated, value, right=True)
+    found = torch.minimum(torch.maximum(found, torch.as_tensor(first)), torch.as_tensor(end) - 1)
+    before = torch.where(found > 0, cumulated[(found - 1).clamp_min(0)], 0.0)
+    share = (value - before) / (cumulated[found] - before).clamp_min(torch.finfo(torch.float64).tiny)
+    return found, share.clamp(0, 1)

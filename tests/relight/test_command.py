@@ -1,0 +1,263 @@
+"""`neilfpp relight` from end to end on tiny runs: with a surface that was found, and with a mesh that was
+given."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from neilfpp_method.cli import COMMANDS, main
+from neilfpp_method.commands.command import Command
+from neilfpp_method.data.images import read_image, write_exr
+from neilfpp_method.settings.presets import PRESETS
+from tests.data.make_capture import make_capture
+from tests.train.small_runs import small_config, solved_light
+
+FEW = ("--spp", "4", "--resolution", "32", "--device", "cpu")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _presets():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "tiny", lambda: small_config(sdf_steps=2, material_steps=3, joint_steps=1))
+        patch.setitem(
+            PRESETS,
+            "tiny_map",
+            lambda: solved_light(small_config(sdf_steps=2, material_steps=3, joint_steps=1)),
+        )
+        yield
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return make_capture(tmp_path_factory.mktemp("capture") / "sphere", masks=True)
+
+
+def trained(folder: Path, capture: Path, *options: str) -> Path:
+    assert main(["train", "--data", str(capture), "--out", str(folder), "--device", "cpu", *options]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory, capture) -> Path:
+    """A run that has found its surface and an environment map."""
+    return trained(tmp_path_factory.mktemp("runs") / "found", capture, "--preset", "tiny_map")
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory, capture) -> Path:
+    """A run with the capture's mesh, and a light that is free at every point."""
+    return trained(tmp_path_factory.mktemp("runs") / "given", capture, "--preset", "tiny", "--host", "mesh")
+
+
+@pytest.fixture(scope="module")
+def sky(tmp_path_factory) -> Path:
+    """Light from +x, and a little from everywhere."""
+    radiance = np.full((8, 16, 3), 0.2, np.float32)
+    radiance[3:5, 3:5] = (8.0, 4.0, 2.0)
+    path = tmp_path_factory.mktemp("light") / "studio.exr"
+    write_exr(path, {"RGB": radiance})
+    return path
+
+
+def relit(run: Path, *options: object) -> int:
+    return main(["relight", str(run), *FEW, *map(str, options)])
+
+
+def refused(capfd, run: Path, *options: object, words: tuple[str, ...]) -> None:
+    before = {path for path in run.rglob("*")}
+    capfd.readouterr()
+    assert relit(run, *options) == 2
+    said = capfd.readouterr().err
+    assert said.count("\n") == 1
+    assert said.startswith("error: ")
+    for word in words:
+        assert word in said
+    assert {path for path in run.rglob("*")} == before
+
+
+@pytest.mark.parametrize("which", ["found", "given"])
+def test_a_run_under_another_light(request, sky, which, capfd):
+    run = request.getfixturevalue(which)
+    assert relit(run, "--env", sky) == 0
+    assert capfd.readouterr().err == ""
+    folder = run / "relit" / "studio"
+    assert {path.name for path in folder.iterdir()} == {"000.exr", "000.png", "000.json"}
+    image = read_image(folder / "000.exr")
+    assert image.pixels.shape == (18, 24, 3)
+    covered = image.alpha == 1
+    assert 0.05 < covered.mean() < 0.9
+    assert (image.pixels[covered] > 0).all()
+    assert not image.pixels[image.alpha == 0].any()
+    shown = read_image(folder / "000.png")
+    np.testing.assert_allclose(shown.alpha, image.alpha, atol=0.003)
+    made = json.loads((folder / "000.json").read_text())
+    assert made["map"] == "studio.exr"
+    assert made["samples"] == 4
+    assert not made["lamps"]
+
+
+def test_the_light_comes_from_where_the_map_has_it(given, sky, tmp_path):
+    """The mesh is a ball: half of it faces the sun at +x, and after half a turn the other half."""
+    means = {}
+    for turn in (0, 180):
+        out = tmp_path / str(turn)
+        assert (
+            relit(given, "--env", sky, "--rotate", turn, "--views", "turntable", "--frames", 2, "--out", out)
+            == 0
+        )
+        means[turn] = [read_image(out / "studio" / f"turn_000{k}.exr").pixels.mean() for k in (0, 1)]
+    # The first camera is at +x, the second at −x.
+    assert means[0][0] > 1.5 * means[0][1]
+    assert means[180][1] > 1.5 * means[180][0]
+    film = cv2.VideoCapture(str(tmp_path / "0" / "studio" / "turntable.mp4"))
+    assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 2
+    assert (film.get(cv2.CAP_PROP_FRAME_WIDTH), film.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (24, 18)
+
+
+def test_its_own_light_keeps_its_lamps(found):
+    assert relit(found, "--scale", 0.5) == 0
+    made = json.loads((found / "relit" / "own" / "000.json").read_text())
+    assert made["lamps"]
+    assert made["width"] == 12
+
+
+def test_what_is_there_is_not_made_again(given, sky, tmp_path, capfd):
+    options = ("--env", sky, "--out", tmp_path)
+    assert relit(given, *options) == 0
+    picture = tmp_path / "studio" / "000.exr"
+    before = picture.stat().st_mtime_ns
+    assert relit(given, *options) == 0
+    assert picture.stat().st_mtime_ns == before
+    capfd.readouterr()
+    assert relit(given, *options, "--rotate", 90) == 2
+    assert "rotate 0.0, not 90.0" in capfd.readouterr().err
+    assert picture.stat().st_mtime_ns == before
+    assert relit(given, *options, "--rotate", 90, "--force") == 0
+    assert picture.stat().st_mtime_ns > before
+    # A picture whose record is missing was not finished.
+    picture.with_suffix(".json").unlink()
+    before = picture.stat().st_mtime_ns
+    assert relit(given, *options, "--rotate", 90) == 0
+    assert picture.stat().st_mtime_ns > before
+
+
+def test_an_edit_changes_what_is_seen(given, sky, tmp_path):
+    def mean(name: str, *options: object) -> np.ndarray:
+        assert relit(given, "--env", sky, "--out", tmp_path / name, *options) == 0
+        return read_image(tmp_path / name / "studio" / "000.exr").pixels.mean((0, 1))
+
+    red = mean("red", "--set", "base_color=0.9,0.05,0.05", "--set", "roughness=1")
+    black = mean("black", "--set", "base_color=0", "--set", "roughness=1", "--set", "metallic=1")
+    beside = mean("beside", "--set", "base_color=0", "--set", "metallic=1", "--box", 90, 90, 90, 91, 91, 91)
+    assert red[0] / red[2] > 6
+    assert black.max() < 0.2 * red[0]
+    assert beside.min() > 2 * black.max()
+
+
+def test_figures_against_true_images(given, sky, tmp_path, capfd):
+    assert relit(given, "--env", sky, "--out", tmp_path / "one") == 0
+    relit_view = read_image(tmp_path / "one" / "studio" / "000.exr")
+    write_exr(tmp_path / "truth" / "000.exr", {"RGB": 0.5 * relit_view.pixels})
+    capfd.readouterr()
+    assert relit(given, "--env", sky, "--out", tmp_path / "one", "--truth", tmp_path / "truth") == 0
+    assert "studio: PSNR" in capfd.readouterr().out
+    figures = json.loads((tmp_path / "one" / "studio" / "metrics.json").read_text())
+    assert figures["relight_psnr_scaled"] > 90
+    assert figures["relight_psnr"] < 40
+    assert figures["scale"] == pytest.approx([0.5, 0.5, 0.5], rel=1e-4)
+    assert figures["mask_source"] == "true depth"
+    assert figures["views"]["000"] > 90
+
+
+def test_the_map_behind_the_surface(given, sky, tmp_path):
+    assert relit(given, "--env", sky, "--background", "map", "--out", tmp_path) == 0
+    image = read_image(tmp_path / "studio" / "000.exr")
+    assert image.alpha is None
+    assert image.pixels.min() > 0
+    assert image.pixels[0, 0].max() >= 0.19
+
+
+def test_a_time_per_view_is_kept(given, sky, tmp_path):
+    command = [
+        "relight",
+        str(given),
+        "--env",
+        str(sky),
+        "--seconds",
+        "0.2",
+        "--out",
+        str(tmp_path),
+        "--device",
+        "cpu",
+    ]
+    assert main(command) == 0
+    made = json.loads((tmp_path / "studio" / "000.json").read_text())
+    assert made["samples"] >= 1
+    assert made["took"] < 20
+
+
+# -------------------------------------------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--env", "missing.exr"], ("missing.exr", "no such image")),
+        (["--spp", "0"], ("--spp is 0",)),
+        (["--bounces", "100"], ("--bounces is 100",)),
+        (["--scale", "0.5", "--width", "10"], ("--scale and --width",)),
+        (["--set", "gloss=1"], ("gloss=1", "roughness")),
+        (["--box", "0", "0", "0", "1", "1", "1"], ("--box without --set",)),
+        (["--set", "metallic=1", "--box", "0", "0", "0", "1", "1", "0"], ("--box has no inside",)),
+        (["--views", "turntable", "--frames", "1"], ("1 frames",)),
+        (["--width", "100000"], ("100000×75000",)),
+        (["--views", "turntable", "--truth", "x"], ("true images",)),
+        (["--checkpoint", "sdf_init"], ("no material",)),
+        (["--rotate", "nan"], ("--rotate",)),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_written(found, capfd, options, words):
+    refused(capfd, found, *options, words=words)
+
+
+@pytest.mark.parametrize(("value", "word"), [(np.nan, "NaN"), (-3.0, "negative")])
+def test_a_map_that_is_no_light_is_refused(found, tmp_path, capfd, value, word):
+    radiance = np.ones((8, 16, 3), np.float32)
+    radiance[2, 3] = value
+    write_exr(tmp_path / "bad.exr", {"RGB": radiance})
+    refused(capfd, found, "--env", tmp_path / "bad.exr", words=("bad.exr", word))
+
+
+def test_a_light_that_is_no_map_needs_one(given, capfd):
+    refused(capfd, given, words=("no environment map", "--env"))
+
+
+def test_a_folder_that_cannot_be_written(found, sky, tmp_path, capfd):
+    (tmp_path / "file").write_text("")
+    refused(capfd, found, "--env", sky, "--out", tmp_path / "file" / "relit", words=("cannot be written",))
+
+
+def test_without_a_denoiser_it_says_so(found, sky, capfd, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "pyoidn", None)
+    refused(capfd, found, "--env", sky, "--denoise", words=("pyoidn", "neilfpp-method[denoise]"))
+
+
+def test_truths_for_each_map(found, sky, capfd):
+    refused(capfd, found, "--env", sky, "--truth", "a", "b", words=("2 folders",))
+
+
+def test_the_commands_of_the_docs_parse(monkeypatch):
+    """Every command line of docs/relighting.md is one that the parser takes."""
+    text = (Path(__file__).parents[2] / "docs" / "relighting.md").read_text()
+    lines = [line.strip() for line in text.splitlines() if line.startswith("    neilfpp relight")]
+    assert len(lines) >= 5
+    for line in lines:
+        taken = []
+        monkeypatch.setitem(COMMANDS, "relight", Command(COMMANDS["relight"].options, taken.append, []))
+        assert main(line.split()[1:]) == 0, line
+        assert taken[0].run == Path("RUN")

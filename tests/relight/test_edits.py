@@ -1,0 +1,59 @@
+"""Edits of a material: what they say, and where they count."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from neilfpp_method.data.views import Normalisation
+from neilfpp_method.errors import UserError
+from neilfpp_method.relight.edits import edited, parse_edits, scene_box
+from neilfpp_method.structures import Material
+
+
+def grey(x: torch.Tensor) -> Material:
+    return Material(torch.full_like(x, 0.5), torch.full_like(x[:, :1], 0.6), torch.full_like(x[:, :1], 0.1))
+
+
+def test_edits_replace_what_they_name():
+    changed = edited(grey, parse_edits(["roughness=0.2", "base_color=0.1,0.2,0.3", "roughness = 0.4"]))(
+        torch.rand(4, 3)
+    )
+    assert torch.allclose(changed.roughness, torch.tensor(0.4))
+    assert torch.allclose(changed.base_color, torch.tensor([0.1, 0.2, 0.3]))
+    assert torch.allclose(changed.metallic, torch.tensor(0.1))
+    assert torch.allclose(
+        edited(grey, parse_edits(["base_color=1"]))(torch.rand(2, 3)).base_color, torch.tensor(1.0)
+    )
+
+
+def test_a_box_of_the_world_bounds_an_edit():
+    # The world is twice as large as the scene, and its middle at (1, 0, 0).
+    box = scene_box((3.0, 2.0, 2.0, 1.0, -2.0, -2.0), Normalisation(2.0, (1.0, 0.0, 0.0)))
+    x = torch.tensor([[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0], [0.5, 0.0, 1.1], [1.0, 1.0, -1.0]])
+    changed = edited(grey, parse_edits(["metallic=1"]), box)(x).metallic[:, 0]
+    assert changed.numpy() == pytest.approx([1.0, 0.1, 0.1, 1.0])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "gloss=1",
+        "roughness",
+        "roughness=",
+        "roughness=2",
+        "metallic=nan",
+        "roughness=0.1,0.2,0.3",
+        "base_color=0.1,0.2",
+        "roughness=much",
+    ],
+)
+def test_what_cannot_be_set_is_refused(text):
+    with pytest.raises(UserError, match=f"--set {text}"):
+        parse_edits([text])
+
+
+@pytest.mark.parametrize("corners", [(0.0, 0.0, 0.0, 1.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0, 1.0, float("nan"))])
+def test_a_box_without_an_inside_is_refused(corners):
+    with pytest.raises(UserError, match="--box"):
+        scene_box(corners, Normalisation(1.0, (0.0, 0.0, 0.0)))
