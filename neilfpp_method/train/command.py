@@ -218,16 +218,16 @@ def _scaled(scale: float, pixels: int, rays: int) -> str:
 
 @contextmanager
 def _nothing_left_on_failure(out: Path) -> Iterator[None]:
-    """What fails before there is a run leaves no folder."""
-    was_there = out.exists()
+    """What fails before there is a run leaves no folder, nor one above it that was made for it."""
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
         yield
     except BaseException:
         if not (out / "config.json").exists():
             shutil.rmtree(out / PIXELS, ignore_errors=True)
             with suppress(OSError):
-                if not was_there:
-                    out.rmdir()
+                for folder in made:
+                    folder.rmdir()
         raise
 
 

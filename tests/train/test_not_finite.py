@@ -32,8 +32,8 @@ def spoil_loss(training: Training, name: str, steps: range | tuple[int, ...], va
     """Let a loss be `value` at these steps."""
     honest, calls = training.model.step, iter(range(1000))
 
-    def spoiled(batch, stage):
-        computed = honest(batch, stage)
+    def spoiled(*arguments):
+        computed = honest(*arguments)
         if next(calls) not in steps:
             return computed
         return computed._replace(terms=computed.terms | {name: LossTerm(computed.terms[name].values * value)})
@@ -47,9 +47,9 @@ def spoil_gradient(training: Training, field: str, steps: tuple[int, ...]) -> No
     parameter = training.model.parameter_groups()[field][0]
     current = [0]
 
-    def counted(batch, stage):
+    def counted(*arguments):
         current[0] = next(calls)
-        return honest(batch, stage)
+        return honest(*arguments)
 
     training.model.step = counted
     parameter.register_hook(lambda gradient: gradient * math.nan if current[0] in steps else gradient)
@@ -146,8 +146,8 @@ def test_ten_in_a_row_are_none(tmp_path, capture, monkeypatch):
 def test_the_command_ends_with_status_1(tmp_path, capture, monkeypatch, capfd):
     honest = NeilfModel.step
 
-    def spoiled(self, batch, stage):
-        computed = honest(self, batch, stage)
+    def spoiled(*arguments):
+        computed = honest(*arguments)
         return computed._replace(terms={name: LossTerm(t.values * math.nan) for name, t in computed.terms.items()})
 
     monkeypatch.setitem(PRESETS, "tiny", small_config)
