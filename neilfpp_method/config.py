@@ -183,7 +183,7 @@ class BackgroundConfig:
     """What a ray sees beyond the scene."""
 
     kind: Literal["auto", "none", "constant", "inverted_sphere"] = "auto"
-    """none: the scene sphere is a surface that closes the scene (VolSDF). constant: one colour. inverted_sphere: a NeRF++
+    """none: R paints the scene sphere, which closes the scene. constant: one colour. inverted_sphere: a NeRF++
     field. auto: constant where one colour is all that the borders of the images show behind the scene, else inverted_sphere."""
     color: tuple[float, float, float] | None = None
     """Linear RGB of a constant background, and what an inverted_sphere starts as; none: read from the borders of the images."""
@@ -236,7 +236,7 @@ class VolumeConfig:
     epsilon: float = 0.1
     """Bound on the opacity's error."""
     samples: int = 64
-    """Final samples per ray."""
+    """Samples per ray that are rendered: two thirds where it is stopped, the rest spread between, both ends among them."""
     normal_radius: float = 0.0
     """Surfaces are shaded with the normal of a neighbourhood of this radius, edges kept; 0: with that of the hit alone."""
     hit_radius: float = 0.05

@@ -19,8 +19,8 @@ from neilfpp_method.hosts.smooth_normals import smooth_normals
 from neilfpp_method.kernels.process import half_precision
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayBatch, SceneLight, SurfaceHits
-from neilfpp_method.volume.compositing import Weights, composite, optical_depth, render_weights
-from neilfpp_method.volume.density import LaplaceDensity, laplace_density
+from neilfpp_method.volume.compositing import Weights, composite, depth_weights, sample_weights, share_near
+from neilfpp_method.volume.density import LaplaceDensity, laplace_depth
 from neilfpp_method.volume.distance_grid import cell_size, sample_grid, trace_grid
 from neilfpp_method.volume.empty_space import EmptySpace
 from neilfpp_method.volume.intersect import Interval, sphere_interval
@@ -34,12 +34,10 @@ GRID_LIFE = 100
 
 @dataclass(frozen=True)
 class March:
-    """Samples along rays: where they are, what G says there, and how much each counts."""
+    """Samples along rays, from near to far: where they are, and what G says there."""
 
     distances: Float[Tensor, "N M"]
-    points: Float[Tensor, "N M 3"]
     surface: SdfSample
-    weights: Weights
     hits: SurfaceHits
 
 
@@ -140,7 +138,7 @@ class VolSdfHost(nn.Module):
     def smooth_normals(self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """The normals of `volume.normal_radius` about hits, edges kept; where that is 0, those of the hits."""
         radius = self.config.volume.normal_radius
-        return smooth_normals(lambda x: self._surface(x).gradient, position, normal, radius) if radius > 0 else normal
+        return smooth_normals(lambda x: self.sdf_field.with_gradient(x).gradient, position, normal, radius) if radius > 0 else normal
 
     @torch.no_grad()
     def may_meet(self, rays: RayBatch) -> Bool[Tensor, " N"]:
@@ -168,25 +166,8 @@ class VolSdfHost(nn.Module):
         return self.distance_grid
 
     def sdf(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-        """Signed distance of the scene's surface; with no background model the scene sphere closes it (VolSDF §3.1)."""
-        distance = self.sdf_field(x)
-        return torch.minimum(distance, self._to_sphere(x)) if self.background_kind == "none" else distance
-
-    def _surface(self, x: Float[Tensor, "P 3"]) -> SdfSample:
-        sample = self.sdf_field.with_gradient(x)
-        if self.background_kind != "none":
-            return sample
-        to_sphere = self._to_sphere(x)
-        beyond = to_sphere < sample.distance
-        inward = -safe_normalize(x)
-        return SdfSample(
-            torch.where(beyond, to_sphere, sample.distance),
-            torch.where(beyond[:, None], inward, sample.gradient),
-            sample.feature,
-        )
-
-    def _to_sphere(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-        return self.config.volume.radius - x.square().sum(-1).clamp_min(1e-12).sqrt()
+        """Signed distance of the scene's surface."""
+        return self.sdf_field(x)
 
     # --------------------------------------------------------------------------------------------------------- rendering
 
@@ -194,18 +175,20 @@ class VolSdfHost(nn.Module):
         interval = sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
         volume = self.config.volume
         if self.empty_space is not None and self.training:
-            interval = self.empty_space.narrow(self.sdf, rays, interval, self.surface_width())
+            full = interval
+            interval = self.empty_space.narrow(self.sdf, rays, full, self.surface_width())
+            if self.background_kind == "none":
+                interval = Interval(interval.near, full.far)  # R paints the scene sphere: rays go on to it
             volume = replace(volume, initial_samples=volume.narrowed_samples)
         distances = self._sample(rays, interval, volume)
         points = rays.origins[:, None] + distances[..., None] * rays.directions[:, None]
-        surface = self._surface(points.reshape(-1, 3))
-        density = self.density(surface.distance).reshape(distances.shape)
-        weights = render_weights(density, distances, interval.far)
+        surface = self.sdf_field.with_gradient(points.reshape(-1, 3))
+        weights = depth_weights(self.density(surface.distance.reshape(distances.shape), distances))
         normals = safe_normalize(surface.gradient)
         wo = (-rays.directions)[:, None].expand_as(points).reshape(-1, 3)
         radiance = self.radiance_field(points.reshape(-1, 3), wo, normals, surface.feature)
-        hits = self._blend(rays, points, distances, weights, normals, radiance)
-        return March(distances, points, surface, weights, hits)
+        hits = self._blend(rays, distances, weights, normals.view_as(points), radiance.view_as(points))
+        return March(distances, surface, hits)
 
     def _sample(self, rays: RayBatch, interval: Interval, volume: VolumeConfig) -> Float[Tensor, "N M"]:
         near, far = interval.near, interval.far
@@ -219,35 +202,33 @@ class VolSdfHost(nn.Module):
     def _blend(
         self,
         rays: RayBatch,
-        points: Float[Tensor, "N M 3"],
         distances: Float[Tensor, "N M"],
-        weights: Weights,
-        normals: Float[Tensor, "P 3"],
-        radiance: Float[Tensor, "P 3"],
+        intervals: Weights,
+        normals: Float[Tensor, "N M 3"],
+        radiance: Float[Tensor, "N M 3"],
     ) -> SurfaceHits:
-        color = composite(weights.weights, radiance.reshape(points.shape)) + self._beyond(rays, weights.transmittance)
-        surface_weights = weights.weights * self._on_object(points)
-        opacity = surface_weights.sum(-1)
+        weights, opacity = sample_weights(intervals.weights), intervals.opacity
         # A ray without weight ends at its last sample: a position that is finite and far from every surface.
         spare = 1e-6
-        depth = ((surface_weights * distances).sum(-1) + spare * distances[:, -1]) / (opacity + spare)
-        near_hit = (distances - depth[:, None]).abs() <= self.config.volume.hit_radius
+        depth = ((weights * distances).sum(-1) + spare * distances[:, -1]) / (opacity + spare)
         return SurfaceHits(
-            color=color,
+            color=composite(weights, radiance) + self._beyond(rays, intervals.transmittance, radiance[:, -1]),
             position=rays.origins + depth[:, None] * rays.directions,
-            normal=safe_normalize(composite(surface_weights, normals.reshape(points.shape))),
+            normal=safe_normalize(composite(weights, normals)),
             opacity=opacity,
-            concentration=(surface_weights.detach() * near_hit).sum(-1),
+            concentration=share_near(distances, intervals.weights.detach(), depth.detach(), self.config.volume.hit_radius),
         )
 
-    def _on_object(self, points: Float[Tensor, "N M 3"]) -> Bool[Tensor, "N M"] | float:
-        """The sphere that closes a scene without background is painted by R, but it is no surface of the object."""
-        if self.background_kind != "none":
-            return 1.0
-        return self._to_sphere(points.flatten(0, 1)).view(points.shape[:2]) > self.config.volume.hit_radius
+    def _beyond(
+        self, rays: RayBatch, transmittance: Float[Tensor, " N"], at_far: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N 3"]:
+        """What still arrives from the scene sphere: from beyond it, or where there is no background from R on the sphere.
 
-    def _beyond(self, rays: RayBatch, transmittance: Float[Tensor, " N"]) -> Float[Tensor, "N 3"]:
-        """What still arrives from beyond the scene sphere."""
+        The published code makes the sphere a surface of the distance field that nothing passes; a ray that reaches it
+        shows R there, `at_far`. It is no surface of the object: opacity and hit leave it out.
+        """
+        if self.background_kind == "none":
+            return transmittance[:, None] * at_far
         if self.background is not None:
             return transmittance[:, None] * self.background(rays.origins, rays.directions)
         return transmittance[:, None] * self.background_color
@@ -273,9 +254,9 @@ class VolSdfHost(nn.Module):
         return terms
 
     def _depth_of_object(self, march: March) -> Float[Tensor, " N"]:
-        """The optical depth of what is sampled of the object. A mask moves surfaces, it makes no fog of them: β is given."""
-        density = laplace_density(march.surface.distance, self.density.beta().detach()).view_as(march.distances)
-        return optical_depth(density * self._on_object(march.points), march.distances)
+        """The optical depth of rays. A mask moves surfaces, it makes no fog of them: β is given."""
+        distance = march.surface.distance.view_as(march.distances)
+        return laplace_depth(distance, march.distances, self.density.beta().detach()).sum(-1)
 
     def _near_surface(self, hits: SurfaceHits) -> Float[Tensor, "N 3"]:
         """One point per ray, scattered about its hit: where second derivatives shape the surface."""
