@@ -22,6 +22,10 @@ __all__ = ["TracedLight", "before_light", "off_surface", "scene_light", "trace_l
 # Four scales up it is 1 % along the normal and 5 % at 80°.
 HEIGHT_IN_WIDTHS = 4.0
 
+# The furthest from its point that a ray of L_ref may start, scene units (published code). Further out it could start behind
+# a neighbouring surface, and nearer than its angle asks for it would meet the layer that it leaves: it is left out.
+FARTHEST_START = 0.2
+
 # Rays that a host without cheap tracing renders at once: what bounds the memory.
 MOST_RENDERED = 2048
 
@@ -34,7 +38,7 @@ Light = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N S 3"]], Float[Tensor, "
 class TracedLight:
     """Rays that left the surface: where from, which way, the radiance that arrives along them, and which ones hit.
 
-    Rays of which the host knows at once that they meet nothing are left out.
+    Rays of which the host knows at once that they meet nothing, and those that cannot leave its layer, are left out.
     """
 
     position: Float[Tensor, "K 3"]
@@ -54,6 +58,7 @@ def trace_light(
 
     Directions are uniform in solid angle within `config.max_angle_deg` of the normal. A ray starts off the surface: at a
     height of `config.offset` and four widths of the host's surface, so the displacement along the ray grows as 1/cos.
+    A ray that would have to start further than `FARTHEST_START` from its point is left out.
     Positions are constants: L_ref says what arrives at a point, not where the point is.
 
     Args:
@@ -68,9 +73,11 @@ def trace_light(
     position, normal = position[rows], normal[rows]
     wi = _cone_directions(normal, math.cos(math.radians(config.max_angle_deg)))
     start = off_surface(host, position, normal, wi, config.offset)
+    worth = (start - position).norm(dim=-1) <= FARTHEST_START
     if isinstance(host, KnowsMisses):
-        worth = torch.nonzero(host.may_meet(RayBatch(start, wi)))[:, 0]
-        position, start, wi = position[worth], start[worth], wi[worth]
+        worth &= host.may_meet(RayBatch(start, wi))
+    rows = torch.nonzero(worth)[:, 0]
+    position, start, wi = position[rows], start[rows], wi[rows]
     with torch.set_grad_enabled(torch.is_grad_enabled() and config.radiance_gradient > 0.0):
         hits = host.render(RayBatch(start, wi))
     radiance = scale_gradient(hits.color, config.radiance_gradient)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from neilfpp_method.shading.color import apply_response
+from neilfpp_method.shading.color import apply_response, luminance
 from neilfpp_method.structures import LossTerm, Material
 
 __all__ = [
@@ -78,8 +78,15 @@ def point_cloud(distance: Float[Tensor, " P"], gradient: Float[Tensor, "P 3"], n
     return LossTerm(distance.abs() + (1.0 - cosine))
 
 
-def inter_reflection(incident: Float[Tensor, "K 3"], outgoing: Float[Tensor, "K 3"], unit: float = 1.0) -> LossTerm:
-    """L_ref = ‖L(x₁, ωi) − R(x₂, −ωi)‖₁ for rays that leave x₁ along ωi and meet the surface at x₂, in a unit of radiance."""
+def inter_reflection(
+    incident: Float[Tensor, "K 3"], outgoing: Float[Tensor, "K 3"], unit: float = 1.0, monochrome: bool = False
+) -> LossTerm:
+    """L_ref = ‖L(x₁, ωi) − R(x₂, −ωi)‖₁ for rays that leave x₁ along ωi and meet the surface at x₂, in a unit of radiance.
+
+    A light without colour is compared by luminance: no L can meet three channels that differ.
+    """
+    if monochrome:
+        incident, outgoing = luminance(incident)[:, None], luminance(outgoing)[:, None]
     return LossTerm((incident - outgoing).abs() / unit)
 
 

@@ -220,7 +220,7 @@ class NeilfModel(nn.Module):
         traced = trace_light(self.host, position, normal, self.config.inter_reflection, self.config.shading.hit_share)
         hit = torch.nonzero(traced.hit)[:, 0]
         incident = self.light.radiance(traced.position[hit], traced.wi[hit][:, None])[:, 0]
-        return losses.inter_reflection(incident, traced.radiance[hit], self.units.incident)
+        return losses.inter_reflection(incident, traced.radiance[hit], self.units.incident, self.config.light.monochrome)
 
     def _specular_change(self, seen: SurfacePixels, material: Material, shading: Shading) -> LossTerm:
         """Looks at some of the points again: highlights must change as R does, whatever the diffuse part is."""
