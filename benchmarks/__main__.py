@@ -1,7 +1,7 @@
 """The benchmarks with a committed baseline.
 
     python -m benchmarks                    every suite
-    python -m benchmarks kernels light      some of them
+    python -m benchmarks kernels shading    some of them
     python -m benchmarks --compare          exit status 1 where a figure is worse than baseline.json by more than its tolerance
     python -m benchmarks --save             these figures become the baseline
 
@@ -30,7 +30,6 @@ BASELINE = Path(__file__).parent / "baseline.json"
 SUITES: Mapping[str, str] = {
     "kernels": "benchmarks.sdf_normals",
     "shading": "benchmarks.shading_samples",
-    "light": "benchmarks.light_fields",
     "steps": "benchmarks.steps",
     "sampler": "benchmarks.sampler",
     "trace": "benchmarks.trace",

@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.attach import attach_neilf, pixel_batch
 from neilfpp_method.hosts.volsdf import VolSdfHost
-from neilfpp_method.presets import preset
+from neilfpp_method.settings.presets import preset
 from neilfpp_method.structures import PixelBatch, RayBatch
 
 STEPS = 100

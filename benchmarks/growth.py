@@ -23,13 +23,13 @@ from rich.console import Console
 from benchmarks.charts import Chart, Line, draw_charts
 from benchmarks.joint import fitted_model, rays_at_the_table, step_on
 from benchmarks.measure import clock, device, hardware
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.demo import demo_scene
+from neilfpp_method.demo.command import demo_scene
 from neilfpp_method.kernels.process import computing_fast
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.presets import free_light, preset
+from neilfpp_method.settings.presets import free_light, preset
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.loop import seed_step
 
 __all__ = ["Growth", "StraightLine", "straight_line"]

@@ -22,23 +22,17 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from benchmarks.light_fields import KINDS
 from benchmarks.measure import Measurement, clock, device
-from benchmarks.shading_samples import Scene, error_curves, scene_of, techniques
 from benchmarks.straightforward import straightforward
-from benchmarks.true_light import read_light
-from neilfpp_method.config import NeilfConfig
-from neilfpp_method.demo import demo_scene
-from neilfpp_method.facts import SceneFacts
-from neilfpp_method.fields.free_light import make_incident_light
 from neilfpp_method.fields.sdf import SdfField
 from neilfpp_method.hosts.volsdf import VolSdfHost
-from neilfpp_method.kernels.process import computing_fast, rounded_products
+from neilfpp_method.kernels.process import computing_fast
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.presets import preset
 from neilfpp_method.schedule import Stage, active_losses, weigh
-from neilfpp_method.shading.sampling import shared_sphere
-from neilfpp_method.structures import IncidentSamples, PixelBatch
+from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.presets import preset
+from neilfpp_method.settings.types import NeilfConfig
+from neilfpp_method.structures import PixelBatch
 from neilfpp_method.train.loop import make_optimizer, seed_step
 
 __all__ = ["cheap_paper", "fitted_model", "measurements", "rays_at_the_table", "step_on", "table"]
@@ -113,24 +107,17 @@ def step_on(model: NeilfModel, batch: PixelBatch) -> Callable[[], None]:
     def step() -> None:
         optimizer.zero_grad(set_to_none=True)
         loss = weigh(model(batch, Stage.JOINT), weights).loss
-        with rounded_products(model.config.train.gradients == "rounded"):
-            loss.backward()
+        loss.backward()
         optimizer.step()
 
     return step
 
 
 def cheap_paper() -> NeilfConfig:
-    """The networks of `paper-mlp`, with what makes them cheap: directions that points share, empty space skipped, half of the
-    cuts a round for what is left of a ray (`benchmarks.sampler` has the error of that), half precision in the sampler's queries
-    (of that the last line here), and rounded products in the backward pass."""
+    """The networks of `paper-mlp`, with empty space skipped, and half of the cuts a round for what is left of a ray
+    (`benchmarks.sampler` has the error of that)."""
     config = preset("paper-mlp")
-    return dataclasses.replace(
-        config,
-        volume=dataclasses.replace(config.volume, skip_empty=True, initial_samples=64, queries="rounded"),
-        shading=dataclasses.replace(config.shading, sampler="shared"),
-        train=dataclasses.replace(config.train, gradients="rounded"),
-    )
+    return dataclasses.replace(config, volume=dataclasses.replace(config.volume, skip_empty=True, initial_samples=64))
 
 
 def seconds_of(steps: Mapping[str, Callable[[], None]], fast: Mapping[str, bool]) -> dict[str, list[float]]:
@@ -151,7 +138,7 @@ def seconds_of(steps: Mapping[str, Callable[[], None]], fast: Mapping[str, bool]
 
 
 def measurements() -> Iterator[Measurement]:
-    """Ratios of whole steps, and the error of the integral over directions that are shared."""
+    """Ratios of whole steps."""
     batch = rays_at_the_table(RAYS)
     with computing_fast():
         cheap, fast = fitted_model(cheap_paper()), fitted_model(preset("fast"))
@@ -171,33 +158,3 @@ def measurements() -> Iterator[Measurement]:
         # Machines change their pace: a ratio is one of neighbours.
         ratio = statistics.median(slow / own for slow, own in zip(plain_seconds, taken, strict=True))
         yield Measurement(f"joint/plain over {name}", ratio, "×", "higher", tolerance=0.5)
-    yield from _errors()
-    yield Measurement("joint/hits moved by rounded queries", _moved_by_rounding(cheap, batch), "β, median", "lower", 1.0)
-
-
-@torch.no_grad()
-def _moved_by_rounding(model: NeilfModel, batch: PixelBatch) -> float:
-    """How far hits move when the sampler's queries are rounded, in β; sampled without random numbers."""
-    host = model.host.eval()
-    exact = dataclasses.replace(host.config.volume, queries="exact")
-    with computing_fast():
-        rounded = host.render(batch.rays).position
-        host.config = dataclasses.replace(host.config, volume=exact)
-        return (host.render(batch.rays).position - rounded).norm(dim=-1).median().item() / SHARP
-
-
-def _shared(scene: Scene, roughness: float, count: int) -> IncidentSamples:
-    """`count` directions above each horizon, of twice as many that all points share."""
-    drawn = shared_sphere(scene.normal, 2 * count, stochastic=True)
-    return IncidentSamples(drawn.wi.expand(len(scene.normal), -1, -1), drawn.pdf.expand(len(scene.normal), -1))
-
-
-def _errors() -> Iterator[Measurement]:
-    """What sharing directions does to the error of the shading integral, under the true light of the scene in the package."""
-    torch.manual_seed(0)
-    scene = scene_of(read_light(demo_scene()), make_incident_light(KINDS["factorised"].config, 10.0, 1.0))
-    draws = {"fibonacci": techniques()["fibonacci"], "shared": _shared}
-    for roughness in (0.1, 0.35, 1.0):
-        curves = error_curves(scene, roughness, draws, counts=(128,))
-        ratio = curves["shared"].y[0] / curves["fibonacci"].y[0]
-        yield Measurement(f"joint/error of shared over own directions, roughness {roughness:g}", ratio, "×", "lower", 1.0)

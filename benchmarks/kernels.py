@@ -25,10 +25,10 @@ from torch import Tensor
 
 from benchmarks.measure import hardware, median_seconds
 from benchmarks.straightforward import plain_units
-from neilfpp_method.config import HashGridConfig, SdfConfig
 from neilfpp_method.fields.sdf import SdfField
 from neilfpp_method.kernels import GridSpec, encode
-from neilfpp_method.presets import preset
+from neilfpp_method.settings.presets import preset
+from neilfpp_method.settings.types import HashGridConfig, SdfConfig
 
 RADIUS = 1.75
 PRIMES = (1, 2654435761, 805459861)

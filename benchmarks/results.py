@@ -2,7 +2,6 @@
 
     python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results
     python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results-mesh --host mesh --compare ladder
-    python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results-mesh --host mesh --compare effects
 
 For each capture: the preset trained from scratch, beside it the paper's free light field with and without L_ref (the paper's
 Table 2), with `--compare ladder` every light with every inter-reflection that goes with it; each measured after the material
@@ -23,11 +22,11 @@ import tyro
 from rich.console import Console
 from torch import Tensor
 
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.evaluate.protocols import evaluate
 from neilfpp_method.evaluate.report import write_report
-from neilfpp_method.presets import fixed_geometry, free_light, preset
 from neilfpp_method.schedule import Stage, stage_steps
+from neilfpp_method.settings.presets import fixed_geometry, free_light, preset
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.loop import make_optimizer, seed_step
@@ -55,13 +54,6 @@ COLUMNS = {
     "incident_light_log_mae_occluded": "… occluded",
 }
 STAGES = {"material_init": "Sep.", "joint": "joint"}
-EFFECTS = {
-    "specular loss": ("loss", "specular", 1.0),
-    "energy loss": ("loss", "energy", 1.0),
-    "unseen places shaded": ("inter_reflection", "unseen", "shaded"),
-    "a quarter of the directions traced": ("inter_reflection", "traced_share", 0.25),
-}
-"""What the preset leaves out: room, setting and value of each."""
 
 
 @dataclass
@@ -76,9 +68,9 @@ class Options:
     """Which settings."""
     host: Literal["volsdf", "mesh"] = "volsdf"
     """Geometry to be found, or given as a mesh."""
-    compare: Literal["preset", "paper", "ladder", "effects"] = "paper"
+    compare: Literal["preset", "paper", "ladder"] = "paper"
     """preset: nothing else. paper: the free light field with and without L_ref. ladder: every light with every
-    inter-reflection that goes with it. effects: each effect that the preset leaves out, switched on by itself."""
+    inter-reflection that goes with it."""
     material_steps: int | None = None
     """Steps of the stage material init; none: the preset's."""
     device: str = "auto"
@@ -89,10 +81,6 @@ def variants(config: NeilfConfig, which: str) -> dict[str, NeilfConfig]:
     """What is compared; the first is the preset as it is."""
     if which == "preset":
         return {"preset": config}
-    if which == "effects":
-        return {"preset": config} | {
-            name: changed(config, room, **{setting: value}) for name, (room, setting, value) in EFFECTS.items()
-        }
     free = free_light(config)
     compared = {
         "preset": config,

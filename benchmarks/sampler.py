@@ -18,7 +18,7 @@ from benchmarks.joint import SHARP, fitted_model, rays_at_the_table
 from benchmarks.measure import Measurement, median_seconds
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.kernels.process import computing_fast
-from neilfpp_method.presets import free_light, preset
+from neilfpp_method.settings.presets import free_light, preset
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume.empty_space import MOST_LIFE, RESOLUTION
 

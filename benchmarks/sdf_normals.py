@@ -12,7 +12,7 @@ from benchmarks.kernels import measure
 from benchmarks.measure import Measurement, device, median_seconds
 from neilfpp_method.kernels.process import computing_fast
 from neilfpp_method.kernels.softplus import softplus, softplus_and_slope
-from neilfpp_method.presets import preset
+from neilfpp_method.settings.presets import preset
 
 __all__ = ["measurements"]
 

@@ -7,16 +7,12 @@ one roughness after another. Every sampler estimates the same integral, of METHO
 between its 4096 directions; the reference is the same estimator with 9216 directions of all techniques together. The error is
 the root of the mean square over points, views, channels and repetitions, divided by that of the reference.
 
-What is known of the light when it is sampled, from little to much, each on a table of 256 cells times the cosine:
-  scene       one table for the scene, the mean over its points: what an environment map knows
-  neighbours  the mean over the four nearest other points: what a coarse cache of positions knows
-  learned     the factorised light field, fitted for 20 s to three of four points by relative squares: what training may know
-  point       the truth at the point itself: the best that a table can do
+Beside the samplers that know nothing of the light, `mis` is measured with an environment map that is the mean of what arrives
+at all points: what training comes to know.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,16 +24,15 @@ from rich.console import Console
 from torch import Tensor
 
 from benchmarks.charts import Chart, Line, draw_charts
-from benchmarks.light_fields import KINDS, Field, fit, relative_error, split
 from benchmarks.measure import Measurement, hardware, in_yardsticks
 from benchmarks.true_light import TrueLight, read_light, true_light
 from neilfpp_method.data.truth import LightField
-from neilfpp_method.demo import demo_scene
-from neilfpp_method.fields.free_light import make_incident_light
+from neilfpp_method.demo.command import demo_scene
+from neilfpp_method.fields.direction_map import map_directions
+from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.shading.brdf import SPHERICAL_GAUSSIAN
 from neilfpp_method.shading.rendering_equation import shade
-from neilfpp_method.shading.sampling import Technique, combine, cosine, sample_directions, specular_lobe, tabulated
-from neilfpp_method.shading.tabulated import cell_directions, with_cosine
+from neilfpp_method.shading.sampling import Technique, combine, cosine, sample_directions, specular_lobe
 from neilfpp_method.structures import IncidentSamples, Material
 
 __all__ = ["Scene", "error_curves", "measurements", "scene_of", "techniques"]
@@ -46,10 +41,8 @@ COUNTS = (8, 16, 32, 64, 128, 256)
 ROUGHNESS = (0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0)
 VIEWS = 4
 REPETITIONS = 4
-CELLS = 16  # rows and columns of a table
+MAP_ROWS = 16
 REFERENCE = 3072  # directions of each of three techniques
-UNKNOWN = 0.1  # share of a table's mean that a cell has at least, where the table belongs to other points
-LEARNING = 20.0  # seconds
 LOBE = SPHERICAL_GAUSSIAN
 
 
@@ -65,13 +58,13 @@ class Options:
 
 @dataclass(frozen=True)
 class Scene:
-    """M pairs of a point and a view, with the light at each and what is known of it."""
+    """M pairs of a point and a view, with the light at each, and a map of its mean."""
 
     normal: Float[Tensor, "M 3"]
     wo: Float[Tensor, "M 3"]
     material: Material
     light: TrueLight
-    tables: Mapping[str, Float[Tensor, "M R C"]]
+    map: EnvironmentLight
 
     def shade(self, roughness: float, samples: IncidentSamples) -> Float[Tensor, "M 3"]:
         """The estimate of the outgoing radiance of a surface with this roughness."""
@@ -83,50 +76,31 @@ class Scene:
         even = torch.full_like(self.material.roughness, roughness)
         return specular_lobe(self.normal, self.wo, even, LOBE)
 
-    def to_light(self, knowledge: str) -> Technique:
-        """Sampling of the light as far as it is known."""
-        return tabulated(with_cosine(self.tables[knowledge], self.normal), self.normal)
+    def to_light(self) -> Technique:
+        """Sampling of the map."""
+        return Technique(lambda count, stochastic: self.map.sample(self.normal, count, stochastic).wi, self.map.pdf)
 
 
 Draw = Callable[[Scene, float, int], IncidentSamples]
 
 
 @torch.no_grad()
-def scene_of(field: LightField, learned: Field, views: int = VIEWS) -> Scene:
-    """The true light field of a capture, seen from the first of its directions, and a field that has learned from it."""
+def scene_of(field: LightField, views: int = VIEWS) -> Scene:
+    """The true light field of a capture, seen from the first of its directions."""
     light = true_light(field.wi, field.incident)
     rows = torch.arange(len(field.position)).repeat_interleave(views)
-    known = _tables(field, light) | {"learned": _learned_table(field, learned)}
-    tables = {name: table.expand(len(field.position), -1, -1)[rows] for name, table in known.items()}
-    return Scene(field.normal[rows], field.wo[:, :views].reshape(-1, 3), field.material[rows], light[rows], tables)
+    wo = field.wo[:, :views].reshape(-1, 3)
+    return Scene(field.normal[rows], wo, field.material[rows], light[rows], _mean_map(field, light))
 
 
-def _tables(field: LightField, light: TrueLight) -> dict[str, Float[Tensor, "N R C"]]:
-    seen = light.directions().matmul(field.normal.T).permute(2, 0, 1) > 0
-    power = light.grid.mean(-1) * seen
-
-    def mean_over(points: Tensor) -> Tensor:
-        mean = power[points].sum(-3) / seen[points].sum(-3).clamp_min(1)
-        table = _coarse(mean.view(-1, *mean.shape[-2:]))
-        return table + UNKNOWN * table.mean((1, 2), keepdim=True)
-
-    apart = torch.cdist(field.position, field.position).fill_diagonal_(math.inf)
-    everywhere = torch.arange(len(field.position))[None]
-    return {
-        "scene": mean_over(everywhere),
-        "neighbours": mean_over(apart.topk(4, largest=False).indices),
-        "point": _coarse(power),
-    }
-
-
-def _learned_table(field: LightField, learned: Field) -> Float[Tensor, "N R C"]:
-    """What a field says of each cell, asked four times."""
-    wi = cell_directions(2 * CELLS, 2 * CELLS, field.position)
-    return _coarse(learned.radiance(field.position, wi.flatten(0, 1)).mean(-1).unflatten(1, wi.shape[:2]))
-
-
-def _coarse(power: Float[Tensor, "N H W"]) -> Float[Tensor, "N R C"]:
-    return torch.nn.functional.adaptive_avg_pool2d(power[:, None], CELLS)[:, 0]
+def _mean_map(field: LightField, light: TrueLight) -> EnvironmentLight:
+    """The mean of the light over the points that a direction is above the horizon of."""
+    mean = EnvironmentLight(MAP_ROWS, 1.0)
+    wi = map_directions(*mean.log_radiance.shape[1:]).to(field.normal)
+    above = (field.normal @ wi.reshape(-1, 3).T > 0)[..., None]
+    radiance = light.radiance(wi.reshape(1, -1, 3).expand(len(field.normal), -1, -1)) * above
+    mean.show((radiance.sum(0) / above.sum(0).clamp_min(1)).T.reshape(mean.log_radiance.shape))
+    return mean
 
 
 def techniques() -> dict[str, Draw]:
@@ -137,20 +111,12 @@ def techniques() -> dict[str, Draw]:
             kind, scene.normal, scene.wo, torch.full_like(scene.material.roughness, roughness), count, LOBE, stochastic=True
         )
 
-    def with_light(knowledge: str) -> Draw:
-        return lambda scene, roughness, count: sample_directions(
-            "mis",
-            scene.normal,
-            scene.wo,
-            torch.full_like(scene.material.roughness, roughness),
-            count,
-            LOBE,
-            stochastic=True,
-            light=scene.to_light(knowledge),
-        )
+    def with_light(scene: Scene, roughness: float, count: int) -> IncidentSamples:
+        even = torch.full_like(scene.material.roughness, roughness)
+        light = scene.to_light()
+        return sample_directions("mis", scene.normal, scene.wo, even, count, LOBE, stochastic=True, light=light)
 
-    known = {f"mis, light: {name}": with_light(name) for name in ("scene", "neighbours", "learned", "point")}
-    return {kind: plain(kind) for kind in ("fibonacci", "cosine", "lobe", "mis")} | known
+    return {kind: plain(kind) for kind in ("fibonacci", "cosine", "lobe", "mis")} | {"mis, light: map": with_light}
 
 
 @torch.no_grad()
@@ -158,7 +124,7 @@ def error_curves(
     scene: Scene, roughness: float, draws: Mapping[str, Draw], counts: tuple[int, ...] = COUNTS
 ) -> dict[str, Line]:
     """Relative root mean square error over the number of directions, by sampler."""
-    parts = [cosine(scene.normal), scene.lobe(roughness), scene.to_light("point")]
+    parts = [cosine(scene.normal), scene.lobe(roughness), scene.to_light()]
     samples = combine([(part, REFERENCE) for part in parts], stochastic=True)
     truth = scene.shade(roughness, samples)
     size = truth.square().mean().sqrt()
@@ -174,12 +140,11 @@ def error_curves(
 
 
 def measurements() -> Iterator[Measurement]:
-    """The error of 32 directions with the light known at the point over that of Fibonacci-128, and the time of the integral."""
+    """The error of 32 directions with a map over that of Fibonacci-128, and the time of the integral."""
     torch.manual_seed(0)
-    unused = make_incident_light(KINDS["factorised"].config, 10.0, 1.0)
-    scene = scene_of(read_light(demo_scene()), unused)
+    scene = scene_of(read_light(demo_scene()))
     draws = techniques()
-    paper, best = draws["fibonacci"], draws["mis, light: point"]
+    paper, best = draws["fibonacci"], draws["mis, light: map"]
     for roughness in (0.1, 0.35, 1.0):
         few = error_curves(scene, roughness, {"": best}, counts=(32,))[""].y[0]
         many = error_curves(scene, roughness, {"": paper}, counts=(128,))[""].y[0]
@@ -219,7 +184,7 @@ def main(options: Options) -> None:
     sections, charts = [hardware()], []
     for capture in options.captures:
         field = read_light(capture)
-        scene = scene_of(field, fit(KINDS["factorised, shared"], split(field), (LEARNING,), relative_error).net)
+        scene = scene_of(field)
         curves = {roughness: error_curves(scene, roughness, techniques()) for roughness in ROUGHNESS}
         sections.append(f"### {capture.name}\n\n{table(curves)}\n")
         charts += [Chart(f"{capture.name}, roughness {r:g}", curves[r]) for r in (0.1, 0.35, 1.0)]

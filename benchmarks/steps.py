@@ -14,13 +14,13 @@ from functools import cache
 from pathlib import Path
 
 from benchmarks.measure import Measurement, device, in_yardsticks
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.demo import demo_scene
+from neilfpp_method.demo.command import demo_scene
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.presets import PRESETS, preset
 from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.settings.presets import PRESETS, preset
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts
 from neilfpp_method.train.loop import make_optimizer, seed_step
 

@@ -18,17 +18,17 @@ from dataclasses import replace
 from functools import partial
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from neilfpp_method.config import NeilfConfig, VolumeConfig
 from neilfpp_method.fields.brdf import BrdfField, BrdfSample
 from neilfpp_method.fields.incident_light import IncidentLightField
 from neilfpp_method.fields.mlp import SOFTPLUS_SHARPNESS, Mlp
 from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.settings.types import NeilfConfig, VolumeConfig
 from neilfpp_method.structures import Material, RayBatch
 from neilfpp_method.volume.intersect import Interval
 from neilfpp_method.volume.samplers import (
@@ -103,9 +103,7 @@ class PlainLight(nn.Module):
         super().__init__()
         self.field = field
 
-    def radiance(
-        self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"], asked: Bool[Tensor, "N S"] | None = None
-    ) -> Float[Tensor, "N S 3"]:
+    def radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
         points = x[:, None].expand_as(wi).reshape(-1, 3)
         return self.field.radiance(points, wi.reshape(-1, 1, 3)).view(wi.shape)
 

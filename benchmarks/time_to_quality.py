@@ -22,14 +22,14 @@ from rich.console import Console
 
 from benchmarks.charts import Chart, Line, draw_charts
 from benchmarks.measure import clock, hardware
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.evaluate.protocols import image_metrics, material_metrics
 from neilfpp_method.evaluate.views import known_test_views, render_test_views
 from neilfpp_method.kernels.process import computing_fast
-from neilfpp_method.presets import preset
 from neilfpp_method.schedule import active_losses, stage_at, stage_steps, weigh
+from neilfpp_method.settings.presets import preset
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.loop import make_optimizer, seed_step, set_rates

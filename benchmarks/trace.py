@@ -18,7 +18,7 @@ from benchmarks.sampler import table_host
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.inter_reflection import TracedLight, trace_light
 from neilfpp_method.kernels.process import computing_fast
-from neilfpp_method.presets import preset
+from neilfpp_method.settings.presets import preset
 from neilfpp_method.structures import RayBatch
 
 __all__ = ["measurements"]

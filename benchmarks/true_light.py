@@ -19,7 +19,6 @@ from torch import Tensor
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.truth import LightField, Truth
 from neilfpp_method.errors import UserError
-from neilfpp_method.shading.tabulated import cell_directions
 
 __all__ = ["TrueLight", "read_light", "true_light"]
 
@@ -77,3 +76,13 @@ def read_light(capture: Path) -> LightField:
     if field is None:
         raise UserError(f"{capture}: no light/light_field_gt.npz", "choose a capture whose light is known")
     return field
+
+
+def cell_directions(rows: int, columns: int, like: Tensor) -> Float[Tensor, "R C 3"]:
+    """The middles of cells of equal solid angle: rows of equal height about +z, columns of equal azimuth from +x towards +y."""
+    i = torch.arange(rows, device=like.device, dtype=like.dtype)
+    j = torch.arange(columns, device=like.device, dtype=like.dtype)
+    z = (1 - 2 * (i[:, None] + 0.5) / rows).expand(rows, columns)
+    azimuth = 2 * math.pi * (j + 0.5) / columns
+    sine = ((1 - z) * (1 + z)).clamp_min(0).sqrt()
+    return torch.stack((sine * azimuth.cos(), sine * azimuth.sin(), z), -1)

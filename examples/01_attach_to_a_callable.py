@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 
 from neilfpp_method import attach_neilf, preset
 from neilfpp_method.attach import pixel_batch
-from neilfpp_method.presets import free_light
+from neilfpp_method.settings.presets import free_light
 
 
 class Ball(nn.Module):

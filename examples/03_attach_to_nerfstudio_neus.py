@@ -17,9 +17,9 @@ from nerfstudio.models.neus import NeuSModelConfig
 from neilfpp_method import attach_neilf, preset
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.demo import demo_scene
+from neilfpp_method.demo.command import demo_scene
 from neilfpp_method.hosts.nerfstudio import NerfstudioHost
-from neilfpp_method.presets import free_light
+from neilfpp_method.settings.presets import free_light
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 STEPS = int(sys.argv[1]) if len(sys.argv) > 1 else 2000

@@ -12,11 +12,11 @@ __version__ = "0.1.0"
 __all__ = ["NeilfConfig", "NeilfModel", "__version__", "attach_neilf", "load_run", "preset"]
 
 _ROOMS = {
-    "NeilfConfig": "neilfpp_method.config",
+    "NeilfConfig": "neilfpp_method.settings.types",
     "NeilfModel": "neilfpp_method.model",
     "attach_neilf": "neilfpp_method.attach",
     "load_run": "neilfpp_method.train.run",
-    "preset": "neilfpp_method.presets",
+    "preset": "neilfpp_method.settings.presets",
 }
 
 

@@ -18,16 +18,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.environment_map import read_environment
 from neilfpp_method.errors import UserError
-from neilfpp_method.facts import SceneFacts
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.hosts.base import HasParameterGroups, Host, LightsItself
 from neilfpp_method.hosts.outputs import check_tensors, host_name
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.presets import free_light, preset
 from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, stage_at, weigh
+from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.presets import free_light, preset
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import Material, PixelBatch, RayBatch, Shading, SurfaceHits
 
 __all__ = ["AttachedNeilf", "CallableHost", "attach_neilf", "missing_capabilities", "pixel_batch"]

@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from neilfpp_method.config import InterReflectionConfig
 from neilfpp_method.hosts.base import HasSurfaceWidth, Host, KnowsMisses, LightsItself
 from neilfpp_method.losses import scale_gradient
+from neilfpp_method.settings.types import InterReflectionConfig
 from neilfpp_method.shading.frame import local_frame
-from neilfpp_method.structures import RayBatch, SceneLight, SceneTracer
+from neilfpp_method.structures import RayBatch, SceneLight
 
-__all__ = ["TracedLight", "before_light", "off_surface", "scene_light", "trace_light", "traced_in_part"]
+__all__ = ["TracedLight", "before_light", "off_surface", "scene_light", "trace_light"]
 
 # A layer of scale β still absorbs along a ray that leaves it: from a height h, the optical depth is exp(−h/β) / (2 cos θ).
 # Four scales up it is 1 % along the normal and 5 % at 80°.
@@ -126,22 +126,6 @@ def before_light(
     point, direction = torch.nonzero(~scene.hit, as_tuple=True)
     behind = light(x[point], wi[point, direction][:, None])[:, 0]
     return scene.radiance.index_put((point, direction), behind)
-
-
-def traced_in_part(
-    trace: SceneTracer, light: Light, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"], share: float
-) -> Float[Tensor, "N S 3"]:
-    """Hard inter-reflection with few rays: the light from every direction, and a correction from a random share of them.
-
-    The light is a control variate. Where a traced direction meets the scene, it brings the scene's radiance less the light's,
-    times the inverse of the share; so the mean over choices is that of `before_light`, and single directions may be below 0.
-    """
-    count = wi.shape[1]
-    traced = max(1, round(share * count))
-    chosen = torch.rand(wi.shape[:2], device=wi.device).topk(traced, dim=1).indices[..., None].expand(-1, -1, 3)
-    scene, arriving = trace(x, wi.gather(1, chosen)), light(x, wi)
-    correction = torch.where(scene.hit[..., None], scene.radiance - arriving.gather(1, chosen), 0.0)
-    return arriving.scatter_add(1, chosen, correction * (count / traced))
 
 
 def _random_rows(points: int, per_point: float, device: torch.device) -> Tensor:

@@ -14,7 +14,6 @@ from neilfpp_method.structures import LossTerm, Material
 
 __all__ = [
     "eikonal",
-    "energy",
     "hessian",
     "inter_reflection",
     "lambertian",
@@ -23,7 +22,6 @@ __all__ = [
     "point_cloud",
     "scale_gradient",
     "smoothness",
-    "specular",
     "surface",
 ]
 
@@ -102,30 +100,6 @@ def smoothness(
 def lambertian(material: Material) -> LossTerm:
     """L_Lam = |r − 1| + |m|: without evidence a surface is rough and not a metal."""
     return LossTerm((material.roughness - 1.0).abs() + material.metallic.abs())
-
-
-def energy(albedo: Float[Tensor, "N 3"]) -> LossTerm:
-    """max(ρ − 1, 0): no surface sends more light than it gets. Diffuse and specular part may together, neither by itself.
-
-    Args:
-        albedo: ρ, directional albedo per channel (`shading.albedo`). PBR-NeRF (Wu et al. 2025) bounds a sum over samples of
-            light; this integral has no noise.
-    """
-    return LossTerm((albedo - 1.0).clamp_min(0.0))
-
-
-def specular(
-    change: Float[Tensor, "N 3"],
-    seen: Float[Tensor, "N 3"],
-    weight: Float[Tensor, "N 1"],
-    unit: float = 1.0,
-) -> LossTerm:
-    """L1 between how the specular part of a point changes from view to view and how its radiance does, in a unit of radiance.
-
-    The diffuse part is the same for all views: whatever is wrong with it, or with the light that it gets, takes itself out.
-    `weight` says how little the lobes of the two views have in common.
-    """
-    return LossTerm((change - seen).abs() / unit, weight)
 
 
 def scale_gradient(value: Tensor, scale: float) -> Tensor:

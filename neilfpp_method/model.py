@@ -14,29 +14,24 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from neilfpp_method import losses
-from neilfpp_method.config import NeilfConfig
-from neilfpp_method.config_check import check_config
-from neilfpp_method.facts import SceneFacts, radiance_units
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.fields.factorised_light import FactorisedLightField
-from neilfpp_method.fields.free_light import make_incident_light
 from neilfpp_method.fields.incident_light import IncidentLightField
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
-from neilfpp_method.inter_reflection import before_light, scene_light, trace_light, traced_in_part
+from neilfpp_method.inter_reflection import before_light, scene_light, trace_light
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.memory import Observed, SurfaceMemory
+from neilfpp_method.lighting.replay import Replay, SurfacePixels
 from neilfpp_method.lighting.sky import SkySightings
 from neilfpp_method.lighting.solve import solve_light
-from neilfpp_method.replay import Replay, SurfacePixels
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, active_losses
-from neilfpp_method.second_view import lobe_difference, second_view
+from neilfpp_method.settings.check import check_config
+from neilfpp_method.settings.facts import SceneFacts, radiance_units
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.albedo import directional_albedo
 from neilfpp_method.shading.brdf import LOBES
-from neilfpp_method.shading.color import srgb_to_linear
-from neilfpp_method.shading.frame import dot
 from neilfpp_method.shading.rendering_equation import shade
 from neilfpp_method.shading.sampling import Technique, sample_directions
 from neilfpp_method.structures import (
@@ -45,19 +40,15 @@ from neilfpp_method.structures import (
     PixelBatch,
     RayBatch,
     SceneLight,
-    SceneTracer,
     Shading,
     SurfaceHits,
 )
-from neilfpp_method.unseen import SeenPlaces, shade_unseen
 
 __all__ = ["Maps", "NeilfModel"]
 
 
 CLEAR = 0.01
 """Opacity of a ray that shows what lies beyond the scene."""
-SECOND_SAMPLES = 16
-"""Incident directions of a place that no camera sees, where what it sends is shaded."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +79,7 @@ class NeilfModel(nn.Module):
             module's, though gradients reach it in the joint stage.
 
     Raises:
-        UserError: settings that do not go together (`config_check`).
+        UserError: settings that do not go together (`settings.check`).
     """
 
     def __init__(self, host: Host, config: NeilfConfig, facts: SceneFacts, borrowed: bool = False) -> None:
@@ -108,7 +99,7 @@ class NeilfModel(nn.Module):
         self.brdf = BrdfField(config.brdf, config.volume.radius)
         base = config.light.base or (10.0 if facts.response == "linear" else math.e)
         first_radiance = facts.median_radiance / self._first_albedo()
-        self.light: IncidentLightField | FactorisedLightField | EnvironmentLight
+        self.light: IncidentLightField | EnvironmentLight
         self.lamps: Lamps | None = None
         self.memory: SurfaceMemory | None = None
         self.evidence: Evidence | None = None
@@ -117,9 +108,6 @@ class NeilfModel(nn.Module):
         train = config.train
         self.replay = Replay(train.fresh, train.rays) if train.fresh < 1 and stands_still else None
         self.seen_sky: SkySightings | None = None
-        self.seen_places: SeenPlaces | None = None
-        if config.inter_reflection.unseen == "shaded":
-            self.seen_places = SeenPlaces(config.volume.radius)
         if config.light.kind != "free":
             fit = config.light.fit
             self.light = EnvironmentLight(config.light.environment_height, first_radiance)
@@ -129,7 +117,7 @@ class NeilfModel(nn.Module):
             if config.light.map is None and facts.background == "inverted_sphere" and fit.sky > 0:
                 self.seen_sky = SkySightings(config.light.environment_height, facts.response)
         else:
-            self.light = make_incident_light(config.light, base, first_radiance)
+            self.light = IncidentLightField(config.light, base, first_radiance)
 
     # -------------------------------------------------------------------------------------------------------- one step
 
@@ -152,8 +140,6 @@ class NeilfModel(nn.Module):
             hits, terms = self._render_host(batch, names)
         if "volume" in names:
             terms["volume"] = losses.photometric(hits.color, batch.color, self.facts.response, self.units.volume)
-        if self.seen_places is not None and self.training:
-            self.seen_places.remember(hits.position[hits.is_hit(self.config.shading.hit_share)])
         if not plan.moves_material:
             return terms
         if self.seen_sky is not None and self.training:
@@ -175,9 +161,6 @@ class NeilfModel(nn.Module):
         # 5. The rendering equation says what leaves.
         shading = self.shade(seen.position, seen.normal, seen.wo, material, self.config.shading.train_samples)
         terms["physical"] = losses.photometric(shading.color, seen.pixel, self.facts.response, self.units.physical)
-
-        if "specular" in names:
-            terms["specular"] = self._specular_change(seen.detach(), material, shading)
 
         # 6. What arrives from another surface is what that surface sends.
         if "inter_reflection" in names:
@@ -212,8 +195,6 @@ class NeilfModel(nn.Module):
             material = self.brdf(seen.position)
         if "lambertian" in names:
             terms["lambertian"] = losses.lambertian(material)
-        if "energy" in names:
-            terms["energy"] = losses.energy(directional_albedo(material, seen.normal, seen.wo, self.lobe))
         return material
 
     def _inter_reflection(self, position: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]) -> LossTerm:
@@ -221,18 +202,6 @@ class NeilfModel(nn.Module):
         hit = torch.nonzero(traced.hit)[:, 0]
         incident = self.light.radiance(traced.position[hit], traced.wi[hit][:, None])[:, 0]
         return losses.inter_reflection(incident, traced.radiance[hit], self.units.incident, self.config.light.monochrome)
-
-    def _specular_change(self, seen: SurfacePixels, material: Material, shading: Shading) -> LossTerm:
-        """Looks at some of the points again: highlights must change as R does, whatever the diffuse part is."""
-        settings = self.config.shading
-        second = second_view(self.host, seen, self.config.inter_reflection.offset, settings.hit_share)
-        seen, material, first = seen[second.row], material[second.row], shading.specular[second.row]
-        other = self.shade(seen.position, seen.normal, second.wo, material, settings.train_samples).specular
-        weight = lobe_difference(self.lobe, material.roughness, seen.normal, seen.wo, second.wo)
-        pixel, known = seen.pixel, 1.0
-        if self.facts.response == "srgb":
-            pixel, known = srgb_to_linear(pixel), (pixel < 1).all(-1, keepdim=True)  # a clipped pixel says too little
-        return losses.specular(first - other, pixel - second.radiance, weight * known, self.units.incident)
 
     def _keep_fitting(self, seen: Observed) -> None:
         """Remember some of what was seen, and when it is time solve for the light that explains what is remembered."""
@@ -273,21 +242,8 @@ class NeilfModel(nn.Module):
         return radiance if self.lamps is None else radiance + self.lamps.seen(x, wi, nearest)
 
     def _scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
-        """What the scene sends: R, and where no camera looked what material and light say."""
-        scene = self._by_radiance(x, wi)
-        if self.seen_places is None:
-            return scene
-        return shade_unseen(scene, x.detach(), wi, self.seen_places, self.host, self.config.shading.hit_share, self._leaving)
-
-    def _by_radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
+        """What the scene sends, by R."""
         return scene_light(self.host, x, wi, self.config.inter_reflection, self.config.shading.hit_share)
-
-    def _leaving(
-        self, position: Float[Tensor, "K 3"], normal: Float[Tensor, "K 3"], wo: Float[Tensor, "K 3"]
-    ) -> Float[Tensor, "K 3"]:
-        """What unseen places send, by R and the light that they get."""
-        normal = self.shading_normals(position, normal)
-        return self.shade(position, normal, wo, self.brdf(position), SECOND_SAMPLES, self._by_radiance).color
 
     def shade(
         self,
@@ -296,22 +252,16 @@ class NeilfModel(nn.Module):
         wo: Float[Tensor, "N 3"],
         material: Material,
         samples: int,
-        scene: SceneTracer | None = None,
     ) -> Shading:
-        """Outgoing radiance towards wo by the rendering equation, from `samples` incident directions per point.
-
-        `scene`: what hard inter-reflection asks; none: `_scene_light`.
-        """
-        settings, scene = self.config.shading, scene or self._scene_light
+        """Outgoing radiance towards wo by the rendering equation, from `samples` incident directions per point."""
+        settings = self.config.shading
         # Without a lobe there is nothing for a lobe to sample: the cosine has no variance left that light does not bring.
         without_lobe = {"mis": "cosine", "lobe": "cosine"}
         sampler = settings.sampler if settings.specular else without_lobe.get(settings.sampler, settings.sampler)
         about, roughness = normal.detach(), material.roughness.detach()
         drawn = sample_directions(sampler, about, wo, roughness, samples, self.lobe, self.training, self._sky(about))
         if self.config.inter_reflection.mode == "hard":
-            incident = self._hard_light(scene, position, drawn.wi.expand(len(position), -1, -1))
-        elif len(drawn.wi) < len(position) and not isinstance(self.light, EnvironmentLight):
-            incident = self.light.radiance(position, drawn.wi, dot(drawn.wi, about) > 0)
+            incident = before_light(self._scene_light(position, drawn.wi), self.light.radiance, position, drawn.wi)
         else:
             incident = self.light.radiance(position, drawn.wi)
         shading = shade(material, normal, wo, drawn, incident, self.lobe, settings.specular)
@@ -321,17 +271,9 @@ class NeilfModel(nn.Module):
         rays = self.lamps.rays_from(position)
         radiance = self.lamps.arriving(rays)
         if self.config.inter_reflection.mode == "hard":
-            radiance = radiance * (self._by_radiance(position, rays.wi).distance >= rays.distance)[..., None]
+            radiance = radiance * (self._scene_light(position, rays.wi).distance >= rays.distance)[..., None]
         lit = shade(material, normal, wo, rays.samples(), radiance, self.lobe, settings.specular)
         return Shading(shading.color + lit.color, shading.diffuse + lit.diffuse, shading.specular + lit.specular)
-
-    def _hard_light(
-        self, scene: SceneTracer, position: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]
-    ) -> Float[Tensor, "N S 3"]:
-        share = self.config.inter_reflection.traced_share
-        if self.training and share < 1:
-            return traced_in_part(scene, self.light.radiance, position, wi, share)
-        return before_light(scene(position, wi), self.light.radiance, position, wi)
 
     def _sky(self, normal: Float[Tensor, "N 3"]) -> Technique | None:
         """The map, as one that draws directions; none for a light that cannot be sampled."""

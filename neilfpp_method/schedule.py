@@ -20,7 +20,7 @@ from enum import Enum
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.config import NeilfConfig, TrainConfig
+from neilfpp_method.settings.types import NeilfConfig, TrainConfig
 from neilfpp_method.structures import LossTerms
 
 __all__ = [
@@ -52,7 +52,7 @@ GEOMETRY = LIGHT_FIELD | {"geometry", "beta"}
 MATERIAL = frozenset({"brdf", "light"})
 
 # Each loss of the material stages with the setting that weighs it.
-MATERIAL_LOSSES = {name: name for name in ("physical", "inter_reflection", "smoothness", "lambertian", "energy", "specular")}
+MATERIAL_LOSSES = {name: name for name in ("physical", "inter_reflection", "smoothness", "lambertian")}
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def active_losses(stage: Stage, config: NeilfConfig, stages: StageTable = STAGES
         weights.pop("inter_reflection", None)
     if not config.shading.specular:
         # A Lambertian surface has neither roughness nor metallic, and sends what it gets times its colour.
-        for loss in ("smoothness", "lambertian", "energy", "specular"):
+        for loss in ("smoothness", "lambertian"):
             weights.pop(loss, None)
     return {loss: weight for loss, weight in weights.items() if weight > 0}
 

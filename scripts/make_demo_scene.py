@@ -1,6 +1,6 @@
 """Make the scene that ships in the package from a larger capture in the NeILF layout.
 
-    python scripts/make_demo_scene.py CAPTURE neilfpp_method/demo_scene
+    python scripts/make_demo_scene.py CAPTURE neilfpp_method/demo/scene
 
 Keeps 24 training views and 4 test views, the truth of the test views, and the light field at 8 of its points.
 """

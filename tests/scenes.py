@@ -7,11 +7,11 @@ import dataclasses
 import torch
 from torch.nn.functional import normalize
 
-from neilfpp_method.config import HashGridConfig, NeilfConfig, TrainConfig
-from neilfpp_method.facts import SceneFacts
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.presets import free_light, preset
+from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.presets import free_light, preset
+from neilfpp_method.settings.types import HashGridConfig, NeilfConfig, TrainConfig
 from neilfpp_method.structures import PixelBatch, RayBatch
 
 

@@ -17,7 +17,7 @@ import trimesh
 from neilfpp_method.cli import COMMANDS, main
 from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.evaluate import protocols
-from neilfpp_method.presets import PRESETS
+from neilfpp_method.settings.presets import PRESETS
 from tests.data.make_capture import CENTRE, RADIUS, make_capture
 from tests.train.small_runs import small_config
 

@@ -11,11 +11,11 @@ import torch
 
 from neilfpp_method import losses
 from neilfpp_method.errors import UserError
-from neilfpp_method.facts import SceneFacts
 from neilfpp_method.hosts.base import LightsItself
 from neilfpp_method.inter_reflection import trace_light
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.structures import Material, RayBatch, SurfaceHits
 from neilfpp_method.train.loop import make_optimizer
 from tests.scenes import sphere_batch, sphere_model, tiny_config
@@ -307,7 +307,7 @@ def test_the_tracing_grid_is_renewed_as_the_geometry_moves_and_survives_a_checkp
 
 
 @pytest.mark.parametrize("kind", ["free", "distant", "auto"])
-@pytest.mark.parametrize("sampler", ["fibonacci", "shared"])
+@pytest.mark.parametrize("sampler", ["fibonacci", "mis"])
 def test_every_light_goes_with_every_kind_of_sampling(kind, sampler):
     """Under light of one radiance from everywhere, a surface shows the same by each."""
     config = tiny_config()

@@ -7,11 +7,11 @@ import dataclasses
 import pytest
 import torch
 
-from neilfpp_method.config import TrainConfig
-from neilfpp_method.config_json import from_dict, to_dict
 from neilfpp_method.errors import UserError
-from neilfpp_method.presets import PRESETS, preset
 from neilfpp_method.schedule import Stage, active_losses, stage_at, weigh
+from neilfpp_method.settings.plain import from_dict, to_dict
+from neilfpp_method.settings.presets import PRESETS, preset
+from neilfpp_method.settings.types import TrainConfig
 from neilfpp_method.structures import LossTerm
 
 # Table 1 of the paper, in its own words.

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 from neilfpp_method.cli import main
-from neilfpp_method.presets import PRESETS
+from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.train import command, loop
 from tests.train.small_runs import small_config
 

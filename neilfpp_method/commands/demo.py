@@ -25,7 +25,7 @@ class Demo:
 
 
 def run(options: Demo) -> None:
-    from neilfpp_method.demo import run_demo
+    from neilfpp_method.demo.command import run_demo
     from neilfpp_method.kernels.process import computing_fast
 
     with computing_fast():

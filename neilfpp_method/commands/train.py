@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Literal
 
 from neilfpp_method.commands.command import Command, Device, terminal
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.errors import UserError
-from neilfpp_method.presets import fixed_geometry, preset
+from neilfpp_method.settings.presets import fixed_geometry, preset
+from neilfpp_method.settings.types import NeilfConfig
 
 __all__ = ["COMMAND"]
 

@@ -13,7 +13,7 @@ from neilfpp_method.inter_reflection import scene_light
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading.frame import dot
 from neilfpp_method.shading.rendering_equation import PDF_FLOOR
-from neilfpp_method.shading.sampling import Technique, combine, cosine, shared_sphere, specular_lobe
+from neilfpp_method.shading.sampling import Technique, combine, cosine, specular_lobe, sphere_lattice
 from neilfpp_method.structures import Indexable, Material, SceneLight
 
 __all__ = ["PATCHES", "Arriving", "arriving_light", "by_patch", "patch_count"]
@@ -82,7 +82,7 @@ def _scene(model: NeilfModel, position: Float[Tensor, "N 3"], wi: Float[Tensor, 
 
 def _nearest_patch(wi: Float[Tensor, "N S 3"]) -> Int[Tensor, "N S"]:
     """Patches are about the directions of a lattice over the sphere."""
-    return (wi @ shared_sphere(wi[0], PATCHES, stochastic=False).wi[0].to(wi).T).argmax(-1)
+    return (wi @ sphere_lattice(PATCHES, wi).to(wi).T).argmax(-1)
 
 
 def patch_count(model: NeilfModel) -> int:

@@ -7,9 +7,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from neilfpp_method.config import BackgroundConfig
 from neilfpp_method.fields.encodings import FrequencyEncoding
 from neilfpp_method.fields.mlp import Mlp
+from neilfpp_method.settings.types import BackgroundConfig
 from neilfpp_method.volume.compositing import composite, render_weights
 
 __all__ = ["InvertedSphere", "field_beyond"]

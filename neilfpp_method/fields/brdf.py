@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from neilfpp_method.config import BrdfConfig
 from neilfpp_method.fields.encodings import position_encoding, pull_back
 from neilfpp_method.fields.mlp import Mlp
+from neilfpp_method.settings.types import BrdfConfig
 from neilfpp_method.structures import Material
 
 __all__ = ["BrdfField", "BrdfSample"]

@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from neilfpp_method.config import HashGridConfig
 from neilfpp_method.errors import UserError
 from neilfpp_method.kernels import Encoded, encode, grid_spec
+from neilfpp_method.settings.types import HashGridConfig
 
 __all__ = [
     "FrequencyEncoding",

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 
-import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from neilfpp_method.config import IncidentLightConfig
 from neilfpp_method.fields.encodings import direction_encoding
 from neilfpp_method.fields.mlp import Mlp
+from neilfpp_method.settings.types import IncidentLightConfig
 
 __all__ = ["IncidentLightField", "exponential"]
 
@@ -44,24 +43,12 @@ class IncidentLightField(nn.Module):
         nn.init.uniform_(self.position_part.weight, -bound, bound)
         self.tail.activation.init_(self.tail.layers[0])
 
-    def radiance(
-        self,
-        x: Float[Tensor, "N 3"],
-        wi: Float[Tensor, "S 3"] | Float[Tensor, "#N S 3"],
-        asked: Bool[Tensor, "N S"] | None = None,
-    ) -> Float[Tensor, "N S 3"]:
+    def radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "S 3"] | Float[Tensor, "#N S 3"]) -> Float[Tensor, "N S 3"]:
         """Radiance > 0 that arrives at x from wi, which points away from x.
 
-        Directions that all points share, (S, 3) or (1, S, 3), go through their part of the network once. Only the pairs of
-        a point and a direction that are `asked` go through the rest, where that is given; the others are 0.
+        Directions that all points share, (S, 3) or (1, S, 3), go through their part of the network once.
         """
-        directions = self.of_directions(wi if wi.ndim == 3 else wi[None])
-        if asked is None:
-            return self.at_positions(x, directions)
-        point, direction = torch.nonzero(asked, as_tuple=True)
-        shared = directions[0, direction] if len(directions) == 1 else directions[point, direction]
-        pairs = self._from_middle(shared + self.position_part(x)[point])
-        return pairs.new_zeros(*asked.shape, 3).index_put((point, direction), pairs)
+        return self.at_positions(x, self.of_directions(wi if wi.ndim == 3 else wi[None]))
 
     def of_directions(self, wi: Float[Tensor, "... 3"]) -> Float[Tensor, "... W"]:
         """The middle layer before its activation, as far as the direction decides it."""
@@ -69,9 +56,7 @@ class IncidentLightField(nn.Module):
 
     def at_positions(self, x: Float[Tensor, "N 3"], directions: Float[Tensor, "#N S W"]) -> Float[Tensor, "N S 3"]:
         """The rest of the network, from the middle layer on."""
-        return self._from_middle(directions + self.position_part(x)[:, None])
-
-    def _from_middle(self, middle: Float[Tensor, "*B W"]) -> Float[Tensor, "*B 3"]:
+        middle = directions + self.position_part(x)[:, None]
         return exponential(self.log_base * self.tail(self.tail.activation.value(middle)), self.initial_radiance)
 
 

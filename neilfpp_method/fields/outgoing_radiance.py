@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from neilfpp_method.config import OutgoingRadianceConfig
 from neilfpp_method.fields.encodings import direction_encoding, position_encoding
 from neilfpp_method.fields.mlp import Mlp
+from neilfpp_method.settings.types import OutgoingRadianceConfig
 
 __all__ = ["MID_GREY", "OutgoingRadianceField"]
 

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from neilfpp_method.config import SdfConfig
 from neilfpp_method.fields.encodings import position_encoding, pull_back
 from neilfpp_method.fields.mlp import Mlp, geometric_init_, weight_normalise_
+from neilfpp_method.settings.types import SdfConfig
 
 __all__ = ["SdfField", "SdfSample"]
 

@@ -14,13 +14,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor, nn
 
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.fields.background import field_beyond
 from neilfpp_method.fields.outgoing_radiance import MID_GREY, OutgoingRadianceField
 from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_tracer, meet, tree_tracer
 from neilfpp_method.hosts.smooth_normals import NEIGHBOURS, smooth_normals
 from neilfpp_method.schedule import FIXED_GEOMETRY
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import RayBatch, SceneLight, SurfaceHits
 

@@ -10,13 +10,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from neilfpp_method import losses
-from neilfpp_method.config import NeilfConfig, VolumeConfig
 from neilfpp_method.fields.background import field_beyond
 from neilfpp_method.fields.outgoing_radiance import MID_GREY, OutgoingRadianceField
 from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.base import RegularisedHits
 from neilfpp_method.hosts.smooth_normals import smooth_normals
-from neilfpp_method.kernels.process import half_precision
+from neilfpp_method.settings.types import NeilfConfig, VolumeConfig
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayBatch, SceneLight, SurfaceHits
 from neilfpp_method.volume.compositing import Weights, composite, depth_weights, sample_weights, share_near
@@ -194,7 +193,7 @@ class VolSdfHost(nn.Module):
         near, far = interval.near, interval.far
         if volume.sampler == "uniform":
             return uniform_samples(near, far, volume.samples, self.training)
-        with torch.no_grad(), half_precision(near.device, volume.queries == "rounded"):
+        with torch.no_grad():
             beta = self.density.beta()
             found = error_bounded_samples(self.sdf, rays.origins, rays.directions, near, far, beta, volume, self.training)
         return found.distances

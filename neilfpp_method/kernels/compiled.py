@@ -13,7 +13,6 @@ import inspect
 from collections.abc import Callable
 
 import numpy as np
-from llvmlite.ir import HalfType
 from numba import njit, types
 from numba.extending import intrinsic
 
@@ -24,7 +23,6 @@ __all__ = [
     "pull_to_points",
     "softplus",
     "softplus_and_slope",
-    "softplus_of_half",
     "sphere_trace",
 ]
 
@@ -260,26 +258,6 @@ def _from_bits(_context, _bits):
     return types.float32(types.int32), code
 
 
-@intrinsic
-def _from_half(_context, _bits):
-    """The number that a float16, written in these 16 bits, stands for."""
-
-    def code(context, builder, _signature, arguments):
-        return builder.fpext(builder.bitcast(arguments[0], HalfType()), context.get_value_type(types.float32))
-
-    return types.float32(types.int16), code
-
-
-@intrinsic
-def _to_half(_context, _number):
-    """The 16 bits of the nearest float16."""
-
-    def code(context, builder, _signature, arguments):
-        return builder.bitcast(builder.fptrunc(arguments[0], HalfType()), context.get_value_type(types.int16))
-
-    return types.int16(types.float32), code
-
-
 @compiled
 def _falling_exponential(t):
     """e^−t for t ≥ 0, to the last digit or two; t counts for FAINT at most.
@@ -312,17 +290,6 @@ def softplus(z, value, sharpness, start, stop):
     for n in range(len(z)):
         rest = _log_of_one_and(_falling_exponential(abs(z[n]) * sharp)) / sharp
         value[n] = rest + (z[n] if z[n] > 0 else np.float32(0))
-
-
-@compiled
-def softplus_of_half(z, value, sharpness, start, stop):
-    """The same for float16, whose bits z and value hold; computed in float32."""
-    sharp = np.float32(sharpness)
-    z, value = z[start:stop], value[start:stop]
-    for n in range(len(z)):
-        number = _from_half(z[n])
-        rest = _log_of_one_and(_falling_exponential(abs(number) * sharp)) / sharp
-        value[n] = _to_half(rest + (number if number > 0 else np.float32(0)))
 
 
 @compiled

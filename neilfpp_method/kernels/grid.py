@@ -13,8 +13,8 @@ from itertools import accumulate
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.config import HashGridConfig
 from neilfpp_method.errors import UserError
+from neilfpp_method.settings.types import HashGridConfig
 
 __all__ = ["Encoded", "GridSpec", "grid_spec"]
 

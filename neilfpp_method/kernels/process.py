@@ -1,6 +1,6 @@
-"""How a process computes: without denormal numbers, with memory that it keeps, with products of rounded factors.
+"""How a process computes: without denormal numbers, and with memory that it keeps.
 
-The first two are settings of the whole process, so a command makes them and a library does not. docs/performance.md has what
+Both are settings of the whole process, so a command makes them and a library does not. docs/performance.md has what
 they gain.
 """
 
@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 
 import torch
 
-__all__ = ["computing_fast", "half_precision", "has_half_units", "rounded_products"]
+__all__ = ["computing_fast"]
 
 # Options of glibc's allocator (malloc.h), and the values that it comes to by itself in a process with large arrays.
 TRIM_THRESHOLD, MMAP_THRESHOLD, MMAP_MAX = -1, -3, -4
@@ -34,32 +34,6 @@ def computing_fast() -> Iterator[None]:
         yield
     finally:
         _set(fast=False)
-
-
-@contextmanager
-def rounded_products(rounded: bool = True) -> Iterator[None]:
-    """Products of float32 matrices with rounded factors (bfloat16; TF32 on a GPU) and exact sums, where the machine has units
-    for that; elsewhere, and where `rounded` is off, all exact. Afterwards the process is as it was."""
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("medium" if rounded else before)
-    try:
-        yield
-    finally:
-        torch.set_float32_matmul_precision(before)
-
-
-def half_precision(device: torch.device, wanted: bool = True) -> AbstractContextManager:
-    """Linear layers in float16, eleven bits to a number, with sums in float32, where the device has units for that; elsewhere,
-    and where it is not wanted, as ever."""
-    return torch.autocast(device.type, torch.float16) if wanted and has_half_units(device.type) else nullcontext()
-
-
-def has_half_units(kind: str) -> bool:
-    """Whether devices of a kind ("cpu", "cuda") multiply matrices of float16 in units for that."""
-    if kind != "cpu":
-        return kind == "cuda"
-    known = getattr(torch.cpu, "get_capabilities", dict)()  # torch below 2.10 does not say
-    return bool(known.get("avx512_fp16") or known.get("amx_fp16"))
 
 
 def _set(fast: bool) -> None:

@@ -14,7 +14,6 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx
 from torch.nn import functional
 
-from neilfpp_method.kernels.process import has_half_units
 from neilfpp_method.kernels.threads import for_each, shares
 
 __all__ = ["UnitSample", "softplus", "softplus_and_slope"]
@@ -34,13 +33,12 @@ class UnitSample:
 def softplus(z: Float[Tensor, "*S"], sharpness: float) -> Float[Tensor, "*S"]:
     """ln(1 + e^(sharpness z)) / sharpness."""
     differentiated = torch.is_grad_enabled() and z.requires_grad
-    half = z.dtype == torch.float16 and has_half_units(z.device.type) and not differentiated
-    if not _takes(z, torch.float16 if half else torch.float32):
+    if not _takes(z):
         return functional.softplus(z, beta=sharpness)
     if differentiated:
         return _Softplus.apply(z, sharpness)[0]
     value = torch.empty_like(z, memory_format=torch.contiguous_format)
-    _run("softplus_of_half" if half else "softplus", sharpness, z, value)
+    _run("softplus", sharpness, z, value)
     return value
 
 
@@ -70,9 +68,9 @@ class _Softplus(torch.autograd.Function):
         return gradient, None
 
 
-def _takes(z: Tensor, dtype: torch.dtype = torch.float32) -> bool:
-    """Whether the loops take these numbers, and they are of that type; torch takes any."""
-    return z.device.type == "cpu" and z.dtype == dtype and _loops() is not None
+def _takes(z: Tensor) -> bool:
+    """Whether the loops take these numbers; torch takes any."""
+    return z.device.type == "cpu" and z.dtype == torch.float32 and _loops() is not None
 
 
 @lru_cache(maxsize=1)
@@ -89,5 +87,4 @@ def _run(loop: str, sharpness: float, *tensors: Tensor) -> None:
 
 
 def _flat(tensor: Tensor) -> np.ndarray:
-    flat = tensor.detach().contiguous().view(-1)
-    return (flat.view(torch.int16) if flat.dtype == torch.float16 else flat).numpy()
+    return tensor.detach().contiguous().view(-1).numpy()

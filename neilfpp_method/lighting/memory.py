@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from neilfpp_method.ring import Ring
+from neilfpp_method.lighting.ring import Ring
 from neilfpp_method.structures import Indexable
 
 __all__ = ["Observed", "SurfaceMemory"]

@@ -14,9 +14,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from neilfpp_method.config import LightFitConfig
 from neilfpp_method.lighting.sky import KnownSky
 from neilfpp_method.lighting.transport import Transport
+from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.shading.color import apply_response, response_slope
 from neilfpp_method.structures import Indexable, Material
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 
-from neilfpp_method.config import IncidentLightConfig
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.lighting.candidates import merge, propose
@@ -14,6 +13,7 @@ from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.settle import settle_lamps
 from neilfpp_method.lighting.sky import KnownSky
 from neilfpp_method.lighting.transport import from_lamps, from_texels
+from neilfpp_method.settings.types import IncidentLightConfig
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import Material, SceneTracer
 

@@ -7,12 +7,12 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.plugin.datamanager import CaptureDataManagerConfig
 from neilfpp_method.plugin.dataparser import CaptureParserConfig
 from neilfpp_method.plugin.model import FieldAdamConfig, NeilfMethodConfig
-from neilfpp_method.presets import fixed_geometry, preset
 from neilfpp_method.schedule import GEOMETRY, MATERIAL, stage_steps
+from neilfpp_method.settings.presets import fixed_geometry, preset
+from neilfpp_method.settings.types import NeilfConfig
 
 __all__ = ["neilfpp", "neilfpp_mesh"]
 

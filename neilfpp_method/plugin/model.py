@@ -18,7 +18,6 @@ from nerfstudio.utils import colormaps
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import metrics
@@ -26,8 +25,9 @@ from neilfpp_method.hosts.nerfstudio import OWN_LOSSES, NerfstudioHost
 from neilfpp_method.model import Maps, NeilfModel
 from neilfpp_method.plugin.datamanager import PIXELS, VALID, pixel_batch
 from neilfpp_method.plugin.foreign import build_foreign
-from neilfpp_method.presets import free_light, preset
 from neilfpp_method.schedule import Stage, active_losses, stage_at, stage_steps, weigh
+from neilfpp_method.settings.presets import free_light, preset
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.color import apply_response, tone_map
 from neilfpp_method.shading.sampling import sample_directions
 from neilfpp_method.structures import RayBatch

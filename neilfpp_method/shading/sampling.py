@@ -22,7 +22,6 @@ from torch import Tensor
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.brdf import Lobe, cosines
 from neilfpp_method.shading.frame import at_least_float32, dot, local_frame
-from neilfpp_method.shading.tabulated import DirectionTable
 from neilfpp_method.structures import IncidentSamples
 
 __all__ = [
@@ -34,9 +33,8 @@ __all__ = [
     "pdf_fibonacci",
     "pdf_specular_lobe",
     "sample_directions",
-    "shared_sphere",
     "specular_lobe",
-    "tabulated",
+    "sphere_lattice",
 ]
 
 GOLDEN_TURN = (3 - math.sqrt(5)) / 2
@@ -147,17 +145,6 @@ def specular_lobe(n: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"], roughness: 
     return Technique(draw, lambda wi: pdf_specular_lobe(wi, n, wo, roughness, lobe))
 
 
-def tabulated(table: DirectionTable, n: Float[Tensor, "N 3"]) -> Technique:
-    """Directions by a table, of each point or of all; some fall below the horizon of n."""
-    n = at_least_float32(n)
-
-    def draw(count: int, stochastic: bool) -> Float[Tensor, "N S 3"]:
-        lattice = _lattice(n, count, stochastic)
-        return table.draw(lattice.u, lattice.v)
-
-    return Technique(draw, table.pdf)
-
-
 # ------------------------------------------------------------------------------------------------------------- samplers
 
 
@@ -174,19 +161,11 @@ def combine(techniques: Sequence[tuple[Technique, int]], stochastic: bool) -> In
     return IncidentSamples(wi, pdf)
 
 
-def shared_sphere(like: Float[Tensor, "N 3"], count: int, stochastic: bool) -> IncidentSamples:
-    """One lattice over the whole sphere for all points, (1, count, 3): what depends on direction alone is asked once.
-
-    About half of it lies above the horizon of a point: `count` here is worth count/2 of `fibonacci`. With `stochastic` the
-    lattice is turned as a whole, evenly among all rotations. Its errors then agree between points, where those of lattices
-    of their own would not.
-    """
+def sphere_lattice(count: int, like: Tensor) -> Float[Tensor, "S 3"]:
+    """`count` directions spread evenly over the whole sphere, on the device and of the type of `like` (float32 at least)."""
     up = at_least_float32(like).new_tensor([[0.0, 0.0, 1.0]])
-    lattice = _lattice(up, count, stochastic)
-    wi = _about(up, 1 - 2 * lattice.u, lattice.v)
-    if stochastic:
-        wi = wi @ local_frame(_about(up, 1 - 2 * torch.rand_like(up[:, :1]), torch.rand_like(up[:, :1]))[:, 0])
-    return IncidentSamples(wi, torch.full_like(wi[..., 0], 1 / (4 * math.pi)))
+    lattice = _lattice(up, count, stochastic=False)
+    return _about(up, 1 - 2 * lattice.u, lattice.v)[0]
 
 
 def sample_directions(
@@ -199,16 +178,13 @@ def sample_directions(
     stochastic: bool,
     light: Technique | None = None,
 ) -> IncidentSamples:
-    """`count` incident directions per point, in at least float32, by fibonacci, cosine, lobe, mis or shared.
+    """`count` incident directions per point, in at least float32, by fibonacci, cosine, lobe or mis.
 
     mis is cosine and lobe by halves or, where there is a `light` that can be sampled, cosine, lobe and light together.
-    shared has `count` above the horizon of each point, of twice as many that all points share, (1, 2 · count, 3).
 
     Raises:
         UserError: there is no such sampler.
     """
-    if kind == "shared":
-        return shared_sphere(n, 2 * count, stochastic)
     if kind == "fibonacci":
         techniques = [(fibonacci(n), count)]
     elif kind == "cosine":
@@ -221,5 +197,5 @@ def sample_directions(
         techniques = [(cosine(n), count - to_lobe - to_light), (specular_lobe(n, wo, roughness, lobe), to_lobe)]
         techniques += [(light, to_light)] if light is not None else []
     else:
-        raise UserError(f"unknown sampler '{kind}'", "choose fibonacci, cosine, lobe, mis or shared")
+        raise UserError(f"unknown sampler '{kind}'", "choose fibonacci, cosine, lobe or mis")
     return combine(techniques, stochastic)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import torch
 
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.environment_map import read_environment
 from neilfpp_method.data.mesh import read_mesh
@@ -16,11 +15,12 @@ from neilfpp_method.data.point_cloud import load_point_cloud
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.errors import UserError
-from neilfpp_method.facts import SceneFacts
 from neilfpp_method.hosts.base import Host
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import OrientedPoints
 
 __all__ = ["build_model", "scene_facts", "show_known_light"]

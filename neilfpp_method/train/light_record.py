@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from neilfpp_method.config import IncidentLightConfig
-from neilfpp_method.config_json import from_dict
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.settings.plain import from_dict
+from neilfpp_method.settings.types import IncidentLightConfig
 from neilfpp_method.train.run import read_json, write_json
 
 __all__ = ["LightFit", "in_words", "note_fit", "read_fits", "write_fits"]

@@ -12,13 +12,12 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor
 
-from neilfpp_method.config import NeilfConfig, OptimizerConfig
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.errors import Diverged, Stopped, UserError
-from neilfpp_method.facts import RadianceUnits
-from neilfpp_method.kernels.process import rounded_products
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, stage_at, stage_steps, weigh
+from neilfpp_method.settings.facts import RadianceUnits
+from neilfpp_method.settings.types import NeilfConfig, OptimizerConfig
 from neilfpp_method.structures import LossTerms
 from neilfpp_method.train.light_record import LightFit, note_fit, read_fits, write_fits
 from neilfpp_method.train.progress import Reporter
@@ -110,8 +109,7 @@ def _update(
     """
     optimizer.zero_grad(set_to_none=True)
     if total.loss.requires_grad:
-        with rounded_products(run.config.train.gradients == "rounded"):
-            run.fabric.backward(total.loss)
+        run.fabric.backward(total.loss)
     norms = _gradient_norms(model)
     psnr = _psnr(terms, run.model.units)
     stop = torch.full_like(psnr, run.should_stop())

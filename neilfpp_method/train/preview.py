@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.images import read_image, write_png
 from neilfpp_method.data.pixels import pixel_colors
 from neilfpp_method.data.views import View, camera_rays
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.structures import RayBatch
 

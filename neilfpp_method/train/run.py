@@ -22,13 +22,13 @@ from typing import Any, TypeVar
 
 import torch
 
-from neilfpp_method.config import NeilfConfig
-from neilfpp_method.config_json import from_dict, to_dict
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.images import replacing
 from neilfpp_method.errors import UserError
-from neilfpp_method.facts import SceneFacts
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.plain import from_dict, to_dict
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model
 
 __all__ = [

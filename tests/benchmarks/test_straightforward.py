@@ -10,8 +10,8 @@ from torch.nn.functional import normalize
 
 from benchmarks.straightforward import straightforward
 from neilfpp_method.inter_reflection import trace_light
-from neilfpp_method.presets import paper_mlp
 from neilfpp_method.schedule import Stage
+from neilfpp_method.settings.presets import paper_mlp
 from neilfpp_method.structures import PixelBatch
 from tests.scenes import sphere_batch, sphere_model, tiny_config
 

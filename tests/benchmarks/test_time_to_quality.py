@@ -9,7 +9,7 @@ import torch
 
 from benchmarks import time_to_quality
 from benchmarks.time_to_quality import FIGURES, Curve, Mark, curve, table
-from neilfpp_method.demo import demo_scene
+from neilfpp_method.demo.command import demo_scene
 from tests.scenes import tiny_config
 
 

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 
-from benchmarks.light_fields import split
 from benchmarks.shading_samples import error_curves, scene_of, techniques
 from benchmarks.true_light import true_light
-from neilfpp_method.config import IncidentLightConfig
 from neilfpp_method.data.truth import LightField
-from neilfpp_method.fields.free_light import make_incident_light
 from neilfpp_method.shading.sampling import combine, fibonacci
 from neilfpp_method.structures import Material
 
@@ -47,16 +42,10 @@ def test_the_mean_over_the_hemisphere_is_that_of_the_truth():
     torch.testing.assert_close(light.radiance(few).mean(1), field.incident.mean(1), rtol=0.01, atol=0.01)
 
 
-def test_a_split_fits_nothing_of_what_is_left_out():
-    data = split(sky(8))
-    assert (data.points.sum(), data.directions.sum()) == (6, 3072)
-    assert len(data.fitted.grid) == 6
-
-
 @pytest.mark.parametrize("name", list(techniques()))
 def test_every_sampler_comes_near_the_reference(name):
     """Smooth light on a rough surface: 256 directions are right to some per cent, and more are better than few."""
-    scene = scene_of(sky(), make_incident_light(IncidentLightConfig(network="factorised"), math.e, 1.0))
+    scene = scene_of(sky())
     few, many = error_curves(scene, 1.0, {name: techniques()[name]}, counts=(8, 256))[name].y
     assert many < (0.6 if name == "lobe" else 0.1)  # a lobe alone seldom looks where the diffuse part does
     assert many < few

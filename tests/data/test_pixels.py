@@ -17,7 +17,7 @@ from neilfpp_method.data.drawing import ValidPixels
 from neilfpp_method.data.images import write_exr, write_png
 from neilfpp_method.data.lens import Lens
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.demo import demo_scene
+from neilfpp_method.demo.command import demo_scene
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.color import tone_map
 from tests.data.make_capture import RADIUS, SCALE, make_capture, radiance, srgb

@@ -25,8 +25,8 @@ from neilfpp_method.evaluate.protocols import confidence_metrics
 from neilfpp_method.evaluate.render_views import render_run
 from neilfpp_method.evaluate.sightings import TrainingViews
 from neilfpp_method.evaluate.views import known_test_views, render_test_views
-from neilfpp_method.facts import SceneFacts
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.structures import RayBatch, SurfaceHits
 from neilfpp_method.train.run import Run
 from tests.data.make_capture import RADIUS, SCALE, make_capture

@@ -16,8 +16,8 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.export import light as light_module
 from neilfpp_method.export.light import export_light
 from neilfpp_method.export.probes import spread, spread_over_surface
-from neilfpp_method.facts import SceneFacts
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.structures import OrientedPoints, RayBatch, SurfaceHits
 from neilfpp_method.train.run import Run
 from tests.data.make_capture import CENTRE, SCALE, make_capture

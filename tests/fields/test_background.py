@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from neilfpp_method.config import BackgroundConfig
 from neilfpp_method.fields.background import InvertedSphere
+from neilfpp_method.settings.types import BackgroundConfig
 
 CONFIG = BackgroundConfig(layers=2, width=16, samples=8)
 

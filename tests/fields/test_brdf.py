@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from neilfpp_method.config import BrdfConfig, HashGridConfig
 from neilfpp_method.fields.brdf import BrdfField
-from neilfpp_method.presets import preset
+from neilfpp_method.settings.presets import preset
+from neilfpp_method.settings.types import BrdfConfig, HashGridConfig
 
 GRID = HashGridConfig(levels=3, log2_entries=9, base_resolution=4, max_resolution=16)
 SMALL = {

@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy.special import roots_legendre, sph_harm_y
 
-from neilfpp_method.config import HashGridConfig
 from neilfpp_method.errors import UserError
 from neilfpp_method.fields.encodings import FrequencyEncoding, HashGrid, Raw, SphericalHarmonics, pull_back
+from neilfpp_method.settings.types import HashGridConfig
 
 GRID = HashGridConfig(levels=3, log2_entries=8, base_resolution=2, max_resolution=16)
 

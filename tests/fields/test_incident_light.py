@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from neilfpp_method.config import IncidentLightConfig
 from neilfpp_method.fields.incident_light import IncidentLightField
-from neilfpp_method.presets import preset
+from neilfpp_method.settings.presets import preset
+from neilfpp_method.settings.types import IncidentLightConfig
 
 
 def rays(points: int = 5, directions: int = 7) -> tuple[torch.Tensor, torch.Tensor]:
@@ -56,22 +56,6 @@ def test_directions_can_be_shared_between_points(shape):
     field.direction_part.register_forward_hook(lambda module, inputs, output: seen.append(output[..., 0].numel()))
     torch.testing.assert_close(field.radiance(x, wi[0].view(shape)), field.radiance(x, every))
     assert seen == [7, 35]
-
-
-@pytest.mark.parametrize("shared", [False, True])
-def test_only_the_pairs_that_are_asked_are_computed(shared):
-    field = IncidentLightField(preset("fast").light, 10.0, 1.0)
-    x, wi = rays()
-    asked = torch.rand(5, 7) > 0.6
-    expected = field.radiance(x, wi[:1] if shared else wi) * asked[..., None]
-    rows = []
-    field.tail.register_forward_hook(lambda module, inputs, output: rows.append(len(output)))
-    radiance = field.radiance(x, wi[:1] if shared else wi, asked)
-    torch.testing.assert_close(radiance, expected)
-    assert rows == [asked.sum().item()]
-    radiance.sum().backward()
-    assert field.position_part.weight.grad.abs().sum() > 0
-    assert not field.radiance(x, wi, torch.zeros_like(asked)).any()
 
 
 def test_monochrome_light_is_grey():

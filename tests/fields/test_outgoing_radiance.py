@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from neilfpp_method.fields.outgoing_radiance import OutgoingRadianceField
-from neilfpp_method.presets import preset
+from neilfpp_method.settings.presets import preset
 
 
 def inputs(feature_width: int) -> list[torch.Tensor]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from neilfpp_method.config import HashGridConfig, SdfConfig
 from neilfpp_method.fields.sdf import SdfField
-from neilfpp_method.presets import preset
+from neilfpp_method.settings.presets import preset
+from neilfpp_method.settings.types import HashGridConfig, SdfConfig
 
 GRID = HashGridConfig(levels=3, log2_entries=9, base_resolution=4, max_resolution=16)
 SMALL = {

@@ -9,7 +9,7 @@ from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.incident_light import IncidentLightField
 from neilfpp_method.fields.outgoing_radiance import OutgoingRadianceField
 from neilfpp_method.fields.sdf import SdfField
-from neilfpp_method.presets import preset
+from neilfpp_method.settings.presets import preset
 
 
 def linear(inputs: int, outputs: int) -> int:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
-from neilfpp_method.config import BackgroundConfig
 from neilfpp_method.fields.background import InvertedSphere
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.incident_light import IncidentLightField
 from neilfpp_method.fields.outgoing_radiance import OutgoingRadianceField
 from neilfpp_method.fields.sdf import SdfField
-from neilfpp_method.presets import preset
+from neilfpp_method.settings.presets import preset
+from neilfpp_method.settings.types import BackgroundConfig
 
 # The origin, faces, edges and corners of the scene cube, vertices of the grid, far outside, almost nothing.
 POSITIONS = torch.tensor(

@@ -7,17 +7,16 @@ import math
 import pytest
 import torch
 
-from neilfpp_method.config import IncidentLightConfig, LightFitConfig
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.fields.factorised_light import FactorisedLightField
 from neilfpp_method.fields.lamps import LampPlaces, Lamps
 from neilfpp_method.lighting.fit import Light, fit_light
 from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.transport import from_lamps, from_texels, in_sight, lamp_kernel
+from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.shading.brdf import GGX, SPHERICAL_GAUSSIAN
 from neilfpp_method.structures import Material
-from tests.hard_cases.test_fields import DTYPES, POSITIONS, assert_bounded, gradients
+from tests.hard_cases.test_fields import DTYPES, assert_bounded
 
 RADIUS = 0.06
 UP = torch.tensor([0.0, 0.0, 1.0])
@@ -77,16 +76,6 @@ def test_a_map_at_its_poles_and_at_its_seam(dtype, radiance):
     assert drawn.wi.dtype == dtype
     assert drawn.pdf.min() > 0
     assert_bounded(drawn.wi, drawn.pdf, sky.pdf(wi))
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_a_factorised_field(dtype):
-    torch.manual_seed(0)
-    field = FactorisedLightField(IncidentLightConfig(network="factorised", width=16, environment_height=8), 10.0, 1.0).to(dtype)
-    x = POSITIONS[:6].to(dtype).requires_grad_()
-    light = field.radiance(x, torch.cat((torch.eye(3), -torch.eye(3))).to(dtype))
-    assert light.min() > 0
-    assert_bounded(light, *gradients(light.sum(), field, x), bound=1e12)
 
 
 @pytest.mark.parametrize("pixel", [0.0, 1e6])

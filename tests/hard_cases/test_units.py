@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.images import read_image, write_exr
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.loop import Training, train
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import small_config, small_training, solved_light

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from neilfpp_method.config import VolumeConfig
+from neilfpp_method.settings.types import VolumeConfig
 from neilfpp_method.volume.compositing import composite, render_weights
 from neilfpp_method.volume.density import laplace_density
 from neilfpp_method.volume.intersect import sphere_interval

@@ -14,17 +14,17 @@ import trimesh
 from torch.nn.functional import normalize
 
 from neilfpp_method.cli import main
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.evaluate.report import write_report
-from neilfpp_method.facts import SceneFacts
 from neilfpp_method.hosts import mesh_tracing
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.hosts.mesh_tracing import build_tree, embree_tracer, tree_tracer
 from neilfpp_method.inter_reflection import trace_light
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.presets import PRESETS, fixed_geometry
 from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.presets import PRESETS, fixed_geometry
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.train.run import load_run
 from tests.data.make_capture import CENTRE, make_capture

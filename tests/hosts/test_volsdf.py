@@ -12,7 +12,6 @@ from torch.nn.functional import normalize
 from neilfpp_method.fields.sdf import SdfSample
 from neilfpp_method.hosts.base import HasParameterGroups, HasSurfaceWidth, Host, Regularised
 from neilfpp_method.hosts.volsdf import VolSdfHost
-from neilfpp_method.presets import preset
 from neilfpp_method.structures import OrientedPoints, RayBatch
 from neilfpp_method.volume.density import laplace_density
 from tests.scenes import sphere_batch, sphere_model, tiny_config
@@ -149,39 +148,3 @@ def test_a_cloud_on_the_surface_costs_little_and_one_off_it_its_distance():
 def test_the_background_field_moves_only_where_it_is_the_background():
     assert "background" in sphere_model(background="inverted_sphere").host.parameter_groups()
     assert "background" not in sphere_model(background="constant").host.parameter_groups()
-
-
-def test_rounded_queries_sample_the_same_surface():
-    """The paper's networks: what is rendered is exact, and where it is sampled moves by a small part of the surface's width.
-    Where the device has no units for half precision both are the same."""
-    config = preset("paper-mlp")
-    volume = dataclasses.replace(config.volume, beta_init=3e-3, initial_samples=64)
-    host = sphere_model(dataclasses.replace(config, volume=volume)).eval().host
-    rays = sphere_batch(24, spread=0.3).rays
-    asked = []
-    plain = host.sdf
-    host.sdf = lambda x: asked.append(plain(x)) or asked[-1]
-    with torch.no_grad():
-        exact = host.render(rays)
-        assert {answer.dtype for answer in asked} == {torch.float32}
-        host.config = dataclasses.replace(host.config, volume=dataclasses.replace(volume, queries="rounded"))
-        rounded = host.render(rays)
-    off = (exact.position - rounded.position).norm(dim=-1) / 3e-3
-    assert off.median() < 0.05
-    assert off.max() < 0.5
-    torch.testing.assert_close(rounded.color, exact.color, atol=2e-3, rtol=0.0)
-    assert (rounded.normal * exact.normal).sum(-1).min() > 0.9999
-    assert rounded.color.dtype == rounded.normal.dtype == torch.float32
-
-
-def test_gradients_do_not_pass_half_precision():
-    """Rounded queries are the sampler's alone: samples that enter the picture are evaluated as ever."""
-    config = preset("paper-mlp")
-    volume = dataclasses.replace(config.volume, initial_samples=32, rounds=1, samples=16, queries="rounded")
-    host = sphere_model(dataclasses.replace(config, volume=volume)).train().host
-    seen = []
-    honest = host.sdf_field.with_gradient
-    host.sdf_field.with_gradient = lambda x: seen.append(honest(x)) or seen[-1]
-    host.render(sphere_batch(8, spread=0.3).rays).color.sum().backward()
-    assert {(s.distance.dtype, s.gradient.dtype) for s in seen} == {(torch.float32, torch.float32)}
-    assert all(p.grad.dtype == torch.float32 for p in host.sdf_field.parameters())

@@ -22,7 +22,7 @@ from neilfpp_method.data.images import write_exr, write_png
 from neilfpp_method.inspection.findings import Inspection, inspect_capture
 from tests.data.make_capture import make_capture, srgb, write_ply
 
-SCENE = Path(neilfpp_method.__file__).parent / "demo_scene"
+SCENE = Path(neilfpp_method.__file__).parent / "demo" / "scene"
 VICTIM = 7
 
 

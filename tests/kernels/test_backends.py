@@ -17,10 +17,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neilfpp_method import kernels
-from neilfpp_method.config import HashGridConfig
 from neilfpp_method.errors import UserError
 from neilfpp_method.kernels import encode, function, grid_spec
 from neilfpp_method.kernels.threads import for_each, shares
+from neilfpp_method.settings.types import HashGridConfig
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 BACKEND = "triton" if INTERPRETED else "cpu"

@@ -14,9 +14,9 @@ import pytest
 import torch
 from torch.autograd import gradcheck, gradgradcheck
 
-from neilfpp_method.config import HashGridConfig
 from neilfpp_method.errors import UserError
 from neilfpp_method.kernels import encode, grid_spec
+from neilfpp_method.settings.types import HashGridConfig
 
 # Resolutions 2, 4, 9: 27 and 125 vertices fit into 128 entries, 1000 do not.
 SMALL = grid_spec(HashGridConfig(levels=3, features=2, log2_entries=7, base_resolution=2, max_resolution=9))

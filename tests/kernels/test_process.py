@@ -8,8 +8,6 @@ import sys
 import pytest
 import torch
 
-from neilfpp_method.kernels.process import half_precision, rounded_products
-
 SMALL = "import torch\nsmall = lambda: (torch.full((64,), 1e-38) * 0.01).count_nonzero().item()\n"
 RESIDENT = """
 import torch
@@ -47,7 +45,7 @@ def test_memory_that_is_freed_is_kept():
     ("words", "does"),
     [
         (["train", "--data", "x"], "train.command.run_training"),
-        (["demo"], "demo.run_demo"),
+        (["demo"], "demo.command.run_demo"),
         (["eval", "x"], "evaluate.protocols.evaluate"),
     ],
 )
@@ -68,44 +66,3 @@ print(small())
 """
     first, *_, last = say(program)  # between them a bar of progress
     assert (first, last) == ("0", "64")
-
-
-def product_error(rounded: bool) -> float:
-    """How far a product is from its value in float64, relative."""
-    generator = torch.Generator().manual_seed(0)
-    a, b = (torch.randn(256, 256, generator=generator) for _ in range(2))
-    with rounded_products(rounded):
-        product = a @ b
-    exact = a.double() @ b.double()
-    return ((product - exact).norm() / exact.norm()).item()
-
-
-def test_factors_are_rounded_where_that_is_asked_for_and_sums_are_not():
-    assert product_error(rounded=False) < 1e-6
-    # bfloat16 has 8 bits: two factors are 0.2 % off in the mean; sums of 8 bits would be several times that.
-    assert product_error(rounded=True) < 4e-3
-    assert product_error(rounded=False) < 1e-6  # and afterwards all is as before
-
-
-def test_rounding_ends_with_an_error():
-    before = torch.get_float32_matmul_precision()
-    with pytest.raises(KeyError), rounded_products():
-        raise KeyError(torch.get_float32_matmul_precision())
-    assert torch.get_float32_matmul_precision() == before
-
-
-@pytest.mark.parametrize("units", [True, False])
-@pytest.mark.parametrize("wanted", [True, False])
-def test_half_precision_is_taken_where_there_are_units_and_it_is_wanted(monkeypatch, units, wanted):
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_fp16": units}, raising=False)
-    x = torch.randn(4, 3)
-    with half_precision(torch.device("cpu"), wanted):
-        inside = torch.nn.functional.linear(x, x).dtype
-    assert inside == (torch.float16 if units and wanted else torch.float32)
-    assert torch.nn.functional.linear(x, x).dtype == torch.float32
-
-
-def test_half_precision_where_torch_does_not_say_what_there_is(monkeypatch):
-    monkeypatch.delattr(torch.cpu, "get_capabilities", raising=False)
-    with half_precision(torch.device("cpu")):
-        assert torch.ones(2, 2).matmul(torch.ones(2, 2)).dtype == torch.float32

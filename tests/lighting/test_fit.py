@@ -8,12 +8,12 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from neilfpp_method.config import LightFitConfig
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.fit import Evidence, Light, fit_light
 from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.lighting.objective import Objective, Target, nearest_points, total_variation, unevenness
 from neilfpp_method.lighting.transport import Transport, from_texels
+from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.shading.rendering_equation import shade
 from neilfpp_method.shading.sampling import sample_directions

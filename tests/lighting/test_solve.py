@@ -9,13 +9,13 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from neilfpp_method.config import IncidentLightConfig, LightFitConfig
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import LampPlaces, Lamps
 from neilfpp_method.lighting.candidates import merge, propose
 from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.lighting.solve import solve_light
 from neilfpp_method.lighting.transport import from_lamps, from_texels
+from neilfpp_method.settings.types import IncidentLightConfig, LightFitConfig
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.structures import Material
 from tests.lighting.surfaces import material, patches

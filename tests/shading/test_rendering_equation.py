@@ -8,7 +8,7 @@ import torch
 
 from neilfpp_method.shading.brdf import GGX, LOBES, SPHERICAL_GAUSSIAN, evaluate
 from neilfpp_method.shading.rendering_equation import shade
-from neilfpp_method.shading.sampling import combine, fibonacci, sample_directions, shared_sphere
+from neilfpp_method.shading.sampling import combine, fibonacci, sample_directions
 from neilfpp_method.structures import IncidentSamples, Material
 from tests import oracles
 
@@ -160,12 +160,3 @@ def test_half_precision_is_summed_in_float32():
         shading = shade(material, n, n, samples, light, GGX, specular=False)
     assert shading.color.dtype == torch.float32
     assert shading.color.allclose(torch.ones(1, 3), atol=1e-5)
-
-
-def test_shared_directions_shade_as_their_copies_do():
-    material, n, wo, _, _ = random_scene()
-    samples = shared_sphere(n, 64, stochastic=False)
-    light = sky(samples.wi)[..., None].expand(-1, -1, 3)
-    copies = IncidentSamples(samples.wi.expand(5, -1, -1), samples.pdf.expand(5, -1))
-    shared = shade(material, n, wo, samples, light, GGX)
-    assert shared.color.allclose(shade(material, n, wo, copies, light.expand(5, -1, -1), GGX).color)

@@ -10,8 +10,7 @@ import torch
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading import sampling
 from neilfpp_method.shading.brdf import GGX, LOBES, SPHERICAL_GAUSSIAN
-from neilfpp_method.shading.sampling import combine, fibonacci, sample_directions, shared_sphere, tabulated
-from neilfpp_method.shading.tabulated import DirectionTable
+from neilfpp_method.shading.sampling import Technique, combine, fibonacci, sample_directions, sphere_lattice
 from tests import oracles
 
 KINDS = ("fibonacci", "cosine", "lobe", "mis")
@@ -101,7 +100,7 @@ def test_samples_carry_no_gradient():
 
 
 def test_an_unknown_sampler_is_refused():
-    with pytest.raises(UserError, match="choose fibonacci, cosine, lobe, mis or shared"):
+    with pytest.raises(UserError, match="choose fibonacci, cosine, lobe or mis"):
         sample_directions("uniform", *points((0, 0, 1.0), (0, 0, 1.0), 1), 4, GGX, False)
 
 
@@ -109,10 +108,18 @@ def test_an_unknown_sampler_is_refused():
 
 
 def light_of(n):
-    """Light from one side, known on a table so coarse that its edges are edges of the χ² cells."""
-    weights = torch.zeros(1, 2, 4, dtype=n.dtype)
-    weights[0, 0, 3] = 1
-    return tabulated(DirectionTable(weights), n)
+    """Light from an eighth of the sphere, z > 0 and azimuths from 270° to 360°, whose edges are edges of the χ² cells."""
+
+    def draw(count, stochastic):
+        z, turn = torch.rand(2, len(n), count, dtype=n.dtype)
+        azimuth, sine = math.pi * (1.5 + 0.5 * turn), (1 - z * z).sqrt()
+        return torch.stack((sine * azimuth.cos(), sine * azimuth.sin(), z), -1)
+
+    def pdf(wi):
+        x, y, z = wi.unbind(-1)
+        return ((x > 0) & (y < 0) & (z > 0)) * (2 / math.pi)
+
+    return Technique(draw, pdf)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 9])
@@ -140,44 +147,17 @@ def test_the_density_of_mis_with_light_is_that_of_its_directions():
     assert result.total == pytest.approx(1, abs=1e-4)
 
 
-# ---------------------------------------------------------------------------------------------------- shared directions
+# ----------------------------------------------------------------------------------------------------- the whole sphere
 
 
-def test_shared_directions_are_spread_evenly():
-    torch.manual_seed(9)
-    like = torch.zeros(1, 3, dtype=torch.float64)
-
-    def draw():
-        return torch.cat([shared_sphere(like, 8, stochastic=True).wi[0] for _ in range(4_000)]).numpy()
-
-    result = oracles.chi2_test(draw, lambda wi: torch.full((len(wi),), 1 / (4 * math.pi)).numpy())
-    assert result.passed, result
-
-
-def test_shared_directions_count_those_above_the_horizon():
-    n, wo, r = points((0.6, 0.0, 0.8), (0.0, 0.0, 1.0), 5)
-    samples = sample_directions("shared", n, wo, r, 64, GGX, stochastic=False)
-    assert samples.wi.shape == (1, 128, 3)
-    assert ((samples.wi[0] @ n[0]) > 0).sum().item() == pytest.approx(64, abs=3)
-
-
-@pytest.mark.parametrize("stochastic", [False, True])
-def test_shared_directions_estimate_the_integral_of_each_point(stochastic):
+def test_a_lattice_of_the_sphere_is_spread_evenly():
     """∫ max(n·wi, 0) dwi = π about any n, from one set of directions; 4 % at 512 on the sphere."""
     torch.manual_seed(10)
     n = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
-    samples = shared_sphere(n, 512, stochastic)
-    assert samples.wi.shape == (1, 512, 3)
-    estimate = ((samples.wi[0] @ n.T).clamp_min(0).T / samples.pdf).mean(1)
+    wi = sphere_lattice(512, n)
+    assert wi.shape == (512, 3)
+    assert wi.norm(dim=-1).allclose(torch.ones(512, dtype=torch.float64))
+    estimate = 4 * math.pi * (n @ wi.T).clamp_min(0).mean(1)
     assert estimate.allclose(torch.full_like(estimate, math.pi), rtol=0.04)
-
-
-def test_one_rotation_turns_all_shared_directions():
-    """Angles between directions are those of the still lattice, up to the strata."""
-    torch.manual_seed(11)
-    like = torch.zeros(3, 3, dtype=torch.float64)
-    moved, again = (shared_sphere(like, 64, stochastic=True).wi[0] for _ in range(2))
-    assert moved.norm(dim=-1).allclose(torch.ones(64, dtype=torch.float64))
-    assert not moved.allclose(again)
-    nearest = (moved @ moved.T - 2 * torch.eye(64)).amax(1).clamp(-1, 1).acos()
-    assert nearest.min() > 0.05  # 64 independent directions come about as near as 0.03 in one of two draws
+    nearest = (wi @ wi.T - 2 * torch.eye(512)).amax(1).clamp(-1, 1).acos()
+    assert nearest.min() > 0.05  # 512 random directions come as near as 0.005

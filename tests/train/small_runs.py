@@ -9,10 +9,10 @@ import torch
 from lightning_fabric import Fabric
 from rich.console import Console
 
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.presets import preset
+from neilfpp_method.settings.presets import preset
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts
 from neilfpp_method.train.loop import Training, seed_step
 from neilfpp_method.train.progress import Reporter

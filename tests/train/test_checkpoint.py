@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.facts import SceneFacts
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.train.run import (
     FORMAT,
     CaptureSource,

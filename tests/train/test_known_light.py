@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from neilfpp_method.cli import main
-from neilfpp_method.config import IncidentLightConfig, LightFitConfig, NeilfConfig
 from neilfpp_method.data.images import read_image
 from neilfpp_method.errors import UserError
-from neilfpp_method.presets import PRESETS
+from neilfpp_method.settings.presets import PRESETS
+from neilfpp_method.settings.types import IncidentLightConfig, LightFitConfig, NeilfConfig
 from neilfpp_method.train.light_record import LightFit, in_words, read_fits, write_fits
 from neilfpp_method.train.run import load_run
 from tests.data.make_capture import make_capture

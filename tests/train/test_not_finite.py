@@ -13,7 +13,7 @@ import torch
 from neilfpp_method.cli import main
 from neilfpp_method.errors import Diverged
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.presets import PRESETS
+from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.structures import LossTerm
 from neilfpp_method.train import loop
 from neilfpp_method.train.loop import Training, train

@@ -19,8 +19,8 @@ import torch
 from rich.console import Console
 
 from neilfpp_method.cli import main
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.errors import Stopped, UserError
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train import loop
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.run import read_description

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from neilfpp_method.config import OptimizerConfig
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.model import CLEAR
-from neilfpp_method.presets import preset
 from neilfpp_method.schedule import Stage
+from neilfpp_method.settings.presets import preset
+from neilfpp_method.settings.types import OptimizerConfig
 from neilfpp_method.train.build import scene_facts
 from neilfpp_method.train.loop import make_optimizer, set_rates, train
 from tests.data.make_capture import make_capture

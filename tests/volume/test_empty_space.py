@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn.functional import normalize
 
-from neilfpp_method.config import VolumeConfig
+from neilfpp_method.settings.types import VolumeConfig
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume import empty_space
 from neilfpp_method.volume.compositing import depth_weights

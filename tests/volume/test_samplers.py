@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy.stats import chisquare, kstest, laplace
 
-from neilfpp_method.config import VolumeConfig
+from neilfpp_method.settings.types import VolumeConfig
 from neilfpp_method.volume import samplers
 from neilfpp_method.volume.compositing import render_weights
 from neilfpp_method.volume.density import laplace_density

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping
 
-from neilfpp_method.config import (
+from neilfpp_method.errors import UserError
+from neilfpp_method.settings.types import (
     BackgroundConfig,
     BrdfConfig,
     HashGridConfig,
@@ -21,7 +22,6 @@ from neilfpp_method.config import (
     TrainConfig,
     VolumeConfig,
 )
-from neilfpp_method.errors import UserError
 
 __all__ = ["PRESETS", "fixed_geometry", "free_light", "preset"]
 

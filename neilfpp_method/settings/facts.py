@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from neilfpp_method.config import NeilfConfig
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.color import apply_response, response_slope
 
 __all__ = ["RadianceUnits", "SceneFacts", "radiance_units"]

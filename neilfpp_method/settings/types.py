@@ -1,4 +1,4 @@
-"""Every setting, one dataclass per room; `presets.py` has the sets of them.
+"""Every setting, one dataclass per room; `settings.presets` has the sets of them.
 
 Lengths are in scene units (the object lies in the unit sphere). A setting with `kind`, `mode` or a `bool` is a switch: an
 effect that is switched off asks no network and traces no ray.
@@ -157,11 +157,6 @@ class IncidentLightConfig:
     before it are sought where `kind` says so."""
     fit: LightFitConfig = field(default_factory=LightFitConfig)
     """How the map is found."""
-    network: Literal["mlp", "factorised"] = "mlp"
-    """What a free field is. mlp: the paper's network. factorised: per colour the exponential of a dot product of a vector of
-    the position with one of the direction; pairs of a point and a direction then cost next to nothing."""
-    rank: int = 32
-    """Length of the vectors of a factorised field; its map of directions has `environment_height` rows."""
     activation: Literal["sine", "relu"] = "sine"
     """Hidden units; sine is SIREN's, with ω = 30."""
     direction_encoding: Literal["frequency", "spherical_harmonics"] = "frequency"
@@ -230,9 +225,6 @@ class VolumeConfig:
     """Most refinement rounds."""
     bisections: int = 10
     """Bisection steps on β."""
-    queries: Literal["exact", "rounded"] = "exact"
-    """The sampler's own queries, which say where a ray is sampled and nothing more. rounded: in half precision where the device
-    has units for that; distances are off by some 1e-4, so this is for β well above."""
     epsilon: float = 0.1
     """Bound on the opacity's error."""
     samples: int = 64
@@ -254,10 +246,9 @@ class ShadingConfig:
     """Distribution and masking of the specular lobe."""
     specular: bool = True
     """Off: a Lambertian surface; roughness and metallic are not asked for."""
-    sampler: Literal["fibonacci", "cosine", "lobe", "mis", "shared"] = "fibonacci"
+    sampler: Literal["fibonacci", "cosine", "lobe", "mis"] = "fibonacci"
     """Who draws the incident directions: the paper's lattice, a cosine, the specular lobe, or cosine, lobe and (where it can
-    be sampled) light together by the balance heuristic. shared: one lattice of the sphere for all points of a step, so
-    that a free field asks its part for directions once."""
+    be sampled) light together by the balance heuristic."""
     train_samples: int = 128
     """Incident directions per point in training."""
     eval_samples: int = 256
@@ -272,12 +263,6 @@ class InterReflectionConfig:
 
     mode: Literal["off", "soft", "hard"] = "soft"
     """soft: the paper's loss. hard: a direction that meets the scene brings R from there; only the others ask the light."""
-    unseen: Literal["radiance", "shaded"] = "radiance"
-    """What hard inter-reflection takes places to send that no camera has looked at. radiance: what R guesses. shaded: what
-    their material makes of the light that they get; the images of what they shine on then teach it."""
-    traced_share: float = 1.0
-    """Share of the incident directions of a step that hard inter-reflection traces. Below 1 it corrects what the light alone
-    would bring, without bias and with more noise: for hosts that trace by rendering. Evaluation traces all."""
     grid_resolution: int = 96
     """Vertices along an edge of the grid that hard inter-reflection traces in a distance field."""
     rays_per_point: float = 1.0
@@ -314,10 +299,6 @@ class LossConfig:
     inter_reflection: float = 0.1
     smoothness: float = 5e-4
     lambertian: float = 5e-4
-    energy: float = 0.0
-    """What a surface would send beyond the light that it gets."""
-    specular: float = 0.0
-    """How highlights change from view to view, beside how R does; the diffuse part takes itself out."""
     mask: float = 0.0
     """Opacity against the object mask, where the capture has masks or shows exactly its background."""
     hessian_method: Literal["analytic", "finite_difference"] = "analytic"
@@ -363,9 +344,6 @@ class TrainConfig:
     """Rays per step and process."""
     fresh: float = 1.0
     """Share of a step's rays that are rendered while the surface stands still; the other points are those of earlier steps."""
-    gradients: Literal["exact", "rounded"] = "exact"
-    """Products of matrices in backward passes. rounded: factors of bfloat16 with sums of float32, where the machine has units
-    for them; what a step renders, and its losses, stay exact."""
     seed: int = 0
     """Every random number of step k follows from seed and k alone."""
     checkpoint_every: int = 500

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from neilfpp_method import losses
-from neilfpp_method.facts import SceneFacts, radiance_units
-from neilfpp_method.presets import preset
+from neilfpp_method.settings.facts import SceneFacts, radiance_units
+from neilfpp_method.settings.presets import preset
 from neilfpp_method.shading.color import apply_response
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from neilfpp_method.lighting.memory import Observed
-from neilfpp_method.ring import Ring
+from neilfpp_method.lighting.ring import Ring
 
 __all__ = ["Replay", "SurfacePixels"]
 

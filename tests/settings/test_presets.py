@@ -7,11 +7,11 @@ import dataclasses
 import pytest
 import torch
 
-from neilfpp_method.facts import SceneFacts
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.presets import PRESETS, preset
 from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.presets import PRESETS, preset
 from neilfpp_method.structures import OrientedPoints
 from tests.scenes import sphere_batch
 

@@ -7,9 +7,9 @@ import dataclasses
 import pytest
 import torch
 
-from neilfpp_method import replay
+from neilfpp_method.lighting import replay
+from neilfpp_method.lighting.replay import Replay, SurfacePixels
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.replay import Replay, SurfacePixels
 from neilfpp_method.schedule import Stage
 from tests.scenes import sphere_batch, sphere_model, tiny_config
 from tests.test_model import count_queries

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from neilfpp_method.ring import Ring
+from neilfpp_method.lighting.ring import Ring
 
 
 def rows(*values: float) -> torch.Tensor:

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from neilfpp_method.config import NeilfConfig
 from neilfpp_method.evaluate.protocols import evaluate, write_metrics
 from neilfpp_method.evaluate.report import write_report
 from neilfpp_method.evaluate.views import render_test_views
-from neilfpp_method.presets import preset
+from neilfpp_method.settings.presets import preset
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.run import load_run, read_json
@@ -27,7 +27,7 @@ SHORT = 20
 
 def demo_scene() -> Path:
     """The capture in the package: a table top under three lamps, 24 views to learn from and 4 to test on."""
-    return Path(str(resources.files("neilfpp_method") / "demo_scene"))
+    return Path(str(resources.files("neilfpp_method.demo") / "scene"))
 
 
 def demo_config(short: bool) -> NeilfConfig:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from neilfpp_method.config import InterReflectionConfig, NeilfConfig
 from neilfpp_method.errors import UserError
+from neilfpp_method.settings.types import InterReflectionConfig, NeilfConfig
 
 __all__ = ["check_config"]
 
@@ -14,10 +14,8 @@ def check_config(config: NeilfConfig) -> None:
     Raises:
         UserError: a share that is none, or two settings that exclude each other.
     """
-    shares = {"train.fresh": config.train.fresh, "inter-reflection.traced-share": config.inter_reflection.traced_share}
-    for name, share in shares.items():
-        if not 0 < share <= 1:
-            raise UserError(f"--config.{name} is {share}", "set it above 0 and to 1 at most")
+    if not 0 < config.train.fresh <= 1:
+        raise UserError(f"--config.train.fresh is {config.train.fresh}", "set it above 0 and to 1 at most")
     _check_scene(config.inter_reflection, config.light.kind)
     if config.light.map is not None and config.light.kind == "free":
         raise UserError(
@@ -27,11 +25,6 @@ def check_config(config: NeilfConfig) -> None:
 
 
 def _check_scene(settings: InterReflectionConfig, light: str) -> None:
-    if settings.unseen == "shaded" and settings.mode != "hard":
-        raise UserError(
-            f"places that no camera sees are shaded, with inter-reflection '{settings.mode}'",
-            "set --config.inter-reflection.mode hard, or --config.inter-reflection.unseen radiance",
-        )
     if settings.mode == "soft" and light != "free":
         raise UserError(
             f"soft inter-reflection with the light '{light}', which L_ref cannot teach",

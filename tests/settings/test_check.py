@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 
 from neilfpp_method.attach import attach_neilf
-from neilfpp_method.config import NeilfConfig
-from neilfpp_method.config_check import check_config
 from neilfpp_method.errors import UserError
-from neilfpp_method.presets import PRESETS, fixed_geometry, free_light, preset
+from neilfpp_method.settings.check import check_config
+from neilfpp_method.settings.presets import PRESETS, fixed_geometry, free_light, preset
+from neilfpp_method.settings.types import NeilfConfig
 from tests.scenes import tiny_config
 
 
@@ -21,9 +21,7 @@ def with_setting(config: NeilfConfig, room: str, **settings: object) -> NeilfCon
 WRONG = {
     "no rays are fresh": (preset("fast"), "train", {"fresh": 0.0}, "train.fresh is 0"),
     "more than all are fresh": (preset("fast"), "train", {"fresh": 1.5}, "train.fresh is 1.5"),
-    "none is traced": (preset("fast"), "inter_reflection", {"traced_share": 0.0}, "traced-share is 0"),
     "a map that L_ref cannot teach": (preset("fast"), "inter_reflection", {"mode": "soft"}, "L_ref"),
-    "nothing meets what no camera sees": (preset("fast"), "inter_reflection", {"mode": "off", "unseen": "shaded"}, "no camera"),
     "a map for a light that has none": (preset("paper-mlp"), "light", {"map": "sky.exr"}, "takes no map"),
 }
 
@@ -43,6 +41,6 @@ def test_presets_and_what_is_made_of_them_pass(name):
 
 
 def test_attaching_asks_as_well():
-    config = with_setting(tiny_config(), "inter_reflection", traced_share=2.0)
-    with pytest.raises(UserError, match="traced-share is 2"):
+    config = with_setting(tiny_config(), "train", fresh=2.0)
+    with pytest.raises(UserError, match="fresh is 2"):
         attach_neilf(lambda origins, directions: (origins, origins, origins), config=config)
