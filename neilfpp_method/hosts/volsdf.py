@@ -27,6 +27,9 @@ from neilfpp_method.volume.samplers import error_bounded_samples, uniform_sample
 
 __all__ = ["VolSdfHost"]
 
+POINTS_ABOUT_OBJECT = 2
+"""Points for regularisers per ray in the cube about the object, beside one in the cube about the scene: 8192 and 4096 in
+the published code."""
 GRID_LIFE = 100
 """Steps in which the geometry moves before the distance grid is sampled again."""
 
@@ -38,6 +41,15 @@ class March:
     distances: Float[Tensor, "N M"]
     surface: SdfSample
     hits: SurfaceHits
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where the regularisers look: ∇G for L_Eik, G for L_surf, and points for L_Hess."""
+
+    gradient: Float[Tensor, "A 3"]
+    distance: Float[Tensor, " B"]
+    curved: Float[Tensor, "C 3"]
 
 
 class VolSdfHost(nn.Module):
@@ -237,13 +249,13 @@ class VolSdfHost(nn.Module):
     def _regularisers(self, march: March, batch: PixelBatch, names: Collection[str]) -> dict[str, LossTerm]:
         settings = self.config.loss
         terms = {}
+        places = self._places(march) if {"eikonal", "surface", "hessian"} & set(names) else None
         if "eikonal" in names:
-            terms["eikonal"] = losses.eikonal(march.surface.gradient)
+            terms["eikonal"] = losses.eikonal(places.gradient)
         if "surface" in names:
-            terms["surface"] = losses.surface(march.surface.distance, settings.surface_epsilon)
+            terms["surface"] = losses.surface(places.distance, settings.surface_epsilon)
         if "hessian" in names:
-            hessian = self.sdf_field.hessian(self._near_surface(march.hits), settings.hessian_method)
-            terms["hessian"] = losses.hessian(hessian)
+            terms["hessian"] = losses.hessian(self.sdf_field.hessian(places.curved, settings.hessian_method))
         if "point_cloud" in names and self.point_position is not None:
             rows = torch.randint(len(self.point_position), (len(batch),), device=self.point_position.device)
             sample = self.sdf_field.with_gradient(self.point_position[rows])
@@ -257,6 +269,16 @@ class VolSdfHost(nn.Module):
         distance = march.surface.distance.view_as(march.distances)
         return laplace_depth(distance, march.distances, self.density.beta().detach()).sum(-1)
 
-    def _near_surface(self, hits: SurfaceHits) -> Float[Tensor, "N 3"]:
-        """One point per ray, scattered about its hit: where second derivatives shape the surface."""
-        return hits.position.detach() + self.config.volume.hit_radius * torch.randn_like(hits.position)
+    def _places(self, march: March) -> Places:
+        """Where the regularisers of G look (`loss.points`)."""
+        position = march.hits.position.detach()
+        if self.config.loss.points == "rays":
+            near_surface = position + self.config.volume.hit_radius * torch.randn_like(position)
+            return Places(march.surface.gradient, march.surface.distance, near_surface)
+        about_object = torch.empty_like(position).repeat(POINTS_ABOUT_OBJECT, 1).uniform_(-1.0, 1.0)
+        anywhere = torch.empty_like(position).uniform_(-1.0, 1.0) * self.config.volume.radius
+        points = torch.cat((about_object, anywhere))
+        sample = self.sdf_field.with_gradient(points)
+        rays, count = march.distances.shape
+        one_of_ray = torch.arange(rays, device=points.device) * count + torch.randint(count, (rays,), device=points.device)
+        return Places(torch.cat((sample.gradient, march.surface.gradient[one_of_ray])), sample.distance, points)

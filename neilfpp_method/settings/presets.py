@@ -1,4 +1,4 @@
-"""The presets: the published settings, and one for a laptop."""
+"""The presets: the published settings (`docs/paper.md`), and one for a laptop."""
 
 from __future__ import annotations
 
@@ -23,25 +23,61 @@ from neilfpp_method.settings.types import (
     VolumeConfig,
 )
 
+SINE_FREQUENCY = 30.0
+"""ω of the sine layers sin(ω (W x + b)) of B and L. In the published code ω is part of W and b, so that a step of Adam there
+is one of 1/ω here."""
+
 __all__ = ["PRESETS", "fixed_geometry", "free_light", "preset"]
 
 
 def paper_mlp() -> NeilfConfig:
-    """The paper's MLP setting: 80k steps, 24 h on a V100."""
-    return NeilfConfig()
+    """The published MLP setting, for display images: 96k steps, 24 h on a V100. `docs/paper.md` has it line by line."""
+    return NeilfConfig(
+        preset="paper-mlp",
+        light=IncidentLightConfig(monochrome=True),
+        background=BackgroundConfig(kind="none"),
+        loss=LossConfig(points="scene", surface_epsilon=10.0, normal_gradient=0.1),
+        optimizer=OptimizerConfig(
+            brdf=1e-3 / SINE_FREQUENCY,
+            light=1e-3 / SINE_FREQUENCY,
+            joint=0.3,
+            final=(0.1, 1.0, 0.1),
+            drops=(1, 0, 1),
+        ),
+        train=TrainConfig(sdf_steps=8_000, material_steps=8_000, joint_steps=80_000),
+    )
 
 
 def paper_ngp() -> NeilfConfig:
-    """The paper's hash-grid setting: 30k steps, 4 h on a V100; it asks for a point cloud in SDF init."""
-    return NeilfConfig(
+    """The published hash-grid setting, for display images: 40k steps, 4 h on a V100; it asks for a point cloud."""
+    replace, mlp = dataclasses.replace, paper_mlp()
+    return replace(
+        mlp,
         preset="paper-ngp",
-        sdf=SdfConfig(encoding="hash", layers=2, width=64, skip=None, feature_width=15),
-        radiance=OutgoingRadianceConfig(encoding="hash", layers=4, width=64, direction_encoding="spherical_harmonics"),
-        brdf=BrdfConfig(encoding="hash", activation="relu", layers=2, width=64, skip=None),
-        light=IncidentLightConfig(activation="relu", direction_encoding="spherical_harmonics", direction_degree=5),
-        loss=LossConfig(point_cloud=0.1, position_gradient=0.0, normal_gradient=0.1, hessian_method="finite_difference"),
-        optimizer=OptimizerConfig(geometry=1e-2, radiance=1e-2, brdf=1e-2, light=1e-3, background=1e-3, beta=1e-3),
-        train=TrainConfig(sdf_steps=15_000, material_steps=7_500, joint_steps=7_500),
+        sdf=SdfConfig(encoding="hash", layers=2, width=64, skip=None, feature_width=64),
+        radiance=OutgoingRadianceConfig(layers=4, width=64, direction_encoding="spherical_harmonics"),
+        brdf=BrdfConfig(encoding="hash", activation="relu", layers=2, width=120, skip=None),
+        light=replace(mlp.light, activation="relu", direction_encoding="spherical_harmonics", direction_degree=4),
+        loss=replace(
+            mlp.loss, point_cloud=0.1, surface=1e-2, position_gradient=0.0, hessian_method="finite_difference"
+        ),
+        optimizer=OptimizerConfig(
+            *(6 * [1e-2]), joint=0.1, final=(0.1, 0.1, 0.01), drops=(1, 1, 2), warm_up=100
+        ),
+        train=TrainConfig(sdf_steps=5_000, material_steps=5_000, joint_steps=30_000),
+    )
+
+
+def paper_ngp_hdr() -> NeilfConfig:
+    """The published hash-grid setting for photographs of linear radiance with a background: 50k steps."""
+    replace, ngp = dataclasses.replace, paper_ngp()
+    return replace(
+        ngp,
+        preset="paper-ngp-hdr",
+        background=BackgroundConfig(kind="inverted_sphere", layers=2, width=64),
+        loss=replace(ngp.loss, surface=1e-3, smoothness=0.0, lambertian=0.0, position_gradient=0.1),
+        optimizer=replace(ngp.optimizer, final=(0.1, 0.1, 1e-3), drops=(1, 1, 3)),
+        train=replace(ngp.train, joint_steps=40_000),
     )
 
 
@@ -128,7 +164,12 @@ def fast() -> NeilfConfig:
     )
 
 
-PRESETS: Mapping[str, Callable[[], NeilfConfig]] = {"fast": fast, "paper-mlp": paper_mlp, "paper-ngp": paper_ngp}
+PRESETS: Mapping[str, Callable[[], NeilfConfig]] = {
+    "fast": fast,
+    "paper-mlp": paper_mlp,
+    "paper-ngp": paper_ngp,
+    "paper-ngp-hdr": paper_ngp_hdr,
+}
 
 
 def preset(name: str) -> NeilfConfig:
@@ -165,7 +206,7 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
     there are twice as many steps with a material. Rays through a mesh are cheap, so light is solved for more often.
     """
     replace, train = dataclasses.replace, config.train
-    return replace(
+    given = replace(
         config,
         preset=f"{config.preset}-mesh",
         host="mesh",
@@ -187,4 +228,20 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
             material_steps=2 * (train.material_steps + train.joint_steps),
             joint_steps=0,
         ),
+    )
+    return as_published_on_a_mesh(given) if config.preset.startswith("paper-") else given
+
+
+def as_published_on_a_mesh(config: NeilfConfig) -> NeilfConfig:
+    """What the published run on given geometry sets in its own way: light in colour, three stages at one rate, more rays."""
+    replace, sine = dataclasses.replace, config.brdf.activation == "sine"
+    slow = 2e-3 / SINE_FREQUENCY if sine else 2e-3
+    rates = replace(OptimizerConfig(*(6 * [2e-3])), brdf=slow, light=slow, final=(1.0, 1.0, 0.04), drops=(0, 0, 2))
+    return replace(
+        config,
+        light=replace(config.light, monochrome=False),
+        background=replace(config.background, kind="auto"),
+        loss=replace(config.loss, smoothness=5e-4, lambertian=5e-3, position_gradient=0.0, normal_gradient=0.0),
+        optimizer=rates,
+        train=replace(config.train, sdf_steps=5_000, material_steps=1_000, joint_steps=30_000, rays=8192),
     )

@@ -227,7 +227,7 @@ class VolumeConfig:
     """Bisection steps on β."""
     epsilon: float = 0.1
     """Bound on the opacity's error."""
-    samples: int = 64
+    samples: int = 98
     """Samples per ray that are rendered: two thirds where it is stopped, the rest spread between, both ends among them."""
     normal_radius: float = 0.0
     """Surfaces are shaded with the normal of a neighbourhood of this radius, edges kept; 0: with that of the hit alone."""
@@ -303,6 +303,9 @@ class LossConfig:
     """Opacity against the object mask, where the capture has masks or shows exactly its background."""
     hessian_method: Literal["analytic", "finite_difference"] = "analytic"
     """How second derivatives of G are taken."""
+    points: Literal["scene", "rays"] = "rays"
+    """Where L_Eik, L_Hess and L_surf look. scene: at points all over the scene, more of them about the object, and L_Eik at
+    one sample of each ray as well (published code). rays: at the samples of the rays, and L_Hess about their hits."""
     surface_epsilon: float = 0.05
     """Width of the smoothed delta of L_surf."""
     position_gradient: float = 0.1
@@ -313,18 +316,22 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """Adam, one learning rate per field; each falls exponentially to `final` of its start over a stage."""
+    """Adam, one learning rate per field, which falls in the course of each stage."""
 
-    geometry: float = 5e-4
-    radiance: float = 5e-4
-    brdf: float = 5e-4
-    light: float = 5e-4
-    background: float = 5e-4
-    beta: float = 5e-4
-    joint: float = 0.5
+    geometry: float = 1e-3
+    radiance: float = 1e-3
+    brdf: float = 1e-3
+    light: float = 1e-3
+    background: float = 1e-3
+    beta: float = 1e-3
+    joint: float = 1.0
     """Factor on all rates in the joint stage."""
-    final: float = 0.1
-    """Rate at the end of a stage over its start."""
+    final: tuple[float, float, float] = (0.1, 0.1, 0.1)
+    """Rate at the end of each of the three stages over its start."""
+    drops: tuple[int, int, int] = (0, 0, 0)
+    """In how many equal steps, evenly spaced, the rate falls in each stage; 0: exponentially all along."""
+    warm_up: int = 0
+    """Steps at the start of each stage in which the rate rises from a tenth."""
     background_from: float = 0.0
     """Share of SDF init that is over when the field beyond the scene starts to move. Until then it is the colour that it starts
     as, so that what lies within the scene is made of surfaces: a field that is seen from everywhere can paint it as well."""
@@ -358,7 +365,7 @@ class TrainConfig:
 class NeilfConfig:
     """Everything that decides a run, besides the capture."""
 
-    preset: str = "paper-mlp"
+    preset: str = "custom"
     """The preset that the settings started from; a label."""
     host: Literal["volsdf", "mesh"] = "volsdf"
     """Where geometry comes from: volsdf trains a distance field; mesh takes triangles as they are."""

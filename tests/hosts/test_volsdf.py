@@ -115,6 +115,27 @@ def test_only_the_named_losses_are_computed(sharp):
     assert sharp.render_regularised(batch, []).terms == {}
 
 
+def test_regularisers_look_all_over_the_scene():
+    """On G = c · x the losses are known at any place, so what is averaged, and how often, shows where they look."""
+    config = tiny_config()
+    config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, points="scene", surface_epsilon=10.0))
+    host, batch, asked = sphere_model(config).train().host, sphere_batch(16), []
+    slope = torch.tensor([0.0, 0.0, 2.0])
+    host.sdf_field.with_gradient = lambda x: asked.append(x) or SdfSample(
+        x @ slope, slope.expand_as(x), torch.zeros(len(x), 4)
+    )
+    host.sdf_field.hessian = lambda x, method: asked.append(x) or torch.zeros(len(x), 3, 3)
+    terms = host.render_regularised(batch, ["eikonal", "surface", "hessian"]).terms
+    _, points, curved = asked
+    assert points is curved
+    assert points.shape == (3 * 16, 3)  # 8192 about the object and 4096 in the scene for 4096 rays
+    assert points[:32].abs().max() <= 1.0
+    assert 1.0 < points[32:].abs().max() <= config.volume.radius
+    assert terms["eikonal"].values.shape == (4 * 16,)  # one sample of each ray as well
+    assert terms["eikonal"].mean().item() == pytest.approx(1.0)
+    torch.testing.assert_close(terms["surface"].values, 10.0 / (torch.pi * (100.0 + (points @ slope) ** 2)))
+
+
 @pytest.mark.parametrize("background", ["constant", "none"])
 def test_a_mask_removes_a_solid_that_stands_in_empty_space(background):
     """No ray comes through, so opacity has no slope; the surface must give way all the same, and not by getting foggy."""
