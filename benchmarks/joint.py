@@ -106,7 +106,7 @@ def step_on(model: NeilfModel, batch: PixelBatch) -> Callable[[], None]:
 
     def step() -> None:
         optimizer.zero_grad(set_to_none=True)
-        loss = weigh(model(batch, Stage.JOINT), weights).loss
+        loss = weigh(model.losses(batch, Stage.JOINT), weights).loss
         loss.backward()
         optimizer.step()
 

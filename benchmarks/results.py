@@ -130,7 +130,7 @@ def branch(trunk: Path, out: Path, config: NeilfConfig) -> None:
     # So far only the host has moved: its moments are all that the optimiser knows, and its parameters come first.
     optimizer.load_state_dict(optimizer.state_dict() | {"state": saved["optimizer"]["state"]})
     create_run(out, config, described.source, described.facts)
-    save_checkpoint(out / "checkpoints" / "last.pt", model, optimizer, saved["step"])
+    save_checkpoint(out / "checkpoints" / "last.pt", model, model.light_solver(), optimizer, saved["step"])
     write_json(out / "timing.json", {"sdf_init": read_json(trunk / "timing.json")["sdf_init"]})
 
 

@@ -33,7 +33,7 @@ from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.shading.brdf import SPHERICAL_GAUSSIAN
 from neilfpp_method.shading.rendering_equation import shade
 from neilfpp_method.shading.sampling import Technique, combine, cosine, sample_directions, specular_lobe
-from neilfpp_method.structures import IncidentSamples, Material
+from neilfpp_method.structures import Incident, IncidentSamples, Material
 
 __all__ = ["Scene", "error_curves", "measurements", "scene_of", "techniques"]
 
@@ -70,7 +70,7 @@ class Scene:
         """The estimate of the outgoing radiance of a surface with this roughness."""
         even = torch.full_like(self.material.roughness, roughness)
         material = Material(self.material.base_color, even, self.material.metallic)
-        return shade(material, self.normal, self.wo, samples, self.light.radiance(samples.wi), LOBE).color
+        return shade(material, self.normal, self.wo, Incident.of(samples, self.light.radiance(samples.wi)), LOBE).color
 
     def lobe(self, roughness: float) -> Technique:
         even = torch.full_like(self.material.roughness, roughness)

@@ -70,7 +70,7 @@ def step_of(model: NeilfModel, stage: Stage, rays: int = RAYS) -> Callable[[], N
     def step() -> None:
         seed_step(0, 1)
         model.freeze_for(stage)
-        total = weigh(model(batch, stage), weights)
+        total = weigh(model.losses(batch, stage), weights)
         optimizer.zero_grad(set_to_none=True)
         total.loss.backward()
         optimizer.step()
@@ -80,7 +80,7 @@ def step_of(model: NeilfModel, stage: Stage, rays: int = RAYS) -> Callable[[], N
 
 def warm_up(model: NeilfModel, step: Callable[[], None]) -> None:
     """Take steps of a material stage until it renders no more than it does in the long run."""
-    while model.replay is not None and model.replay.share == 1.0:
+    while model.replay.share > model.replay.fresh:
         step()
 
 

@@ -107,6 +107,10 @@ class PlainLight(nn.Module):
         points = x[:, None].expand_as(wi).reshape(-1, 3)
         return self.field.radiance(points, wi.reshape(-1, 1, 3)).view(wi.shape)
 
+    def technique(self, normal: Float[Tensor, "N 3"]) -> None:
+        """None: a network cannot be sampled."""
+        return None
+
 
 class PlainHost(VolSdfHost):
     """VolSDF with its sampler as published: a batch of rays takes a round more as long as one of them asks for it."""

@@ -27,6 +27,7 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.evaluate.protocols import image_metrics, material_metrics
 from neilfpp_method.evaluate.views import known_test_views, render_test_views
 from neilfpp_method.kernels.process import computing_fast
+from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import active_losses, stage_at, stage_steps, weigh
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
@@ -115,11 +116,11 @@ def curve(root: Path, config: NeilfConfig, cap: float, first: float, views: int,
 
 
 def _training(
-    model: torch.nn.Module, pixels: PixelDataset, config: NeilfConfig, device: torch.device
+    model: NeilfModel, pixels: PixelDataset, config: NeilfConfig, device: torch.device
 ) -> Iterator[tuple[int, float]]:
     """The steps of all stages as `train.loop` takes them, with nothing kept: how many are done, and the last one's seconds."""
     now = clock(device)
-    optimizer = make_optimizer(model, config.optimizer)
+    optimizer, solver = make_optimizer(model, config.optimizer), model.light_solver().to(device)
     for step in range(sum(stage_steps(config.train).values())):
         began = now()
         position = stage_at(step, config.train)
@@ -128,9 +129,11 @@ def _training(
         seed_step(config.train.seed, step)
         set_rates(optimizer, config.optimizer, position)
         optimizer.zero_grad(set_to_none=True)
-        terms = model(pixels.sample(config.train.rays), position.stage)
-        weigh(terms, active_losses(position.stage, config, model.stages, position.share)).loss.backward()
+        computed = model.step(pixels.sample(config.train.rays), position.stage)
+        weigh(computed.terms, active_losses(position.stage, config, model.stages, position.share)).loss.backward()
         optimizer.step()
+        solver.observe(computed)
+        solver.solve(model.brdf, model.scene)
         yield step + 1, now() - began
 
 

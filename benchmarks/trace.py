@@ -16,7 +16,7 @@ from benchmarks.joint import rays_at_the_table
 from benchmarks.measure import Measurement, median_seconds
 from benchmarks.sampler import table_host
 from neilfpp_method.hosts.volsdf import VolSdfHost
-from neilfpp_method.inter_reflection import TracedLight, trace_light
+from neilfpp_method.incident.traced import TracedLight, trace_light
 from neilfpp_method.kernels.process import computing_fast
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.structures import RayBatch

@@ -25,9 +25,10 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.protocols import light_metrics
 from neilfpp_method.evaluate.views import known_test_views, render_test_views
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.lighting.memory import Observed
+from neilfpp_method.fields.light import LightModel
+from neilfpp_method.lighting.objective import Objective
 from neilfpp_method.lighting.solve import solve_light
-from neilfpp_method.structures import Material
+from neilfpp_method.structures import Material, Observed
 from neilfpp_method.train.run import Run, load_run
 
 MAPS = ("base_color", "roughness", "metallic")
@@ -80,14 +81,12 @@ def solve_under_truth(run: Run, known: Known, fits: int) -> None:
     # The base colour is no unknown here.
     settings = dataclasses.replace(settings, fit=dataclasses.replace(settings.fit, evenness=0.0))
     model.light.log_radiance.fill_(math.log(model.facts.median_radiance / 0.3))
-    if model.lamps is not None:
-        model.lamps.lit = 0
-    lobe = model.lobe if run.config.shading.specular else None
+    model.lamps.lit = 0
+    light, objective = LightModel(model.light, model.lamps), Objective(model.facts.response, model.units.physical, settings.fit)
     for _ in range(fits):
         rows = torch.randperm(len(known.seen.position))[: settings.fit.points]
         seen, material = known.seen[rows], known.material[rows]
-        scene, response, unit = model._scene_light, model.facts.response, model.units.physical
-        solve_light(model.light, model.lamps, seen, material, lobe, scene, response, unit, settings, first=False)
+        solve_light(light, seen, material, model.lobe, model.scene, objective, settings, first=False)
 
 
 def line(run: Run, title: str) -> str:
@@ -99,7 +98,7 @@ def line(run: Run, title: str) -> str:
     figures = light_metrics(run, field, truth.mesh())
     text = f"{title:>22}: " + ", ".join(f"{name.removeprefix('incident_light_')} {x:.3f}" for name, x in figures.items())
     lamps = run.model.lamps
-    for k in range(0 if lamps is None else lamps.lit):
+    for k in range(lamps.lit):
         place = run.capture.normalisation.to_world(lamps.position[k]).tolist()
         text += "\n" + 24 * " " + "lamp at " + ", ".join(f"{x:.2f}" for x in place)
         text += "; axis " + ", ".join(f"{x:.2f}" for x in lamps.axis[k].tolist())

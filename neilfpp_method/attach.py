@@ -88,12 +88,14 @@ class AttachedNeilf(nn.Module):
 
     Attributes:
         model: the method itself; `model.maps(rays)` gives every map of a view.
+        light_solver: remembers what steps showed, and solves for the light now and then.
         missing: the optional methods that the host does not have, and what is lost without each.
     """
 
     def __init__(self, model: NeilfModel) -> None:
         super().__init__()
         self.model = model
+        self.light_solver = model.light_solver()
         self.missing = missing_capabilities(model.host)
 
     def forward(self, batch: PixelBatch, step: int | Stage) -> Total:
@@ -114,11 +116,14 @@ class AttachedNeilf(nn.Module):
         if place != own:
             raise UserError(f"rays on {place}, material and light on {own}", "move one of them: neilf.to(device)")
         position = StagePosition(step, 0, 1) if isinstance(step, Stage) else stage_at(step, self.model.config.train)
-        terms = self.model(batch, position.stage)
-        if not terms:
+        computed = self.model(batch, position.stage)
+        if not computed.terms:
             # A loop without a loss of its own may still call backward.
             return Total(torch.zeros((), device=place, requires_grad=True), {})
-        return weigh(terms, active_losses(position.stage, self.model.config, self.model.stages, position.share))
+        if self.training:
+            self.light_solver.observe(computed)
+            self.light_solver.solve(self.model.brdf, self.model.scene)
+        return weigh(computed.terms, active_losses(position.stage, self.model.config, self.model.stages, position.share))
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
         """The parameters by field, for a learning rate each (`config.optimizer`)."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from enum import IntEnum
 from typing import NamedTuple, TypeVar
 
 import torch
@@ -15,19 +16,28 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 __all__ = [
+    "PDF_FLOOR",
+    "Incident",
     "IncidentSamples",
     "Indexable",
     "LossTerm",
     "LossTerms",
     "Material",
+    "Observed",
     "OrientedPoints",
     "PixelBatch",
     "RayBatch",
     "SceneLight",
     "SceneTracer",
     "Shading",
+    "Source",
+    "StepResult",
     "SurfaceHits",
+    "SurfacePixels",
 ]
+
+PDF_FLOOR = 1e-6
+"""Smallest density divided by, per steradian. Less than 2π · 1e-6 of a sampler's directions lie where it acts."""
 
 Structure = TypeVar("Structure", bound="Indexable")
 
@@ -135,6 +145,40 @@ class IncidentSamples(Indexable):
     pdf: Float[Tensor, "N S"]
 
 
+class Source(IntEnum):
+    """Where incident light comes from, as `Incident.source` numbers it; lamp k is `LAMPS` + k."""
+
+    LIGHT = 0
+    SCENE = 1
+    LAMPS = 2
+
+
+@dataclass(frozen=True)
+class Incident(Indexable):
+    """Light that arrives at N points along S directions.
+
+    `radiance` is linear; `weight` is the solid angle that a direction stands for, steradians, so that the sum over S of
+    weight · radiance · f · cos is the estimate of the rendering equation; `source` is a `Source`, or more for a lamp.
+    """
+
+    wi: Float[Tensor, "N S 3"]
+    radiance: Float[Tensor, "N S 3"]
+    weight: Float[Tensor, "N S"]
+    source: Int[Tensor, "N S"]
+
+    @staticmethod
+    def of(drawn: IncidentSamples, radiance: Float[Tensor, "#N S 3"], source: Int[Tensor, "N S"] | None = None) -> Incident:
+        """What arrives along drawn directions: each stands for 1/(S · pdf). No `source`: all comes from the light."""
+        weight = 1 / (drawn.pdf.clamp_min(PDF_FLOOR) * drawn.pdf.shape[1])
+        if source is None:
+            source = torch.zeros((), dtype=torch.long, device=weight.device).expand(weight.shape)
+        return Incident(drawn.wi, radiance, weight, source)
+
+    def beside(self, other: Incident) -> Incident:
+        """The directions of both."""
+        return Incident(*(torch.cat((getattr(self, f.name), getattr(other, f.name)), 1) for f in fields(self)))
+
+
 @dataclass(frozen=True)
 class Shading(Indexable):
     """Outgoing radiance of a point towards the viewer, and its two parts: `color` = `diffuse` + `specular`."""
@@ -176,3 +220,55 @@ class LossTerm(NamedTuple):
 
 
 LossTerms = Mapping[str, LossTerm]
+
+
+@dataclass(frozen=True)
+class Observed(Indexable):
+    """Surface points and what an image holds of each: `pixel` in the capture's response, `wo` towards the camera."""
+
+    position: Float[Tensor, "N 3"]
+    normal: Float[Tensor, "N 3"]
+    wo: Float[Tensor, "N 3"]
+    pixel: Float[Tensor, "N 3"]
+
+
+@dataclass(frozen=True)
+class SurfacePixels(Observed):
+    """Surface points, what an image holds of each, and how fast that changes from pixel to pixel."""
+
+    image_gradient: Float[Tensor, " N"]
+
+    @staticmethod
+    def none_of(batch: PixelBatch) -> SurfacePixels:
+        """No points, on the device of a batch."""
+        nothing = batch.color[:0]
+        return SurfacePixels(nothing, nothing, nothing, nothing, batch.image_gradient[:0])
+
+
+class StepResult(NamedTuple):
+    """What a training step computed: its losses, and constants for those who solve for the light.
+
+    Wrappers of data-parallel training change no frozen dataclass, so points and pixels travel as the rows of tensors.
+
+    Attributes:
+        terms: the losses that count in the stage, before their weights.
+        surface_rows: position, normal, wo and pixel of the surface points that the step rendered; none before the material
+            stages.
+        beyond_rows: direction and pixel of the rays that pass the scene by; none before the material stages.
+    """
+
+    terms: LossTerms
+    surface_rows: Float[Tensor, "P 12"]
+    beyond_rows: Float[Tensor, "Q 6"]
+
+    @staticmethod
+    def of(terms: LossTerms, surface: Observed, beyond: PixelBatch) -> StepResult:
+        """The result of a step that rendered these surface points, and these pixels beyond the scene."""
+        points = (surface.position, surface.normal, surface.wo, surface.pixel)
+        pixels = (beyond.directions, beyond.color)
+        return StepResult(terms, torch.cat(points, -1).detach(), torch.cat(pixels, -1))
+
+    @property
+    def surface(self) -> Observed:
+        """The surface points that the step rendered, as they are shaded."""
+        return Observed(*self.surface_rows.split(3, -1))

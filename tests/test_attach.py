@@ -166,8 +166,8 @@ def test_in_an_open_scene_rays_that_meet_nothing_show_its_light():
     assert 0 < missed < len(batch)
     neilf = attach_neilf(mesh_host(SPHERE), config, open_scene=True).train()
     neilf.losses(batch, Stage.MATERIAL_INIT)
-    assert neilf.model.seen_sky.pixels.sum() == missed
-    assert attach_neilf(mesh_host(SPHERE), config).model.seen_sky is None
+    assert neilf.light_solver.sky.pixels.sum() == missed
+    assert attach_neilf(mesh_host(SPHERE), config).light_solver.sky is None
 
 
 def test_shading_is_that_of_the_maps_and_nothing_where_nothing_is_hit():

@@ -12,7 +12,7 @@ import torch
 from neilfpp_method import losses
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.base import LightsItself
-from neilfpp_method.inter_reflection import trace_light
+from neilfpp_method.incident.traced import trace_light
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.facts import SceneFacts

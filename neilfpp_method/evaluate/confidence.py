@@ -21,8 +21,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from neilfpp_method.data.views import camera_rays
-from neilfpp_method.evaluate.arriving import PATCHES, arriving_light, by_patch, patch_count
 from neilfpp_method.evaluate.looks import possible_looks, sent_by_patch
+from neilfpp_method.evaluate.patches import PATCHES, by_patch, light_by_patch, patch_count
 from neilfpp_method.evaluate.posterior import Deviation, Sights, expected_error, guessed_error
 from neilfpp_method.evaluate.sightings import Sightings, TrainingViews
 from neilfpp_method.evaluate.views import RenderedView
@@ -96,11 +96,11 @@ def gather_evidence(run: Run) -> Evidence:
             continue
         position, normal, seen = hits.position[rows], normal[rows], seen[rows]
         material = model.materials(position)
-        arriving = arriving_light(model, position, normal, seen.wo, material)
-        error = _relative_error(model, sent_by_patch(model, arriving, material, normal, seen.wo).sum(-1), seen)
+        incident = light_by_patch(model, position, normal, seen.wo, material)
+        error = _relative_error(model, sent_by_patch(model, incident, material, normal, seen.wo).sum(-1), seen)
         errors.append(error[seen.seen].abs().flatten())
         misfits.append(_mean_over_looks(error.square(), seen).sqrt())
-        parts = by_patch(arriving.light, arriving.patch, patch_count(model))
+        parts = by_patch(incident.light, incident.patch, patch_count(model))
         shares.append(parts / parts.sum(-1, keepdim=True).clamp_min(TINY))
     if not errors:
         return Evidence(views, 1.0, 1.0, views.centres.new_zeros(3, patch_count(model)))
@@ -187,14 +187,14 @@ def _deviation(
 ) -> Deviation:
     """Of points that are treated together."""
     material = model.materials(position)
-    arriving = arriving_light(model, position, normal, seen.wo, material)
-    sent = sent_by_patch(model, arriving, material, normal, seen.wo)
+    incident = light_by_patch(model, position, normal, seen.wo, material)
+    sent = sent_by_patch(model, incident, material, normal, seen.wo)
     deviations = _light_deviations(model).to(sent)
     peculiar = sent - sent.sum(-1, keepdim=True) * evidence.typical
     outside = torch.cat((peculiar[..., :PATCHES], peculiar[..., 2 * PATCHES :]), -1).sum(-1, keepdim=True)
     shared = torch.cat((peculiar * deviations[:-1], outside * deviations[-1]), -1)
     sights = Sights(seen.seen, _to_radiance(model, seen.pixel), evidence.noise * _unit_error(model, seen.pixel), shared)
-    looks = possible_looks(model, arriving, normal, seen.wo)
+    looks = possible_looks(model, incident, normal, seen.wo)
     deviation = expected_error(looks, sights, material, model.config.shading.specular)
     return _widened(deviation, guessed_error(material), _birge_ratio(model, evidence, sent.sum(-1), seen))
 

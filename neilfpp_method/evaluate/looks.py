@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.evaluate.arriving import Arriving, by_patch, patch_count
+from neilfpp_method.evaluate.patches import PatchLight, by_patch, patch_count
 from neilfpp_method.evaluate.posterior import ROUGHNESS_NODES, Looks
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading.brdf import Cosines, cosines, diffuse_reflectance, normal_reflectance
@@ -19,7 +19,7 @@ __all__ = ["possible_looks", "sent_by_patch"]
 
 @torch.no_grad()
 def sent_by_patch(
-    model: NeilfModel, arriving: Arriving, material: Material, normal: Float[Tensor, "N 3"], wo: Float[Tensor, "N V 3"]
+    model: NeilfModel, incident: PatchLight, material: Material, normal: Float[Tensor, "N 3"], wo: Float[Tensor, "N V 3"]
 ) -> Float[Tensor, "N V 3 K"]:
     """The radiance that leaves each point towards each viewer, by the patch that it came from."""
     specular, patches = model.config.shading.specular, patch_count(model)
@@ -28,24 +28,24 @@ def sent_by_patch(
     for direction in wo.unbind(1):
         reflected = kd / math.pi
         if specular:
-            cos = cosines(normal, direction, arriving.wi)
+            cos = cosines(normal, direction, incident.wi)
             steep = _steepness(cos)[..., None]
             reflected = reflected + _lobe(model, cos, material.roughness)[..., None] * (f0 * (1 - steep) + steep)
-        sent.append(by_patch(arriving.light * reflected, arriving.patch, patches))
+        sent.append(by_patch(incident.light * reflected, incident.patch, patches))
     return torch.stack(sent, 1)
 
 
 @torch.no_grad()
-def possible_looks(model: NeilfModel, arriving: Arriving, normal: Float[Tensor, "N 3"], wo: Float[Tensor, "N V 3"]) -> Looks:
+def possible_looks(model: NeilfModel, incident: PatchLight, normal: Float[Tensor, "N 3"], wo: Float[Tensor, "N V 3"]) -> Looks:
     """What points would send whatever they are made of; no specular part where the model has none."""
-    diffuse = arriving.light.sum(1) / math.pi
+    diffuse = incident.light.sum(1) / math.pi
     nodes = diffuse.new_tensor(ROUGHNESS_NODES)[:, None, None].expand(-1, len(diffuse), 1)
     facing = diffuse.new_zeros(len(diffuse), wo.shape[1], len(nodes), 3)
     grazing = torch.zeros_like(facing)
     for v, direction in enumerate(wo.unbind(1) if model.config.shading.specular else ()):
-        cos = cosines(normal, direction, arriving.wi)
+        cos = cosines(normal, direction, incident.wi)
         steep = _steepness(cos)[..., None]
-        toward = torch.cat((arriving.light * (1 - steep), arriving.light * steep), -1)
+        toward = torch.cat((incident.light * (1 - steep), incident.light * steep), -1)
         lobes = torch.stack([_lobe(model, cos, roughness) for roughness in nodes], 1)
         facing[:, v], grazing[:, v] = (lobes @ toward).split(3, -1)
     return Looks(diffuse, facing, grazing)

@@ -227,7 +227,7 @@ def light_sections(run: Run, rendered: Sequence[RenderedView], scale: Float[np.n
 def _lamps_above(run: Run, point: LightPoint) -> Float[np.ndarray, "K 3"]:
     """Directions from a point to the lamps on its surface's side."""
     lamps = run.model.lamps
-    if lamps is None:
+    if not lamps.lit:
         return np.zeros((0, 3), np.float32)
     towards = lamps.position[: lamps.lit].cpu().numpy() - point.position
     towards = towards[towards @ point.normal > 0]

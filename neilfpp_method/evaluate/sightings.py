@@ -12,7 +12,6 @@ from torch import Tensor
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.views import Camera, project
-from neilfpp_method.inter_reflection import scene_light
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.structures import Indexable, PixelBatch, RayBatch
 
@@ -94,10 +93,9 @@ def _nothing_between(
     distance: Float[Tensor, " N"],
 ) -> Bool[Tensor, " N"]:
     """Whether a camera sees surface points that lie in its picture: traced as light is, or else rendered from there."""
-    settings, share = model.config.inter_reflection, model.config.shading.hit_share
-    if settings.mode == "hard":
-        met = scene_light(model.host, position, direction[:, None], settings, share)
-        return met.distance[:, 0] >= distance - TOLERANCE
+    scene, share = model.scene, model.config.shading.hit_share
+    if scene is not None:
+        return scene(position, direction[:, None]).distance[:, 0] >= distance - TOLERANCE
     free = torch.zeros_like(distance, dtype=torch.bool)
     for rows in torch.arange(len(free), device=free.device).split(model.config.train.eval_chunk):
         hits = model.host.render(RayBatch(centre.expand(len(rows), 3), -direction[rows]))

@@ -73,7 +73,7 @@ def export_light(run: Run, out: Path, probes: int | None = None) -> ExportedLigh
     if isinstance(light, EnvironmentLight):
         environment = out / "environment.exr"
         write_exr(environment, {"RGB": light.log_radiance.exp().permute(1, 2, 0).cpu().numpy()})
-        described = [] if run.model.lamps is None else _lamps(run, run.model.lamps)
+        described = _lamps(run, run.model.lamps)
         lamps = len(described)
         write_json(out / "lamps.json", {"format": FORMAT, "frame": "world", "lamps": described})
     if probes is None:

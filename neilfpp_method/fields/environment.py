@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from neilfpp_method.fields.direction_map import interpolate, texels_of
 from neilfpp_method.shading.color import luminance
+from neilfpp_method.shading.sampling import Technique
 from neilfpp_method.structures import IncidentSamples
 
 __all__ = ["EnvironmentLight", "TexelDirections"]
@@ -80,6 +81,10 @@ class EnvironmentLight(nn.Module):
     def radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "#N S 3"]) -> Float[Tensor, "#N S 3"]:
         """Radiance > 0 from wi, whatever x; what stands between is not this model's."""
         return interpolate(self.log_radiance.exp(), wi)
+
+    def technique(self, normal: Float[Tensor, "N 3"]) -> Technique:
+        """Directions in proportion to the radiance, for the points of these normals; some fall below their horizons."""
+        return Technique(lambda count, stochastic: self.sample(normal, count, stochastic).wi, self.pdf)
 
     @torch.no_grad()
     def sample(self, like: Float[Tensor, "N 3"], count: int, stochastic: bool) -> IncidentSamples:

@@ -43,21 +43,18 @@ class IncidentLightField(nn.Module):
         nn.init.uniform_(self.position_part.weight, -bound, bound)
         self.tail.activation.init_(self.tail.layers[0])
 
-    def radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "S 3"] | Float[Tensor, "#N S 3"]) -> Float[Tensor, "N S 3"]:
+    def radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "#N S 3"]) -> Float[Tensor, "N S 3"]:
         """Radiance > 0 that arrives at x from wi, which points away from x.
 
-        Directions that all points share, (S, 3) or (1, S, 3), go through their part of the network once.
+        Directions that all points share, (1, S, 3), go through their part of the network once.
         """
-        return self.at_positions(x, self.of_directions(wi if wi.ndim == 3 else wi[None]))
-
-    def of_directions(self, wi: Float[Tensor, "... 3"]) -> Float[Tensor, "... W"]:
-        """The middle layer before its activation, as far as the direction decides it."""
-        return self.direction_part(self.direction(wi))
-
-    def at_positions(self, x: Float[Tensor, "N 3"], directions: Float[Tensor, "#N S W"]) -> Float[Tensor, "N S 3"]:
-        """The rest of the network, from the middle layer on."""
+        directions = self.direction_part(self.direction(wi))
         middle = directions + self.position_part(x)[:, None]
         return exponential(self.log_base * self.tail(self.tail.activation.value(middle)), self.initial_radiance)
+
+    def technique(self, normal: Float[Tensor, "N 3"]) -> None:
+        """None: a network cannot be sampled."""
+        return None
 
 
 def exponential(exponent: Float[Tensor, "*B C"], initial_radiance: float) -> Float[Tensor, "*B 3"]:

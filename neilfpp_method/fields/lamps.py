@@ -85,15 +85,15 @@ class Lamps(nn.Module):
         """Radiance along rays towards the lit lamps where nothing is in the way."""
         return rays.emission[..., None] * self.radiance()
 
-    def seen(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"], before: Float[Tensor, "N S"]) -> Float[Tensor, "N S 3"]:
+    def met(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"], before: Float[Tensor, "N S"]) -> Float[Tensor, "N S 3"]:
         """Radiance of the lamps that directions meet nearer than a distance; where they overlap, all of them."""
         total = torch.zeros_like(wi)
         towards = self.position[: self.lit] - x[:, None]
         for offset, axis, radiance in zip(towards.unbind(1), self.axis[: self.lit], self.radiance(), strict=True):
             along = dot(wi, offset)
             miss = offset.square().sum(-1)[:, None] - along.square()
-            met = (along > 0) & (miss < self.radius**2) & (along < before)
-            total = total + (met * _emission(wi, axis))[..., None] * radiance
+            hit = (along > 0) & (miss < self.radius**2) & (along < before)
+            total = total + (hit * _emission(wi, axis))[..., None] * radiance
         return total
 
     def get_extra_state(self) -> dict[str, int]:

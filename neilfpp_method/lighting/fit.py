@@ -17,19 +17,20 @@ from neilfpp_method.lighting.descent import Unknown, descend
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.transport import Transport
 
-__all__ = ["Evidence", "Light", "compare", "evidence", "fit_light"]
+__all__ = ["MIN_POINTS", "Evidence", "Light", "compare", "evidence", "fit_light"]
 
 ROOT_RATE, GAIN_RATE = 0.5, 0.1
 """Rates of the roots of what lamps bring, and of the logarithms of the factors on base colour, over that of log radiance."""
-LEAST_REACH = 0.05
-"""A lamp that brings less than this share of the mean, were all alike, is not sought: behind a wall anything fits."""
-LEAST_GAIN = 0.01
-"""Of the relative error: lamps that explain less than a hundredth are no lamps."""
-FEWEST = 20
-"""Points kept back that say something."""
-LEAST_SIGHT = 0.05
-"""Share of the points that see a texel which the images may set. A few can ask anything of what only they see, and would make
-suns of it for the sake of one pixel; it takes after its surroundings."""
+MIN_REACH = 0.05
+"""A lamp that brings less than this share of the mean over all lamps, at equal intensity, is not sought: behind a wall any
+intensity fits."""
+MIN_GAIN = 0.01
+"""Relative error that lamps must save: those that explain less than a hundredth are not kept."""
+MIN_POINTS = 20
+"""Points kept back from which something is concluded."""
+MIN_VISIBLE_SHARE = 0.05
+"""Share of the points that must see a texel for the images to set it. Texels seen by few points follow the smoothness prior
+only."""
 FIRST_SHARE = 0.1
 """Of the light that typical points receive, what all lamps that are not yet lit start with together."""
 
@@ -61,11 +62,11 @@ class Evidence:
         To be chosen it must gain more than chance brings about once in forty times, and enough to be worth it; to stay, it
         may well do so.
         """
-        if self.points < FEWEST:
+        if self.points < MIN_POINTS:
             return False
         if chosen:
-            return self.gain + 2 * self.deviation > LEAST_GAIN
-        return self.gain > max(2 * self.deviation, LEAST_GAIN)
+            return self.gain + 2 * self.deviation > MIN_GAIN
+        return self.gain > max(2 * self.deviation, MIN_GAIN)
 
 
 def evidence(gain: Float[Tensor, " N"]) -> Evidence:
@@ -99,25 +100,25 @@ def fit_light(start: Light, carried: Transport, target: Target, objective: Objec
     log_radiance = start.log_radiance.clone().requires_grad_()
     # In units of what a lamp brings to a white surface in the mean over the points: its unknowns are then of one size.
     brought = carried.sources[0, :, texels:].mean(0)[:, None] / unit
-    reaches = brought > LEAST_REACH * brought.mean()
+    reaches = brought > MIN_REACH * brought.mean()
     first = FIRST_SHARE / max(1, len(brought))
     root = (start.intensity * brought).clamp_min(first).sqrt().requires_grad_()
-    # What a wall or the ground hides from all points has no part in how they look: half of the texels over a table.
-    felt = torch.nonzero(carried.sources.amax((0, 1)))[:, 0]
-    carried = carried.of(felt)
-    reaching = carried.sources[0].mean(0)
-    told = ((carried.sources[0] > 0).float().mean(0) > LEAST_SIGHT) | (felt >= texels)
-    told = told[:, None]
+    # Sources that reach no point take no part in the sum: half of the texels over a table.
+    reaching_any = torch.nonzero(carried.sources.amax((0, 1)))[:, 0]
+    carried = carried.of(reaching_any)
+    mean_transport = carried.sources[0].mean(0)
+    visible_share = (carried.sources[0] > 0).float().mean(0)
+    set_by_images = ((visible_share > MIN_VISIBLE_SHARE) | (reaching_any >= texels))[:, None]
 
     def light() -> Light:
         return Light(log_radiance, torch.where(reaches, root.square() / brought.clamp_min(1e-20), 0.0))
 
     def loss_of(gain: Float[Tensor, "#N 3"]) -> Float[Tensor, ""]:
-        strength = light().strength()[felt]
-        strength = torch.where(told, strength, strength.detach())
+        strength = light().strength()[reaching_any]
+        strength = torch.where(set_by_images, strength, strength.detach())
         loss = objective.misfit(strength, carried, target, gain)
         loss = loss + objective.unlikely(log_radiance)
-        return loss + objective.price(unit * root.square().mean(-1), reaching @ strength)
+        return loss + objective.price(unit * root.square().mean(-1), mean_transport @ strength)
 
     unknowns = (Unknown(log_radiance, config.rate), Unknown(root, ROOT_RATE * config.rate))
     descend(unknowns, GAIN_RATE * config.rate, config.steps, target, objective, loss_of)

@@ -1,36 +1,24 @@
-"""What light is fitted to: surface points that training has seen, a share of every step's."""
+"""The surface points that light is fitted to: a share of every training step's."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
-from torch import Tensor, nn
+from torch import nn
 
 from neilfpp_method.lighting.ring import Ring
-from neilfpp_method.structures import Indexable
+from neilfpp_method.structures import Observed
 
-__all__ = ["Observed", "SurfaceMemory"]
+__all__ = ["SurfaceMemory"]
 
-PATIENCE = 4
-"""Steps that the first fit waits for more points."""
-
-
-@dataclass(frozen=True)
-class Observed(Indexable):
-    """Surface points and what an image holds of each: `pixel` in the capture's response, `wo` towards the camera."""
-
-    position: Float[Tensor, "N 3"]
-    normal: Float[Tensor, "N 3"]
-    wo: Float[Tensor, "N 3"]
-    pixel: Float[Tensor, "N 3"]
+FIRST_WAIT = 4
+"""Steps after which the first fit is due even if the memory is not full: surfaces learn under a light that is a guess."""
 
 
 class SurfaceMemory(nn.Module):
-    """The newest points of all images, and when to fit to them next: for the first time when the memory is full, or after a few
-    steps, as surfaces start to learn under a light that nobody has fitted. It is part of a checkpoint.
+    """The newest surface points of all images, and when to fit to them next: for the first time when the memory is full, or
+    after a few steps. It is part of a checkpoint.
 
     Args:
         capacity: how many points are kept.
@@ -49,14 +37,15 @@ class SurfaceMemory(nn.Module):
         """Whether it is time to fit: `every` steps after each fit, and soon for the first time."""
         if self.age is not None:
             return self.age >= self.every
-        return self.points.full or (self.points.filled > 0 and self.waited >= PATIENCE)
+        return self.points.full or (self.points.filled > 0 and self.waited >= FIRST_WAIT)
 
     @torch.no_grad()
-    def remember(self, seen: Observed) -> None:
+    def remember(self, observed: Observed) -> None:
         """Keep some rows, in the place of the oldest; before the first fit all of them."""
         self.waited += self.age is None
-        share = len(seen) if self.age is None else math.ceil(self.points.capacity / self.every)
-        self.points.keep(torch.cat((seen.position, seen.normal, seen.wo, seen.pixel), -1)[:share])
+        share = len(observed) if self.age is None else math.ceil(self.points.capacity / self.every)
+        rows = torch.cat((observed.position, observed.normal, observed.wo, observed.pixel), -1)
+        self.points.keep(rows[:share])
         if self.age is not None:
             self.age += 1
 

@@ -18,12 +18,11 @@ from torch import Tensor
 from neilfpp_method.fields.lamps import LampPlaces
 from neilfpp_method.lighting.candidates import FoundLamps
 from neilfpp_method.lighting.descent import Unknown, descend
-from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.transport import Transport, in_sight, lamp_kernel
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.shading.frame import safe_normalize
-from neilfpp_method.structures import SceneTracer
+from neilfpp_method.structures import Observed, SceneTracer
 
 __all__ = ["settle_lamps"]
 
@@ -51,7 +50,7 @@ def settle_lamps(
     found: FoundLamps,
     radius: float,
     beside: Transport,
-    seen: Observed,
+    observed: Observed,
     target: Target,
     lobe: Lobe | None,
     scene: SceneTracer | None,
@@ -66,15 +65,15 @@ def settle_lamps(
         found: lamps to start from, the strongest first.
         radius: of each, scene units.
         beside: all other light, with no sources of its own.
-        seen, target: the points, and what they look like.
+        observed, target: the points, and what they look like.
         lobe, scene: as of `from_texels`.
         objective: what is minimised.
     """
-    if not len(found.intensity) or not len(seen):
+    if not len(found.intensity) or not len(observed):
         return found
 
     def loss_of(lamps: FoundLamps, sight: Bool[Tensor, "N M"], gain: Float[Tensor, "#N 3"]) -> Float[Tensor, ""]:
-        kernel = lamp_kernel(lamps.places, radius, sight, seen, target.material.roughness, lobe)
+        kernel = lamp_kernel(lamps.places, radius, sight, observed, target.material.roughness, lobe)
         brought = kernel[0].mean(0)[:, None] * lamps.intensity
         all_light = brought.sum(0) + beside.scene[0].mean(0)
         misfit = objective.misfit(lamps.intensity, Transport(kernel, beside.scene), target, gain)
@@ -82,7 +81,7 @@ def settle_lamps(
 
     def settle(lamps: FoundLamps) -> _Settled:
         # A shadow's edge has no derivative here: what is hidden at the start stays so, and the next fit looks again.
-        sight = in_sight(lamps.places, radius, seen.position, scene)
+        sight = in_sight(lamps.places, radius, observed.position, scene)
         return _descend(lamps, target, objective, lambda moved, gain: loss_of(moved, sight, gain))
 
     best = settle(found)
@@ -95,7 +94,7 @@ def settle_lamps(
         if without.loss < best.loss:
             best = without
     for number in range(len(best.lamps.intensity)):
-        pair = best, settle(_of_other_kind(best.lamps, number, seen.position))
+        pair = best, settle(_of_other_kind(best.lamps, number, observed.position))
         panel, bulb = pair if best.lamps.places.axis[number].any() else reversed(pair)
         best = panel if panel.loss < (1 - PANEL_GAIN) * bulb.loss else bulb
     return settle(best.lamps).lamps

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -18,12 +18,12 @@ from neilfpp_method.shading.color import luminance, srgb_to_linear
 
 __all__ = ["KnownSky", "SkySightings"]
 
-FAITH = 0.3
-"""Standard deviation of the radiance within a texel, over its mean, at which what was seen of it counts for half."""
-SMALL = 0.1
+HALF_WEIGHT_SPREAD = 0.3
+"""Standard deviation of the radiance within a texel, over its mean, at which the texel counts for half."""
+QUADRATIC_BELOW = 0.1
 """Differences of logarithms below this count by their square."""
-DARKEST = 1e-3
-"""Of the mean of all that was seen: what is darker counts as this where logarithms are compared."""
+DARK_FLOOR = 1e-3
+"""Share of the mean radiance below which a texel counts as this dark where logarithms are compared."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class KnownSky:
 
     def misfit(self, log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, ""]:
         """How far a map is from what was seen, in the mean over its texels."""
-        off = functional.smooth_l1_loss(log_radiance, self.log_radiance, beta=SMALL, reduction="none")
+        off = functional.smooth_l1_loss(log_radiance, self.log_radiance, beta=QUADRATIC_BELOW, reduction="none")
         return (self.weight * off.mean(0)).mean()
 
 
@@ -57,17 +57,16 @@ class SkySightings(nn.Module):
         self.register_buffer("clipped", torch.zeros(height, 2 * height))
 
     @torch.no_grad()
-    def remember(self, directions: Float[Tensor, "N 3"], color: Float[Tensor, "N 3"], beyond: Bool[Tensor, " N"]) -> None:
-        """Add the pixels of rays, as images hold them, as far as they show what lies `beyond` the scene."""
+    def remember(self, directions: Float[Tensor, "N 3"], color: Float[Tensor, "N 3"]) -> None:
+        """Add pixels, as images hold them, whose rays pass the scene by."""
+        clipped = torch.zeros_like(color[:, 0])
         if self.response == "srgb":
-            clipped, color = (color >= 1).any(-1), srgb_to_linear(color)
-        else:
-            clipped = torch.zeros_like(beyond)
-        texel, seen = texels_of(directions, *self.pixels.shape), beyond.to(color.dtype)
-        self.radiance.view(3, -1).index_add_(1, texel, (color * seen[:, None]).t())
-        self.squares.view(-1).index_add_(0, texel, luminance(color).square() * seen)
-        self.pixels.view(-1).index_add_(0, texel, seen)
-        self.clipped.view(-1).index_add_(0, texel, clipped * seen)
+            clipped, color = (color >= 1).any(-1).to(color.dtype), srgb_to_linear(color)
+        texel = texels_of(directions, *self.pixels.shape)
+        self.radiance.view(3, -1).index_add_(1, texel, color.t())
+        self.squares.view(-1).index_add_(0, texel, luminance(color).square())
+        self.pixels.view(-1).index_add_(0, texel, torch.ones_like(clipped))
+        self.clipped.view(-1).index_add_(0, texel, clipped)
 
     def known(self) -> KnownSky:
         """What the texels are, as far as they were seen."""
@@ -75,6 +74,6 @@ class SkySightings(nn.Module):
         mean = self.radiance / count
         bright = luminance(mean.permute(1, 2, 0))
         spread = (self.squares / count - bright.square()).clamp_min(0) / bright.square().clamp_min(1e-20)
-        weight = self.pixels / (self.pixels + 1) / (1 + spread / FAITH**2) * (self.clipped == 0)
-        least = DARKEST * self.radiance.sum() / (3 * self.pixels.sum().clamp_min(1))
-        return KnownSky(mean.clamp_min(least.clamp_min(1e-20)).log(), weight)
+        weight = self.pixels / (self.pixels + 1) / (1 + spread / HALF_WEIGHT_SPREAD**2) * (self.clipped == 0)
+        floor = DARK_FLOOR * self.radiance.sum() / (3 * self.pixels.sum().clamp_min(1))
+        return KnownSky(mean.clamp_min(floor.clamp_min(1e-20)).log(), weight)

@@ -1,21 +1,18 @@
-"""The light of a scene from what was seen of it: the map, and lamps where the points that were kept back ask for them."""
+"""The light of a scene from what was observed of it: the map, and lamps where the points that were kept back ask for them."""
 
 from __future__ import annotations
 
 import torch
 
-from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.fields.lamps import Lamps
+from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.candidates import merge, propose
 from neilfpp_method.lighting.fit import Evidence, Light, compare, evidence, fit_light
-from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.settle import settle_lamps
-from neilfpp_method.lighting.sky import KnownSky
 from neilfpp_method.lighting.transport import from_lamps, from_texels
 from neilfpp_method.settings.types import IncidentLightConfig
 from neilfpp_method.shading.brdf import Lobe
-from neilfpp_method.structures import Material, SceneTracer
+from neilfpp_method.structures import Material, Observed, SceneTracer
 
 __all__ = ["solve_light"]
 
@@ -27,60 +24,56 @@ KNOWN_ROWS = 32
 
 @torch.no_grad()
 def solve_light(
-    environment: EnvironmentLight,
-    lamps: Lamps | None,
-    seen: Observed,
+    light: LightModel,
+    observed: Observed,
     material: Material,
     lobe: Lobe | None,
     scene: SceneTracer | None,
-    response: str,
-    unit: float,
+    objective: Objective,
     config: IncidentLightConfig,
     first: bool,
-    sky: KnownSky | None = None,
 ) -> Evidence | None:
     """Set the map, and the lamps where there may be any, to what explains the points. A map that is known stays.
 
     Args:
-        environment, lamps: what is set; the search starts from what they are.
-        seen, material: surface points, and what they are made of.
+        light: what is set; the search starts from what it is.
+        observed, material: surface points, and what they are made of.
         lobe, scene: as of `from_texels`.
-        response, unit: as of `Objective`.
+        objective: what is minimised.
         config: with "auto" the lamps must earn their place: the fit is done with and without, and they stay where they
             lower the error at points kept back from both (`Evidence.favours`).
         first: nothing has been decided yet.
-        sky: as of `Objective`; a map of as many rows.
 
     Returns:
-        What spoke for lamps, or against them; none where the settings had decided.
+        What was measured for and against lamps; none where the settings had decided.
     """
-    target = Target(seen.position, material, seen.pixel)
-    objective = Objective(response, unit, config.fit, sky)
+    environment, lamps = light.light, light.lamps
+    target = Target(observed.position, material, observed.pixel)
     dark = environment.log_radiance.new_zeros(0, 3)
     if config.map is None:
         sought = environment.log_radiance
-        texels = from_texels(environment, seen, material.roughness, lobe, scene)
+        texels = from_texels(environment, observed, material.roughness, lobe, scene)
     else:
         sought = environment.log_radiance.new_zeros(3, 0, 0)
         known = environment.at_most(KNOWN_ROWS)
-        texels = from_texels(known, seen, material.roughness, lobe, scene)
+        texels = from_texels(known, observed, material.roughness, lobe, scene)
         texels = texels.lit(known.log_radiance.exp().flatten(1).t())
     plain_start = Light(sought, dark)
-    if lamps is None:
+    if config.kind == "distant":
         sought.copy_(fit_light(plain_start, texels, target, objective).log_radiance)
         return None
 
-    places = propose(lamps, seen.position, config.fit.candidates)
-    near = from_lamps(places, lamps.radius, seen, material.roughness, lobe, scene)
+    places = propose(lamps, observed.position, config.fit.candidates)
+    near = from_lamps(places, lamps.radius, observed, material.roughness, lobe, scene)
     both = texels.beside(near)
     intensity = dark.new_zeros(len(places.position), 3)
     intensity[: lamps.lit] = lamps.intensity[: lamps.lit]
     start = Light(sought, intensity)
     if config.kind != "auto":
-        found, spoken = fit_light(start, both, target, objective), None
+        found, measured = fit_light(start, both, target, objective), None
     else:
-        # Before anything is known a wrong choice would last: what surfaces then learn speaks for the light they learn it under.
-        fold = torch.randperm(len(seen), device=seen.position.device) % FOLDS
+        # A wrong first choice would last, as surfaces then learn what suits it: so it is made on all points in turn.
+        fold = torch.randperm(len(observed), device=observed.position.device) % FOLDS
         gains = []
         for number in range(FOLDS if first else 1):
             kept_back, fitted = fold == number, fold != number
@@ -88,18 +81,18 @@ def solve_light(
             found = fit_light(start, both[fitted], target[fitted], objective)
             carried = (texels[kept_back], both[kept_back])
             gains.append(compare((plain, found), carried, target[kept_back], objective))
-        spoken = evidence(torch.cat(gains))
-        if not spoken.favours(chosen=lamps.lit > 0):
+        measured = evidence(torch.cat(gains))
+        if not measured.favours(chosen=lamps.lit > 0):
             sought.copy_(plain.log_radiance)
             lamps.place(dark, dark)
-            return spoken
+            return measured
     sought.copy_(found.log_radiance)
     lit = merge(places, found.intensity, near.sources[0].mean(0), len(lamps.position))
     beside = texels.lit(sought.exp().flatten(1).t())
-    lit = settle_lamps(lit, lamps.radius, beside, seen, target, lobe, scene, objective)
+    lit = settle_lamps(lit, lamps.radius, beside, observed, target, lobe, scene, objective)
     # The map was found beside lamps in pieces; what it had to make up for, or left to them, is theirs or its own now.
-    near = from_lamps(lit.places, lamps.radius, seen, material.roughness, lobe, scene)
+    near = from_lamps(lit.places, lamps.radius, observed, material.roughness, lobe, scene)
     found = fit_light(Light(sought, lit.intensity), texels.beside(near), target, objective)
     sought.copy_(found.log_radiance)
     lamps.place(lit.places.position, found.intensity, lit.places.axis)
-    return spoken
+    return measured

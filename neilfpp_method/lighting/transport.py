@@ -19,10 +19,9 @@ from torch import Tensor
 
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import LampPlaces, rays_towards
-from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.shading.brdf import Lobe, diffuse_reflectance, normal_reflectance, specular_terms
 from neilfpp_method.shading.frame import dot
-from neilfpp_method.structures import Material, SceneTracer
+from neilfpp_method.structures import Material, Observed, SceneTracer
 
 __all__ = ["Transport", "from_lamps", "from_texels", "in_sight", "lamp_kernel"]
 
@@ -90,7 +89,7 @@ class _SumOverSources(torch.autograd.Function):
 @torch.no_grad()
 def from_texels(
     environment: EnvironmentLight,
-    seen: Observed,
+    observed: Observed,
     roughness: Float[Tensor, "N 1"],
     lobe: Lobe | None,
     scene: SceneTracer | None,
@@ -99,14 +98,14 @@ def from_texels(
 
     Args:
         environment: whose texels are meant; its radiance plays no part.
-        seen: surface points; unit normals and directions to the viewer.
+        observed: surface points; unit normals and directions to the viewer.
         roughness: at the points.
         lobe: of the specular reflection; none for Lambertian surfaces.
         scene: stands between the points and the map, and shines on them; none where inter-reflection is off.
     """
     texels = environment.log_radiance[0].numel()
     sources, added = [], []
-    for part, rough in _chunks(seen, roughness, texels):
+    for part, rough in _chunks(observed, roughness, texels):
         drawn = environment.texel_directions(part.position)
         weight = dot(drawn.wi, part.normal).clamp_min(0) * drawn.solid_angle
         # The map is even about every plane through its middle: half of its texels are above a horizon, up to grazing ones.
@@ -127,14 +126,14 @@ def from_texels(
 def from_lamps(
     lamps: LampPlaces,
     radius: float,
-    seen: Observed,
+    observed: Observed,
     roughness: Float[Tensor, "N 1"],
     lobe: Lobe | None,
     scene: SceneTracer | None,
 ) -> Transport:
     """From small lamps, per unit of intensity: the direction to their middle is traced. Arguments as of `from_texels`."""
     sources = []
-    for part, rough in _chunks(seen, roughness, len(lamps.position)):
+    for part, rough in _chunks(observed, roughness, len(lamps.position)):
         sight = in_sight(lamps, radius, part.position, scene)
         sources.append(lamp_kernel(lamps, radius, sight, part, rough, lobe))
     kernel = torch.cat(sources, 1)
@@ -143,7 +142,7 @@ def from_lamps(
 
 @torch.no_grad()
 def in_sight(lamps: LampPlaces, radius: float, x: Float[Tensor, "N 3"], scene: SceneTracer | None) -> Bool[Tensor, "N M"]:
-    """Whether the middle of a lamp is to be seen from a point."""
+    """Whether the middle of a lamp is to be observed from a point."""
     rays = rays_towards(x, lamps.position, lamps.axis, radius)
     if scene is None:
         return torch.ones_like(rays.distance, dtype=torch.bool)
@@ -154,18 +153,18 @@ def lamp_kernel(
     lamps: LampPlaces,
     radius: float,
     sight: Bool[Tensor, "N M"],
-    seen: Observed,
+    observed: Observed,
     roughness: Float[Tensor, "N 1"],
     lobe: Lobe | None,
 ) -> Float[Tensor, "K N M"]:
     """`sources` of a transport from lamps; differentiable in where they are and which way they send, up to `sight`."""
-    rays = rays_towards(seen.position, lamps.position, lamps.axis, radius)
-    weight = sight * rays.emission * dot(rays.wi, seen.normal).clamp_min(0) / rays.distance.square()
-    return _kernel(seen, roughness, rays.wi, weight, lobe)
+    rays = rays_towards(observed.position, lamps.position, lamps.axis, radius)
+    weight = sight * rays.emission * dot(rays.wi, observed.normal).clamp_min(0) / rays.distance.square()
+    return _kernel(observed, roughness, rays.wi, weight, lobe)
 
 
 def _kernel(
-    seen: Observed,
+    observed: Observed,
     roughness: Float[Tensor, "N 1"],
     wi: Float[Tensor, "N S 3"],
     weight: Float[Tensor, "N S"],
@@ -174,11 +173,11 @@ def _kernel(
     """The parts of the BRDF times a weight that holds cosine and solid angle."""
     if lobe is None:
         return weight[None] / math.pi
-    terms = specular_terms(roughness, seen.normal, seen.wo, wi, lobe)
+    terms = specular_terms(roughness, observed.normal, observed.wo, wi, lobe)
     return torch.stack((weight / math.pi, weight * terms.facing, weight * terms.grazing))
 
 
-def _chunks(seen: Observed, roughness: Float[Tensor, "N 1"], sources: int) -> list[tuple[Observed, Tensor]]:
+def _chunks(observed: Observed, roughness: Float[Tensor, "N 1"], sources: int) -> list[tuple[Observed, Tensor]]:
     rows = max(1, PAIRS_AT_ONCE // max(1, sources))
-    spans = [slice(start, start + rows) for start in range(0, len(seen), rows)]
-    return [(seen[span], roughness[span]) for span in spans]
+    spans = [slice(start, start + rows) for start in range(0, len(observed), rows)]
+    return [(observed[span], roughness[span]) for span in spans]

@@ -22,6 +22,7 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.hosts.nerfstudio import OWN_LOSSES, NerfstudioHost
+from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.model import Maps, NeilfModel
 from neilfpp_method.plugin.datamanager import PIXELS, VALID, pixel_batch
 from neilfpp_method.plugin.foreign import build_foreign
@@ -100,6 +101,8 @@ class NeilfMethod(Model):
                 own_losses=self.config.host_losses > 0.0,
             )
             self.neilf = NeilfModel(host, settings, facts)
+        self.light_solver = self.neilf.light_solver()
+        self.evidence: Evidence | None = None
         self.step = -1
         self.set_up_for: Stage | None = None
 
@@ -165,7 +168,10 @@ class NeilfMethod(Model):
         if not self.training:
             return {"rgb": (outputs["rgb"] - batch["image"].to(self.device)).abs().mean()}
         pixels = pixel_batch(outputs["origins"], outputs["directions"], batch)
-        terms = self.neilf.losses(pixels, self.stage)
+        computed = self.neilf.step(pixels, self.stage)
+        terms = computed.terms
+        self.light_solver.observe(computed)
+        self.evidence = self.light_solver.solve(self.neilf.brdf, self.neilf.scene) or self.evidence
         share = stage_at(self.step, self.config.neilf.train).share
         weights = {
             **active_losses(self.stage, self.neilf.config, self.neilf.stages, share),
@@ -177,11 +183,10 @@ class NeilfMethod(Model):
         return {name: weigh({name: term}, weights).loss for name, term in terms.items()}
 
     def _light_found(self) -> dict[str, Tensor]:
-        """What spoke for lamps when the light was last solved for, where the settings leave that open."""
-        found, lamps = self.neilf.evidence, self.neilf.lamps
-        if found is None or lamps is None:
+        """What the last fit of the light measured for and against lamps, where the settings leave that open."""
+        if self.evidence is None:
             return {}
-        return {"lamp_gain": torch.tensor(found.gain), "lamps": torch.tensor(float(lamps.lit))}
+        return {"lamp_gain": torch.tensor(self.evidence.gain), "lamps": torch.tensor(float(self.neilf.lamps.lit))}
 
     # ------------------------------------------------------------------------------------------------------------ outputs
 

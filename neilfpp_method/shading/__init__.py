@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from neilfpp_method.shading.albedo import directional_albedo, initial_albedo
 from neilfpp_method.shading.brdf import GGX, LOBES, SPHERICAL_GAUSSIAN, BrdfValue, Lobe, evaluate
 from neilfpp_method.shading.color import apply_response, linear_to_srgb, luminance, srgb_to_linear, tone_map
 from neilfpp_method.shading.frame import local_frame, safe_normalize
@@ -19,7 +20,9 @@ __all__ = [
     "BrdfValue",
     "Lobe",
     "apply_response",
+    "directional_albedo",
     "evaluate",
+    "initial_albedo",
     "linear_to_srgb",
     "local_frame",
     "luminance",

@@ -11,11 +11,10 @@ from torch.nn import functional
 
 from neilfpp_method.shading.brdf import Lobe, diffuse_reflectance, normal_reflectance, specular_terms
 from neilfpp_method.shading.frame import dot
-from neilfpp_method.shading.rendering_equation import PDF_FLOOR
 from neilfpp_method.shading.sampling import specular_lobe
-from neilfpp_method.structures import Material
+from neilfpp_method.structures import PDF_FLOOR, Material
 
-__all__ = ["directional_albedo"]
+__all__ = ["directional_albedo", "initial_albedo"]
 
 SIZE = 32
 """Entries along either axis, roughness and cosine of the viewer."""
@@ -41,6 +40,15 @@ def directional_albedo(
     found = functional.grid_sample(table, place[None, :, None], padding_mode="border", align_corners=False)
     facing, grazing = found[0, :, :, 0].unsqueeze(-1)
     return diffuse_reflectance(material) + normal_reflectance(material) * facing + grazing
+
+
+def initial_albedo(base_color: float, metallic: float, lobe: Lobe | None) -> float:
+    """Directional albedo of an even grey material of roughness 0.5 along its normal; no `lobe`: a Lambertian surface."""
+    if lobe is None:
+        return base_color
+    material = Material(torch.full((1, 3), base_color), torch.full((1, 1), 0.5), torch.full((1, 1), metallic))
+    up = torch.tensor([[0.0, 0.0, 1.0]])
+    return directional_albedo(material, up, up, lobe).mean().item()
 
 
 @lru_cache

@@ -10,38 +10,32 @@ from torch import Tensor
 
 from neilfpp_method.shading.brdf import Lobe, diffuse_reflectance, normal_reflectance, specular_terms
 from neilfpp_method.shading.frame import at_least_float32, dot
-from neilfpp_method.structures import IncidentSamples, Material, Shading
+from neilfpp_method.structures import Incident, Material, Shading
 
-__all__ = ["PDF_FLOOR", "shade"]
-
-PDF_FLOOR = 1e-6
-"""Smallest density divided by, per steradian. Less than 2π · 1e-6 of a sampler's directions lie where it acts."""
+__all__ = ["shade"]
 
 
 def shade(
     material: Material,
     n: Float[Tensor, "N 3"],
     wo: Float[Tensor, "N 3"],
-    samples: IncidentSamples,
-    incident_radiance: Float[Tensor, "#N S 3"],
-    lobe: Lobe,
-    specular: bool = True,
+    incident: Incident,
+    lobe: Lobe | None,
 ) -> Shading:
-    """L_o(wo) ≈ 1/S Σ f(wo, wi) L(wi) max(n·wi, 0) / pdf(wi), in at least float32.
+    """L_o(wo) ≈ Σ weight f(wo, wi) L(wi) max(n·wi, 0), in at least float32.
 
     The colour of a surface does not depend on the direction, so it leaves the sum: three scalar weights per direction
     stand for f, and of tensors (N, S, 3) autograd keeps the directions and the radiance alone. `n`, `wo` are unit and
-    point away from the surface. With `specular=False` the surface is Lambertian and nothing specular is computed.
+    point away from the surface. Without a `lobe` the surface is Lambertian and nothing specular is computed.
     """
-    radiance = at_least_float32(incident_radiance)
-    cos_i = dot(samples.wi, n).clamp_min(0)
-    weight = cos_i / samples.pdf.clamp_min(PDF_FLOOR) / samples.pdf.shape[1]
+    radiance = at_least_float32(incident.radiance)
+    weight = dot(incident.wi, n).clamp_min(0) * incident.weight
 
-    diffuse = diffuse_reflectance(material, specular) / math.pi * _integrate(weight, radiance)
-    if not specular:
+    diffuse = diffuse_reflectance(material, lobe is not None) / math.pi * _integrate(weight, radiance)
+    if lobe is None:
         return Shading(diffuse, diffuse, torch.zeros_like(diffuse))
 
-    terms = specular_terms(material.roughness, n, wo, samples.wi, lobe)
+    terms = specular_terms(material.roughness, n, wo, incident.wi, lobe)
     facing, grazing = _integrate(weight * terms.facing, radiance), _integrate(weight * terms.grazing, radiance)
     reflected = normal_reflectance(material) * facing + grazing
     return Shading(diffuse + reflected, diffuse, reflected)

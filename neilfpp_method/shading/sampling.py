@@ -174,7 +174,7 @@ def sample_directions(
     wo: Float[Tensor, "N 3"],
     roughness: Float[Tensor, "N 1"],
     count: int,
-    lobe: Lobe,
+    lobe: Lobe | None,
     stochastic: bool,
     light: Technique | None = None,
 ) -> IncidentSamples:

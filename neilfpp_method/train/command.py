@@ -101,7 +101,8 @@ def run_training(
     continue_with = _continue_with(command, out, device, devices)
     with reporting(out, console, fabric.is_global_zero) as reporter, _stop_request() as stopped:
         preview = _preview(out, capture, fabric, reporter)
-        training = Training(out, config, model, pixels, fabric, reporter, stopped, preview, continue_with)
+        solver = model.light_solver()
+        training = Training(out, config, model, pixels, fabric, reporter, stopped, preview, continue_with, solver)
         train(training)
     if fabric.is_global_zero and training.fits:
         console.print(f"light: {in_words(config.light, training.fits)}", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""What spoke for lamps before the environment map, or against them: the record of a run, fit by fit, in `RUN/light.json`."""
+"""What the kept-back points said of lamps before the environment map: the record of a run, fit by fit, in `RUN/light.json`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.model import NeilfModel
+from neilfpp_method.lighting.fit import MIN_POINTS, Evidence
 from neilfpp_method.settings.plain import from_dict
 from neilfpp_method.settings.types import IncidentLightConfig
 from neilfpp_method.train.run import read_json, write_json
@@ -38,11 +38,9 @@ class LightFit:
     lamps: int
 
 
-def note_fit(fits: list[LightFit], model: NeilfModel, step: int) -> None:
-    """Add what the step found out about the light, where it did; `model.evidence` is then noted."""
-    found, model.evidence = model.evidence, None
+def note_fit(fits: list[LightFit], found: Evidence | None, lamps: int, step: int) -> None:
+    """Add what a fit measured for and against lamps, where it did, and how many are lit since."""
     if found is not None:
-        lamps = model.lamps.lit if model.lamps is not None else 0
         fits.append(LightFit(step, found.gain, found.deviation, found.points, lamps))
 
 
@@ -79,6 +77,8 @@ def in_words(config: IncidentLightConfig, fits: Sequence[LightFit]) -> str:
     if not fits:
         return f"{sky} and lamps before it" if config.kind == "distant_near" else sky
     last = fits[-1]
+    if last.points < MIN_POINTS:
+        return f"{sky}; {last.points} points kept back are too few to say anything of lamps"
     change = f"error {-100 * last.gain:+.1f} ± {100 * last.deviation:.1f} % at {last.points} points kept back"
     change = change.replace("-", "\N{MINUS SIGN}")
     if last.lamps:

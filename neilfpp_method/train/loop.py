@@ -14,11 +14,12 @@ from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.errors import Diverged, Stopped, UserError
+from neilfpp_method.lighting.solver import LightSolver
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, rate_factor, stage_at, stage_steps, weigh
 from neilfpp_method.settings.facts import RadianceUnits
 from neilfpp_method.settings.types import NeilfConfig, OptimizerConfig
-from neilfpp_method.structures import LossTerms
+from neilfpp_method.structures import LossTerms, StepResult
 from neilfpp_method.train.light_record import LightFit, note_fit, read_fits, write_fits
 from neilfpp_method.train.progress import Reporter
 from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, save_checkpoint, write_json
@@ -42,6 +43,7 @@ class Training:
     should_stop: Callable[[], bool]
     preview: Callable[[NeilfModel, Stage], None]
     continue_with: str
+    light_solver: LightSolver
     fits: list[LightFit] = field(default_factory=list)
     skipped: int = 0
     skipped_in_a_row: int = 0
@@ -57,6 +59,7 @@ def train(run: Training) -> None:
     """
     settings = run.config.train
     model = run.model.to(run.fabric.device).train()
+    run.light_solver.to(run.fabric.device)
     optimizer = make_optimizer(model, run.config.optimizer)
     step = _restore(run, optimizer)
     total = sum(stage_steps(settings).values())
@@ -85,10 +88,10 @@ def _train_stage(run: Training, model: NeilfModel, optimizer: torch.optim.Optimi
         share = number / position.length
         set_rates(optimizer, run.config.optimizer, StagePosition(stage, number, position.length))
         batch = run.pixels.sample(settings.rays)
-        terms = wrapped(batch, stage)
-        note_fit(run.fits, model, step)
-        total = weigh(terms, active_losses(stage, run.config, model.stages, share))
-        stop = _update(run, model, optimizer, terms, total, step)
+        computed = wrapped(batch, stage)
+        total = weigh(computed.terms, active_losses(stage, run.config, model.stages, share))
+        stop = _update(run, model, optimizer, computed.terms, total, step)
+        _solve_light(run, model, computed, step)
         step += 1
         run.seconds[stage.value] = before + time.perf_counter() - started
         if number + 1 == position.length:
@@ -98,6 +101,20 @@ def _train_stage(run: Training, model: NeilfModel, optimizer: torch.optim.Optimi
         if stop:
             raise Stopped(f"stopped after step {step}", f"continue with: {run.continue_with}")
     return step
+
+
+def _solve_light(run: Training, model: NeilfModel, computed: StepResult, step: int) -> None:
+    """Show the light solver what a step showed; when it is time, it sets the light. The first process does it for all."""
+    fabric, solver = run.fabric, run.light_solver
+    if fabric.is_global_zero:
+        solver.observe(computed)
+    if not fabric.broadcast(solver.due):
+        return
+    if fabric.is_global_zero:
+        note_fit(run.fits, solver.solve(model.brdf, model.scene), model.lamps.lit, step)
+    if fabric.world_size > 1:
+        for part in (model.light, model.lamps):
+            part.load_state_dict(fabric.broadcast(part.state_dict()))
 
 
 def _update(
@@ -204,10 +221,10 @@ def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
 def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str | None = None) -> None:
     if run.fabric.is_global_zero:
         try:
-            # Before the checkpoint: what it knows too much is left out when a run continues, and what it lacks would be lost.
+            # Fits first: extra ones are dropped on resume, gaps cannot be recovered.
             write_fits(run.path, run.fits)
             for name in filter(None, (also, "last")):
-                save_checkpoint(run.path / "checkpoints" / f"{name}.pt", run.model, optimizer, step)
+                save_checkpoint(run.path / "checkpoints" / f"{name}.pt", run.model, run.light_solver, optimizer, step)
             write_json(run.path / "timing.json", run.seconds)
         except UserError as error:
             raise UserError(error.problem, f"make room, and continue with: {run.continue_with}") from error
@@ -219,7 +236,8 @@ def _restore(run: Training, optimizer: torch.optim.Optimizer) -> int:
     if not path.exists():
         return 0
     saved = load_checkpoint(path)
-    load_weights(run.model, saved, run.path)
+    load_weights(run.model, saved["model"], run.path)
+    load_weights(run.light_solver, saved["light_solver"], run.path)
     optimizer.load_state_dict(saved["optimizer"])
     if (run.path / "timing.json").exists():
         run.seconds.update(read_json(run.path / "timing.json"))

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
+from torch import nn
 
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.images import replacing
@@ -47,7 +48,7 @@ __all__ = [
     "write_json",
 ]
 
-FORMAT = 1
+FORMAT = 2
 PACKAGES = (
     "neilfpp-method",
     "torch",
@@ -58,7 +59,7 @@ PACKAGES = (
     "trimesh",
     "scikit-image",
 )
-CHECKPOINT_KEYS = {"format", "step", "model", "optimizer"}
+CHECKPOINT_KEYS = {"format", "step", "model", "light_solver", "optimizer"}
 
 
 @dataclass(frozen=True)
@@ -155,7 +156,7 @@ def load_run(path: Path | str, device: torch.device | str = "cpu", checkpoint: s
     saved = load_checkpoint(path / "checkpoints" / f"{checkpoint}.pt")
     capture = described.source.load_again(path)
     model = build_model(capture, described.facts, described.config)
-    load_weights(model, saved, path)
+    load_weights(model, saved["model"], path)
     return Run(path, described.config, capture, described.facts, model.to(device).eval(), saved["step"])
 
 
@@ -202,9 +203,10 @@ def _described(kind: type[Part], values: Any, where: str) -> Part:
 # ---------------------------------------------------------------------------------------------------------- checkpoints
 
 
-def save_checkpoint(path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer, step: int) -> None:
-    """Weights and optimiser after `step` steps, in one step: never half a file."""
-    contents = {"format": FORMAT, "step": step, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
+def save_checkpoint(path: Path, model: nn.Module, light_solver: nn.Module, optimizer: torch.optim.Optimizer, step: int) -> None:
+    """Weights, what the light solver remembers, and the optimiser after `step` steps, in one step: never half a file."""
+    parts = {"model": model, "light_solver": light_solver, "optimizer": optimizer}
+    contents = {"format": FORMAT, "step": step, **{name: part.state_dict() for name, part in parts.items()}}
     with replacing(path) as temporary, temporary.open("wb") as file:
         try:
             torch.save(contents, file)
@@ -232,14 +234,14 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     return contents
 
 
-def load_weights(model: torch.nn.Module, saved: Mapping[str, Any], run: Path) -> None:
-    """Put the weights of a checkpoint into the model that the settings of its run describe.
+def load_weights(module: nn.Module, weights: Mapping[str, Any], run: Path) -> None:
+    """Put weights of a checkpoint into the model, or the light solver, that the settings of its run describe.
 
     Raises:
         UserError: they do not fit.
     """
     try:
-        model.load_state_dict(saved["model"])
+        module.load_state_dict(weights)
     except (RuntimeError, TypeError) as error:
         raise UserError(
             f"{run}: the checkpoint does not fit the settings in config.json",

@@ -9,7 +9,7 @@ import torch
 from torch.nn.functional import normalize
 
 from benchmarks.straightforward import straightforward
-from neilfpp_method.inter_reflection import trace_light
+from neilfpp_method.incident.traced import trace_light
 from neilfpp_method.schedule import Stage
 from neilfpp_method.settings.presets import paper_mlp
 from neilfpp_method.structures import PixelBatch

@@ -12,7 +12,6 @@ import torch
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import confidence
-from neilfpp_method.evaluate.arriving import arriving_light, by_patch, patch_count
 from neilfpp_method.evaluate.confidence import (
     LEAST_NOISE,
     gather_evidence,
@@ -21,6 +20,7 @@ from neilfpp_method.evaluate.confidence import (
     with_deviation,
 )
 from neilfpp_method.evaluate.metrics import confidence_ratio
+from neilfpp_method.evaluate.patches import by_patch, light_by_patch, patch_count
 from neilfpp_method.evaluate.protocols import confidence_metrics
 from neilfpp_method.evaluate.render_views import render_run
 from neilfpp_method.evaluate.sightings import TrainingViews
@@ -105,7 +105,7 @@ def test_the_first_views_are_far_from_one_another(run: Run):
 def test_patches_add_up_to_all_light(run: Run):
     normal = on_sphere(20)
     material = run.model.materials(SPHERE * normal)
-    arriving = arriving_light(run.model, SPHERE * normal, normal, normal[:, None], material)
+    arriving = light_by_patch(run.model, SPHERE * normal, normal, normal[:, None], material)
     parts = by_patch(arriving.light, arriving.patch, patch_count(run.model))
     torch.testing.assert_close(parts.sum(-1), arriving.light.sum(1))
     assert ((parts > 0).any(1).sum(-1) > 5).all()

@@ -46,15 +46,14 @@ def test_position_and_direction_enter_where_the_paper_says():
     torch.testing.assert_close(field.radiance(x, wi), expected)
 
 
-@pytest.mark.parametrize("shape", [(1, 7, 3), (7, 3)])
-def test_directions_can_be_shared_between_points(shape):
+def test_directions_can_be_shared_between_points():
     """The half of the network that sees the direction alone then runs once a direction, not once a pair."""
     field = IncidentLightField(preset("fast").light, 10.0, 1.0)
     x, wi = rays()
     every = wi[:1].expand_as(wi)
     seen = []
     field.direction_part.register_forward_hook(lambda module, inputs, output: seen.append(output[..., 0].numel()))
-    torch.testing.assert_close(field.radiance(x, wi[0].view(shape)), field.radiance(x, every))
+    torch.testing.assert_close(field.radiance(x, wi[:1]), field.radiance(x, every))
     assert seen == [7, 35]
 
 

@@ -9,9 +9,8 @@ import torch
 from torch.nn.functional import normalize
 
 from neilfpp_method.fields.lamps import Lamps
-from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.shading.rendering_equation import shade
-from neilfpp_method.structures import Material
+from neilfpp_method.structures import Incident, Material
 
 
 def lamps() -> Lamps:
@@ -34,7 +33,7 @@ def test_a_lambertian_surface_shows_cosine_and_inverse_square():
     rays = light.rays_from(x)
     material = Material(torch.tensor([[0.5, 0.5, 0.5]]), torch.ones(1, 1), torch.zeros(1, 1))
     radiance = light.arriving(rays)
-    color = shade(material, up, up, rays.samples(), radiance, GGX, specular=False).color[0]
+    color = shade(material, up, up, Incident.of(rays.samples(), radiance), None).color[0]
     expected = 0.5 / math.pi * (0.8 * torch.tensor([0.3, 0.6, 0.9]) + 0.2)
     torch.testing.assert_close(color, expected)
 
@@ -45,7 +44,7 @@ def test_the_light_that_is_seen_brings_the_same_irradiance_as_the_rays():
     torch.manual_seed(0)
     wi = normalize(torch.randn(1, 2_000_000, 3), dim=-1)
     wi[..., 2] = wi[..., 2].abs()
-    seen = light.seen(torch.zeros(1, 3), wi, torch.full((1, 2_000_000), math.inf))
+    seen = light.met(torch.zeros(1, 3), wi, torch.full((1, 2_000_000), math.inf))
     irradiance = 2 * math.pi * (seen * wi[..., 2:]).mean(1)[0]
     torch.testing.assert_close(irradiance, 0.8 * torch.tensor([0.3, 0.6, 0.9]) + 0.2, rtol=0.05, atol=0.0)
 
@@ -60,16 +59,16 @@ def test_a_lamp_with_an_axis_sends_by_the_cosine_and_nothing_backwards():
     expected = full * torch.tensor([1.0, 0.5, 0.0])[:, None].expand(3, 3)
     torch.testing.assert_close(light.arriving(light.rays_from(x))[:, 0], expected, atol=1e-4, rtol=1e-5)
     infinite = torch.full((3, 1), math.inf)
-    torch.testing.assert_close(light.seen(x, -x[:, None] / 2, infinite)[:, 0], expected, atol=1e-4, rtol=1e-5)
+    torch.testing.assert_close(light.met(x, -x[:, None] / 2, infinite)[:, 0], expected, atol=1e-4, rtol=1e-5)
 
 
 def test_what_stands_before_a_lamp_hides_it():
     light = lamps()
     up = torch.tensor([[[0.0, 0.0, 1.0]]])
     x = torch.zeros(1, 3)
-    assert light.seen(x, up, torch.tensor([[0.5]])).sum() == 0
-    assert light.seen(x, up, torch.tensor([[2.0]])).sum() > 0
-    assert light.seen(x, -up, torch.tensor([[math.inf]])).sum() == 0
+    assert light.met(x, up, torch.tensor([[0.5]])).sum() == 0
+    assert light.met(x, up, torch.tensor([[2.0]])).sum() > 0
+    assert light.met(x, -up, torch.tensor([[math.inf]])).sum() == 0
 
 
 def test_a_point_inside_a_lamp_gets_finite_light():

@@ -10,12 +10,11 @@ import torch
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import LampPlaces, Lamps
 from neilfpp_method.lighting.fit import Light, fit_light
-from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.transport import from_lamps, from_texels, in_sight, lamp_kernel
 from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.shading.brdf import GGX, SPHERICAL_GAUSSIAN
-from neilfpp_method.structures import Material
+from neilfpp_method.structures import Material, Observed
 from tests.hard_cases.test_fields import DTYPES, assert_bounded
 
 RADIUS = 0.06
@@ -58,7 +57,7 @@ def test_what_lamps_show_of_themselves(dtype, intensity):
     x = BESIDE.to(dtype)
     rays = lamps.rays_from(x)
     assert_bounded(rays.wi, rays.samples().pdf, lamps.arriving(rays), bound=1e10)
-    seen = lamps.seen(x, rays.wi, torch.full(rays.wi.shape[:2], math.inf, dtype=dtype))
+    seen = lamps.met(x, rays.wi, torch.full(rays.wi.shape[:2], math.inf, dtype=dtype))
     assert_bounded(seen, bound=1e10)
     assert (seen[2].max() > 0) == (intensity > 0)
 

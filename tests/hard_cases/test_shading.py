@@ -9,7 +9,7 @@ import torch
 
 from neilfpp_method.shading import LOBES, apply_response, evaluate, sample_directions, shade, srgb_to_linear
 from neilfpp_method.shading.color import linear_to_srgb
-from neilfpp_method.structures import IncidentSamples, Material
+from neilfpp_method.structures import Incident, IncidentSamples, Material
 
 DTYPES = (torch.float64, torch.float32, torch.bfloat16)
 ROUGHNESS = (0.0, 1e-4, 1e-2, 0.044, 0.1, 0.5, 1.0)
@@ -77,7 +77,7 @@ def test_shade(lobe, dtype, light):
     leaf, material, wo, wi = hard_scene(dtype)
     leaf["radiance"] = torch.full_like(wi, light).requires_grad_()
     samples = IncidentSamples(wi, torch.full_like(wi[..., 0], 0.159))
-    color = shade(material, leaf["n"], wo, samples, leaf["radiance"], LOBES[lobe]).color
+    color = shade(material, leaf["n"], wo, Incident.of(samples, leaf["radiance"]), LOBES[lobe]).color
     assert_tame(color, leaf, BOUND[dtype])
     assert color.ge(0).all()
     assert light > 0 or color.eq(0).all()
@@ -88,7 +88,7 @@ def test_shade(lobe, dtype, light):
 def test_a_vanishing_pdf_divides_nothing_by_zero(lobe, dtype):
     leaf, material, wo, wi = hard_scene(dtype)
     samples = IncidentSamples(wi, torch.zeros_like(wi[..., 0]))
-    color = shade(material, leaf["n"], wo, samples, torch.ones_like(wi), LOBES[lobe]).color
+    color = shade(material, leaf["n"], wo, Incident.of(samples, torch.ones_like(wi)), LOBES[lobe]).color
     assert_tame(color, leaf, BOUND[dtype])
 
 
@@ -103,7 +103,7 @@ def test_samplers(kind, lobe, dtype):
     assert samples.pdf.ge(0).all()
     assert (samples.wi.norm(dim=-1) - 1).abs().max() < (0.02 if dtype == torch.bfloat16 else 1e-5)
     leaf["radiance"] = torch.full_like(samples.wi, 1e6).requires_grad_()
-    assert_tame(shade(material, leaf["n"], wo, samples, leaf["radiance"], LOBES[lobe]).color, leaf, BOUND[dtype])
+    assert_tame(shade(material, leaf["n"], wo, Incident.of(samples, leaf["radiance"]), LOBES[lobe]).color, leaf, BOUND[dtype])
 
 
 @lobes
@@ -118,7 +118,9 @@ def test_importance_samples_of_a_mirror_do_not_sparkle(kind, lobe):
     single = IncidentSamples(samples.wi.reshape(-1, 1, 3), samples.pdf.reshape(-1, 1))
     many = Material(*(t.repeat_interleave(4096, 0) for t in (material.base_color, r, material.metallic)))
     light = torch.ones_like(single.wi)
-    color = shade(many, n[:1].expand(len(light), 3), wo[:1].expand(len(light), 3), single, light, LOBES[lobe]).color
+    color = shade(
+        many, n[:1].expand(len(light), 3), wo[:1].expand(len(light), 3), Incident.of(single, light), LOBES[lobe]
+    ).color
     assert color.max() < 2.5
     # The mirror under unit light sends out 1, whatever its roughness.
     assert (color[:, 0].reshape(3, -1).mean(1) - 1).abs().max() < 0.02

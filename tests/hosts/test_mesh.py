@@ -19,7 +19,7 @@ from neilfpp_method.evaluate.report import write_report
 from neilfpp_method.hosts import mesh_tracing
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.hosts.mesh_tracing import build_tree, embree_tracer, tree_tracer
-from neilfpp_method.inter_reflection import trace_light
+from neilfpp_method.incident.traced import trace_light
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.facts import SceneFacts

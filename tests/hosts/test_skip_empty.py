@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neilfpp_method.hosts.volsdf import VolSdfHost
-from neilfpp_method.inter_reflection import trace_light
+from neilfpp_method.incident.traced import trace_light
 from neilfpp_method.volume import empty_space
 from tests.scenes import sphere_batch, tiny_config
 

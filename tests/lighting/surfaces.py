@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torch.nn.functional import normalize
 
-from neilfpp_method.lighting.memory import Observed
-from neilfpp_method.structures import Material, SceneLight
+from neilfpp_method.structures import Material, Observed, SceneLight
 
 
 def half_room(x: torch.Tensor, wi: torch.Tensor) -> SceneLight:

@@ -10,14 +10,13 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.fit import Evidence, Light, fit_light
-from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.lighting.objective import Objective, Target, nearest_points, total_variation, unevenness
 from neilfpp_method.lighting.transport import Transport, from_texels
 from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.shading.rendering_equation import shade
 from neilfpp_method.shading.sampling import sample_directions
-from neilfpp_method.structures import Material
+from neilfpp_method.structures import Incident, Material, Observed
 from tests.lighting.surfaces import half_room, material, patches, points
 
 
@@ -60,7 +59,7 @@ def test_transport_agrees_with_the_estimator_under_a_map_and_a_wall():
     drawn = sample_directions("mis", seen.normal, seen.wo, of.roughness, 16_384, GGX, stochastic=True)
     arriving = environment.radiance(seen.position, drawn.wi)
     arriving = torch.where(drawn.wi[..., 2:] < 0, 0.7, arriving)
-    expected = shade(of, seen.normal, seen.wo, drawn, arriving, GGX).color
+    expected = shade(of, seen.normal, seen.wo, Incident.of(drawn, arriving), GGX).color
     torch.testing.assert_close(carried, expected, rtol=0.06, atol=0.02)
 
 

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from neilfpp_method.lighting import replay
-from neilfpp_method.lighting.replay import Replay, SurfacePixels
+from neilfpp_method.lighting.replay import Replay
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage
+from neilfpp_method.structures import SurfacePixels
 from tests.scenes import sphere_batch, sphere_model, tiny_config
 from tests.test_model import count_queries
 
@@ -55,7 +56,7 @@ def test_every_ray_is_rendered_where(where):
 
 def test_a_borrowed_host_moves_as_its_trainer_likes():
     own = filled()
-    assert NeilfModel(own.host, own.config, own.facts, borrowed=True).replay is None
+    assert NeilfModel(own.host, own.config, own.facts, borrowed=True).replay.fresh == 1
 
 
 def test_points_come_back_with_their_pixels():

@@ -11,13 +11,12 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.fields.lamps import LampPlaces
 from neilfpp_method.lighting.candidates import FoundLamps
-from neilfpp_method.lighting.memory import Observed
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.settle import settle_lamps
 from neilfpp_method.lighting.transport import Transport, from_lamps, in_sight, lamp_kernel
 from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.shading.brdf import GGX
-from neilfpp_method.structures import Material
+from neilfpp_method.structures import Material, Observed
 from tests.lighting.surfaces import half_room, material, patches, points
 
 RADIUS = 0.06

@@ -13,7 +13,7 @@ from neilfpp_method.fields.direction_map import map_directions
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.fit import Light, fit_light
 from neilfpp_method.lighting.objective import Objective, Target
-from neilfpp_method.lighting.sky import FAITH, SkySightings
+from neilfpp_method.lighting.sky import HALF_WEIGHT_SPREAD, SkySightings
 from neilfpp_method.lighting.transport import from_texels
 from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.shading.color import linear_to_srgb
@@ -39,8 +39,7 @@ def test_texels_are_what_their_pixels_show(response):
     sky, wi = SkySightings(HEIGHT, response), looks(20_000, below=0.2)
     shown = gradient(wi)
     beyond = torch.rand(len(wi), generator=torch.Generator().manual_seed(1)) < 0.5
-    color = torch.where(beyond[:, None], shown, 7.0 if response == "linear" else 0.99)  # the rest is the object
-    sky.remember(wi, color if response == "linear" else torch.where(beyond[:, None], linear_to_srgb(color), color), beyond)
+    sky.remember(wi[beyond], shown[beyond] if response == "linear" else linear_to_srgb(shown[beyond]))
     known, middle = sky.known(), map_directions(HEIGHT, 2 * HEIGHT)
     inside = (middle[..., 2] < 0.0) & (middle[..., 2] > -0.95)
     assert (known.weight[inside] > 0.8).all()
@@ -53,8 +52,8 @@ def test_what_lies_near_counts_for_less():
     """Half of the pixels of every direction show something else: a wall that each camera sees elsewhere."""
     sky, wi = SkySightings(HEIGHT, "linear"), looks(20_000)
     color = torch.where(torch.arange(len(wi))[:, None] % 2 == 0, 0.1, 1.0).expand(-1, 3)
-    sky.remember(wi, color, torch.ones(len(wi), dtype=torch.bool))
-    expected = 1 / (1 + (0.45 / 0.55) ** 2 / FAITH**2)  # 0.12
+    sky.remember(wi, color)
+    expected = 1 / (1 + (0.45 / 0.55) ** 2 / HALF_WEIGHT_SPREAD**2)  # 0.12
     assert sky.known().weight[sky.pixels > 30].mean() == pytest.approx(expected, rel=0.15)
 
 
@@ -62,7 +61,7 @@ def test_a_clipped_pixel_makes_its_texel_unseen():
     sky, wi = SkySightings(HEIGHT, "srgb"), looks(5000)
     color = torch.full((len(wi), 3), 0.5)
     color[wi[:, 2] > 0.5, 0] = 1.0
-    sky.remember(wi, color, torch.ones(len(wi), dtype=torch.bool))
+    sky.remember(wi, color)
     up = map_directions(HEIGHT, 2 * HEIGHT)[..., 2]
     weight = sky.known().weight
     assert (weight[up > 0.7] == 0).all()
@@ -71,7 +70,7 @@ def test_a_clipped_pixel_makes_its_texel_unseen():
 
 def test_nothing_seen_is_nothing_known():
     sky = SkySightings(HEIGHT, "linear")
-    sky.remember(looks(100), torch.zeros(100, 3), torch.zeros(100, dtype=torch.bool))
+    sky.remember(looks(100)[:0], torch.zeros(0, 3))
     known = sky.known()
     assert not known.weight.any()
     assert known.log_radiance.isfinite().all()
@@ -88,7 +87,7 @@ def test_a_fit_keeps_to_what_was_seen_and_finds_the_rest():
     carried = from_texels(environment, seen, of.roughness, None, None)
     image = carried.outgoing(of, truth.flatten(1).t())
     sky, wi = SkySightings(HEIGHT, "linear"), looks(20_000, below=0.1)
-    sky.remember(wi, gradient(wi), torch.ones(len(wi), dtype=torch.bool))
+    sky.remember(wi, gradient(wi))
     wrong = dataclasses.replace(of, base_color=0.7 * of.base_color)
 
     def error(known: SkySightings | None) -> torch.Tensor:

@@ -11,13 +11,15 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import LampPlaces, Lamps
+from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.candidates import merge, propose
-from neilfpp_method.lighting.memory import Observed
+from neilfpp_method.lighting.fit import Evidence
+from neilfpp_method.lighting.objective import Objective
 from neilfpp_method.lighting.solve import solve_light
 from neilfpp_method.lighting.transport import from_lamps, from_texels
 from neilfpp_method.settings.types import IncidentLightConfig, LightFitConfig
 from neilfpp_method.shading.brdf import GGX
-from neilfpp_method.structures import Material
+from neilfpp_method.structures import Material, Observed
 from tests.lighting.surfaces import material, patches
 
 CONFIG = IncidentLightConfig(kind="auto", environment_height=12, fit=LightFitConfig(points=800, steps=150))
@@ -55,12 +57,25 @@ def photographed(lamp: LampPlaces | None, speckled: bool = False) -> tuple[Obser
     return dataclasses.replace(seen, pixel=image), of
 
 
+def solve(
+    environment: EnvironmentLight,
+    lamps: Lamps,
+    seen: Observed,
+    of: Material,
+    unit: float,
+    config: IncidentLightConfig,
+    first: bool,
+) -> Evidence | None:
+    objective = Objective("linear", unit, config.fit)
+    return solve_light(LightModel(environment, lamps), seen, of, GGX, None, objective, config, first)
+
+
 def solved(seen: Observed, of: Material, rounds: int, config: IncidentLightConfig = CONFIG) -> tuple[Lamps, object]:
     torch.manual_seed(0)
     environment, lamps = EnvironmentLight(12, 0.7), Lamps(4, 0.06)
     for number in range(rounds):
         unit = seen.pixel.median().item()
-        evidence = solve_light(environment, lamps, seen, of, GGX, None, "linear", unit, config, first=number == 0)
+        evidence = solve(environment, lamps, seen, of, unit, config, first=number == 0)
     return lamps, evidence
 
 
@@ -133,7 +148,7 @@ def test_before_a_known_map_lamps_are_found_and_the_map_stays():
     torch.manual_seed(0)
     for _ in range(3):
         unit = seen.pixel.median().item()
-        evidence = solve_light(environment, lamps, seen, of, GGX, None, "linear", unit, known, first=False)
+        evidence = solve(environment, lamps, seen, of, unit, known, first=False)
     assert torch.equal(environment.log_radiance, before)
     assert lamps.lit
     assert evidence.points == 160
@@ -148,7 +163,7 @@ def test_under_a_known_sky_alone_no_lamp_is_lit():
     environment, lamps = EnvironmentLight(12, 0.5), Lamps(4, 0.06)
     torch.manual_seed(0)
     known = dataclasses.replace(CONFIG, map="sky.exr")
-    evidence = solve_light(environment, lamps, seen, of, GGX, None, "linear", seen.pixel.median().item(), known, first=True)
+    evidence = solve(environment, lamps, seen, of, seen.pixel.median().item(), known, first=True)
     assert evidence.points == 800  # the first time each has its turn
     assert lamps.lit == 0
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from neilfpp_method.shading import SPHERICAL_GAUSSIAN, shade
-from neilfpp_method.structures import IncidentSamples, Material
+from neilfpp_method.structures import Incident, IncidentSamples, Material
 
 DATA = Path(os.environ.get("NEILFPP_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
 
@@ -33,7 +33,7 @@ def test_the_estimator_closes_the_rendering_equation(light_field):
     samples = IncidentSamples(wi, torch.full(wi.shape[:2], 1 / (2 * math.pi)))
     material = Material(light_field["base_color"], light_field["roughness"][:, None], light_field["metallic"][:, None])
     views = light_field["wo"].unbind(1)
-    shaded = [shade(material, n, wo, samples, light_field["incident"], SPHERICAL_GAUSSIAN).color for wo in views]
+    shaded = [shade(material, n, wo, Incident.of(samples, light_field["incident"]), SPHERICAL_GAUSSIAN).color for wo in views]
     outgoing = torch.stack(shaded, 1)
 
     assert outgoing.sum((0, 1)).allclose(truth.sum((0, 1)), rtol=0.02)

@@ -9,7 +9,7 @@ import torch
 from neilfpp_method.shading.brdf import GGX, LOBES, SPHERICAL_GAUSSIAN, evaluate
 from neilfpp_method.shading.rendering_equation import shade
 from neilfpp_method.shading.sampling import combine, fibonacci, sample_directions
-from neilfpp_method.structures import IncidentSamples, Material
+from neilfpp_method.structures import Incident, IncidentSamples, Material
 from tests import oracles
 
 KINDS = ("fibonacci", "cosine", "lobe", "mis")
@@ -42,7 +42,7 @@ def test_is_the_mean_of_integrand_over_pdf(lobe):
     material, n, wo, samples, light = random_scene()
     f = evaluate(material, n, wo, samples.wi, LOBES[lobe])
     factor = light * ((samples.wi * n[:, None]).sum(-1).clamp_min(0) / samples.pdf)[..., None]
-    shading = shade(material, n, wo, samples, light, LOBES[lobe])
+    shading = shade(material, n, wo, Incident.of(samples, light), LOBES[lobe])
     assert shading.diffuse.allclose((f.diffuse * factor).mean(1))
     assert shading.specular.allclose((f.specular * factor).mean(1))
     assert torch.equal(shading.color, shading.diffuse + shading.specular)
@@ -55,7 +55,7 @@ def test_white_furnace_is_exact_at_every_count(count):
     material = Material(rows(B, 10, torch.float32), torch.ones(10, 1), torch.full((10, 1), M))
     samples = combine([(fibonacci(n), count)], stochastic=False)
     for specular, expected in ((True, (1 - M) * material.base_color), (False, material.base_color)):
-        shading = shade(material, n, n, samples, torch.ones_like(samples.wi), GGX, specular)
+        shading = shade(material, n, n, Incident.of(samples, torch.ones_like(samples.wi)), GGX if specular else None)
         assert (shading.diffuse - expected).abs().max() < 1e-6
 
 
@@ -85,7 +85,7 @@ def test_every_sampler_estimates_the_same_integral(kind, lobe, r, m, truth):
     n, wo = rows((0.0, 0.0, 1.0), count), rows(WO, count)
     samples = sample_directions(kind, n, wo, material.roughness, 32, LOBES[lobe], stochastic=True)
     light = sky(samples.wi)[..., None].expand_as(samples.wi)
-    estimates = shade(material, n, wo, samples, light, LOBES[lobe]).color[:, 0]
+    estimates = shade(material, n, wo, Incident.of(samples, light), LOBES[lobe]).color[:, 0]
     error = estimates.std().item() / count**0.5
     assert error < 0.01 * truth[lobe, r, m]
     assert abs(estimates.mean().item() - truth[lobe, r, m]) < 4 * error + 1e-4
@@ -99,7 +99,7 @@ def test_midpoint_lattices_converge_too(lobe, truth):
     for kind in ("fibonacci", "cosine", "mis"):
         samples = sample_directions(kind, n, wo, material.roughness, 4096, LOBES[lobe], stochastic=False)
         light = sky(samples.wi)[..., None].expand_as(samples.wi)
-        color = shade(material, n, wo, samples, light, LOBES[lobe]).color[0, 0].item()
+        color = shade(material, n, wo, Incident.of(samples, light), LOBES[lobe]).color[0, 0].item()
         assert color == pytest.approx(truth[lobe, r, m], rel=2e-3)
 
 
@@ -111,7 +111,7 @@ def test_specular_furnace_of_a_smooth_metal():
     n = rows((0.0, 0.0, 1.0), count)
     for lobe in (SPHERICAL_GAUSSIAN, GGX):
         samples = sample_directions("lobe", n, n, material.roughness, 64, lobe, stochastic=True)
-        color = shade(material, n, n, samples, torch.ones_like(samples.wi), lobe).color
+        color = shade(material, n, n, Incident.of(samples, torch.ones_like(samples.wi)), lobe).color
         assert color.mean().item() == pytest.approx(1, abs=0.01)
 
 
@@ -120,7 +120,7 @@ def test_gradcheck(lobe):
     material, n, wo, samples, light = random_scene(3, 4)
 
     def color(b, r, m, n, light):
-        return shade(Material(b, r, m), n, wo, samples, light, LOBES[lobe]).color
+        return shade(Material(b, r, m), n, wo, Incident.of(samples, light), LOBES[lobe]).color
 
     inputs = (material.base_color, material.roughness, material.metallic, n, light)
     assert torch.autograd.gradcheck(color, [t.requires_grad_() for t in inputs])
@@ -134,7 +134,9 @@ def test_gradient_of_the_estimate_is_the_gradient_of_the_integral(truth):
     roughness = rows([r], count).clone().requires_grad_()
     samples = sample_directions("lobe", n, wo, roughness, 32, GGX, stochastic=True)
     light = sky(samples.wi)[..., None].expand_as(samples.wi)
-    specular = shade(Material(rows(B, count), roughness, rows([M], count)), n, wo, samples, light, GGX).specular[:, 0]
+    specular = shade(Material(rows(B, count), roughness, rows([M], count)), n, wo, Incident.of(samples, light), GGX).specular[
+        :, 0
+    ]
     (gradient,) = torch.autograd.grad(specular.sum(), roughness)
 
     def integral(r: float) -> float:
@@ -157,6 +159,6 @@ def test_half_precision_is_summed_in_float32():
     light = torch.ones(1, count, 3, dtype=torch.bfloat16)
     material = Material(n.new_ones(1, 3), n.new_ones(1, 1), n.new_zeros(1, 1))
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        shading = shade(material, n, n, samples, light, GGX, specular=False)
+        shading = shade(material, n, n, Incident.of(samples, light), None)
     assert shading.color.dtype == torch.float32
     assert shading.color.allclose(torch.ones(1, 3), atol=1e-5)

@@ -62,7 +62,9 @@ def small_training(root: Path, out: Path, config: NeilfConfig) -> Training:
     seed_step(config.train.seed, step=-1)
     model = build_model(capture, scene_facts(capture, pixels, config), config)
     fabric = Fabric(accelerator="cpu", devices=1)
-    return Training(out, config, model, pixels, fabric, Listener(), lambda: False, lambda model, stage: None, "")
+    return Training(
+        out, config, model, pixels, fabric, Listener(), lambda: False, lambda model, stage: None, "", model.light_solver()
+    )
 
 
 def differences(one: object, other: object, where: str = "") -> list[str]:

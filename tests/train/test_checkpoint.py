@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from neilfpp_method.errors import UserError
+from neilfpp_method.lighting.solver import NothingToSolve
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.train.run import (
     FORMAT,
@@ -30,13 +31,13 @@ from tests.scenes import tiny_config
 FACTS = SceneFacts("linear", 0.25, 3.0, "constant", (0.5, 0.25, 0.125))
 
 
-def learner() -> tuple[torch.nn.Module, torch.optim.Optimizer]:
-    """A model and its optimiser after one step."""
+def learner() -> tuple[torch.nn.Module, torch.nn.Module, torch.optim.Optimizer]:
+    """A model, a light solver that remembers nothing, and the optimiser after one step."""
     model = torch.nn.Linear(3, 2)
     optimizer = torch.optim.Adam(model.parameters())
     model(torch.ones(1, 3)).sum().backward()
     optimizer.step()
-    return model, optimizer
+    return model, NothingToSolve(), optimizer
 
 
 def refused(path: Path, complaint: str) -> None:
@@ -51,12 +52,12 @@ def refused(path: Path, complaint: str) -> None:
 
 
 def test_a_checkpoint_holds_what_was_saved(tmp_path):
-    model, optimizer = learner()
-    save_checkpoint(tmp_path / "checkpoints" / "last.pt", model, optimizer, 7)
+    model, solver, optimizer = learner()
+    save_checkpoint(tmp_path / "checkpoints" / "last.pt", model, solver, optimizer, 7)
     saved = load_checkpoint(tmp_path / "checkpoints" / "last.pt")
     assert saved["step"] == 7
     torch.testing.assert_close(saved["model"], model.state_dict(), rtol=0, atol=0)
-    other_model, other = learner()
+    other_model, _, other = learner()
     other_model.load_state_dict(saved["model"])
     other.load_state_dict(saved["optimizer"])
     torch.testing.assert_close(other.state_dict(), optimizer.state_dict(), rtol=0, atol=0)

@@ -12,6 +12,7 @@ import torch
 from neilfpp_method.cli import main
 from neilfpp_method.data.images import read_image
 from neilfpp_method.errors import UserError
+from neilfpp_method.lighting.solver import NothingToSolve
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.settings.types import IncidentLightConfig, LightFitConfig, NeilfConfig
 from neilfpp_method.train.light_record import LightFit, in_words, read_fits, write_fits
@@ -82,7 +83,7 @@ def test_a_map_alone_leaves_nothing_to_fit(capture, tmp_path, capfd):
     out = tmp_path / "second"
     assert train(capture, out, "--light", sky, "--config.light.kind", "distant") == 0
     run = load_run(out)
-    assert run.model.memory is None
+    assert isinstance(run.model.light_solver(), NothingToSolve)
     assert read_fits(out, before=10**9) == []
     assert not (out / "light.json").exists()
 

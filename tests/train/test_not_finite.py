@@ -30,26 +30,28 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def spoil_loss(training: Training, name: str, steps: range | tuple[int, ...], value: float = math.nan) -> None:
     """Let a loss be `value` at these steps."""
-    honest, calls = training.model.losses, iter(range(1000))
+    honest, calls = training.model.step, iter(range(1000))
 
-    def losses(batch, stage):
-        terms = honest(batch, stage)
-        return terms | {name: LossTerm(terms[name].values * value)} if next(calls) in steps else terms
+    def spoiled(batch, stage):
+        computed = honest(batch, stage)
+        if next(calls) not in steps:
+            return computed
+        return computed._replace(terms=computed.terms | {name: LossTerm(computed.terms[name].values * value)})
 
-    training.model.losses = losses
+    training.model.step = spoiled
 
 
 def spoil_gradient(training: Training, field: str, steps: tuple[int, ...]) -> None:
     """Let the gradient of a field be NaN at these steps, and the loss stay finite."""
-    honest, calls = training.model.losses, iter(range(1000))
+    honest, calls = training.model.step, iter(range(1000))
     parameter = training.model.parameter_groups()[field][0]
     current = [0]
 
-    def losses(batch, stage):
+    def counted(batch, stage):
         current[0] = next(calls)
         return honest(batch, stage)
 
-    training.model.losses = losses
+    training.model.step = counted
     parameter.register_hook(lambda gradient: gradient * math.nan if current[0] in steps else gradient)
 
 
@@ -142,14 +144,14 @@ def test_ten_in_a_row_are_none(tmp_path, capture, monkeypatch):
 
 
 def test_the_command_ends_with_status_1(tmp_path, capture, monkeypatch, capfd):
-    honest = NeilfModel.losses
+    honest = NeilfModel.step
 
-    def losses(self, batch, stage):
-        terms = honest(self, batch, stage)
-        return {name: LossTerm(term.values * math.nan) for name, term in terms.items()}
+    def spoiled(self, batch, stage):
+        computed = honest(self, batch, stage)
+        return computed._replace(terms={name: LossTerm(t.values * math.nan) for name, t in computed.terms.items()})
 
     monkeypatch.setitem(PRESETS, "tiny", small_config)
-    monkeypatch.setattr(NeilfModel, "losses", losses)
+    monkeypatch.setattr(NeilfModel, "step", spoiled)
     out = tmp_path / "run"
     options = ["--preset", "tiny", "--config.train.sdf-steps", "20", "--device", "cpu"]
     assert main(["train", "--data", str(capture), "--out", str(out), *options]) == 1

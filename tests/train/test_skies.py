@@ -10,7 +10,7 @@ import torch
 
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.model import CLEAR
+from neilfpp_method.model import CLEAR_OPACITY
 from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import OptimizerConfig
@@ -78,14 +78,15 @@ def test_pixels_beyond_the_scene_are_remembered_as_its_light(tmp_path, backgroun
     capture = load_capture(make_sky_capture(tmp_path / "sky"))
     batch = PixelDataset(capture, capture.views).sample(400)
     torch.manual_seed(1)
-    model.losses(batch, Stage.MATERIAL_INIT)
+    solver = model.light_solver()
+    solver.observe(model.step(batch, Stage.MATERIAL_INIT))
     if background == "constant":
-        assert model.seen_sky is None
+        assert solver.sky is None
         return
     torch.manual_seed(1)  # the same samples along the same rays
     with torch.no_grad():
-        clear = model.host.render(batch.rays).opacity < CLEAR
+        clear = model.host.render(batch.rays).opacity < CLEAR_OPACITY
     assert 0 < clear.sum() < 400
-    known = model.seen_sky.known()
-    assert model.seen_sky.pixels.sum() == clear.sum()
+    known = solver.sky.known()
+    assert solver.sky.pixels.sum() == clear.sum()
     assert torch.isin(known.log_radiance[0][known.weight > 0.5], torch.tensor([GROUND, SKY[0]]).log()).any()

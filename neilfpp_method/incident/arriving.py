@@ -1,0 +1,86 @@
+"""What arrives along incident directions: the light, the scene where it stands before the light, and the lamps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neilfpp_method.fields.lamps import Lamps
+from neilfpp_method.fields.light import Light
+from neilfpp_method.structures import Incident, IncidentSamples, SceneLight, SceneTracer, Source
+
+__all__ = ["Sources", "arriving", "incident_radiance"]
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Everything that may send light to a surface point.
+
+    Attributes:
+        light: an environment map, or a field that is free at every point.
+        lamps: small lamps close to the scene; perhaps none is lit.
+        scene: the scene's own surfaces, which stand before light and lamps; none: nothing is traced (a free field holds what
+            arrives from everywhere).
+    """
+
+    light: Light
+    lamps: Lamps
+    scene: SceneTracer | None
+
+
+def arriving(sources: Sources, x: Float[Tensor, "N 3"], drawn: IncidentSamples) -> Incident:
+    """What arrives at surface points along drawn directions, and from the lamps.
+
+    A drawn direction never meets a lamp: each lamp is a direction of its own, with a shadow ray where there is a scene. So the
+    sum over all directions of weight · radiance · f · cos estimates the integral of the rendering equation.
+
+    Args:
+        sources: what may send light.
+        x: surface points, scene frame.
+        drawn: incident directions with the density that drew them.
+
+    Returns:
+        S incident directions per point, and one more for each lit lamp. Gradients reach the light.
+    """
+    incident = _from_light(sources, x, drawn)
+    return incident.beside(_from_lamps(sources, x)) if sources.lamps.lit else incident
+
+
+def incident_radiance(sources: Sources, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
+    """Linear radiance that arrives at x from any directions wi, lamps that they meet included."""
+    if sources.scene is None:
+        radiance, nearest = sources.light.radiance(x, wi), torch.full_like(wi[..., 0], torch.inf)
+    else:
+        scene = sources.scene(x, wi)
+        radiance, nearest = _behind_scene(scene, sources.light, x, wi), scene.distance
+    return radiance + sources.lamps.met(x, wi, nearest) if sources.lamps.lit else radiance
+
+
+def _from_light(sources: Sources, x: Float[Tensor, "N 3"], drawn: IncidentSamples) -> Incident:
+    if sources.scene is None:
+        return Incident.of(drawn, sources.light.radiance(x, drawn.wi))
+    scene = sources.scene(x, drawn.wi)
+    source = torch.where(scene.hit, Source.SCENE, Source.LIGHT)
+    return Incident.of(drawn, _behind_scene(scene, sources.light, x, drawn.wi), source)
+
+
+def _from_lamps(sources: Sources, x: Float[Tensor, "N 3"]) -> Incident:
+    rays = sources.lamps.rays_from(x)
+    radiance = sources.lamps.arriving(rays)
+    if sources.scene is not None:
+        visibility = sources.scene(x, rays.wi).distance >= rays.distance
+        radiance = radiance * visibility[..., None]
+    number = Source.LAMPS + torch.arange(sources.lamps.lit, device=x.device)
+    return Incident(rays.wi, radiance, rays.solid_angle, number.expand(rays.distance.shape))
+
+
+def _behind_scene(
+    scene: SceneLight, light: Light, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]
+) -> Float[Tensor, "N S 3"]:
+    """The scene's radiance where a direction meets it, elsewhere that of the light, which is asked there alone."""
+    point, direction = torch.nonzero(~scene.hit, as_tuple=True)
+    beyond = light.radiance(x[point], wi[point, direction][:, None])[:, 0]
+    return scene.radiance.index_put((point, direction), beyond)

@@ -1,0 +1,68 @@
+"""What the scene's own surfaces send: rays that leave a surface, traced through the host (METHOD §2)."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neilfpp_method.hosts.base import HasSurfaceWidth, Host, LightsItself
+from neilfpp_method.settings.types import InterReflectionConfig
+from neilfpp_method.structures import RayBatch, SceneLight, SceneTracer
+
+__all__ = ["off_surface", "scene_light", "scene_tracer"]
+
+HEIGHT_IN_WIDTHS = 4.0
+"""Height above a surface of scale β at which a ray starts, in β. A ray that leaves from a height h has the optical depth
+exp(−h/β) / (2 cos θ) before it: from four scales up that is 1 % along the normal and 5 % at 80°."""
+
+MIN_COSINE = 0.1
+"""Directions closer to the surface than 6° start as far along as those at 6°."""
+
+RAYS_AT_ONCE = 2048
+"""Rays that a host without cheap tracing renders at once; bounds the memory."""
+
+
+def scene_tracer(host: Host, config: InterReflectionConfig, hit_share: float) -> SceneTracer:
+    """`scene_light` of a host, for those who know surface points and directions alone."""
+    return lambda x, wi: scene_light(host, x, wi, config, hit_share)
+
+
+@torch.no_grad()
+def scene_light(
+    host: Host,
+    x: Float[Tensor, "N 3"],
+    wi: Float[Tensor, "N S 3"],
+    config: InterReflectionConfig,
+    hit_share: float,
+) -> SceneLight:
+    """What the scene itself sends to surface points: by the host's own tracing, or by rendering all N·S rays.
+
+    Args:
+        host: geometry and outgoing radiance.
+        x: surface points, scene frame.
+        wi: unit directions away from the surface.
+        config: `offset`, scene units, is where rays start where the host traces by rendering.
+        hit_share: smallest concentration of a ray's blending weight that counts as a hit.
+    """
+    x = x.detach()
+    if isinstance(host, LightsItself):
+        return host.scene_light(x, wi)
+    start = (x[:, None] + config.offset * wi).reshape(-1, 3)
+    radiance, distance = [], []
+    for origins, directions in zip(start.split(RAYS_AT_ONCE), wi.reshape(-1, 3).split(RAYS_AT_ONCE), strict=True):
+        hits = host.render(RayBatch(origins, directions))
+        hit = hits.is_hit(hit_share)
+        distance.append(torch.where(hit, (hits.position - origins).norm(dim=-1), torch.inf))
+        radiance.append(torch.where(hit[:, None], hits.color, 0.0))
+    distance = torch.cat(distance).view(wi.shape[:2])
+    return SceneLight(distance.isfinite(), torch.cat(radiance).view(wi.shape), distance)
+
+
+def off_surface(
+    host: Host, x: Float[Tensor, "K 3"], normal: Float[Tensor, "K 3"], w: Float[Tensor, "K 3"], offset: float
+) -> Float[Tensor, "K 3"]:
+    """Points along w above the soft layer that a host's surface is, at a height of `offset` and four widths of it."""
+    width = host.surface_width() if isinstance(host, HasSurfaceWidth) else 0.0
+    cosine = (w * normal).sum(-1, keepdim=True).clamp_min(MIN_COSINE)
+    return x + ((offset + HEIGHT_IN_WIDTHS * width) / cosine) * w

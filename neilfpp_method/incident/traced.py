@@ -1,0 +1,89 @@
+"""Rays for L_ref: what arrives from another surface, as the host renders it (METHOD §2, §4)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from neilfpp_method.hosts.base import Host, KnowsMisses
+from neilfpp_method.incident.scene import off_surface
+from neilfpp_method.losses import scale_gradient
+from neilfpp_method.settings.types import InterReflectionConfig
+from neilfpp_method.shading.frame import local_frame
+from neilfpp_method.structures import RayBatch
+
+__all__ = ["TracedLight", "trace_light"]
+
+FARTHEST_START = 0.2
+"""Distance from its point, scene units, beyond which no ray starts (published code). Further out it could start behind a
+neighbouring surface, and nearer than its angle asks for it would meet the layer that it leaves: it is left out."""
+
+
+@dataclass(frozen=True)
+class TracedLight:
+    """Rays that left the surface: where from, which way, the radiance that arrives along them, and which ones hit.
+
+    Rays that start too far away, or of which the host knows at once that they meet nothing, are left out.
+    """
+
+    position: Float[Tensor, "K 3"]
+    wi: Float[Tensor, "K 3"]
+    radiance: Float[Tensor, "K 3"]
+    hit: Bool[Tensor, " K"]
+
+
+def trace_light(
+    host: Host,
+    position: Float[Tensor, "N 3"],
+    normal: Float[Tensor, "N 3"],
+    config: InterReflectionConfig,
+    hit_share: float,
+) -> TracedLight:
+    """Trace random directions from random points through the host.
+
+    Directions are uniform in solid angle within `config.max_angle_deg` of the normal. A ray starts off the surface: at a
+    height of `config.offset` and four widths of the host's surface, so the displacement along the ray grows as 1/cos.
+    A ray that would have to start further than `FARTHEST_START` from its point is left out.
+    Positions are constants: L_ref says what arrives at a point, not where the point is.
+
+    Args:
+        host: renders the rays; its radiance gets a gradient scaled by `config.radiance_gradient`, none when that is 0.
+        position: surface points, scene frame.
+        normal: unit normals, away from the surface.
+        config: how many, how far, how steep.
+        hit_share: smallest concentration of a hit.
+    """
+    position, normal = position.detach(), normal.detach()
+    rows = _random_rows(position.shape[0], config.rays_per_point, position.device)
+    position, normal = position[rows], normal[rows]
+    wi = _cone_directions(normal, math.cos(math.radians(config.max_angle_deg)))
+    start = off_surface(host, position, normal, wi, config.offset)
+    worth = (start - position).norm(dim=-1) <= FARTHEST_START
+    if isinstance(host, KnowsMisses):
+        worth &= host.may_meet(RayBatch(start, wi))
+    kept = torch.nonzero(worth)[:, 0]
+    position, start, wi = position[kept], start[kept], wi[kept]
+    with torch.set_grad_enabled(torch.is_grad_enabled() and config.radiance_gradient > 0.0):
+        hits = host.render(RayBatch(start, wi))
+    radiance = scale_gradient(hits.color, config.radiance_gradient)
+    return TracedLight(position, wi, radiance, hits.is_hit(hit_share))
+
+
+def _random_rows(points: int, per_point: float, device: torch.device) -> Tensor:
+    """Rows of the points that send a ray: every point ⌊per_point⌋ times, and a random choice for the rest."""
+    whole = int(per_point)
+    rest = round(points * (per_point - whole))
+    return torch.cat([torch.arange(points, device=device).repeat(whole), torch.randperm(points, device=device)[:rest]])
+
+
+def _cone_directions(normal: Float[Tensor, "K 3"], min_cosine: float) -> Float[Tensor, "K 3"]:
+    """Directions uniform in the cone cos θ ≥ `min_cosine` about the normal."""
+    azimuth = 2.0 * math.pi * torch.rand_like(normal[:, :1])
+    cosine = min_cosine + (1.0 - min_cosine) * torch.rand_like(normal[:, :1])
+    sine = (1.0 - cosine.square()).clamp_min(0.0).sqrt()
+    local = torch.cat([sine * azimuth.cos(), sine * azimuth.sin(), cosine], dim=-1)
+    return (local[:, None] @ local_frame(normal))[:, 0]

@@ -1,0 +1,121 @@
+"""The light solver: it remembers what training steps showed, and now and then solves for the light that explains it.
+
+    solver = model.light_solver()
+    step = model.step(batch, stage)
+    solver.observe(step)
+    evidence = solver.solve(model.brdf, model.scene)
+
+A light that is free at every point is learned by gradients instead; `NothingToSolve` then stands in the solver's place.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import torch
+from torch import nn
+
+from neilfpp_method.fields.brdf import BrdfField
+from neilfpp_method.fields.light import LightModel
+from neilfpp_method.lighting.fit import Evidence
+from neilfpp_method.lighting.memory import SurfaceMemory
+from neilfpp_method.lighting.objective import Objective
+from neilfpp_method.lighting.sky import SkySightings
+from neilfpp_method.lighting.solve import solve_light
+from neilfpp_method.settings.facts import RadianceUnits, SceneFacts
+from neilfpp_method.settings.types import IncidentLightConfig
+from neilfpp_method.shading.brdf import Lobe
+from neilfpp_method.structures import SceneTracer, StepResult
+
+__all__ = ["LightSolver", "MapSolver", "NothingToSolve", "make_light_solver"]
+
+
+@runtime_checkable
+class LightSolver(Protocol):
+    """What a training loop calls after every step. It is an `nn.Module`: what it remembers is part of a checkpoint."""
+
+    @property
+    def due(self) -> bool:
+        """Whether `solve` would solve now."""
+        ...
+
+    def observe(self, step: StepResult) -> None:
+        """Remember what a training step showed of the surface and of the light beyond it."""
+        ...
+
+    def solve(self, brdf: BrdfField, scene: SceneTracer | None) -> Evidence | None:
+        """Set the light to what explains the remembered points, when it is time.
+
+        Args:
+            brdf: says what the remembered points are made of.
+            scene: stands between the points and the light, and shines on them; none where nothing is traced.
+
+        Returns:
+            What the points that were kept back say of lamps; none where nothing was solved, or the settings had decided.
+        """
+        ...
+
+
+class NothingToSolve(nn.Module):
+    """The solver of a light that is learned by gradients, or known."""
+
+    due = False
+
+    def observe(self, step: StepResult) -> None:
+        """Nothing is remembered."""
+
+    def solve(self, brdf: BrdfField, scene: SceneTracer | None) -> None:
+        """Nothing is solved for."""
+
+
+class MapSolver(nn.Module):
+    """Solves for an environment map and the lamps before it.
+
+    Args:
+        config: of the light.
+        facts, units: of the scene.
+        light: the map and the lamps that are set; they stay those of the model.
+        lobe: of the specular reflection; none for Lambertian surfaces.
+    """
+
+    def __init__(
+        self, config: IncidentLightConfig, facts: SceneFacts, units: RadianceUnits, light: LightModel, lobe: Lobe | None
+    ) -> None:
+        super().__init__()
+        self.config, self.response, self.unit = config, facts.response, units.physical
+        self.light, self.lobe = light, lobe
+        self.memory = SurfaceMemory(config.fit.points, config.fit.every)
+        # Only a background that is no backdrop shows the light, and only a map that is sought has to keep to it.
+        sightings = config.map is None and facts.background == "inverted_sphere" and config.fit.sky > 0
+        self.sky = SkySightings(config.environment_height, facts.response) if sightings else None
+
+    @property
+    def due(self) -> bool:
+        """Whether `solve` would solve now."""
+        return self.memory.due
+
+    def observe(self, step: StepResult) -> None:
+        """As of `LightSolver`."""
+        if not len(step.surface_rows) and not len(step.beyond_rows):
+            return
+        self.memory.remember(step.surface)
+        if self.sky is not None:
+            self.sky.remember(*step.beyond_rows.split(3, -1))
+
+    @torch.no_grad()
+    def solve(self, brdf: BrdfField, scene: SceneTracer | None) -> Evidence | None:
+        """As of `LightSolver`."""
+        if not self.due:
+            return None
+        first, observed = self.memory.age is None, self.memory.recall()
+        sky = None if self.sky is None else self.sky.known()
+        objective = Objective(self.response, self.unit, self.config.fit, sky)
+        return solve_light(self.light, observed, brdf(observed.position), self.lobe, scene, objective, self.config, first)
+
+
+def make_light_solver(
+    config: IncidentLightConfig, facts: SceneFacts, units: RadianceUnits, light: LightModel, lobe: Lobe | None
+) -> MapSolver | NothingToSolve:
+    """The solver that a light needs; arguments as of `MapSolver`."""
+    known = config.map is not None and config.kind == "distant"
+    return NothingToSolve() if config.kind == "free" or known else MapSolver(config, facts, units, light, lobe)
