@@ -53,9 +53,7 @@ def test_rates_fall_smoothly_or_in_drops():
     config = OptimizerConfig(joint=0.5, final=(0.01, 0.1, 0.01), drops=(0, 1, 2))
     assert factors(config, Stage.SDF_INIT, [0, 50, 100], 100) == pytest.approx([1.0, 0.1, 0.01])
     assert factors(config, Stage.MATERIAL_INIT, [0, 49, 50, 99, 100], 100) == pytest.approx([1.0, 1.0, 0.1, 0.1, 0.1])
-    assert factors(config, Stage.JOINT, [0, 29, 30, 59, 60, 90], 90) == pytest.approx(
-        [0.5, 0.5, 0.05, 0.05, 0.005, 0.005]
-    )
+    assert factors(config, Stage.JOINT, [0, 29, 30, 59, 60, 90], 90) == pytest.approx([0.5, 0.5, 0.05, 0.05, 0.005, 0.005])
 
 
 def test_rates_rise_from_a_tenth():

@@ -149,7 +149,11 @@ class VolSdfHost(nn.Module):
     def smooth_normals(self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """The normals of `volume.normal_radius` about hits, edges kept; where that is 0, those of the hits."""
         radius = self.config.volume.normal_radius
-        return smooth_normals(lambda x: self.sdf_field.with_gradient(x).gradient, position, normal, radius) if radius > 0 else normal
+        return (
+            smooth_normals(lambda x: self.sdf_field.with_gradient(x).gradient, position, normal, radius)
+            if radius > 0
+            else normal
+        )
 
     @torch.no_grad()
     def may_meet(self, rays: RayBatch) -> Bool[Tensor, " N"]:
@@ -230,9 +234,7 @@ class VolSdfHost(nn.Module):
             concentration=share_near(distances, intervals.weights.detach(), depth.detach(), self.config.volume.hit_radius),
         )
 
-    def _beyond(
-        self, rays: RayBatch, transmittance: Float[Tensor, " N"], at_far: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N 3"]:
+    def _beyond(self, rays: RayBatch, transmittance: Float[Tensor, " N"], at_far: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """What still arrives from the scene sphere: from beyond it, or where there is no background from R on the sphere.
 
         The published code makes the sphere a surface of the distance field that nothing passes; a ray that reaches it

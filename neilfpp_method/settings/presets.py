@@ -58,12 +58,8 @@ def paper_ngp() -> NeilfConfig:
         radiance=OutgoingRadianceConfig(layers=4, width=64, direction_encoding="spherical_harmonics"),
         brdf=BrdfConfig(encoding="hash", activation="relu", layers=2, width=120, skip=None),
         light=replace(mlp.light, activation="relu", direction_encoding="spherical_harmonics", direction_degree=4),
-        loss=replace(
-            mlp.loss, point_cloud=0.1, surface=1e-2, position_gradient=0.0, hessian_method="finite_difference"
-        ),
-        optimizer=OptimizerConfig(
-            *(6 * [1e-2]), joint=0.1, final=(0.1, 0.1, 0.01), drops=(1, 1, 2), warm_up=100
-        ),
+        loss=replace(mlp.loss, point_cloud=0.1, surface=1e-2, position_gradient=0.0, hessian_method="finite_difference"),
+        optimizer=OptimizerConfig(*(6 * [1e-2]), joint=0.1, final=(0.1, 0.1, 0.01), drops=(1, 1, 2), warm_up=100),
         train=TrainConfig(sdf_steps=5_000, material_steps=5_000, joint_steps=30_000),
     )
 

@@ -121,9 +121,7 @@ def test_regularisers_look_all_over_the_scene():
     config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, points="scene", surface_epsilon=10.0))
     host, batch, asked = sphere_model(config).train().host, sphere_batch(16), []
     slope = torch.tensor([0.0, 0.0, 2.0])
-    host.sdf_field.with_gradient = lambda x: asked.append(x) or SdfSample(
-        x @ slope, slope.expand_as(x), torch.zeros(len(x), 4)
-    )
+    host.sdf_field.with_gradient = lambda x: asked.append(x) or SdfSample(x @ slope, slope.expand_as(x), torch.zeros(len(x), 4))
     host.sdf_field.hessian = lambda x, method: asked.append(x) or torch.zeros(len(x), 3, 3)
     terms = host.render_regularised(batch, ["eikonal", "surface", "hessian"]).terms
     _, points, curved = asked

@@ -38,7 +38,9 @@ def test_slope_on_the_surface_is_that_of_the_laplace_density():
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("ends", [(0.5, 0.2), (0.3, -0.4), (-0.1, -2.0), (0.01, 0.0102), (-1e-4, 1e-4), (0.0, 0.0), (-3.0, 40.0)])
+@pytest.mark.parametrize(
+    "ends", [(0.5, 0.2), (0.3, -0.4), (-0.1, -2.0), (0.01, 0.0102), (-1e-4, 1e-4), (0.0, 0.0), (-3.0, 40.0)]
+)
 def test_depth_is_the_integral_of_the_density_of_a_linear_distance(ends, dtype):
     beta, width = 0.1, 0.7
     inner = 0.5 if ends[0] == ends[1] else np.clip(ends[0] / (ends[0] - ends[1]), 0.0, 1.0)  # the kink of the density
@@ -46,7 +48,9 @@ def test_depth_is_the_integral_of_the_density_of_a_linear_distance(ends, dtype):
     expected, _ = quad(
         lambda t: laplace.cdf(-(ends[0] + slope * t), scale=beta) / beta, 0.0, 1.0, points=[inner], epsabs=0.0, epsrel=1e-10
     )
-    found = laplace_depth(torch.tensor([ends], dtype=dtype), torch.tensor([[2.0, 2.0 + width]], dtype=dtype), torch.tensor(beta))
+    found = laplace_depth(
+        torch.tensor([ends], dtype=dtype), torch.tensor([[2.0, 2.0 + width]], dtype=dtype), torch.tensor(beta)
+    )
     assert found.item() == pytest.approx(width * expected, rel=1e-6 if dtype is torch.float64 else 2e-5)
 
 
