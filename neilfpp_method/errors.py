@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["Diverged", "EarlyEnd", "Stopped", "UserError"]
+__all__ = ["Diverged", "EarlyEnd", "Stopped", "Unsound", "UserError"]
 
 
 class EarlyEnd(Exception):
@@ -30,3 +30,7 @@ class Stopped(EarlyEnd):
 
 class Diverged(EarlyEnd):
     """Training met too many steps in a row without a finite loss and gradient."""
+
+
+class Unsound(EarlyEnd):
+    """Training came to its end, and its result is of no use."""

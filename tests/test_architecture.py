@@ -26,6 +26,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("hosts.base", "lighting"),
     ("hosts", "incident"),
     ("model",),
+    ("health",),
     ("attach", "train"),
     ("export",),
     ("evaluate",),

@@ -73,6 +73,7 @@ def test_eval_writes_flat_finite_figures(trained, tmp_path, monkeypatch, capfd):
     material = {"base_color_psnr", "base_color_psnr_gamma", "base_color_psnr_scaled", "roughness_psnr", "metallic_psnr"}
     wanted = {"volume_psnr", "pbr_psnr", "normal_mae_deg"} | material | {f"{name}_frame" for name in material}
     assert wanted <= figures.keys()
+    assert figures.pop("health") in ("sound", "doubtful", "failed")
     for name, value in figures.items():
         assert isinstance(value, float), name
         assert math.isfinite(value), name

@@ -41,6 +41,8 @@ class Train:
     """Hold out every k-th view for testing; none: the capture's split.json, or every 8th."""
     response: Literal["auto", "linear", "srgb"] = "auto"
     """What the pixels are: linear radiance (HDR) or sRGB (LDR); auto: told from the files."""
+    strict: bool = False
+    """End with exit status 1 where the result is of no use: no surface, fog, nothing shaded (docs/health.md)."""
     device: Device = "auto"
     """Where to train; auto takes a GPU where there is one."""
     devices: int = 1
@@ -66,6 +68,7 @@ def run(options: Train) -> None:
             format=options.format,
             device=options.device,
             devices=options.devices,
+            strict=options.strict,
             console=terminal(),
         )
 

@@ -48,7 +48,7 @@ POINTS_AT_ONCE, SIGHTED_AT_ONCE = 512, 2**16
 NEIGHBOURS, NEAR, TURN = 9, 0.1, 0.1
 """Most points that tell how sure one is, itself among them; how near they are, in scene units; and how far a radian between
 normals puts two of them apart."""
-LEAST_NOISE = 1e-3
+MIN_NOISE = 1e-3
 """No image is better than this."""
 STEP = 1e-3
 """Of a pixel, for the slope of radiance over it."""
@@ -104,7 +104,7 @@ def gather_evidence(run: Run) -> Evidence:
         shares.append(parts / parts.sum(-1, keepdim=True).clamp_min(TINY))
     if not errors:
         return Evidence(views, 1.0, 1.0, views.centres.new_zeros(3, patch_count(model)))
-    noise, misfit = (max(torch.cat(values).median().item(), LEAST_NOISE) for values in (errors, misfits))
+    noise, misfit = (max(torch.cat(values).median().item(), MIN_NOISE) for values in (errors, misfits))
     return Evidence(views, noise, misfit, torch.cat(shares).mean(0))
 
 

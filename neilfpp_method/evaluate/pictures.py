@@ -162,7 +162,7 @@ GROUP_GAP = 28
 LABEL_WIDTH = 250
 TITLE_HEIGHT = 96
 HEADER_HEIGHT = 70
-LEAST_ROW = 100
+MIN_ROW_HEIGHT = 100
 TITLE, HEADING, TEXT, NOTE = 34, 24, 20, 16
 
 
@@ -227,7 +227,7 @@ def _section_height(section: Section) -> int:
 
 
 def _row_height(row: Row) -> int:
-    return max([LEAST_ROW] + [picture.shape[0] for picture in row.pictures if picture is not None])
+    return max([MIN_ROW_HEIGHT] + [picture.shape[0] for picture in row.pictures if picture is not None])
 
 
 def _column_lefts(groups: Sequence[Group], cell_width: int) -> Iterator[int]:

@@ -25,7 +25,7 @@ __all__ = ["ROUGHNESS_NODES", "Deviation", "Looks", "Sights", "expected_error", 
 ROUGHNESS_NODES = (0.05, 0.15, 0.25, 0.35, 0.5, 0.65, 0.8, 1.0)
 """Roughnesses at which F and G are known; between them both are linear."""
 ROUGHNESS_CELLS, METALLIC_CELLS = 20, 9
-LEAST_PRECISION = 1e-2
+PRIOR_PRECISION = 1e-2
 """Of a channel of base colour that nothing depends on; the cut at 0 and 1 makes an even prior of it."""
 
 
@@ -154,8 +154,8 @@ def _solve(products: _Products, m: Float[Tensor, " M"]) -> _BaseColor:
     aa = (1 - m).square() * p.dd + 2 * m * (1 - m) * p.df + m.square() * p.ff
     ar = (1 - m) * p.dr + m * p.fr - k * ((1 - m) * p.df + m * p.ff)
     rr = p.rr - 2 * k * p.fr + k.square() * p.ff
-    precision = aa + LEAST_PRECISION
-    centre = (ar + 0.5 * LEAST_PRECISION) / precision
+    precision = aa + PRIOR_PRECISION
+    centre = (ar + 0.5 * PRIOR_PRECISION) / precision
     width = precision.rsqrt()
     low, high = -centre / width, (1 - centre) / width
 

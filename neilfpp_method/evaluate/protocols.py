@@ -44,7 +44,9 @@ from neilfpp_method.evaluate.views import (
     surface_points,
 )
 from neilfpp_method.export.mesh import HasSdf, extract_mesh
+from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.shading.color import tone_map
+from neilfpp_method.train.health_record import read_findings
 from neilfpp_method.train.run import Run, write_json
 
 __all__ = ["evaluate", "protocol", "write_metrics"]
@@ -106,8 +108,13 @@ def protocol(run: Run) -> dict[str, str]:
 
 
 def write_metrics(path: Path, run: Run, figures: Mapping[str, float]) -> None:
-    """Write the figures as a flat JSON object, and how to read them beside it, as `<stem>-protocol.json`."""
-    write_json(path, figures)
+    """Write the figures and the verdict on the run's health as a flat JSON object.
+
+    Beside it, as `<stem>-protocol.json`, stands how to read them.
+    """
+    findings = read_findings(run.path)
+    health = {} if findings is None else {"health": verdict_of(findings)}
+    write_json(path, {**figures, **health})
     write_json(path.with_name(f"{path.stem}-protocol.json"), protocol(run))
 
 

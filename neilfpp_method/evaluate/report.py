@@ -18,6 +18,8 @@ from neilfpp_method.evaluate.panels import albedo_scale, light_sections, view_se
 from neilfpp_method.evaluate.pictures import contact_sheet
 from neilfpp_method.evaluate.views import RenderedView, has_material, known_test_views, render_view
 from neilfpp_method.schedule import stage_steps
+from neilfpp_method.train.health_record import in_words as in_words_of_health
+from neilfpp_method.train.health_record import read_findings
 from neilfpp_method.train.light_record import in_words, read_fits
 from neilfpp_method.train.run import Run, read_json
 
@@ -112,6 +114,9 @@ def _facts(run: Run) -> dict[str, str]:
         "Light": in_words(run.config.light, read_fits(run.path, run.step)),
         "Rays a step": str(train.rays),
     }
+    findings = read_findings(run.path)
+    if findings is not None:
+        facts["Health"] = in_words_of_health(findings)
     path = run.path / "environment.json"
     if path.is_file():
         machine = read_json(path)

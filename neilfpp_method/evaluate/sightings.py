@@ -19,7 +19,7 @@ __all__ = ["Sightings", "TrainingViews"]
 
 TOLERANCE = 0.05
 """Surfaces this close to one another count as one, scene units, as they do for a hit."""
-LEAST_COSINE = 0.05
+MIN_COSINE = 0.05
 """Flatter looks see a pixel's width of surface, and a bend of the normal."""
 
 
@@ -77,7 +77,7 @@ class TrainingViews:
             towards = self.centres[i] - position[rows]
             distance = towards.norm(dim=-1)
             direction = towards / distance[:, None]
-            kept = (index >= 0) & usable[index] & ((direction * normal[rows]).sum(-1) > LEAST_COSINE)
+            kept = (index >= 0) & usable[index] & ((direction * normal[rows]).sum(-1) > MIN_COSINE)
             rows, direction, distance, index = rows[kept], direction[kept], distance[kept], index[kept]
             free = _nothing_between(model, self.centres[i], position[rows], direction, distance)
             rows, slot = rows[free], seen[rows[free]].sum(1)

@@ -28,7 +28,7 @@ FORMAT = 1
 PROBE_HEIGHT = 64
 FREE_PROBES = 16
 """Probes of a light that is free at every point, of which nothing else can be exported."""
-MOST_PROBES = 1024
+MAX_PROBES = 1024
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ def check_light(run: Run, probes: int | None) -> None:
     """
     if not has_light(run):
         raise UserError(f"{run.path}: there is no light yet at step {run.step}", "train the next stage")
-    if probes is not None and not 0 <= probes <= MOST_PROBES:
-        raise UserError(f"{probes} probes", f"ask for 0 to {MOST_PROBES} with --probes")
+    if probes is not None and not 0 <= probes <= MAX_PROBES:
+        raise UserError(f"{probes} probes", f"ask for 0 to {MAX_PROBES} with --probes")
 
 
 def export_light(run: Run, out: Path, probes: int | None = None) -> ExportedLight:

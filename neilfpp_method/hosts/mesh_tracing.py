@@ -25,7 +25,7 @@ RAYS_AT_ONCE = 8192
 """Bounds the memory: some hundred triangles are tried per ray."""
 SLACK = 1e-6
 """In shares of a triangle: rays through an edge that two triangles share must not slip between them."""
-LEAST = 1e-12
+MIN_COMPONENT = 1e-12
 """A direction's component is kept off zero by this, so that its inverse is finite."""
 
 
@@ -101,7 +101,7 @@ def tree_tracer(tree: BoxTree) -> FirstHits:
 def _descend(tree: BoxTree, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
     """All rays go down the tree together: a level takes pairs (ray, node) and leaves those that meet."""
     count, device = len(origins), origins.device
-    inverse = 1.0 / torch.where(directions < 0.0, directions.clamp_max(-LEAST), directions.clamp_min(LEAST))
+    inverse = 1.0 / torch.where(directions < 0.0, directions.clamp_max(-MIN_COMPONENT), directions.clamp_min(MIN_COMPONENT))
     rays = torch.arange(count, device=device)
     nodes = torch.zeros_like(rays)
     children = torch.arange(BRANCHES, device=device)
@@ -140,7 +140,7 @@ def _fill_up(rows: Tensor, value: float | int) -> Tensor:
 def _morton(points: Float[Tensor, "F 3"]) -> Int[Tensor, " F"]:
     """Interleaved bits of the coordinates: points that are close on the curve are close in space."""
     low, high = points.amin(dim=0), points.amax(dim=0)
-    cells = ((points - low) / (high - low).amax().clamp_min(LEAST) * (2**MORTON_BITS - 1)).long()
+    cells = ((points - low) / (high - low).amax().clamp_min(MIN_COMPONENT) * (2**MORTON_BITS - 1)).long()
     code = torch.zeros_like(cells[:, 0])
     for bit in range(MORTON_BITS):
         for axis in range(3):

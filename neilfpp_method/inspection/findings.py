@@ -23,9 +23,9 @@ JUMP = 1.5
 BLURRED = 0.4
 CLIPPED_VIEW, CLIPPED_A_BIT, CLIPPED_MUCH = 0.01, 0.001, 0.02
 INVALID_VIEW = 0.5
-FEWEST, FEW = 3, 16
+MIN_COUNT, FEW_COUNT = 3, 16
 SPARSE_GAP = 25.0
-LEAST_COVERAGE = 0.25
+MIN_COVERAGE = 0.25
 EDGE, STRAY_POINTS, SMALL_CLOUD = 1.05, 0.1, 0.2
 FEW_LEVELS = 256
 ENOUGH = 16
@@ -136,13 +136,13 @@ def _of_cameras(capture: Capture, where: Stand) -> Iterator[Finding]:
         text = "cameras within the unit sphere, which is to hold the object alone"
         yield Finding("camera_inside", "warning", text, "make the scene box smaller", tuple(names[where.within]))
     count = len(names)
-    if count < FEW:
-        severity: Severity = "problem" if count < FEWEST else "warning"
-        yield Finding("few_views", severity, f"{count} views", f"take {FEW} or more, better 50, from all around")
-    if count >= FEWEST and where.coverage < LEAST_COVERAGE:
+    if count < FEW_COUNT:
+        severity: Severity = "problem" if count < MIN_COUNT else "warning"
+        yield Finding("few_views", severity, f"{count} views", f"take {FEW_COUNT} or more, better 50, from all around")
+    if count >= MIN_COUNT and where.coverage < MIN_COVERAGE:
         text = f"the views cover {100 * where.coverage:.0f} % of the directions around the object"
         yield Finding("coverage", "warning", text, "add views from other sides, and from other heights")
-    if count >= FEWEST and where.gap > SPARSE_GAP:
+    if count >= MIN_COUNT and where.gap > SPARSE_GAP:
         text = f"{where.gap:.0f}° from one view to the next"
         yield Finding("sparse", "warning", text, f"add views between them, {SPARSE_GAP:.0f}° apart or less")
 

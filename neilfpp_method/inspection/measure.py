@@ -26,7 +26,7 @@ BORDER_SHARE = 0.5
 DARK = 1e-3
 FULL = 254.5 / 255
 PLATEAU_WIDTH = 1e-4
-LEAST_PLATEAU = 16
+MIN_CLIPPED = 16
 """Fewest pixels at the very maximum of an image that are more than a coincidence."""
 SOME = 200_000
 """Pixels of which the levels are counted."""
@@ -137,7 +137,7 @@ def _clipped(image: ImageFile, color: Float32[np.ndarray, "H W 3"], shown: Bool[
         return float((image.pixels[shown] >= FULL).any(axis=-1).mean())
     # A sensor that clips piles pixels up at one level; without clipping hardly two pixels share the maximum.
     top = pixels >= pixels.max(axis=0) * (1 - PLATEAU_WIDTH)
-    piled = (top.sum(axis=0) >= LEAST_PLATEAU) & (pixels.max(axis=0) > pixels.min(axis=0))
+    piled = (top.sum(axis=0) >= MIN_CLIPPED) & (pixels.max(axis=0) > pixels.min(axis=0))
     return float((top & piled).any(axis=-1).mean())
 
 

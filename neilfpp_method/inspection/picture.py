@@ -17,7 +17,7 @@ PROBLEM, WARNING, FINE = (200, 40, 40), (225, 150, 20), (70, 130, 180)
 CELL, LABEL, GAP, MARGIN = 160, 40, 12, 32
 COLUMNS = 7
 PLAN = 420
-MOST = 210
+MAX_DRAWN = 210
 """Views that are shown at most: a picture of more is too long to look at."""
 KEY = 0.25
 """What the median luminance of the capture is shown as, linear."""
@@ -27,7 +27,7 @@ def draw(inspection: Inspection) -> UInt8[np.ndarray, "H W 3"]:
     """The picture; views keep one exposure, so that jumps are seen."""
     colors = _colors(inspection)
     ranks = [{PROBLEM: 0, WARNING: 1, FINE: 2}[color] for color in colors]
-    order = sorted(range(len(ranks)), key=lambda i: ranks[i])[:MOST]
+    order = sorted(range(len(ranks)), key=lambda i: ranks[i])[:MAX_DRAWN]
     rows = -(-len(order) // COLUMNS)
     width = 2 * MARGIN + COLUMNS * (CELL + GAP) - GAP
     top = MARGIN + 70 + PLAN + 2 * GAP

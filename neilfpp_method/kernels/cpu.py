@@ -21,7 +21,7 @@ from neilfpp_method.kernels.threads import for_each, shares
 
 __all__ = ["KERNELS"]
 
-LEAST = 16_384  # points times levels that are worth waking a thread for
+MIN_PAIRS_PER_THREAD = 16_384  # points times levels that are worth waking a thread for
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def table_gradient(x01: Float[Tensor, "N 3"], spec: GridSpec, gradients: OutputG
     grid = _layout(spec)
     fixed = (*_arrays(x01), grid.offsets, grid.cells, grid.dense, *_gradients(gradients), *_arrays(table))
     levels = len(spec.resolutions)
-    runs = shares(levels, max(1, levels * LEAST // max(1, len(x01) * levels)))
+    runs = shares(levels, max(1, levels * MIN_PAIRS_PER_THREAD // max(1, len(x01) * levels)))
     for_each(lambda first, last: compiled.add_to_table(*fixed, first, last), runs)
     return table
 
@@ -73,7 +73,7 @@ def point_gradient(
 
 
 def _shares_of_points(count: int, spec: GridSpec) -> list[tuple[int, int]]:
-    return shares(count, LEAST // len(spec.resolutions))
+    return shares(count, MIN_PAIRS_PER_THREAD // len(spec.resolutions))
 
 
 def _arrays(*tensors: Tensor) -> tuple[np.ndarray, ...]:

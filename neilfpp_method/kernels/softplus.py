@@ -18,7 +18,7 @@ from neilfpp_method.kernels.threads import for_each, shares
 
 __all__ = ["UnitSample", "softplus", "softplus_and_slope"]
 
-LEAST = 65_536
+MIN_VALUES_PER_THREAD = 65_536
 """Numbers that are worth waking a thread for."""
 
 
@@ -83,7 +83,7 @@ def _loops() -> ModuleType | None:
 
 def _run(loop: str, sharpness: float, *tensors: Tensor) -> None:
     work, arrays = getattr(_loops(), loop), [_flat(tensor) for tensor in tensors]
-    for_each(lambda start, stop: work(*arrays, sharpness, start, stop), shares(tensors[0].numel(), LEAST))
+    for_each(lambda start, stop: work(*arrays, sharpness, start, stop), shares(tensors[0].numel(), MIN_VALUES_PER_THREAD))
 
 
 def _flat(tensor: Tensor) -> np.ndarray:

@@ -10,7 +10,7 @@ from neilfpp_method.kernels.threads import for_each, shares
 
 __all__ = ["sphere_trace"]
 
-LEAST = 2048
+MIN_RAYS_PER_THREAD = 2048
 """Rays that are worth waking a thread for."""
 
 
@@ -35,4 +35,4 @@ def sphere_trace(
     def trace(first: int, last: int) -> None:
         compiled.sphere_trace(vertices, radius, start, towards, least, steps, *written, first, last)
 
-    for_each(trace, shares(len(origins), LEAST))
+    for_each(trace, shares(len(origins), MIN_RAYS_PER_THREAD))

@@ -1,4 +1,4 @@
-"""Where lamps might be: guesses for a fit to choose from, and what the chosen ones come down to."""
+"""Candidate places of lamps, from which a fit chooses, and the lamps that the chosen ones are merged into."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ away looks the same from all of it."""
 CLEARANCE = 3.0
 """In radii: lamps are sought at this distance from every surface point and more."""
 CLONES = 12
-"""Guesses around each lamp that is lit, so that it can move and turn."""
-BARE_SHARE = 1 / 3
-"""Of the guesses: those that send alike in all directions."""
-SPREAD = 0.7
-"""Of the axes of the others about the direction to the scene's middle: a lamp is mostly turned to what it lights."""
-UNANIMOUS = 0.5
-"""Mean of the axes of lamps that are one, above which it has an axis: opposite ones make a bulb."""
-TOGETHER = 0.2
-"""Lamps within this distance, scene units, are one."""
+"""Candidates around each lit lamp, so that it can move and turn."""
+BULB_SHARE = 1 / 3
+"""Share of the candidates that send alike in all directions; the others are panels with an axis."""
+AXIS_SPREAD = 0.7
+"""Standard deviation added to the direction to the scene's middle, per axis, for the axis of a panel: a lamp mostly faces what
+it lights."""
+MIN_MEAN_AXIS = 0.5
+"""Length of the mean axis above which merged candidates make a panel; opposite axes make a bulb."""
+MERGE_DISTANCE = 0.2
+"""Candidates within this distance, scene units, are merged into one lamp."""
 STEP = 0.06
-"""Scale of the distance, per axis, of the guesses around a lamp."""
-LEAST_SHARE = 0.02
-"""Of the light that all lamps bring; what brings less is none."""
+"""Standard deviation of their distance from it, per axis, scene units."""
+MIN_LAMP_SHARE = 0.02
+"""Share of the light of all lamps below which a lamp is dropped."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +54,8 @@ def propose(lamps: Lamps, surface: Float[Tensor, "N 3"], count: int) -> LampPlac
     guesses = torch.cat((moved, anywhere[anywhere.norm(dim=-1) < REACH]))
     clear = torch.cdist(guesses, surface).amin(-1) > CLEARANCE * lamps.radius
     guesses = guesses[clear]
-    turned = safe_normalize(safe_normalize(-guesses) + SPREAD * torch.randn_like(guesses))
-    bare = torch.rand_like(guesses[:, :1]) < BARE_SHARE
+    turned = safe_normalize(safe_normalize(-guesses) + AXIS_SPREAD * torch.randn_like(guesses))
+    bare = torch.rand_like(guesses[:, :1]) < BULB_SHARE
     return LampPlaces(torch.cat((lit, guesses)), torch.cat((axis, turned.masked_fill(bare, 0.0))))[:count]
 
 
@@ -69,15 +70,15 @@ def merge(places: LampPlaces, intensity: Float[Tensor, "M 3"], reach: Float[Tens
     position, axis = places.position, places.axis
     positions, axes, intensities = [], [], []
     for leader in power.argsort(descending=True).tolist():
-        if len(positions) == most or power[leader] <= LEAST_SHARE * power.sum():
+        if len(positions) == most or power[leader] <= MIN_LAMP_SHARE * power.sum():
             break
         if left[leader]:
-            group = left & ((position - position[leader]).norm(dim=-1) < TOGETHER)
+            group = left & ((position - position[leader]).norm(dim=-1) < MERGE_DISTANCE)
             left &= ~group
             share = power[group, None] / power[group].sum()
             positions.append((share * position[group]).sum(0))
             towards = (share * axis[group]).sum(0)
-            axes.append(torch.where(towards.norm() > UNANIMOUS, safe_normalize(towards), 0.0))
+            axes.append(torch.where(towards.norm() > MIN_MEAN_AXIS, safe_normalize(towards), 0.0))
             intensities.append(intensity[group].sum(0))
     if not positions:
         return FoundLamps(places[:0], intensity[:0])

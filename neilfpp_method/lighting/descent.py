@@ -1,9 +1,8 @@
-"""How a fit moves: with the base colour of the points unknown beside the light.
+"""Descent of a light fit, with a factor on the base colour of every point as an unknown beside the light.
 
-What surfaces have learned so far they have learned under the light so far: a lamp in the wrong place leaves its glow in their
-base colour, which then holds it there. So a fit takes from them what the base colour is in the mean, and asks of each point
-no more than that it is like its neighbours: surfaces are mostly made of few materials, and light changes slowly along them
-(Land and McCann 1971, "Lightness and Retinex Theory"). What is left over when the fit ends is for the surfaces to learn.
+Surfaces have learned their base colour under the light so far: a lamp in the wrong place leaves its glow in it, which then
+holds the lamp there. So a fit keeps the mean base colour and asks of each point only that it is like its neighbours: surfaces
+are mostly made of few materials, and light changes slowly along them (Land and McCann 1971, "Lightness and Retinex Theory").
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from neilfpp_method.lighting.objective import Objective, Target, nearest_points,
 
 __all__ = ["Unknown", "descend"]
 
-LEAST_RATE = 0.05
-"""The last step's rate over the first's."""
+FINAL_RATE_SHARE = 0.05
+"""Rate of the last step over that of the first."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ def descend(
     nearest = nearest_points(target.position) if weight > 0 else None
     groups = [{"params": [u.value], "lr": u.rate} for u in (*unknowns, Unknown(log_gain, gain_rate))]
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
-    falling = torch.optim.lr_scheduler.ExponentialLR(optimizer, LEAST_RATE ** (1 / steps))
+    falling = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL_RATE_SHARE ** (1 / steps))
     with torch.enable_grad():
         for _ in range(steps):
             gain = (log_gain - log_gain.mean() if objective.sky is None else log_gain).exp()

@@ -1,8 +1,8 @@
-"""What speaks against a light: points that look otherwise than their pixels, and what light and surfaces mostly are.
+"""The objective of a light fit: the error of remembered points against their pixels, and priors on light and base colour.
 
-What they mostly are takes no side in the factor between light and base colour: the total variation of the map is of
-logarithms, and so is the unevenness of base colour; lamps pay for their share of all light, and the tint is of ratios. A price
-per amount of light would make the light dimmer and surfaces brighter at every fit, as the base colour follows.
+The priors are of ratios, so that none prefers a dimmer light and brighter surfaces: the total variation of the map's log
+radiance, differences of log base colour, lamps by their share of all light, and the tint. A price per amount of light would
+dim the light at every fit, as the base colour follows.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from neilfpp_method.structures import Indexable, Material
 
 __all__ = ["Objective", "Target", "nearest_points", "tint", "total_variation", "unevenness"]
 
-SMOOTHED = 1e-2
-"""Differences of logarithms below this count by their square, so that they have a gradient everywhere."""
-SMALL_SHARE = 0.02
-"""Of all light: a lamp that brings less pays for what it brings, one that brings much more hardly for more than being there."""
+QUADRATIC_BELOW = 1e-2
+"""Differences of logarithms below this count by their square, so that the gradient has no jump at 0."""
+LINEAR_SHARE = 0.02
+"""Share of all light below which a lamp's price is linear; above it, logarithmic."""
 NEIGHBOURS = 4
 """Points whose base colour a point is compared with."""
-DARKEST = 0.02
-"""Base colours below this count as this where their logarithms are compared."""
+DARK_FLOOR = 0.02
+"""Base colours are raised to this before their logarithms are compared."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Objective:
         Σ ln(1 + share/s) over the lamps' shares of all light is concave: one strong lamp is cheaper than two half as strong.
         """
         share = brought / all_light.mean()
-        lamps = self.config.sparsity * (share / SMALL_SHARE).log1p().sum()
+        lamps = self.config.sparsity * (share / LINEAR_SHARE).log1p().sum()
         return lamps + self.config.whiteness * tint(all_light)
 
 
@@ -111,13 +111,13 @@ def nearest_points(position: Float[Tensor, "N 3"]) -> Int[Tensor, "N K"]:
 
 def unevenness(base_color: Float[Tensor, "N 3"], nearest: Int[Tensor, "N K"]) -> Float[Tensor, ""]:
     """Mean |difference of log base colour| between neighbours: an edge costs what it is, in however many steps it comes."""
-    logarithm = base_color.clamp_min(DARKEST).log()
+    logarithm = base_color.clamp_min(DARK_FLOOR).log()
     apart = logarithm[:, None] - logarithm[nearest]
     return _size(apart).sum() / max(1, apart.numel())
 
 
 def _size(difference: Float[Tensor, ...]) -> Float[Tensor, ...]:
-    return (difference.square() + SMOOTHED**2).sqrt()
+    return (difference.square() + QUADRATIC_BELOW**2).sqrt()
 
 
 def tint(light: Float[Tensor, " 3"]) -> Float[Tensor, ""]:

@@ -1,7 +1,7 @@
-"""Found lamps move to where they explain the points best, and those that are not needed go.
+"""Refine found lamps: their places, axes and intensities by descent, and drop those that are not needed.
 
-Guesses lie beside a lamp, never on it, so what a fit finds is a lamp in pieces: several guesses around it and some beyond, too
-strong together. Their places are refined by descent, in turns with the choice of guesses: conditional gradients with moving
+Candidates lie beside a lamp, never on it, so a fit finds a lamp in pieces: several candidates around it, too strong
+together. Their places are refined by descent, in turns with the choice of candidates: conditional gradients with moving
 atoms (Boyd, Schiebinger and Recht 2017, "The alternating descent conditional gradient method for sparse inverse problems").
 """
 
@@ -29,14 +29,14 @@ __all__ = ["settle_lamps"]
 STEPS = 100
 RATE = 0.02
 """Scene units per step, at the start."""
-QUICKER = 3.0
-"""Rate of axes and of logarithms of intensity over that of places."""
+AXIS_RATE = 0.06
+"""Per step, at the start, of axes and of logarithms of intensity."""
 GAIN_RATE = 0.1
-"""Of the logarithms of the factors on base colour."""
+"""Per step, at the start, of the logarithms of the factors on base colour."""
 PANEL_GAIN = 0.01
-"""Share of the loss that a panel must save: with an axis, which a bulb has not, it explains a little more of anything."""
-FAINTEST = 1e-3
-"""Of the strongest: a channel that is darker starts here, where its logarithm has a slope."""
+"""Share of the loss that a panel must save over a bulb: its axis is one more unknown, and any unknown lowers the loss."""
+FAINT_SHARE = 1e-3
+"""Share of the strongest channel to which darker ones are raised at the start, where the logarithm has a slope."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,10 @@ def settle_lamps(
     scene: SceneTracer | None,
     objective: Objective,
 ) -> FoundLamps:
-    """Where the lamps are, which way they send and how strong they are, once all of it may change; no more than it takes.
+    """Lamps whose places, axes and intensities minimise the objective, and as few of them as do.
 
-    From the weakest to the strongest, a lamp goes where the others, its power with its neighbour, do as well without it. Of
-    those that are left each is tried as a panel and as a bulb: the one elsewhere looks much like the other.
+    From the weakest to the strongest, a lamp is dropped where the others, its power given to its neighbour, have a lower loss.
+    Each lamp that is left is tried as a panel and as a bulb, as one at another place looks much like the other.
 
     Args:
         found: lamps to start from, the strongest first.
@@ -127,12 +127,12 @@ def _descend(
     bare = start.places.axis.square().sum(-1, keepdim=True) == 0
     position = start.places.position.clone().requires_grad_()
     axis = start.places.axis.clone().requires_grad_()
-    log_intensity = start.intensity.clamp_min(FAINTEST * start.intensity.max()).log().requires_grad_()
+    log_intensity = start.intensity.clamp_min(FAINT_SHARE * start.intensity.max()).log().requires_grad_()
 
     def lamps() -> FoundLamps:
         return FoundLamps(LampPlaces(position, safe_normalize(axis).masked_fill(bare, 0.0)), log_intensity.exp())
 
-    unknowns = (Unknown(position, RATE), Unknown(axis, QUICKER * RATE), Unknown(log_intensity, QUICKER * RATE))
+    unknowns = (Unknown(position, RATE), Unknown(axis, AXIS_RATE), Unknown(log_intensity, AXIS_RATE))
     loss = descend(unknowns, GAIN_RATE, STEPS, target, objective, lambda gain: loss_of(lamps(), gain)).item()
     settled = lamps()
     settled = FoundLamps(settled.places.detach(), settled.intensity.detach())

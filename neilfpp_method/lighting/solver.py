@@ -39,6 +39,11 @@ class LightSolver(Protocol):
         """Whether `solve` would solve now."""
         ...
 
+    @property
+    def points(self) -> int:
+        """How many surface points are remembered."""
+        ...
+
     def observe(self, step: StepResult) -> None:
         """Remember what a training step showed of the surface and of the light beyond it."""
         ...
@@ -59,7 +64,7 @@ class LightSolver(Protocol):
 class NothingToSolve(nn.Module):
     """The solver of a light that is learned by gradients, or known."""
 
-    due = False
+    due, points = False, 0
 
     def observe(self, step: StepResult) -> None:
         """Nothing is remembered."""
@@ -93,6 +98,11 @@ class MapSolver(nn.Module):
     def due(self) -> bool:
         """Whether `solve` would solve now."""
         return self.memory.due
+
+    @property
+    def points(self) -> int:
+        """How many surface points are remembered."""
+        return self.memory.points.filled
 
     def observe(self, step: StepResult) -> None:
         """As of `LightSolver`."""

@@ -17,13 +17,16 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.environment_map import check_environment
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.errors import UserError
+from neilfpp_method.errors import Unsound, UserError
+from neilfpp_method.health.cases import verdict_of
+from neilfpp_method.health.watch import LOOKED_AT, Watch
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, stage_steps
 from neilfpp_method.settings.check import check_config
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.device import pick_device
+from neilfpp_method.train.health_record import in_words as health_in_words
 from neilfpp_method.train.light_record import in_words
 from neilfpp_method.train.loop import Training, seed_step, train
 from neilfpp_method.train.preview import write_preview
@@ -52,6 +55,7 @@ def run_training(
     devices: int,
     console: Console,
     format: str | None = None,
+    strict: bool = False,
     command: str = "neilfpp train",
 ) -> Path:
     """Train a run to its end and return its folder. A run that is finished is left as it is.
@@ -59,12 +63,14 @@ def run_training(
     Args:
         config: the settings; none, with `resume`: those of the run.
         format: the capture's format; none: told from what is in the folder.
+        strict: end with an error where the result is of no use.
         command: what a person types to get here, for the line that says how a stopped run continues.
 
     Raises:
         UserError: bad input; no run folder is left behind.
         Stopped: a person asked for it; names the command that continues.
         Diverged: see `train.loop.train`.
+        Unsound: `strict`, and a finding is severe; the run is kept.
     """
     place = pick_device(device)
     # Whatever the headers and the settings can tell is told before other processes start.
@@ -101,12 +107,22 @@ def run_training(
     continue_with = _continue_with(command, out, device, devices)
     with reporting(out, console, fabric.is_global_zero) as reporter, _stop_request() as stopped:
         preview = _preview(out, capture, fabric, reporter)
-        solver = model.light_solver()
-        training = Training(out, config, model, pixels, fabric, reporter, stopped, preview, continue_with, solver)
+        solver, watch = model.light_solver(), _watch(pixels, config, reporter)
+        training = Training(out, config, model, pixels, fabric, reporter, stopped, preview, continue_with, solver, watch)
         train(training)
     if fabric.is_global_zero and training.fits:
         console.print(f"light: {in_words(config.light, training.fits)}", soft_wrap=True)
+    findings = list(watch.findings.values())
+    if fabric.is_global_zero:
+        console.print(f"health: {health_in_words(findings)}", soft_wrap=True, markup=False)
+    if strict and verdict_of(findings) == "failed":
+        raise Unsound(f"{out}: {findings[0].what}", findings[0].remedy)
     return out
+
+
+def _watch(pixels: PixelDataset, config: NeilfConfig, reporter: Reporter) -> Watch:
+    seed_step(config.train.seed, step=-2)
+    return Watch(pixels.sample(LOOKED_AT), reporter.warn)
 
 
 def _refuse_changes(

@@ -14,12 +14,14 @@ from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.errors import Diverged, Stopped, UserError
+from neilfpp_method.health.watch import Watch
 from neilfpp_method.lighting.solver import LightSolver
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, rate_factor, stage_at, stage_steps, weigh
 from neilfpp_method.settings.facts import RadianceUnits
 from neilfpp_method.settings.types import NeilfConfig, OptimizerConfig
 from neilfpp_method.structures import LossTerms, StepResult
+from neilfpp_method.train.health_record import read_findings, write_findings
 from neilfpp_method.train.light_record import LightFit, note_fit, read_fits, write_fits
 from neilfpp_method.train.progress import Reporter
 from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, save_checkpoint, write_json
@@ -44,6 +46,7 @@ class Training:
     preview: Callable[[NeilfModel, Stage], None]
     continue_with: str
     light_solver: LightSolver
+    watch: Watch
     fits: list[LightFit] = field(default_factory=list)
     skipped: int = 0
     skipped_in_a_row: int = 0
@@ -67,6 +70,8 @@ def train(run: Training) -> None:
     while step < total:
         position = stage_at(step, settings)
         step = _train_stage(run, model, optimizer, step, position)
+        if run.fabric.is_global_zero:
+            run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
         _save(run, optimizer, step, also=position.stage.value)
         model.eval()
         run.preview(model, position.stage)
@@ -92,6 +97,7 @@ def _train_stage(run: Training, model: NeilfModel, optimizer: torch.optim.Optimi
         total = weigh(computed.terms, active_losses(stage, run.config, model.stages, share))
         stop = _update(run, model, optimizer, computed.terms, total, step)
         _solve_light(run, model, computed, step)
+        run.watch.after_step(model.stages[stage], computed, step)
         step += 1
         run.seconds[stage.value] = before + time.perf_counter() - started
         if number + 1 == position.length:
@@ -111,6 +117,7 @@ def _solve_light(run: Training, model: NeilfModel, computed: StepResult, step: i
     if not fabric.broadcast(solver.due):
         return
     if fabric.is_global_zero:
+        run.watch.after_fit(solver.points, step)
         note_fit(run.fits, solver.solve(model.brdf, model.scene), model.lamps.lit, step)
     if fabric.world_size > 1:
         for part in (model.light, model.lamps):
@@ -223,6 +230,7 @@ def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str 
         try:
             # Fits first: extra ones are dropped on resume, gaps cannot be recovered.
             write_fits(run.path, run.fits)
+            write_findings(run.path, run.watch)
             for name in filter(None, (also, "last")):
                 save_checkpoint(run.path / "checkpoints" / f"{name}.pt", run.model, run.light_solver, optimizer, step)
             write_json(run.path / "timing.json", run.seconds)
@@ -242,6 +250,7 @@ def _restore(run: Training, optimizer: torch.optim.Optimizer) -> int:
     if (run.path / "timing.json").exists():
         run.seconds.update(read_json(run.path / "timing.json"))
     run.fits += read_fits(run.path, saved["step"])
+    run.watch.findings |= {finding.case: finding for finding in read_findings(run.path) or ()}
     return saved["step"]
 
 

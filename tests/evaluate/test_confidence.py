@@ -13,7 +13,7 @@ from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import confidence
 from neilfpp_method.evaluate.confidence import (
-    LEAST_NOISE,
+    MIN_NOISE,
     gather_evidence,
     material_deviation,
     shown_surface,
@@ -143,7 +143,7 @@ def test_what_no_view_sees_is_a_guess(run: Run, evidence):
 
 def test_the_better_the_images_are_explained_the_less_is_left_to_guess(run: Run, evidence):
     normal = on_sphere(60)
-    hopeless = replace(evidence, noise=1e4, misfit=LEAST_NOISE)
+    hopeless = replace(evidence, noise=1e4, misfit=MIN_NOISE)
     doubt = [
         material_deviation(run.model, believed, SPHERE * normal, normal).roughness.var().item()
         for believed in (hopeless, replace(evidence, noise=0.05))

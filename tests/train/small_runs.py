@@ -11,6 +11,7 @@ from rich.console import Console
 
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.health.watch import Watch
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts
@@ -61,10 +62,9 @@ def small_training(root: Path, out: Path, config: NeilfConfig) -> Training:
     pixels = PixelDataset(capture, capture.train_views)
     seed_step(config.train.seed, step=-1)
     model = build_model(capture, scene_facts(capture, pixels, config), config)
-    fabric = Fabric(accelerator="cpu", devices=1)
-    return Training(
-        out, config, model, pixels, fabric, Listener(), lambda: False, lambda model, stage: None, "", model.light_solver()
-    )
+    fabric, listener = Fabric(accelerator="cpu", devices=1), Listener()
+    solver, watch = model.light_solver(), Watch(pixels.sample(64), listener.warn)
+    return Training(out, config, model, pixels, fabric, listener, lambda: False, lambda model, stage: None, "", solver, watch)
 
 
 def differences(one: object, other: object, where: str = "") -> list[str]:

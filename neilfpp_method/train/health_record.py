@@ -1,0 +1,42 @@
+"""The findings of a run, in `RUN/health.json`: written with every checkpoint, read by evaluation, report and resumed runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from neilfpp_method.errors import UserError
+from neilfpp_method.health.cases import Finding, Verdict, verdict_of
+from neilfpp_method.health.watch import FILE, FORMAT, Watch
+from neilfpp_method.settings.plain import from_dict
+from neilfpp_method.train.run import read_json, write_json
+
+__all__ = ["in_words", "read_findings", "write_findings"]
+
+
+def write_findings(run: Path, watch: Watch) -> None:
+    """The findings so far, and the verdict that they come to."""
+    write_json(run / FILE, watch.record())
+
+
+def read_findings(run: Path) -> list[Finding] | None:
+    """The findings of a run; none where it has no record, as a run that has not saved anything yet.
+
+    Raises:
+        UserError: the file is damaged or of another version.
+    """
+    path = run / FILE
+    if not path.is_file():
+        return None
+    stored = read_json(path)
+    if stored.get("format") != FORMAT or not isinstance(stored.get("findings"), list):
+        raise UserError(f"{path}: a record of another version", "remove the file, or use the version that wrote it")
+    try:
+        return [from_dict(Finding, finding, str(path)) for finding in stored["findings"]]
+    except (TypeError, AttributeError) as error:
+        raise UserError(f"{path}: not a complete record ({error})", "remove the file, or train again") from error
+
+
+def in_words(findings: list[Finding]) -> str:
+    """A verdict in one line."""
+    verdict: Verdict = verdict_of(findings)
+    return verdict + (": " + "; ".join(finding.what for finding in findings) if findings else "")

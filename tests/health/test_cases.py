@@ -1,0 +1,56 @@
+"""What is a finding and what is not, and the verdict that findings come to."""
+
+from __future__ import annotations
+
+import pytest
+
+from neilfpp_method.health.cases import (
+    few_light_points,
+    material_findings,
+    nothing_shaded,
+    skipped_steps,
+    surface_findings,
+    verdict_of,
+)
+from neilfpp_method.health.look import Look
+
+
+def cases(findings) -> list[str]:
+    return [finding.case for finding in findings]
+
+
+@pytest.mark.parametrize(
+    ("opaque", "sharp", "found"),
+    [(0.9, 0.95, []), (0.9, 0.1, ["fog"]), (0.01, 0.0, ["no_surface"]), (0.01, 1.0, ["no_surface"]), (0.3, 0.6, [])],
+)
+def test_a_surface_is_there_and_sharp_or_it_is_said(opaque, sharp, found):
+    assert cases(surface_findings(Look(100, opaque, sharp, None), 7)) == found
+
+
+@pytest.mark.parametrize(("share", "found"), [(None, []), (0.2, []), (0.8, ["material_at_bounds"])])
+def test_a_material_at_its_bounds_is_said(share, found):
+    assert cases(material_findings(Look(100, 1.0, 1.0, share), 7)) == found
+
+
+@pytest.mark.parametrize(
+    ("function", "good", "bad", "case"),
+    [
+        (nothing_shaded, 10, 60, "nothing_shaded"),
+        (few_light_points, 1024, 40, "few_light_points"),
+        (skipped_steps, 3, 20, "skipped_steps"),
+    ],
+)
+def test_a_count_beyond_its_limit_is_said(function, good, bad, case):
+    assert function(good, 100) == []
+    (finding,) = function(bad, 100)
+    assert finding.case == case
+    assert finding.line().startswith("step 100: ")
+    assert finding.remedy
+
+
+def test_the_verdict_is_the_worst_finding():
+    fog = surface_findings(Look(100, 1.0, 0.0, None), 1)
+    doubt = few_light_points(3, 1)
+    assert verdict_of([]) == "sound"
+    assert verdict_of(doubt) == "doubtful"
+    assert verdict_of(doubt + fog) == "failed"

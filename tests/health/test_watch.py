@@ -1,0 +1,100 @@
+"""Models that are fog, and ones that are not: what a watch says of them, and when it takes it back."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from neilfpp_method.cli import main
+from neilfpp_method.errors import UserError
+from neilfpp_method.health.look import look
+from neilfpp_method.health.watch import Watch
+from neilfpp_method.schedule import STAGES, Stage
+from neilfpp_method.settings.presets import PRESETS
+from neilfpp_method.structures import PixelBatch, SurfaceHits
+from neilfpp_method.train.health_record import read_findings, write_findings
+from neilfpp_method.train.run import write_json
+from tests.data.make_capture import make_capture
+from tests.scenes import sphere_batch, sphere_model, tiny_config
+
+PIXELS = sphere_batch(spread=0.1)
+"""All of them meet the sphere."""
+
+
+def hits_of(batch: PixelBatch, opacity: float, concentration: float) -> SurfaceHits:
+    ones = torch.ones(len(batch.origins))
+    return SurfaceHits(batch.color, batch.origins, -batch.directions, opacity * ones, concentration * ones)
+
+
+def showing(opacity: float, concentration: float):
+    """A model whose host shows fog, nothing, or a surface."""
+    model = sphere_model()
+    model.host.render = lambda rays: hits_of(PIXELS, opacity, concentration)
+    return model
+
+
+@pytest.mark.parametrize(("opacity", "concentration", "case"), [(1.0, 1.0, None), (1.0, 0.1, "fog"), (0.0, 0.0, "no_surface")])
+def test_a_look_tells_surface_from_fog_and_from_nothing(opacity, concentration, case):
+    said: list[str] = []
+    watch = Watch(PIXELS, said.append)
+    watch.after_stage(showing(opacity, concentration), STAGES[Stage.SDF_INIT], 0, 40)
+    assert list(watch.findings) == ([case] if case else [])
+    assert len(said) == len(watch.findings)
+    assert watch.record()["verdict"] == ("failed" if case else "sound")
+
+
+def test_what_a_later_look_finds_mended_is_dropped_and_nothing_is_said_twice():
+    said: list[str] = []
+    watch = Watch(PIXELS, said.append)
+    for _ in range(2):
+        watch.after_stage(showing(1.0, 0.1), STAGES[Stage.SDF_INIT], 0, 40)
+    assert len(said) == 1
+    watch.after_stage(showing(1.0, 1.0), STAGES[Stage.JOINT], 0, 80)
+    assert watch.record()["verdict"] == "sound"
+
+
+def test_steps_that_shade_nothing_are_counted_in_material_stages():
+    model, said = sphere_model(), []
+    watch = Watch(PIXELS, said.append)
+    away = PIXELS[:0]
+    for step in range(60):
+        watch.after_step(STAGES[Stage.SDF_INIT], model.step(away, Stage.SDF_INIT), step)
+    assert not said
+    empty = model.step(away, Stage.MATERIAL_INIT)
+    for step in range(60):
+        watch.after_step(STAGES[Stage.MATERIAL_INIT], empty, step)
+    assert len(said) == 1
+    assert "no surface point was shaded" in said[0]
+
+
+def test_a_look_leaves_the_model_in_its_mode():
+    model = sphere_model().train()
+    assert look(model, PIXELS, with_material=True).at_bound == 0.0
+    assert model.training
+
+
+def test_the_record_comes_back(tmp_path):
+    watch = Watch(PIXELS, lambda line: None)
+    assert read_findings(tmp_path) is None
+    watch.after_fit(3, 100)
+    write_findings(tmp_path, watch)
+    assert read_findings(tmp_path) == list(watch.findings.values())
+    write_json(tmp_path / "health.json", {"format": 99})
+    with pytest.raises(UserError, match="another version"):
+        read_findings(tmp_path)
+
+
+def test_a_strict_command_ends_with_status_1_and_keeps_the_run(tmp_path, monkeypatch, capfd):
+    """Three steps make no surface that is sharp."""
+    monkeypatch.setitem(PRESETS, "tiny", tiny_config)
+    capture, out = make_capture(tmp_path / "sphere"), tmp_path / "run"
+    steps = [f"--config.train.{stage}-steps=1" for stage in ("sdf", "material", "joint")]
+    arguments = ["train", "--data", str(capture), "--out", str(out), "--device", "cpu", "--preset=tiny", *steps]
+    monkeypatch.setattr("neilfpp_method.health.cases.MIN_SHARP", 1.1)
+    assert main([*arguments, "--strict"]) == 1
+    said = capfd.readouterr()
+    assert "fog" in said.err
+    assert json.loads((out / "health.json").read_text())["verdict"] == "failed"
+    assert (out / "checkpoints" / "last.pt").is_file()
