@@ -1,14 +1,20 @@
-# `make demo` and `make test` are all that a fresh machine needs; each makes its own virtual environment first.
+# `make demo` and `make test` are all that a fresh machine needs; each makes its virtual environment first.
 
 PYTHON ?= python3
 VENV := .venv
 RUN := $(VENV)/bin
+INSTALL = $(RUN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
 
-.PHONY: demo demo-short test test-slow lint results clean test-nerfstudio
+.PHONY: demo demo-short test test-slow lint results clean test-nerfstudio package test-pythons
 
+# What running needs, and nothing for tests; the second adds that.
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(RUN)/python || $(PYTHON) -m venv $(VENV)
-	$(RUN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(INSTALL) .
+	touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed
+	$(INSTALL) '.[dev]'
 	touch $@
 
 demo: $(VENV)/.installed
@@ -19,10 +25,10 @@ demo-short: $(VENV)/.installed
 
 # The tensors of the tests are small: a second thread costs more than it brings, many times more on a busy machine.
 # Two processes instead, each with whole modules, so that what a module prepares is prepared once.
-test: $(VENV)/.installed
+test: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(RUN)/python -m pytest -m "not slow" -n 2 --dist loadscope
 
-test-slow: $(VENV)/.installed
+test-slow: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(RUN)/python -m pytest -m slow
 
 # Nerfstudio pins another OpenCV, so it has an environment of its own.
@@ -39,11 +45,20 @@ $(NERFSTUDIO)/.installed: pyproject.toml $(NERFSTUDIO_PINS)
 test-nerfstudio: $(NERFSTUDIO)/.installed
 	OMP_NUM_THREADS=1 $(NERFSTUDIO)/bin/python -m pytest tests_nerfstudio -m "not slow"
 
-lint: $(VENV)/.installed
+# Wheel and source distribution, and the wheel's command in an empty environment.
+package:
+	$(PYTHON) scripts/check_package.py
+
+# The pins of constraints.txt and the start of the command, on every Python from 3.10 that is on the machine.
+test-pythons:
+	$(PYTHON) scripts/check_pythons.py
+
+lint: $(VENV)/.installed-dev
 	$(RUN)/ruff check .
 
-results: $(VENV)/.installed  ## make results CAPTURES="DIR DIR"
-	$(RUN)/python -m benchmarks.results $(CAPTURES)
+results: $(VENV)/.installed  ## make results CAPTURES="DIR DIR" [OPTIONS="--save NAME"]; none: only the tables
+	$(if $(CAPTURES),$(RUN)/python -m benchmarks.results $(CAPTURES) $(OPTIONS))
+	$(RUN)/python -m benchmarks.tables
 
 clean:
-	rm -rf $(VENV) $(NERFSTUDIO) build demo-run
+	rm -rf $(VENV) $(NERFSTUDIO) build dist demo-run

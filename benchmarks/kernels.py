@@ -93,10 +93,10 @@ def with_backend(step: Callable[[SdfField, Tensor], None], backend: str) -> Call
     return chosen
 
 
-def measure(config: SdfConfig, points: int, repeats: int, device: torch.device) -> dict[str, float]:
+def measure(config: SdfConfig, grid: HashGridConfig, points: int, repeats: int, device: torch.device) -> dict[str, float]:
     """Median milliseconds of each route."""
     torch.manual_seed(0)
-    field = SdfField(config, RADIUS).to(device)
+    field = SdfField(config, grid, RADIUS).to(device)
     torch.nn.init.normal_(field.encoding.table, std=1e-2)
     start = torch.nn.functional.normalize(torch.randn(points // SAMPLES, 1, 3, device=device), dim=-1)
     along = torch.linspace(0.1, 1.5, SAMPLES, device=device)[:, None]
@@ -140,10 +140,10 @@ class Options:
 
 def main(options: Options) -> None:
     """Measure and print."""
-    paper = SdfConfig(encoding="hash", grid=HashGridConfig(), layers=2, width=64, skip=None, feature_width=15)
     print(f"{hardware()}; {options.points} points, medians of {options.repeats}")
-    for title, config in {"16 levels × 2, 2^19": paper, "the grid of `fast`, 8 × 2, 2^16": preset("fast").sdf}.items():
-        medians = measure(config, options.points, options.repeats, torch.device(options.device))
+    for title, name in (("16 levels × 2, 2^19", "paper-ngp"), ("the grid of `fast`, 8 × 2, 2^18", "fast")):
+        config = preset(name)
+        medians = measure(config.host.sdf, config.encoding, options.points, options.repeats, torch.device(options.device))
         print(title)
         for name, median in medians.items():
             print(f"  {name:24} {median:9.1f} ms   {medians['naive'] / median:6.1f} times faster than naive")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import statistics
+import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import Literal
 
 import torch
 
-__all__ = ["Measurement", "clock", "device", "hardware", "in_yardsticks", "median_seconds", "yardstick"]
+__all__ = ["Measurement", "clock", "device", "hardware", "in_yardsticks", "median_seconds", "revision", "yardstick"]
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,15 @@ def hardware() -> str:
     """The machine in a line."""
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     return f"{_processor()}, {torch.get_num_threads()} thread(s), GPU {gpu}, torch {torch.__version__}"
+
+
+def revision() -> str:
+    """The commit that is measured, short; with a plus where files differ from it; "unknown" outside a repository."""
+    try:
+        command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--exclude", "*", "--abbrev=7", "--dirty=+"]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
 
 
 def _processor() -> str:

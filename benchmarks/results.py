@@ -4,16 +4,17 @@
     python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results-mesh --host mesh --compare ladder
 
 For each capture: the preset trained from scratch, beside it the paper's free light field with and without L_ref (the paper's
-Table 2), with `--compare ladder` every light with every inter-reflection that goes with it; each measured after the material
-stage ("Sep.") and after the joint stage (Table 3), beside baselines that need no method. The runs share the stage SDF init,
-which none of this enters; every step depends on seed and number alone, so sharing changes nothing. With the mesh host
-geometry is given, and there is one stage.
+Table 2), with `--compare ladder` every light with every inter-reflection that goes with it; each measured after the
+material stage (the paper's "Sep.") and after the joint stage (Table 3), beside baselines that need no method. The runs share
+the stage SDF init, which none of this enters; every step depends on seed and number alone, so sharing changes nothing. With
+the mesh host geometry is given, and there is one stage. `--save NAME` keeps the figures for docs/results.md.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
+import shlex
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -22,6 +23,8 @@ import tyro
 from rich.console import Console
 from torch import Tensor
 
+from benchmarks.measure import hardware, revision
+from benchmarks.tables import COLUMNS, RESULTS, Result, Row, markdown, write_result
 from neilfpp_method.evaluate.protocols import evaluate
 from neilfpp_method.evaluate.report import write_report
 from neilfpp_method.schedule import Stage, stage_steps
@@ -40,20 +43,9 @@ from neilfpp_method.train.run import (
     write_json,
 )
 
-COLUMNS = {
-    "volume_psnr": "R",
-    "pbr_psnr": "PBR",
-    "base_color_psnr": "base colour",
-    "base_color_psnr_gamma": "… one gamma",
-    "base_color_psnr_scaled": "… scaled",
-    "roughness_psnr": "roughness",
-    "metallic_psnr": "metallic",
-    "normal_mae_deg": "normals °",
-    "chamfer": "Chamfer",
-    "incident_light_log_mae": "light",
-    "incident_light_log_mae_occluded": "… occluded",
-}
-STAGES = {"material_init": "Sep.", "joint": "joint"}
+STAGES = {"material_init": "material stage", "joint": "joint stage"}
+TABLES = {"volsdf": "found-geometry", "mesh": "given-geometry"}
+"""Of each host, the table of docs/results.md."""
 
 
 @dataclass
@@ -63,7 +55,9 @@ class Options:
     captures: tyro.conf.Positional[tuple[Path, ...]]
     """Folders of captures."""
     out: Path = Path("runs/results")
-    """Where the runs and the tables go."""
+    """Where the runs and results.json go."""
+    save: str | None = None
+    """Keep the figures under this name in benchmarks/results, for the tables of docs/results.md; none: in --out alone."""
     preset: str = "fast"
     """Which settings."""
     host: Literal["volsdf", "mesh"] = "volsdf"
@@ -143,61 +137,54 @@ def measure(out: Path, config: NeilfConfig) -> dict[str, dict[str, float]]:
     """The figures of a run after each of its stages with a material."""
     figures = {}
     steps = stage_steps(config.train)
-    for stage, name in STAGES.items():
+    for stage in STAGES:
         if not steps[Stage(stage)]:
             continue
         path = out / f"metrics-{stage}.json"
         if not path.exists():
             write_json(path, evaluate(load_run(out, checkpoint=stage)))
-        figures[name] = read_json(path)
+        figures[stage] = read_json(path)
     return figures
 
 
-def table(rows: dict[str, dict[str, float]]) -> str:
-    """A Markdown table; a dash where a figure does not exist."""
-    lines = ["| | " + " | ".join(COLUMNS.values()) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
-    for name, figures in rows.items():
-        cells = [_cell(name, figures.get(key)) for key, name in COLUMNS.items()]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
-def _cell(column: str, value: float | None) -> str:
-    if value is None:
-        return "–"
-    return f"{value:.4f}" if column == "Chamfer" else f"{value:.2f}"
-
-
 def main(options: Options) -> None:
-    """Train, measure, and write `tables.md`."""
+    """Train, measure, and write the result file."""
     config = preset(options.preset)
     config = fixed_geometry(config) if options.host == "mesh" else config
     if options.material_steps is not None:
         config = dataclasses.replace(config, train=dataclasses.replace(config.train, material_steps=options.material_steps))
-    sections = []
+    rows: list[Row] = []
     for capture in options.captures:
-        rows: dict[str, dict[str, float]] = {}
-        times = []
         base = options.out / capture.name
-        for name, settings in variants(config, options.compare).items():
+        compared = variants(config, options.compare)
+        for name, settings in compared.items():
             run = base if settings is config else options.out / f"{capture.name}-{name.replace(', ', '-').replace(' ', '-')}"
             shares_trunk = run != base and config.train.sdf_steps > 0
             train(capture, run, settings, options.device, start_from=base if shares_trunk else None)
             figures = measure(run, config)
             final = list(figures.values())[-1]
-            if not rows:
-                rows["naive baseline"] = {k: final[f"baseline_{k}"] for k in COLUMNS if f"baseline_{k}" in final}
-            rows |= {f"{stage}, {name}": values for stage, values in figures.items()}
+            if settings is config:
+                baseline = {key: final[f"baseline_{key}"] for key in COLUMNS if f"baseline_{key}" in final}
+                rows.append(Row("naive baseline", baseline, capture.name))
             seconds = read_json(run / "timing.json")
+            rows += [
+                Row(f"{STAGES[stage]}, {name}", {**values, "seconds": seconds_until(stage, seconds)}, capture.name)
+                for stage, values in figures.items()
+            ]
             write_report(load_run(run), run, final, seconds)
-            times.append(f"{name}: " + ", ".join(f"{stage} {value:.0f} s" for stage, value in seconds.items()))
-        hardware = read_json(base / "environment.json")
-        machine = f"{hardware['processor']}, {hardware['threads']} threads, GPU {', '.join(hardware['gpus']) or 'none'}"
-        sections.append(f"### {capture.name}\n\n{table(rows)}\n\nTraining time: {'; '.join(times)}. {machine}.\n")
-        options.out.mkdir(parents=True, exist_ok=True)
-        (options.out / "tables.md").write_text("\n".join(sections))
-    Console().print("\n".join(sections), markup=False, highlight=False)
-    Console().print(json.dumps({"tables": str(options.out / "tables.md")}), markup=False)
+        # After every capture, so that what is measured is kept where a later one fails.
+        table = "light-ladder" if options.compare == "ladder" else TABLES[options.host]
+        result = Result(table, revision(), f"python -m benchmarks.results {shlex.join(sys.argv[1:])}", hardware(), tuple(rows))
+        write_result(options.out / "results.json", result)
+        if options.save is not None:
+            write_result(RESULTS / f"{options.save}.json", result)
+    Console().print(markdown([result]), markup=False, highlight=False, soft_wrap=True)
+
+
+def seconds_until(stage: str, seconds: dict[str, float]) -> float:
+    """How long training took to the end of a stage."""
+    stages = list(seconds)
+    return sum(seconds[name] for name in stages[: stages.index(stage) + 1])
 
 
 if __name__ == "__main__":

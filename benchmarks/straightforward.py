@@ -32,6 +32,7 @@ from neilfpp_method.settings.types import NeilfConfig, VolumeConfig
 from neilfpp_method.structures import Material, RayBatch
 from neilfpp_method.volume.intersect import Interval
 from neilfpp_method.volume.samplers import (
+    OPACITY_ERROR,
     bound_shares,
     bounded_beta,
     first_cuts,
@@ -73,7 +74,7 @@ class PlainSdf(nn.Module):
             sample = SdfSample(outputs[:, 0], gradient_of(outputs[:, 0], x, trains), outputs[:, 1:])
         return sample if trains else SdfSample(sample.distance.detach(), sample.gradient, sample.feature.detach())
 
-    def hessian(self, x: Float[Tensor, "N 3"], method: str) -> Float[Tensor, "N 3 3"]:
+    def hessian(self, x: Float[Tensor, "N 3"], method: str | None = None) -> Float[Tensor, "N 3 3"]:
         x = x.detach().requires_grad_()
         gradient = self.with_gradient(x).gradient
         return torch.stack([gradient_of(gradient[:, axis], x, differentiable=True) for axis in range(3)], 1)
@@ -123,10 +124,10 @@ class PlainHost(VolSdfHost):
     def _sample(self, rays: RayBatch, interval: Interval, volume: VolumeConfig) -> Float[Tensor, "N M"]:
         beta = self.density.beta().reshape(1, 1)
         partition = first_cuts(self.sdf, rays, interval.near, interval.far, volume.initial_samples, self.training)
-        worst = partition.width.square().sum(dim=-1, keepdim=True).div(4.0 * math.log1p(volume.epsilon)).sqrt()
+        worst = partition.width.square().sum(dim=-1, keepdim=True).div(4.0 * math.log1p(OPACITY_ERROR)).sqrt()
         wide = torch.maximum(worst, beta)
         for number in range(volume.rounds + 1):
-            converged = log_error_bound(partition, beta) <= math.log(volume.epsilon)
+            converged = log_error_bound(partition, beta) <= math.log(OPACITY_ERROR)
             wide = torch.where(converged, beta, bounded_beta(partition, beta, wide, volume))
             if number == volume.rounds or converged.all():
                 break

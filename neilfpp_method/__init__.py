@@ -20,6 +20,11 @@ _ROOMS = {
 }
 
 
+def __dir__() -> list[str]:
+    """The public names: those above are not attributes before somebody asks for them."""
+    return sorted(__all__)
+
+
 def __getattr__(name: str) -> Any:
     if name not in _ROOMS:
         raise AttributeError(f"module 'neilfpp_method' has no attribute '{name}'")

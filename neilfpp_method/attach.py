@@ -20,7 +20,6 @@ from torch import Tensor, nn
 
 from neilfpp_method.data.environment_map import read_environment
 from neilfpp_method.errors import UserError
-from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.hosts.base import HasParameterGroups, Host, LightsItself
 from neilfpp_method.hosts.outputs import check_tensors, host_name
 from neilfpp_method.model import NeilfModel
@@ -180,8 +179,8 @@ def attach_neilf(
     if config is None:
         config = preset("fast") if isinstance(adapted, LightsItself) else free_light(preset("fast"))
     attached = AttachedNeilf(NeilfModel(adapted, config, facts, borrowed=borrowed))
-    if config.light.map is not None and isinstance(attached.model.light, EnvironmentLight):
-        attached.model.light.show(read_environment(Path(config.light.map)))
+    if config.known_map is not None:
+        attached.model.light.show(read_environment(Path(config.known_map)))
     if attached.missing:
         lost = "; ".join(f"no {name}: {loss}" for name, loss in attached.missing.items())
         log.warning("NeILF++ attached to %s, which has %s", host_name(adapted), lost)

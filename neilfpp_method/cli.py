@@ -7,7 +7,6 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stderr
-from itertools import takewhile
 from typing import Any
 
 import tyro
@@ -15,6 +14,7 @@ from rich.console import Console
 
 from neilfpp_method.commands import COMMANDS
 from neilfpp_method.commands.command import Command
+from neilfpp_method.commands.mistakes import closest, mistake
 from neilfpp_method.errors import EarlyEnd, Stopped, UserError
 
 __all__ = ["main"]
@@ -50,7 +50,9 @@ def _run(name: str, arguments: Sequence[str]) -> None:
         print(f"neilfpp {__version__}")
         return
     if name not in COMMANDS:
-        raise UserError(f"unknown command '{name}'", f"choose one of {', '.join(COMMANDS)}")
+        meant = closest(name, COMMANDS)
+        remedy = f"did you mean neilfpp {meant}?" if meant else f"choose one of {', '.join(COMMANDS)}"
+        raise UserError(f"unknown command '{name}'", remedy)
     command = COMMANDS[name]
     try:
         command.run(_parse(name, command, arguments))
@@ -62,23 +64,24 @@ def _run(name: str, arguments: Sequence[str]) -> None:
 
 def _parse(name: str, command: Command, arguments: Sequence[str]) -> Any:
     description = f"{command.summary}\n\nExamples:\n" + "\n".join(f"  {example}" for example in command.examples)
-    known: dict[str, Any] = {"args": arguments, "prog": f"neilfpp {name}", "description": description}
+    known: dict[str, Any] = {"prog": f"neilfpp {name}", "description": description}
+    if command.usual is not None:
+        known["description"] += f"\n\nEvery setting: neilfpp {name} --help-all"
+        if {"-h", "--help"} & set(arguments):
+            tyro.cli(command.usual, args=["--help"], **known)
+        arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
     if command.default is not None:
         known["default"] = command.default(arguments)
     complaint = io.StringIO()
     try:
         with redirect_stderr(complaint):
-            return tyro.cli(command.options, **known)
+            return tyro.cli(command.options, args=arguments, **known)
     except SystemExit as end:
         if not complaint.getvalue():  # --help
             raise
-        raise UserError(_first_paragraph(complaint.getvalue()), f"see neilfpp {name} --help") from end
-
-
-def _first_paragraph(boxed: str) -> str:
-    """What a complaint says first, as one line, without the box around it."""
-    lines = [line.strip("│ ") for line in boxed.splitlines() if line.startswith("│")] or boxed.split("\n")
-    return " ".join(takewhile(lambda line: line.strip("─"), lines)).rstrip(".")
+        what, meant = mistake(complaint.getvalue(), arguments)
+        see = f"see neilfpp {name} --help"
+        raise UserError(what, f"did you mean {meant}? Otherwise {see}" if meant else see) from end
 
 
 def _overview() -> str:
@@ -87,7 +90,7 @@ def _overview() -> str:
         "",
         "usage: neilfpp COMMAND [options]        neilfpp COMMAND --help",
         "",
-        *(f"  {name:8} {command.summary}" for name, command in COMMANDS.items()),
+        *(f"  {name:10} {command.summary}" for name, command in COMMANDS.items()),
         "",
         "examples:",
         "  neilfpp demo",

@@ -109,9 +109,9 @@ class NeilfModel(nn.Module):
         self.check_outputs = OutputCheck(host, config.shading.hit_share)
         lobe = LOBES[config.shading.lobe]
         self.lobe = lobe if config.shading.specular else None
-        self.brdf = BrdfField(config.brdf, config.volume.radius)
+        self.brdf = BrdfField(config.brdf, config.encoding, config.volume.radius)
         albedo = initial_albedo(config.brdf.initial_base_color, config.brdf.initial_metallic, self.lobe)
-        parts = make_light(config.light, facts.response, facts.median_radiance / albedo)
+        parts = make_light(config, facts.response, facts.median_radiance / albedo)
         self.light, self.lamps = parts.light, parts.lamps
         # The surface of a borrowed host moves as its own trainer likes.
         stands_still = not borrowed and not self.stages[Stage.MATERIAL_INIT].moves_host

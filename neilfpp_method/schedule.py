@@ -52,8 +52,8 @@ LIGHT_FIELD = frozenset({"radiance", "background"})
 GEOMETRY = LIGHT_FIELD | {"geometry", "beta"}
 MATERIAL = frozenset({"brdf", "light"})
 
-# Each loss of the material stages with the setting that weighs it.
-MATERIAL_LOSSES = {name: name for name in ("physical", "inter_reflection", "smoothness", "lambertian")}
+# Each loss of the material stages with the setting that weighs it; L_phys is what the others are weighed against, and has 1.
+MATERIAL_LOSSES = {name: name for name in ("inter_reflection", "smoothness", "lambertian")}
 
 
 @dataclass(frozen=True)
@@ -129,6 +129,11 @@ def stage_steps(config: TrainConfig) -> Mapping[Stage, int]:
     }
 
 
+def has_material(steps: int, config: TrainConfig) -> bool:
+    """Whether the first `steps` steps moved the material and the light; before that they are what they start as."""
+    return steps > config.sdf_steps
+
+
 @dataclass(frozen=True)
 class StagePosition:
     """Where a global step lies: its stage, its number within the stage, and the stage's length."""
@@ -184,6 +189,8 @@ def active_losses(stage: Stage, config: NeilfConfig, stages: StageTable = STAGES
     plan = stages[stage]
     weights = {loss: getattr(config.loss, setting) for loss, setting in plan.weights.items()}
     weights |= {loss: weights[loss] * getattr(config.loss, setting) ** share for loss, setting in plan.grows.items()}
+    if plan.moves_material:
+        weights["physical"] = 1.0
     if config.inter_reflection.mode != "soft":
         weights.pop("inter_reflection", None)
     if not config.shading.specular:

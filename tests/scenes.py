@@ -11,26 +11,26 @@ from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import free_light, preset
-from neilfpp_method.settings.types import HashGridConfig, NeilfConfig, TrainConfig
+from neilfpp_method.settings.types import HashGridConfig, NeilfConfig, TrainConfig, VolSdfConfig
 from neilfpp_method.structures import PixelBatch, RayBatch
 
 
 def tiny_config(**changes) -> NeilfConfig:
     """The preset `fast`, cut down to milliseconds a step."""
     config = free_light(preset("fast"))
-    grid = HashGridConfig(levels=3, log2_entries=10, base_resolution=8, max_resolution=32)
     small = dataclasses.replace(
         config,
-        sdf=dataclasses.replace(config.sdf, grid=grid, width=16, feature_width=4),
-        radiance=dataclasses.replace(config.radiance, grid=grid, layers=1, width=16),
-        brdf=dataclasses.replace(config.brdf, grid=grid, layers=1, width=16),
-        light=dataclasses.replace(config.light, layers=4, width=16, direction_degree=3),
+        host=VolSdfConfig(sdf=dataclasses.replace(config.host.sdf, width=16, feature_width=4)),
+        encoding=HashGridConfig(levels=3, log2_entries=10, sdf_log2_entries=10, max_resolution=32),
+        radiance=dataclasses.replace(config.radiance, layers=1, width=16),
+        brdf=dataclasses.replace(config.brdf, layers=1, width=16),
+        light=dataclasses.replace(config.light, layers=4, width=16),
         background=dataclasses.replace(config.background, layers=2, width=16, samples=4),
         volume=dataclasses.replace(config.volume, initial_samples=24, rounds=1, samples=20, beta_init=0.02, skip_empty=False),
         shading=dataclasses.replace(config.shading, train_samples=8, eval_samples=8),
         inter_reflection=dataclasses.replace(config.inter_reflection, rays_per_point=0.5),
         loss=dataclasses.replace(config.loss, lambertian=5e-4),  # every loss of the table counts
-        train=TrainConfig(sdf_steps=4, material_steps=4, joint_steps=4, rays=48, checkpoint_every=3, log_every=2),
+        train=TrainConfig(sdf_steps=4, material_steps=4, joint_steps=4, rays=48, checkpoint_every=3),
     )
     return dataclasses.replace(small, **changes)
 

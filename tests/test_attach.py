@@ -17,6 +17,7 @@ from neilfpp_method.data.images import write_exr
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.settings.types import MapLightConfig
 from neilfpp_method.structures import PixelBatch
 from tests.hosts.balls import Ball, BallHost, ball_rays
 from tests.hosts.test_mesh import SPHERE, mesh_config, mesh_host
@@ -152,7 +153,7 @@ def test_a_map_that_the_settings_name_lights_the_scene_and_stays(tmp_path):
     known = np.random.default_rng(0).random((6, 12, 3), dtype=np.float32) + 0.5
     write_exr(tmp_path / "sky.exr", {"RGB": known})
     config = mesh_config()
-    light = dataclasses.replace(config.light, kind="distant", map=str(tmp_path / "sky.exr"))
+    light = MapLightConfig(kind="distant", map=str(tmp_path / "sky.exr"))
     mode = dataclasses.replace(config.inter_reflection, mode="hard")
     neilf = attach_neilf(mesh_host(SPHERE), dataclasses.replace(config, light=light, inter_reflection=mode))
     assert neilf.losses(pixels(), Stage.MATERIAL_INIT).loss.isfinite()

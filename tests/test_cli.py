@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +41,15 @@ def trained(tmp_path_factory: pytest.TempPathFactory, capture: Path) -> Path:
         patch.setitem(PRESETS, "tiny", small_config)
         assert train("--data", capture, "--out", out) == 0
     return out
+
+
+@pytest.fixture(scope="module")
+def completion() -> str:
+    """What `neilfpp completion bash` prints."""
+    printed = io.StringIO()
+    with redirect_stdout(printed):
+        assert main(["completion", "bash"]) == 0
+    return printed.getvalue()
 
 
 def train(*options: object) -> int:
@@ -147,10 +158,41 @@ def test_the_examples_parse(monkeypatch):
             assert isinstance(seen[0], command.options)
 
 
+def test_help_of_train_fits_on_two_screens_and_all_of_it_is_one_option_away(capsys):
+    assert main(["train", "--help"]) == 0
+    usual = capsys.readouterr().out
+    assert len(usual.splitlines()) <= 64
+    assert "--help-all" in usual
+    assert "--config FILE" in usual
+    assert "--config.train.rays" not in usual
+    assert main(["train", "--help-all"]) == 0
+    assert "--config.train.rays" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("arguments", [["--help"], ["train", "--help"], ["train", "--data", "x", "--colour", "red"]])
 def test_help_and_mistyped_options_do_not_wait_for_torch(arguments):
     asks = f"import sys; from neilfpp_method.cli import main; main({arguments}); sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", asks], capture_output=True, timeout=60, check=False).returncode == 0
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [
+        ("tr", "train"),
+        ("train --da", "--data"),
+        ("eval --check", "--checkpoint"),
+        ("train --config.train.ra", "--config.train.rays"),
+    ],
+)
+def test_bash_completes(completion, words, completed):
+    """As bash asks: its variables are set, the registered function is called, and `COMPREPLY` is the answer."""
+    before = ["neilfpp", *words.split()]
+    ask = f"COMP_WORDS=({' '.join(before)}); COMP_CWORD={len(before) - 1}; COMP_LINE='neilfpp {words}'"
+    call = "eval \"$(complete -p neilfpp | sed 's/.*-F \\([^ ]*\\).*/\\1/')\" neilfpp; echo ${COMPREPLY[@]}"
+    script = f"{completion}\n{ask}; COMP_POINT=${{#COMP_LINE}}\n{call}"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.split() == [completed]
 
 
 def test_version(capsys):
@@ -180,11 +222,15 @@ def refused(capfd, arguments: list[object], *words: object, leaves: Path) -> Non
     ("arguments", "words"),
     [
         (["paint"], ("unknown command 'paint'", "train", "eval")),
+        (["tran", "--data", "x"], ("unknown command 'tran'", "did you mean neilfpp train?")),
+        (["train", "--dta", "x"], ("--dta", "did you mean --data?", "neilfpp train --help")),
+        (["train", "--data", "x", "--config.shading.specular", "False"], ("did you mean --config.shading.no-specular?",)),
+        (["train", "--data", "x", "--config.shading.specular", "true"], ("did you mean --config.shading.specular?",)),
         (["train", "--preset", "slow"], ("unknown preset 'slow'", "fast", "paper-ngp")),
         (["train", "--preset=slow"], ("unknown preset 'slow'",)),
         (["train", "--preset"], ("--preset", "neilfpp train --help")),
         (["train", "--data", "x", "--colour", "red"], ("--colour", "neilfpp train --help")),
-        (["train", "--data", "x", "--config.train.rayss", "3"], ("--config.train.rayss", "neilfpp train --help")),
+        (["train", "--data", "x", "--config.train.rayss", "3"], ("did you mean --config.train.rays?",)),
         (["train", "--data", "x", "--config.train.rays", "few"], ("--config.train.rays", "'few'")),
         (["train", "--response", "hdr"], ("--response", "linear", "srgb")),
         (["train", "--test-every", "often"], ("--test-every", "'often'")),
@@ -206,10 +252,8 @@ def test_a_command_line_that_makes_no_sense(tmp_path, monkeypatch, capfd, argume
     [
         (["--config.train.rays", "0"], ("--config.train.rays is 0",)),
         (["--config.train.checkpoint-every", "0"], ("--config.train.checkpoint-every is 0",)),
-        (["--config.train.log-every", "-1"], ("--config.train.log-every is -1",)),
         (["--config.train.joint-steps", "-1"], ("no steps",)),
         (["--config.loss.volume", "0"], ("--config.loss.volume",)),
-        (["--config.loss.physical", "0"], ("--config.loss.physical",)),
         (["--devices", "0"], ("--devices",)),
         (["--device", "cuda:99"], ("no device 'cuda:99' here", "cpu")),
         (["--device", "abacus"], ("no device 'abacus' here", "cpu")),
@@ -285,6 +329,17 @@ def test_a_capture_that_cannot_be_used(tmp_path, capfd, capture, case):
     spoil(root)
     command = ["train", "--data", root, "--out", tmp_path / "runs" / "new", "--preset", "tiny", "--device", "cpu"]
     refused(capfd, command, root, complaint, leaves=tmp_path)
+
+
+@pytest.mark.parametrize("folder", ["", "front", "inputs"])
+def test_a_folder_of_photographs_has_to_be_prepared(tmp_path, capfd, folder):
+    """Nothing but pictures: no cameras are known yet, and `neilfpp prepare` finds them."""
+    photos = tmp_path / "photos"
+    (photos / folder).mkdir(parents=True)
+    for name in ("001.jpg", "002.JPG", "003.dng", ".004.jpg", "notes.txt"):
+        (photos / folder / name).write_bytes(b"")
+    words = (f"{photos}: 3 photographs and no cameras", f"run neilfpp prepare {photos} --out CAPTURE")
+    refused(capfd, ["train", "--data", photos], *words, leaves=tmp_path)
 
 
 def test_a_point_cloud_that_the_settings_need(tmp_path, capfd, capture):

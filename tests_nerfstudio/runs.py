@@ -48,7 +48,7 @@ def reduced_tabletop(root: Path) -> Path:
 def small_settings(**steps: int) -> NeilfConfig:
     """The tiny settings with the light of the preset, solved for every third step; four steps a stage but for `steps`."""
     config, usual = small_config(**steps), preset("fast")
-    fit = LightFitConfig(points=48, every=3, steps=5, candidates=8, lamps=2)
+    fit = LightFitConfig(points=48, every=3, steps=5)
     return dataclasses.replace(
         config,
         light=dataclasses.replace(usual.light, environment_height=8, fit=fit),

@@ -50,7 +50,7 @@ FIELDS = {
 }
 SETTINGS = small_settings()
 # L_ref with a gradient for R: in material init R stays all the same.
-L_REF = dataclasses.replace(SETTINGS.inter_reflection, radiance_gradient=1.0, rays_per_point=4.0, max_angle_deg=90.0)
+L_REF = dataclasses.replace(SETTINGS.inter_reflection, radiance_gradient=1.0, rays_per_point=4.0)
 FREE = free_light(dataclasses.replace(SETTINGS, inter_reflection=L_REF))
 
 

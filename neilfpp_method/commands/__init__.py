@@ -5,7 +5,7 @@ What a command needs to run is imported when it runs, so that help and a mistype
 
 from __future__ import annotations
 
-from neilfpp_method.commands import demo, evaluate, export, inspect, prepare, render, train
+from neilfpp_method.commands import completion, demo, evaluate, export, inspect, prepare, render, train
 
 __all__ = ["COMMANDS"]
 
@@ -17,4 +17,5 @@ COMMANDS = {
     "eval": evaluate.COMMAND,
     "render": render.COMMAND,
     "export": export.COMMAND,
+    "completion": completion.COMMAND,
 }

@@ -26,12 +26,14 @@ class Command:
         examples: command lines for the help.
         default: the options that a command line starts from, where some of its words decide what others default to;
             none: the defaults of the dataclass.
+        usual: the dataclass that `--help` shows, where `options` has too many to read; `--help-all` then shows all.
     """
 
     options: type
     run: Callable[[Any], None]
     examples: Sequence[str]
     default: Callable[[Sequence[str]], Any] | None = None
+    usual: type | None = None
 
     @property
     def summary(self) -> str:

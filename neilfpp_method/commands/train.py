@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
+
+import tyro
 
 from neilfpp_method.commands.command import Command, Device, terminal
 from neilfpp_method.errors import UserError
-from neilfpp_method.settings.presets import fixed_geometry, preset
-from neilfpp_method.settings.types import NeilfConfig
+from neilfpp_method.settings.files import read_settings
+from neilfpp_method.settings.plain import changed
+from neilfpp_method.settings.presets import PRESETS, fixed_geometry, free_light, preset
+from neilfpp_method.settings.types import MapLightConfig, MeshConfig, NeilfConfig
 
 __all__ = ["COMMAND"]
 
 DEFAULT_PRESET = "fast"
+ROOMS_WITH_KINDS = ("light", "encoding")
+"""Rooms whose other settings depend on their `kind`; that of the host is --host."""
 
 
 @dataclass
@@ -26,7 +32,9 @@ class Train:
     out: Path | None = None
     """The run's folder; none: runs/CAPTURE-PRESET."""
     preset: str | None = None
-    """fast (minutes on a laptop's CPU), paper-mlp or paper-ngp (the published settings); none: fast."""
+    """fast (minutes on a laptop's CPU), paper-mlp, paper-ngp or paper-ngp-hdr (the published settings); none: fast."""
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
+    """Settings from a .yaml or .json file, all or some; a run folder's config.json is one. Options here win over it."""
     host: Literal["volsdf", "mesh"] = "volsdf"
     """Where geometry comes from: volsdf recovers it; mesh takes it as given and recovers material and light."""
     mesh: Path | None = None
@@ -47,16 +55,23 @@ class Train:
     """Where to train; auto takes a GPU where there is one."""
     devices: int = 1
     """Processes that share the work, one per GPU (or CPU process)."""
+
+
+@dataclass
+class TrainWithSettings(Train):
+    """Recover geometry, material and light from posed images."""
+
     config: NeilfConfig = field(default_factory=NeilfConfig)
     """Any setting of the preset."""
 
 
-def run(options: Train) -> None:
+def run(options: TrainWithSettings) -> None:
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.command import run_training
 
-    config = _settings(options)
-    as_before = options.resume and options.preset is None and config == preset(DEFAULT_PRESET)
+    config = _with_files(options)
+    named = options.preset is not None or options.config_file is not None
+    as_before = options.resume and not named and config == preset(DEFAULT_PRESET)
     with computing_fast():
         run_training(
             data=options.data,
@@ -73,39 +88,75 @@ def run(options: Train) -> None:
         )
 
 
-def _settings(options: Train) -> NeilfConfig:
-    """The settings, with those that have an option of their own."""
+def _with_files(options: TrainWithSettings) -> NeilfConfig:
+    """The settings, with the files that have an option of their own."""
     config = options.config
     if options.mesh is not None:
-        if config.host != "mesh":
-            raise UserError(f"--mesh {options.mesh}: the host {config.host} takes no mesh", "add --host mesh")
-        config = replace(config, mesh=replace(config.mesh, path=str(options.mesh.resolve())))
+        if not isinstance(config.host, MeshConfig):
+            raise UserError(f"--mesh {options.mesh}: the host {config.host.kind} takes no mesh", "add --host mesh")
+        config = changed(config, {"host.path": str(options.mesh.resolve())})
     if options.light is not None:
-        config = replace(config, light=replace(config.light, map=str(options.light.resolve())))
+        if not isinstance(config.light, MapLightConfig):
+            raise UserError(
+                f"{options.light}: a light that is free at every point takes no map",
+                "add --config.light.kind distant, or auto to look for lamps before the map as well",
+            )
+        config = changed(config, {"light.map": str(options.light.resolve())})
     return config
 
 
-def _starting_point(arguments: Sequence[str]) -> Train:
-    """Preset and host decide the defaults of all other settings, so they are read first."""
-    config = preset(_option(arguments, "--preset") or DEFAULT_PRESET)
-    return Train(config=fixed_geometry(config) if _option(arguments, "--host") == "mesh" else config)
+def _starting_point(arguments: Sequence[str]) -> TrainWithSettings:
+    """What decides which other settings there are, and what they default to, is read first: the file, the preset, the host,
+    and the kinds of light and of encoding."""
+    file = _option(arguments, "--config")
+    stored = dict(read_settings(Path(file))) if file is not None else {}
+    where = file or "config"
+    host = _option(arguments, "--host")
+    config = _base(_option(arguments, "--preset"), host, stored, where)
+    config = changed(config, stored, where)
+    if host is not None and host != config.host.kind:
+        raise UserError(f"{where}: its host is {config.host.kind}, and --host {host} is given", "leave one of them out")
+    kinds = {room: _option(arguments, f"--config.{room}.kind") for room in ROOMS_WITH_KINDS}
+    chosen = {f"{room}.kind": kind for room, kind in kinds.items() if kind is not None}
+    if kinds["light"] == "free" and config.light.kind != "free":
+        config = free_light(config)
+    return TrainWithSettings(config=changed(config, chosen, "--config"))
+
+
+def _base(name: str | None, host: str | None, stored: Mapping[str, Any], where: str) -> NeilfConfig:
+    """The preset that a file changes: the one that is named, else the file's own, else the usual one."""
+    label = stored.get("preset", DEFAULT_PRESET) if name is None else name
+    kind = stored.get("host", {})
+    mesh = host == "mesh" or (isinstance(kind, Mapping) and kind.get("kind") == "mesh") or stored.get("host.kind") == "mesh"
+    if not isinstance(label, str):
+        raise UserError(f"{where}.preset: {label!r} where a name belongs", f"choose one of {', '.join(PRESETS)}")
+    label = label.removesuffix("-mesh") if name is None else label
+    # What no preset made has the label of the settings' own defaults.
+    config = NeilfConfig() if name is None and label == NeilfConfig().preset else preset(label)
+    config = fixed_geometry(config) if mesh else config
+    light = stored.get("light", {})
+    free = isinstance(light, Mapping) and light.get("kind") == "free" and config.light.kind != "free"
+    return free_light(config) if free else config
 
 
 def _option(arguments: Sequence[str], name: str) -> str | None:
+    """The value of an option, the last where it is given more than once."""
+    value = None
     for i, argument in enumerate(arguments):
         if argument == name and i + 1 < len(arguments):
-            return arguments[i + 1]
+            value = arguments[i + 1]
         if argument.startswith(f"{name}="):
-            return argument.split("=", 1)[1]
-    return None
+            value = argument.split("=", 1)[1]
+    return value
 
 
 COMMAND = Command(
-    Train,
+    TrainWithSettings,
     run,
     [
         "neilfpp train --data captures/teapot",
         "neilfpp train --data captures/teapot --preset paper-ngp --out runs/teapot",
+        "neilfpp train --data captures/teapot --config settings.yaml",
         "neilfpp train --data captures/teapot --host mesh --mesh scans/teapot.ply",
         "neilfpp train --data captures/teapot --light studio.exr",
         "neilfpp train --out runs/teapot --resume",
@@ -113,4 +164,5 @@ COMMAND = Command(
         "neilfpp train --data captures/teapot --config.inter-reflection.mode off",
     ],
     _starting_point,
+    usual=Train,
 )

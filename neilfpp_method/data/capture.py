@@ -15,7 +15,8 @@ import numpy as np
 
 from neilfpp_method.data import capture_folder
 from neilfpp_method.data.formats import blender, colmap, dtu, nero, sfm_scene, transforms
-from neilfpp_method.data.images import image_header
+from neilfpp_method.data.images import IMAGE_SUFFIXES, image_header
+from neilfpp_method.data.raw import RAW_SUFFIXES
 from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, SceneSource, View, check_camera, inside, plain_name
 from neilfpp_method.errors import UserError
 
@@ -151,8 +152,18 @@ def _recognise(root: Path) -> str:
     for name, reader in READERS.items():
         if reader.recognise(root):
             return name
+    photographs = _photographs(root)
+    if photographs:
+        remedy = f"run neilfpp prepare {root} --out CAPTURE, and train on CAPTURE"
+        raise UserError(f"{root}: {photographs} photographs and no cameras", remedy)
     layouts = "; ".join(f"{name} ({reader.LAYOUT})" for name, reader in READERS.items())
     raise UserError(f"{root}: no capture in this folder", f"the formats are: {layouts}")
+
+
+def _photographs(root: Path) -> int:
+    """How many photographs lie in a folder and in its own folders, as `neilfpp prepare` takes them."""
+    files = [*root.glob("*"), *root.glob("*/*")]
+    return sum(file.suffix.lower() in (*IMAGE_SUFFIXES, *RAW_SUFFIXES) for file in files if not file.name.startswith("."))
 
 
 def _check_views(views: tuple[View, ...]) -> bool:

@@ -26,6 +26,7 @@ from neilfpp_method.evaluate.patches import PATCHES, by_patch, light_by_patch, p
 from neilfpp_method.evaluate.posterior import Deviation, Sights, expected_error, guessed_error
 from neilfpp_method.evaluate.sightings import Sightings, TrainingViews
 from neilfpp_method.evaluate.views import RenderedView
+from neilfpp_method.lighting.objective import error_unit
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading.color import apply_response, response_slope, srgb_to_linear
 from neilfpp_method.structures import OrientedPoints
@@ -62,7 +63,7 @@ class Evidence:
     Attributes:
         views: the training views.
         noise: half of the relative errors of radiance are below it; they are relative to what was seen and a share of what
-            is typical (`config.light.fit.floor`).
+            is typical (`lighting.objective.FLOOR`).
         misfit: half of the points have a root mean square of their relative errors below it.
         typical: the mean over points of the shares of diffuse light that come from each patch.
     """
@@ -224,7 +225,7 @@ def _mean_over_looks(values: Float[Tensor, "N V 3"], seen: Sightings) -> Float[T
 
 def _light_deviations(model: NeilfModel) -> Float[Tensor, " E"]:
     """Of each patch, and last of all light from outside together."""
-    known = model.config.light.map is not None
+    known = model.config.known_map is not None
     direct, overall = (KNOWN, KNOWN) if known else (DIRECT, OVERALL)
     lamps = patch_count(model) - 2 * PATCHES
     return torch.tensor([direct] * PATCHES + [REFLECTED] * PATCHES + [DIRECT] * lamps + [overall])
@@ -234,7 +235,7 @@ def _unit_error(model: NeilfModel, pixel: Float[Tensor, "*B 3"]) -> Float[Tensor
     """The radiance that a relative error of 1 stands for at a pixel, as fits of the light have it (`Objective`)."""
     response = model.facts.response
     typical = apply_response(torch.tensor(model.facts.median_radiance), response)
-    unit = response_slope(pixel, response) + model.config.light.fit.floor * response_slope(typical, response).item()
+    unit = error_unit(pixel, response, response_slope(typical, response).item())
     if response == "linear":
         return unit
     return unit * (srgb_to_linear(pixel + STEP) - srgb_to_linear(pixel)) / STEP

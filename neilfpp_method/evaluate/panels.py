@@ -25,7 +25,7 @@ from neilfpp_method.evaluate.pictures import (
     nearest_radiance,
     ring,
 )
-from neilfpp_method.evaluate.views import KnownView, RenderedView, has_material
+from neilfpp_method.evaluate.views import KnownView, RenderedView
 from neilfpp_method.export.probes import spread
 from neilfpp_method.shading.color import srgb_to_linear
 from neilfpp_method.structures import OrientedPoints
@@ -101,7 +101,7 @@ def _image_map(run: Run, rendered: Sequence[RenderedView], known: Sequence[Known
     for view, image in zip(rendered, images, strict=True):
         shown, truth = display_color(view.maps["rgb"], exposure), display_color(image, exposure)
         comparisons.append(Comparison(shown, truth, display_error(_difference(shown, truth), 0.25)))
-    source = "rendering equation" if has_material(run) else "volume rendering"
+    source = "rendering equation" if run.has_material else "volume rendering"
     note = f"{source}\nexposure {exposure:.2g}" if run.capture.hdr else source
     return ComparedMap("Image", note, tuple(comparisons), 0.25)
 
@@ -109,7 +109,7 @@ def _image_map(run: Run, rendered: Sequence[RenderedView], known: Sequence[Known
 def _material_maps(
     run: Run, rendered: Sequence[RenderedView], known: Sequence[KnownView], scale: Float[np.ndarray, " 3"] | None
 ) -> Iterator[ComparedMap]:
-    if not has_material(run):
+    if not run.has_material:
         return
     yield _material_map("Base colour", "as estimated", "base_color", rendered, known)
     if scale is not None:

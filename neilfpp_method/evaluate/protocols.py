@@ -36,7 +36,6 @@ from neilfpp_method.evaluate.confidence import gather_evidence, material_deviati
 from neilfpp_method.evaluate.views import (
     KnownView,
     RenderedView,
-    has_material,
     known_test_views,
     mask_source,
     mean_observed_color,
@@ -45,6 +44,7 @@ from neilfpp_method.evaluate.views import (
 )
 from neilfpp_method.export.mesh import HasSdf, extract_mesh
 from neilfpp_method.health.cases import verdict_of
+from neilfpp_method.hosts.volsdf import HIT_RADIUS
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.train.health_record import read_findings
 from neilfpp_method.train.run import Run, write_json
@@ -91,7 +91,7 @@ def evaluate(
     mesh, light = truth.mesh(), truth.light_field()
     if mesh is not None and isinstance(run.model.host, HasSdf):
         figures |= chamfer_metrics(run, mesh)
-    if light is not None and has_material(run):
+    if light is not None and run.has_material:
         figures |= light_metrics(run, light, mesh)
     on_progress(1.0)
     return figures
@@ -134,7 +134,7 @@ class Scores(defaultdict[str, list[float]]):
 
 def image_metrics(run: Run, pairs: Pairs) -> dict[str, float]:
     """PSNR and SSIM of what R and what the rendering equation show; the second once there is a material."""
-    shown = {"volume": "rgb_volume"} | ({"pbr": "rgb"} if has_material(run) else {})
+    shown = {"volume": "rgb_volume"} | ({"pbr": "rgb"} if run.has_material else {})
     scores = Scores()
     for view, known in pairs:
         image = _tone_mapped(known.image) if run.capture.hdr else known.image
@@ -154,7 +154,7 @@ def material_metrics(run: Run, pairs: Pairs) -> dict[str, float]:
     Both alignments are one for all test views. A Lambertian run estimates neither roughness nor metallic.
     """
     pairs = [(view, known) for view, known in pairs if known.material is not None]
-    if not pairs or not has_material(run):
+    if not pairs or not run.has_material:
         return {}
     estimate = np.concatenate([view.maps["base_color"][known.mask] for view, known in pairs])
     true = _pooled(pairs, "base_color")
@@ -178,7 +178,7 @@ def material_metrics(run: Run, pairs: Pairs) -> dict[str, float]:
 def confidence_metrics(run: Run, pairs: Pairs) -> dict[str, float]:
     """Whether the run knows where its material is wrong; absent where the other half is without error."""
     pairs = [(view, known) for view, known in pairs if known.material is not None]
-    if not pairs or not has_material(run) or not run.capture.train_views:
+    if not pairs or not run.has_material or not run.capture.train_views:
         return {}
     rows = [np.flatnonzero(known.mask & (view.maps["opacity"][..., 0] > 0.5)) for view, known in pairs]
     step = max(1, sum(map(len, rows)) // CONFIDENCE_PIXELS)
@@ -235,7 +235,7 @@ def chamfer_metrics(run: Run, truth: Mesh) -> dict[str, float]:
     corner = np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))
     device = next(run.model.parameters()).device
     # The sphere that may close the scene is no surface of the object, and what lies far from the truth is cut anyway.
-    radius = min(float(corner), volume.radius - volume.hit_radius)
+    radius = min(float(corner), volume.radius - HIT_RADIUS)
     surface = extract_mesh(run.model.host.sdf, radius, MESH_RESOLUTION, device=device)
     points = metrics.sample_surface(surface, SURFACE_POINTS)
     points = points[((points >= low) & (points <= high)).all(axis=-1)]

@@ -13,7 +13,7 @@ from neilfpp_method.data.images import write_exr, write_png
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.confidence import gather_evidence, with_deviation
 from neilfpp_method.evaluate.pictures import display
-from neilfpp_method.evaluate.views import RenderedView, has_material, render_view
+from neilfpp_method.evaluate.views import RenderedView, render_view
 from neilfpp_method.train.run import Run
 
 __all__ = ["render_run"]
@@ -50,7 +50,7 @@ def render_run(
         UserError: a view that the capture does not have, or confidence of a material that is not there yet.
     """
     names = view_names(run.capture, views)
-    if confidence and not has_material(run):
+    if confidence and not run.has_material:
         raise UserError(f"{run.path}: there is no material at step {run.step}", "train the next stage")
     evidence = gather_evidence(run) if confidence else None
     written = []

@@ -16,7 +16,7 @@ from neilfpp_method.evaluate.confidence import gather_evidence, with_deviation
 from neilfpp_method.evaluate.page import Figure, report_page
 from neilfpp_method.evaluate.panels import albedo_scale, light_sections, view_sections
 from neilfpp_method.evaluate.pictures import contact_sheet
-from neilfpp_method.evaluate.views import RenderedView, has_material, known_test_views, render_view
+from neilfpp_method.evaluate.views import RenderedView, known_test_views, render_view
 from neilfpp_method.schedule import stage_steps
 from neilfpp_method.train.health_record import in_words as in_words_of_health
 from neilfpp_method.train.health_record import read_findings
@@ -64,12 +64,12 @@ def write_report(
     at_hand = {view.name: view for view in rendered}
     rendered = [at_hand.get(view.name) or render_view(run, run.capture.views.index(view)) for view in shown.capture.test_views]
     known = known_test_views(shown, rendered).views
-    scale = albedo_scale(rendered, known) if has_material(run) else None
-    if has_material(run) and run.capture.train_views:
+    scale = albedo_scale(rendered, known) if run.has_material else None
+    if run.has_material and run.capture.train_views:
         evidence = gather_evidence(run)
         rendered = [with_deviation(run, evidence, view, CONFIDENCE_STEP) for view in rendered]
     views = view_sections(shown, rendered, known, scale)
-    light = light_sections(shown, rendered, scale) if has_material(run) else []
+    light = light_sections(shown, rendered, scale) if run.has_material else []
 
     title = f"{run.capture.root.resolve().name}, {run.config.preset}"
     subtitle = f"step {run.step} of {sum(stage_steps(run.config.train).values())}"
@@ -84,7 +84,7 @@ def write_report(
 
 def write_light_picture(run: Run, path: Path) -> bool:
     """Write the report's pictures of incident light alone, as a PNG. Returns whether the run has any to show."""
-    if not has_material(run):
+    if not run.has_material:
         return False
     shown = _with_shown_views(run)
     rendered = [render_view(run, run.capture.views.index(view)) for view in shown.capture.test_views]

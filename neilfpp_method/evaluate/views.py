@@ -23,7 +23,6 @@ __all__ = [
     "HeldOut",
     "KnownView",
     "RenderedView",
-    "has_material",
     "known_test_views",
     "mask_source",
     "mean_observed_color",
@@ -44,11 +43,6 @@ class RenderedView:
     maps: Mapping[str, Float[np.ndarray, "H W C"]]
 
 
-def has_material(run: Run) -> bool:
-    """Whether a step has moved the material and the light; before that they are what they start as."""
-    return run.step > run.config.train.sdf_steps
-
-
 def render_view(run: Run, view_index: int) -> RenderedView:
     """Render view `view_index` of `run.capture.views` in full size; the same picture every time.
 
@@ -61,7 +55,7 @@ def render_view(run: Run, view_index: int) -> RenderedView:
     chunk = run.config.train.eval_chunk
     parts: dict[str, list[Tensor]] = {f.name: [] for f in fields(Maps)}
     for start in range(0, len(rays), chunk):
-        maps = run.model.maps(rays[start : start + chunk].to(device), has_material(run))
+        maps = run.model.maps(rays[start : start + chunk].to(device), run.has_material)
         for name, rows in parts.items():
             rows.append(getattr(maps, name).float().cpu())
     return RenderedView(view.name, {name: _image(torch.cat(rows), view) for name, rows in parts.items()})

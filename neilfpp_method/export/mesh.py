@@ -16,6 +16,7 @@ from torch import Tensor
 
 from neilfpp_method.data.images import replacing
 from neilfpp_method.errors import UserError
+from neilfpp_method.hosts.volsdf import HIT_RADIUS
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.train.run import Run
 
@@ -86,7 +87,7 @@ def export_mesh(run: Run, path: Path, resolution: int = 256) -> trimesh.Trimesh:
     device = next(run.model.parameters()).device
     volume = run.config.volume
     # The sphere that may close the scene (METHOD §3) is no surface of the object.
-    mesh = extract_mesh(run.model.host.sdf, volume.radius - volume.hit_radius, resolution, device=device)
+    mesh = extract_mesh(run.model.host.sdf, volume.radius - HIT_RADIUS, resolution, device=device)
     position = torch.as_tensor(mesh.vertices, dtype=torch.float32, device=device)
     if run.step > run.config.train.sdf_steps:
         mesh.visual.vertex_colors = _vertex_colors(run, position)

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.kernels import Encoded, encode, grid_spec
-from neilfpp_method.settings.types import HashGridConfig
+from neilfpp_method.kernels import Encoded, GridSpec, encode, grid_spec
+from neilfpp_method.settings.types import FrequencyConfig, HashGridConfig
 
 __all__ = [
     "FrequencyEncoding",
@@ -26,6 +26,9 @@ __all__ = [
     "position_encoding",
     "pull_back",
 ]
+
+POSITION_OCTAVES = 6
+"""Of the frequency encoding of positions (NeILF++ §5); the finest wave is 1/32 of the coarsest."""
 
 
 def pull_back(gradient: Float[Tensor, "N K F"], encoded: Encoded) -> Float[Tensor, "N K 3"]:
@@ -80,9 +83,9 @@ class HashGrid(nn.Module):
     The features start at U(−1e−4, 1e−4) (Müller et al. 2022, §4).
     """
 
-    def __init__(self, config: HashGridConfig, radius: float) -> None:
+    def __init__(self, spec: GridSpec, radius: float) -> None:
         super().__init__()
-        self.spec = grid_spec(config)
+        self.spec = spec
         self.radius = radius
         self.width = 3 + self.spec.width
         self.step = 2 * radius / self.spec.resolutions[-1]
@@ -107,12 +110,15 @@ def _identity(x: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3 3"]:
 
 
 def position_encoding(
-    kind: Literal["raw", "frequency", "hash"], grid: HashGridConfig, radius: float, octaves: int = 0
-) -> Raw | FrequencyEncoding | HashGrid:
-    """The position encoding that a configuration names."""
-    if kind == "hash":
-        return HashGrid(grid, radius)
-    return FrequencyEncoding(octaves) if kind == "frequency" else Raw()
+    config: FrequencyConfig | HashGridConfig, radius: float, log2_entries: int | None = None
+) -> FrequencyEncoding | HashGrid:
+    """The position encoding that a configuration names, for positions within `radius`.
+
+    `log2_entries`: the table size of one level of a grid, as a power of two; none: `config.log2_entries`.
+    """
+    if isinstance(config, FrequencyConfig):
+        return FrequencyEncoding(POSITION_OCTAVES)
+    return HashGrid(grid_spec(config.levels, log2_entries or config.log2_entries, config.max_resolution), radius)
 
 
 # -------------------------------------------------------------------------------------------------------- directions
@@ -130,7 +136,7 @@ class SphericalHarmonics(nn.Module):
     def __init__(self, degree: int) -> None:
         super().__init__()
         if not 1 <= degree <= len(BANDS):
-            raise UserError(f"spherical harmonics of {degree} bands", "choose direction_degree between 1 and 5")
+            raise UserError(f"spherical harmonics of {degree} bands", "choose 1 to 5")
         self.degree = degree
         self.width = degree**2
 
@@ -174,7 +180,7 @@ BANDS: tuple[Callable[[Tensor, Tensor, Tensor], list[Tensor]], ...] = (
 
 
 def direction_encoding(
-    kind: Literal["frequency", "spherical_harmonics"], degree: int
+    kind: Literal["frequency", "spherical_harmonics"], octaves: int, bands: int
 ) -> FrequencyEncoding | SphericalHarmonics:
-    """The direction encoding that a configuration names; `degree` counts octaves or bands."""
-    return FrequencyEncoding(degree) if kind == "frequency" else SphericalHarmonics(degree)
+    """The direction encoding that a configuration names."""
+    return FrequencyEncoding(octaves) if kind == "frequency" else SphericalHarmonics(bands)

@@ -12,13 +12,17 @@ from torch import Tensor, nn
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.incident_light import IncidentLightField
 from neilfpp_method.fields.lamps import Lamps
-from neilfpp_method.settings.types import IncidentLightConfig
+from neilfpp_method.settings.types import FreeLightConfig, NeilfConfig
 from neilfpp_method.shading.sampling import Technique
 
 __all__ = ["Light", "LightModel", "make_light"]
 
 FREE_BASE = {"linear": 10.0, "srgb": math.e}
 """Base of the exponential at the end of a free field, by what the pixels are (METHOD §5)."""
+MOST_LAMPS = 8
+"""Lamps close by: more than photographs of one object tell apart."""
+LAMP_RADIUS = 0.06
+"""Of every lamp, scene units: a bulb beside an object of a metre. Only how sharp its reflections are depends on it."""
 
 
 @runtime_checkable
@@ -42,10 +46,11 @@ class LightModel:
     lamps: Lamps
 
 
-def make_light(config: IncidentLightConfig, response: str, initial_radiance: float) -> LightModel:
+def make_light(config: NeilfConfig, response: str, initial_radiance: float) -> LightModel:
     """An untrained light that sends `initial_radiance` from everywhere; `response` is "linear" or "srgb"."""
-    if config.kind == "free":
-        base = config.base or FREE_BASE[response]
-        return LightModel(IncidentLightField(config, base, initial_radiance), Lamps(0, config.fit.lamp_radius))
-    lamps = 0 if config.kind == "distant" else config.fit.lamps
-    return LightModel(EnvironmentLight(config.environment_height, initial_radiance), Lamps(lamps, config.fit.lamp_radius))
+    settings = config.light
+    if isinstance(settings, FreeLightConfig):
+        field = IncidentLightField(settings, config.encoding, FREE_BASE[response], initial_radiance)
+        return LightModel(field, Lamps(0, LAMP_RADIUS))
+    lamps = Lamps(0 if settings.kind == "distant" else MOST_LAMPS, LAMP_RADIUS)
+    return LightModel(EnvironmentLight(settings.environment_height, initial_radiance), lamps)

@@ -20,12 +20,15 @@ from torch.nn.utils import parametrizations
 from neilfpp_method.errors import UserError
 from neilfpp_method.kernels.softplus import UnitSample, softplus, softplus_and_slope
 
-__all__ = ["ACTIVATIONS", "Activation", "Mlp", "MlpSample", "geometric_init_", "weight_normalise_"]
+__all__ = ["ACTIVATIONS", "Activation", "Mlp", "MlpSample", "geometric_init_", "middle_skip", "weight_normalise_"]
 
 SOFTPLUS_SHARPNESS = 100.0  # VolSDF, IDR
 SINE_FREQUENCY = 30.0  # SIREN's ω
 SPHERE_SAMPLES = 4096  # points at which the geometric start is corrected
 RIDGE = 1e-2  # price of that correction, relative to the mean square of a unit
+SKIP_FROM = 4
+"""Hidden layers from which a network sees its input once more, at the middle: deep ones forget it (DeepSDF), shallow ones
+have it close by."""
 
 
 @dataclass(frozen=True)
@@ -179,3 +182,8 @@ def weight_normalise_(mlp: Mlp) -> None:
     """Split every weight row into length and direction (Salimans & Kingma 2016); the function stays as it is."""
     for layer in mlp.layers:
         parametrizations.weight_norm(layer)
+
+
+def middle_skip(layers: int) -> int | None:
+    """The layer at which a network of so many hidden ones sees its input again; none for a shallow one."""
+    return layers // 2 if layers >= SKIP_FROM else None

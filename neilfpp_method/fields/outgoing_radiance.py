@@ -8,26 +8,38 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from neilfpp_method.fields.encodings import direction_encoding, position_encoding
+from neilfpp_method.fields.encodings import Raw, direction_encoding, position_encoding
 from neilfpp_method.fields.mlp import Mlp
-from neilfpp_method.settings.types import OutgoingRadianceConfig
+from neilfpp_method.settings.types import FrequencyConfig, HashGridConfig, OutgoingRadianceConfig
 
 __all__ = ["MID_GREY", "OutgoingRadianceField"]
 
 MID_GREY = 0.2
+DIRECTION_OCTAVES, DIRECTION_BANDS = 4, 4
+"""Of the encoding of directions (NeILF++ §5)."""
 
 
 class OutgoingRadianceField(nn.Module):
-    """A sigmoid times `scale`, the largest radiance it reaches; starts near the radiance `start`, at most at scale/2."""
+    """A sigmoid times `scale`, the largest radiance it reaches; starts near the radiance `start`, at most at scale/2.
+
+    Positions may enter raw (`config.positions`) where there is a feature of G, which has seen their encoding (NeILF++ §5).
+    """
 
     def __init__(
-        self, config: OutgoingRadianceConfig, feature_width: int, radius: float, scale: float, start: float = MID_GREY
+        self,
+        config: OutgoingRadianceConfig,
+        encoding: FrequencyConfig | HashGridConfig,
+        feature_width: int,
+        radius: float,
+        scale: float,
+        start: float = MID_GREY,
     ) -> None:
         super().__init__()
         self.scale = scale
         self.mirrored = config.direction == "mirrored"
-        self.position = position_encoding(config.encoding, config.grid, radius, config.frequencies)
-        self.direction = direction_encoding(config.direction_encoding, config.direction_degree)
+        waves = isinstance(encoding, FrequencyConfig)
+        self.position = Raw() if config.positions == "raw" and feature_width else position_encoding(encoding, radius)
+        self.direction = direction_encoding("frequency" if waves else "spherical_harmonics", DIRECTION_OCTAVES, DIRECTION_BANDS)
         inputs = self.position.width + self.direction.width + self.mirrored + 3 + feature_width
         self.mlp = Mlp(inputs, 3, config.layers, config.width, "relu", output_scale=0.1)
         share = min(start / scale, 0.5)

@@ -9,11 +9,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from neilfpp_method.fields.encodings import position_encoding, pull_back
-from neilfpp_method.fields.mlp import Mlp, geometric_init_, weight_normalise_
-from neilfpp_method.settings.types import SdfConfig
+from neilfpp_method.fields.encodings import FrequencyEncoding, position_encoding, pull_back
+from neilfpp_method.fields.mlp import Mlp, geometric_init_, middle_skip, weight_normalise_
+from neilfpp_method.settings.types import FrequencyConfig, HashGridConfig, SdfConfig
 
 __all__ = ["SdfField", "SdfSample"]
+
+FIRST_RADIUS = 0.6
+"""Of the sphere that the field starts as, scene units: within the unit sphere that holds the object, and most of it."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +35,13 @@ class SdfField(nn.Module):
     as in IDR and VolSDF. Behind a hash grid, whose features start near 0 themselves, neither is called for.
     """
 
-    def __init__(self, config: SdfConfig, radius: float) -> None:
+    def __init__(self, config: SdfConfig, encoding: FrequencyConfig | HashGridConfig, radius: float) -> None:
         super().__init__()
-        self.encoding = position_encoding(config.encoding, config.grid, radius, config.frequencies)
+        waves = isinstance(encoding, FrequencyConfig)
+        self.encoding = position_encoding(encoding, radius, None if waves else encoding.sdf_log2_entries)
         outputs = 1 + config.feature_width
-        self.mlp = Mlp(self.encoding.width, outputs, config.layers, config.width, "softplus", config.skip)
-        waves = config.encoding == "frequency"
-        geometric_init_(self.mlp, config.sphere_radius, extent=radius, encoded=0.0 if waves else 1.0)
+        self.mlp = Mlp(self.encoding.width, outputs, config.layers, config.width, "softplus", middle_skip(config.layers))
+        geometric_init_(self.mlp, FIRST_RADIUS, extent=radius, encoded=0.0 if waves else 1.0)
         if waves:
             weight_normalise_(self.mlp)
 
@@ -52,13 +55,17 @@ class SdfField(nn.Module):
         sample = self.mlp.with_gradient(encoded.features, slice(0, 1))
         return SdfSample(sample.value[:, 0], pull_back(sample.gradient, encoded)[:, 0], sample.value[:, 1:])
 
-    def hessian(self, x: Float[Tensor, "N 3"], method: Literal["analytic", "finite_difference"]) -> Float[Tensor, "N 3 3"]:
+    def hessian(
+        self, x: Float[Tensor, "N 3"], method: Literal["analytic", "finite_difference"] | None = None
+    ) -> Float[Tensor, "N 3 3"]:
         """H_ij = ∂²G / ∂x_i ∂x_j; a loss on it reaches the parameters.
 
         analytic: autograd through `with_gradient`. Exact, but inside a grid cell a trilinear function has no curvature
         along the axes. finite_difference: forward differences of the gradient over one cell of the finest grid (for
-        waves, a fiftieth of a radian of the finest), which see the curvature that lies in the kinks between cells.
+        waves, a fiftieth of a radian of the finest), which see the curvature that lies in the kinks between cells. None: the
+        former for waves, the latter for a grid.
         """
+        method = method or ("analytic" if isinstance(self.encoding, FrequencyEncoding) else "finite_difference")
         return self._analytic_hessian(x) if method == "analytic" else self._difference_hessian(x)
 
     def _analytic_hessian(self, x: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3 3"]:

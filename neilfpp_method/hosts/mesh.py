@@ -71,13 +71,13 @@ class MeshHost(nn.Module):
     ) -> None:
         super().__init__()
         radius = config.volume.radius
-        self.radiance_field = OutgoingRadianceField(config.radiance, 0, radius, radiance_scale, radiance_start)
+        self.radiance_field = OutgoingRadianceField(config.radiance, config.encoding, 0, radius, radiance_scale, radiance_start)
         self.register_buffer("background_color", torch.tensor(background_color))
         self.background = field_beyond(background, config.background, radius, radiance_scale, self.background_color)
         triangles = mesh.vertices[mesh.faces]
         across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         outward = safe_normalize(across, eps=TINY)
-        smooth = _corner_normals(mesh, outward) if config.mesh.smooth_normals else outward[:, None]
+        smooth = _corner_normals(mesh, outward)
         self.register_buffer("triangles", triangles, persistent=False)
         self.register_buffer("outward", outward, persistent=False)
         self.register_buffer("corner_normals", smooth.expand(-1, 3, -1), persistent=False)

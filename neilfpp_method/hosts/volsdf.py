@@ -23,13 +23,19 @@ from neilfpp_method.volume.density import LaplaceDensity, laplace_depth
 from neilfpp_method.volume.distance_grid import cell_size, sample_grid, trace_grid
 from neilfpp_method.volume.empty_space import EmptySpace
 from neilfpp_method.volume.intersect import Interval, sphere_interval
-from neilfpp_method.volume.samplers import error_bounded_samples, uniform_samples
+from neilfpp_method.volume.samplers import error_bounded_samples
 
 __all__ = ["VolSdfHost"]
 
 POINTS_ABOUT_OBJECT = 2
 """Points for regularisers per ray in the cube about the object, beside one in the cube about the scene: 8192 and 4096 in
 the published code."""
+HIT_RADIUS = 0.05
+"""Scene units: the blending weight within this distance of the blended hit is its concentration (METHOD §2)."""
+SURFACE_WIDTH = {"scene": 10.0, "rays": 0.05}
+"""Scene units, by `loss.points`: width of the smoothed delta of L_surf. The former is the published one."""
+GRID_RESOLUTION = 96
+"""Vertices along an edge of the grid that hard inter-reflection traces."""
 GRID_LIFE = 100
 """Steps in which the geometry moves before the distance grid is sampled again."""
 
@@ -81,16 +87,17 @@ class VolSdfHost(nn.Module):
         self.register_buffer("point_position", None if points is None else points.position, persistent=False)
         self.register_buffer("point_normal", None if points is None else points.normal, persistent=False)
         radius = config.volume.radius
-        self.sdf_field = SdfField(config.sdf, radius)
+        sdf = config.host.sdf
+        self.sdf_field = SdfField(sdf, config.encoding, radius)
         self.radiance_field = OutgoingRadianceField(
-            config.radiance, config.sdf.feature_width, radius, radiance_scale, radiance_start
+            config.radiance, config.encoding, sdf.feature_width, radius, radiance_scale, radiance_start
         )
-        self.density = LaplaceDensity(config.volume.beta_init, config.volume.beta_floor)
+        self.density = LaplaceDensity(config.volume.beta_init)
         self.register_buffer("background_color", torch.tensor(background_color))
         self.background = field_beyond(background, config.background, radius, radiance_scale, self.background_color)
         self.empty_space = EmptySpace(radius) if config.volume.skip_empty else None
         hard = config.inter_reflection.mode == "hard"
-        resolution = config.inter_reflection.grid_resolution if hard else 0
+        resolution = GRID_RESOLUTION if hard else 0
         # Kept in checkpoints, with its age: a resumed run must trace the very same grid.
         self.register_buffer("distance_grid", torch.zeros(resolution, resolution, resolution))
         self.grid_age: int | None = None
@@ -194,7 +201,7 @@ class VolSdfHost(nn.Module):
             interval = self.empty_space.narrow(self.sdf, rays, full, self.surface_width())
             if self.background_kind == "none":
                 interval = Interval(interval.near, full.far)  # R paints the scene sphere: rays go on to it
-            volume = replace(volume, initial_samples=volume.narrowed_samples)
+            volume = replace(volume, initial_samples=max(volume.initial_samples // 2, 1))
         distances = self._sample(rays, interval, volume)
         points = rays.origins[:, None] + distances[..., None] * rays.directions[:, None]
         surface = self.sdf_field.with_gradient(points.reshape(-1, 3))
@@ -207,8 +214,6 @@ class VolSdfHost(nn.Module):
 
     def _sample(self, rays: RayBatch, interval: Interval, volume: VolumeConfig) -> Float[Tensor, "N M"]:
         near, far = interval.near, interval.far
-        if volume.sampler == "uniform":
-            return uniform_samples(near, far, volume.samples, self.training)
         with torch.no_grad():
             beta = self.density.beta()
             found = error_bounded_samples(self.sdf, rays.origins, rays.directions, near, far, beta, volume, self.training)
@@ -231,7 +236,7 @@ class VolSdfHost(nn.Module):
             position=rays.origins + depth[:, None] * rays.directions,
             normal=safe_normalize(composite(weights, normals)),
             opacity=opacity,
-            concentration=share_near(distances, intervals.weights.detach(), depth.detach(), self.config.volume.hit_radius),
+            concentration=share_near(distances, intervals.weights.detach(), depth.detach(), HIT_RADIUS),
         )
 
     def _beyond(self, rays: RayBatch, transmittance: Float[Tensor, " N"], at_far: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
@@ -249,15 +254,14 @@ class VolSdfHost(nn.Module):
     # ------------------------------------------------------------------------------------------------------- regularisers
 
     def _regularisers(self, march: March, batch: PixelBatch, names: Collection[str]) -> dict[str, LossTerm]:
-        settings = self.config.loss
         terms = {}
         places = self._places(march) if {"eikonal", "surface", "hessian"} & set(names) else None
         if "eikonal" in names:
             terms["eikonal"] = losses.eikonal(places.gradient)
         if "surface" in names:
-            terms["surface"] = losses.surface(places.distance, settings.surface_epsilon)
+            terms["surface"] = losses.surface(places.distance, SURFACE_WIDTH[self.config.loss.points])
         if "hessian" in names:
-            terms["hessian"] = losses.hessian(self.sdf_field.hessian(places.curved, settings.hessian_method))
+            terms["hessian"] = losses.hessian(self.sdf_field.hessian(places.curved))
         if "point_cloud" in names and self.point_position is not None:
             rows = torch.randint(len(self.point_position), (len(batch),), device=self.point_position.device)
             sample = self.sdf_field.with_gradient(self.point_position[rows])
@@ -275,7 +279,7 @@ class VolSdfHost(nn.Module):
         """Where the regularisers of G look (`loss.points`)."""
         position = march.hits.position.detach()
         if self.config.loss.points == "rays":
-            near_surface = position + self.config.volume.hit_radius * torch.randn_like(position)
+            near_surface = position + HIT_RADIUS * torch.randn_like(position)
             return Places(march.surface.gradient, march.surface.distance, near_surface)
         about_object = torch.empty_like(position).repeat(POINTS_ABOUT_OBJECT, 1).uniform_(-1.0, 1.0)
         anywhere = torch.empty_like(position).uniform_(-1.0, 1.0) * self.config.volume.radius

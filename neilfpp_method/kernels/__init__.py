@@ -1,7 +1,7 @@
 """What is worth code of its own: hash-grid encoding, rays through a sampled distance field, and softplus units (`softplus`).
 
-Every backend of the encoding computes what `reference.encode` computes, which the tests hold it to. A grid's setting
-`backend` names one; "auto" takes the compiled loops on a CPU, Triton's kernels on a GPU, and the reference anywhere else.
+Every backend of the encoding computes what `reference.encode` computes, which the tests hold it to. `GridSpec.backend`
+names one; "auto" takes the compiled loops on a CPU, Triton's kernels on a GPU, and the reference anywhere else.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def _kernels(backend: str, device: str) -> Kernels | None:
         warnings.warn(f"hash grids take the slow reference: {error}", RuntimeWarning, stacklevel=3)
         return None
     if device not in module.KERNELS.devices:
-        raise UserError(f"hash-grid backend '{name}' does not run on {device}", "set the grid's backend to auto")
+        raise UserError(f"hash-grid backend '{name}' does not run on {device}", "set the backend of its `GridSpec` to auto")
     return module.KERNELS
 
 

@@ -14,9 +14,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.settings.types import HashGridConfig
 
 __all__ = ["Encoded", "GridSpec", "grid_spec"]
+
+BASE_RESOLUTION = 16
+"""Cells along an edge at the coarsest level, and"""
+FEATURES = 2
+"""numbers per vertex, as Müller et al. (2022) have them."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ class GridSpec:
     features: int
     """Length of a table row."""
     backend: str = "auto"
-    """Who computes it: `HashGridConfig.backend`."""
+    """Who computes it: auto (the fastest that runs on the device), reference (plain torch), cpu (Numba) or triton (CUDA)."""
 
     @cached_property
     def offsets(self) -> tuple[int, ...]:
@@ -60,19 +64,33 @@ class Encoded:
     jacobian: Float[Tensor, "N F 3"] | None
 
 
-def grid_spec(config: HashGridConfig) -> GridSpec:
-    """The layout that a configuration asks for: resolutions grow geometrically from base to max.
+def grid_spec(
+    levels: int,
+    log2_entries: int,
+    max_resolution: int,
+    base_resolution: int = BASE_RESOLUTION,
+    features: int = FEATURES,
+    backend: str = "auto",
+) -> GridSpec:
+    """A layout whose resolutions grow geometrically from base to max.
+
+    Args:
+        levels: number of grids.
+        log2_entries: table size of one level, as a power of two.
+        max_resolution: cells along an edge at the finest level.
+        base_resolution: the same at the coarsest.
+        features: numbers per vertex.
+        backend: who computes it: `GridSpec.backend`.
 
     Raises:
-        UserError: the configuration describes no grid.
+        UserError: this describes no grid.
     """
-    base, finest = config.base_resolution, config.max_resolution
-    if config.levels < 1 or config.features < 1 or not 1 <= base <= finest or not 1 <= config.log2_entries <= 24:
+    if levels < 1 or features < 1 or not 1 <= base_resolution <= max_resolution or not 1 <= log2_entries <= 24:
         raise UserError(
-            f"no such hash grid: {config}",
-            "it needs levels, features ≥ 1, 1 ≤ base_resolution ≤ max_resolution, 1 ≤ log2_entries ≤ 24",
+            f"no hash grid has {levels} levels of {base_resolution} to {max_resolution} cells and 2^{log2_entries} entries",
+            f"choose levels ≥ 1, max_resolution ≥ {base_resolution}, 1 ≤ log2_entries ≤ 24",
         )
-    growth = (finest / base) ** (1 / max(config.levels - 1, 1))
-    resolutions = tuple(round(base * growth**level) for level in range(config.levels))
-    entries = tuple(min((r + 1) ** 3, 2**config.log2_entries) for r in resolutions)
-    return GridSpec(resolutions, entries, config.features, config.backend)
+    growth = (max_resolution / base_resolution) ** (1 / max(levels - 1, 1))
+    resolutions = tuple(round(base_resolution * growth**level) for level in range(levels))
+    entries = tuple(min((r + 1) ** 3, 2**log2_entries) for r in resolutions)
+    return GridSpec(resolutions, entries, features, backend)

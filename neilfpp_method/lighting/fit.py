@@ -19,6 +19,8 @@ from neilfpp_method.lighting.transport import Transport
 
 __all__ = ["MIN_POINTS", "Evidence", "Light", "compare", "evidence", "fit_light"]
 
+RATE = 0.1
+"""Of log radiance at the start of a fit; roots of lamps and gains of base colour move at these shares of it:"""
 ROOT_RATE, GAIN_RATE = 0.5, 0.1
 """Rates of the roots of what lamps bring, and of the logarithms of the factors on base colour, over that of log radiance."""
 MIN_REACH = 0.05
@@ -120,8 +122,8 @@ def fit_light(start: Light, carried: Transport, target: Target, objective: Objec
         loss = loss + objective.unlikely(log_radiance)
         return loss + objective.price(unit * root.square().mean(-1), mean_transport @ strength)
 
-    unknowns = (Unknown(log_radiance, config.rate), Unknown(root, ROOT_RATE * config.rate))
-    descend(unknowns, GAIN_RATE * config.rate, config.steps, target, objective, loss_of)
+    unknowns = (Unknown(log_radiance, RATE), Unknown(root, ROOT_RATE * RATE))
+    descend(unknowns, GAIN_RATE * RATE, config.steps, target, objective, loss_of)
     found = light()
     found = Light(found.log_radiance.detach(), found.intensity.detach())
     finite = found.log_radiance.isfinite().all() and found.intensity.isfinite().all()

@@ -20,8 +20,17 @@ from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.shading.color import apply_response, response_slope
 from neilfpp_method.structures import Indexable, Material
 
-__all__ = ["Objective", "Target", "nearest_points", "tint", "total_variation", "unevenness"]
+__all__ = ["FLOOR", "Objective", "Target", "error_unit", "nearest_points", "tint", "total_variation", "unevenness"]
 
+FLOOR = 0.1
+"""Errors are relative to the pixel and this share of a typical one, so that dark pixels do not count for their noise."""
+OUTLIER = 0.1
+"""Relative errors beyond this count by their size rather than by their square: some points no light explains."""
+SKY = 1.0
+"""Weight of the difference between the map's log radiance and what cameras saw beyond the scene, per texel, against the
+relative error: that much is certain, and the scale of light and base colour hangs on it."""
+SPARSITY = 0.001
+"""Weight of the lamps, by the logarithm of their shares of all light, against the relative error."""
 QUADRATIC_BELOW = 1e-2
 """Differences of logarithms below this count by their square, so that the gradient has no jump at 0."""
 LINEAR_SHARE = 0.02
@@ -69,21 +78,21 @@ class Objective:
         material = target.material
         tinted = Material((material.base_color * gain).clamp(0, 1), material.roughness, material.metallic)
         shown = apply_response(carried.outgoing(tinted, strength), self.response)
-        return (shown - target.pixel) / (response_slope(target.pixel, self.response) + self.config.floor * self.unit)
+        return (shown - target.pixel) / error_unit(target.pixel, self.response, self.unit)
 
     def misfit(
         self, strength: Float[Tensor, "T 3"], carried: Transport, target: Target, gain: Float[Tensor, "#N 3"]
     ) -> Float[Tensor, ""]:
         """The relative error in the mean: by its square where it is small, by its size where it is large."""
         error = self.relative_error(strength, carried, target, gain)
-        return functional.smooth_l1_loss(error, torch.zeros_like(error), beta=self.config.outlier)
+        return functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER)
 
     def unlikely(self, log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, ""]:
         """What speaks against a map by itself: that it is uneven, and that it is not what cameras saw of it."""
         uneven = self.config.smoothness * total_variation(log_radiance)
         if self.sky is None or not log_radiance.numel():
             return uneven
-        return uneven + self.config.sky * self.sky.misfit(log_radiance)
+        return uneven + SKY * self.sky.misfit(log_radiance)
 
     def price(self, brought: Float[Tensor, " M"], all_light: Float[Tensor, " 3"]) -> Float[Tensor, ""]:
         """Of lamps, by the light that each brings to the points, and of the tint of all light that reaches them.
@@ -91,8 +100,19 @@ class Objective:
         Σ ln(1 + share/s) over the lamps' shares of all light is concave: one strong lamp is cheaper than two half as strong.
         """
         share = brought / all_light.mean()
-        lamps = self.config.sparsity * (share / LINEAR_SHARE).log1p().sum()
+        lamps = SPARSITY * (share / LINEAR_SHARE).log1p().sum()
         return lamps + self.config.whiteness * tint(all_light)
+
+
+def error_unit(pixel: Float[Tensor, "*B 3"], response: str, typical: float) -> Float[Tensor, "*B 3"]:
+    """What a pixel may change by for a relative error of 1.
+
+    Args:
+        pixel: in the capture's response.
+        response: "linear" or "srgb".
+        typical: what a pixel of typical brightness changes by per unit of log radiance (`response_slope`).
+    """
+    return response_slope(pixel, response) + FLOOR * typical
 
 
 def total_variation(values: Float[Tensor, "C H W"]) -> Float[Tensor, ""]:

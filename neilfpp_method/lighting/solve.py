@@ -10,12 +10,14 @@ from neilfpp_method.lighting.fit import Evidence, Light, compare, evidence, fit_
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.settle import settle_lamps
 from neilfpp_method.lighting.transport import from_lamps, from_texels
-from neilfpp_method.settings.types import IncidentLightConfig
+from neilfpp_method.settings.types import MapLightConfig
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import Material, Observed, SceneTracer
 
 __all__ = ["solve_light"]
 
+CANDIDATES = 256
+"""Places for lamps that one fit tries."""
 FOLDS = 5
 """One part in so many of the points is not fitted to, and decides between two lights; the first time each part in turn."""
 KNOWN_ROWS = 32
@@ -30,7 +32,7 @@ def solve_light(
     lobe: Lobe | None,
     scene: SceneTracer | None,
     objective: Objective,
-    config: IncidentLightConfig,
+    config: MapLightConfig,
     first: bool,
 ) -> Evidence | None:
     """Set the map, and the lamps where there may be any, to what explains the points. A map that is known stays.
@@ -63,7 +65,7 @@ def solve_light(
         sought.copy_(fit_light(plain_start, texels, target, objective).log_radiance)
         return None
 
-    places = propose(lamps, observed.position, config.fit.candidates)
+    places = propose(lamps, observed.position, CANDIDATES)
     near = from_lamps(places, lamps.radius, observed, material.roughness, lobe, scene)
     both = texels.beside(near)
     intensity = dark.new_zeros(len(places.position), 3)

@@ -23,7 +23,7 @@ from neilfpp_method.lighting.objective import Objective
 from neilfpp_method.lighting.sky import SkySightings
 from neilfpp_method.lighting.solve import solve_light
 from neilfpp_method.settings.facts import RadianceUnits, SceneFacts
-from neilfpp_method.settings.types import IncidentLightConfig
+from neilfpp_method.settings.types import FreeLightConfig, MapLightConfig
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import SceneTracer, StepResult
 
@@ -84,14 +84,14 @@ class MapSolver(nn.Module):
     """
 
     def __init__(
-        self, config: IncidentLightConfig, facts: SceneFacts, units: RadianceUnits, light: LightModel, lobe: Lobe | None
+        self, config: MapLightConfig, facts: SceneFacts, units: RadianceUnits, light: LightModel, lobe: Lobe | None
     ) -> None:
         super().__init__()
         self.config, self.response, self.unit = config, facts.response, units.physical
         self.light, self.lobe = light, lobe
         self.memory = SurfaceMemory(config.fit.points, config.fit.every)
         # Only a background that is no backdrop shows the light, and only a map that is sought has to keep to it.
-        sightings = config.map is None and facts.background == "inverted_sphere" and config.fit.sky > 0
+        sightings = config.map is None and facts.background == "inverted_sphere"
         self.sky = SkySightings(config.environment_height, facts.response) if sightings else None
 
     @property
@@ -124,8 +124,9 @@ class MapSolver(nn.Module):
 
 
 def make_light_solver(
-    config: IncidentLightConfig, facts: SceneFacts, units: RadianceUnits, light: LightModel, lobe: Lobe | None
+    config: FreeLightConfig | MapLightConfig, facts: SceneFacts, units: RadianceUnits, light: LightModel, lobe: Lobe | None
 ) -> MapSolver | NothingToSolve:
     """The solver that a light needs; arguments as of `MapSolver`."""
-    known = config.map is not None and config.kind == "distant"
-    return NothingToSolve() if config.kind == "free" or known else MapSolver(config, facts, units, light, lobe)
+    if isinstance(config, FreeLightConfig) or (config.map is not None and config.kind == "distant"):
+        return NothingToSolve()
+    return MapSolver(config, facts, units, light, lobe)

@@ -26,7 +26,7 @@ from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.model import Maps, NeilfModel
 from neilfpp_method.plugin.datamanager import PIXELS, VALID, pixel_batch
 from neilfpp_method.plugin.foreign import build_foreign
-from neilfpp_method.schedule import Stage, active_losses, stage_at, stage_steps, weigh
+from neilfpp_method.schedule import Stage, active_losses, has_material, stage_at, stage_steps, weigh
 from neilfpp_method.settings.presets import free_light, preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.color import apply_response, tone_map
@@ -211,7 +211,7 @@ class NeilfMethod(Model):
         }
 
     def _has_material(self) -> bool:
-        return self.neilf.stages[self.stage].moves_material
+        return has_material(self.step + 1, self.config.neilf.train)
 
     @torch.no_grad()
     def _incident_light(self, rays: RayBatch, maps: Maps) -> Float[Tensor, "N 3"]:

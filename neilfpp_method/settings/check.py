@@ -23,11 +23,6 @@ def check_config(config: NeilfConfig) -> None:
             "set each of final above 0, the others to 0 at least",
         )
     _check_scene(config.inter_reflection, config.light.kind)
-    if config.light.map is not None and config.light.kind == "free":
-        raise UserError(
-            f"{config.light.map}: a light that is free at every point takes no map",
-            "add --config.light.kind distant, or auto to look for lamps before the map as well",
-        )
 
 
 def _check_scene(settings: InterReflectionConfig, light: str) -> None:

@@ -1,163 +1,174 @@
-"""The presets: the published settings (`docs/paper.md`), and one for a laptop."""
+"""The presets: the published settings (`docs/paper.md`), and one for a laptop. Each is written as what it changes."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.settings.types import (
-    BackgroundConfig,
-    BrdfConfig,
-    HashGridConfig,
-    IncidentLightConfig,
-    InterReflectionConfig,
-    LightFitConfig,
-    LossConfig,
-    NeilfConfig,
-    OptimizerConfig,
-    OutgoingRadianceConfig,
-    SdfConfig,
-    ShadingConfig,
-    TrainConfig,
-    VolumeConfig,
-)
+from neilfpp_method.settings.plain import changed
+from neilfpp_method.settings.types import FrequencyConfig, MeshConfig, NeilfConfig
+
+__all__ = ["PRESETS", "fixed_geometry", "free_light", "preset"]
 
 SINE_FREQUENCY = 30.0
 """ω of the sine layers sin(ω (W x + b)) of B and L. In the published code ω is part of W and b, so that a step of Adam there
 is one of 1/ω here."""
 
-__all__ = ["PRESETS", "fixed_geometry", "free_light", "preset"]
+# Beside the settings' own defaults.
+PAPER_MLP: Mapping[str, Any] = {
+    "preset": "paper-mlp",
+    "light.monochrome": True,
+    "background.kind": "none",
+    "loss.points": "scene",
+    "loss.normal_gradient": 0.1,
+    "optimizer.brdf": 1e-3 / SINE_FREQUENCY,
+    "optimizer.light": 1e-3 / SINE_FREQUENCY,
+    "optimizer.joint": 0.3,
+    "optimizer.final": (0.1, 1.0, 0.1),
+    "optimizer.drops": (1, 0, 1),
+    "train.sdf_steps": 8_000,
+    "train.material_steps": 8_000,
+    "train.joint_steps": 80_000,
+}
 
 
 def paper_mlp() -> NeilfConfig:
     """The published MLP setting, for display images: 96k steps, 24 h on a V100. `docs/paper.md` has it line by line."""
-    return NeilfConfig(
-        preset="paper-mlp",
-        light=IncidentLightConfig(monochrome=True),
-        background=BackgroundConfig(kind="none"),
-        loss=LossConfig(points="scene", surface_epsilon=10.0, normal_gradient=0.1),
-        optimizer=OptimizerConfig(
-            brdf=1e-3 / SINE_FREQUENCY,
-            light=1e-3 / SINE_FREQUENCY,
-            joint=0.3,
-            final=(0.1, 1.0, 0.1),
-            drops=(1, 0, 1),
-        ),
-        train=TrainConfig(sdf_steps=8_000, material_steps=8_000, joint_steps=80_000),
-    )
+    return changed(NeilfConfig(), PAPER_MLP)
+
+
+# Beside paper-mlp: hash grids with small networks behind them, and the rates and the steps that suit them.
+PAPER_NGP: Mapping[str, Any] = {
+    "preset": "paper-ngp",
+    "encoding.kind": "hash",
+    "host.sdf.layers": 2,
+    "host.sdf.width": 64,
+    "host.sdf.feature_width": 64,
+    "radiance.width": 64,
+    "brdf.layers": 2,
+    "brdf.width": 120,
+    "light.activation": "relu",
+    "loss.point_cloud": 0.1,
+    "loss.surface": 1e-2,
+    "loss.position_gradient": 0.0,
+    "optimizer.geometry": 1e-2,
+    "optimizer.radiance": 1e-2,
+    "optimizer.brdf": 1e-2,
+    "optimizer.light": 1e-2,
+    "optimizer.background": 1e-2,
+    "optimizer.beta": 1e-2,
+    "optimizer.joint": 0.1,
+    "optimizer.final": (0.1, 0.1, 0.01),
+    "optimizer.drops": (1, 1, 2),
+    "optimizer.warm_up": 100,
+    "train.sdf_steps": 5_000,
+    "train.material_steps": 5_000,
+    "train.joint_steps": 30_000,
+}
 
 
 def paper_ngp() -> NeilfConfig:
     """The published hash-grid setting, for display images: 40k steps, 4 h on a V100; it asks for a point cloud."""
-    replace, mlp = dataclasses.replace, paper_mlp()
-    return replace(
-        mlp,
-        preset="paper-ngp",
-        sdf=SdfConfig(encoding="hash", layers=2, width=64, skip=None, feature_width=64),
-        radiance=OutgoingRadianceConfig(layers=4, width=64, direction_encoding="spherical_harmonics"),
-        brdf=BrdfConfig(encoding="hash", activation="relu", layers=2, width=120, skip=None),
-        light=replace(mlp.light, activation="relu", direction_encoding="spherical_harmonics", direction_degree=4),
-        loss=replace(mlp.loss, point_cloud=0.1, surface=1e-2, position_gradient=0.0, hessian_method="finite_difference"),
-        optimizer=OptimizerConfig(*(6 * [1e-2]), joint=0.1, final=(0.1, 0.1, 0.01), drops=(1, 1, 2), warm_up=100),
-        train=TrainConfig(sdf_steps=5_000, material_steps=5_000, joint_steps=30_000),
-    )
+    return changed(paper_mlp(), PAPER_NGP)
+
+
+# Beside paper-ngp.
+PAPER_NGP_HDR: Mapping[str, Any] = {
+    "preset": "paper-ngp-hdr",
+    "background.kind": "inverted_sphere",
+    "background.layers": 2,
+    "background.width": 64,
+    "loss.surface": 1e-3,
+    "loss.smoothness": 0.0,
+    "loss.lambertian": 0.0,
+    "loss.position_gradient": 0.1,
+    "optimizer.final": (0.1, 0.1, 1e-3),
+    "optimizer.drops": (1, 1, 3),
+    "train.joint_steps": 40_000,
+}
 
 
 def paper_ngp_hdr() -> NeilfConfig:
     """The published hash-grid setting for photographs of linear radiance with a background: 50k steps."""
-    replace, ngp = dataclasses.replace, paper_ngp()
-    return replace(
-        ngp,
-        preset="paper-ngp-hdr",
-        background=BackgroundConfig(kind="inverted_sphere", layers=2, width=64),
-        loss=replace(ngp.loss, surface=1e-3, smoothness=0.0, lambertian=0.0, position_gradient=0.1),
-        optimizer=replace(ngp.optimizer, final=(0.1, 0.1, 1e-3), drops=(1, 1, 3)),
-        train=replace(ngp.train, joint_steps=40_000),
-    )
+    return changed(paper_ngp(), PAPER_NGP_HDR)
+
+
+# Beside the settings' own defaults.
+FAST: Mapping[str, Any] = {
+    "preset": "fast",
+    "encoding.kind": "hash",
+    "encoding.levels": 8,
+    "encoding.log2_entries": 16,
+    "encoding.sdf_log2_entries": 18,
+    "encoding.max_resolution": 256,
+    "host.sdf.layers": 1,
+    "host.sdf.width": 64,
+    "host.sdf.feature_width": 15,
+    "radiance.positions": "encoded",
+    "radiance.direction": "mirrored",
+    "radiance.layers": 2,
+    "radiance.width": 64,
+    "brdf.initial_base_color": 0.3,
+    "brdf.initial_metallic": 0.1,
+    "brdf.layers": 2,
+    "brdf.width": 64,
+    "light": {
+        "kind": "auto",
+        "environment_height": 48,
+        "fit": {"smoothness": 0.02, "every": 150},
+    },
+    "background.layers": 4,
+    "background.width": 64,
+    "background.samples": 16,
+    "volume.radius": 1.75,
+    "volume.beta_init": 0.05,
+    "volume.skip_empty": True,
+    "volume.initial_samples": 64,
+    "volume.rounds": 2,
+    "volume.bisections": 5,
+    "volume.samples": 32,
+    "volume.normal_radius": 0.15,
+    "shading.sampler": "mis",
+    "shading.train_samples": 32,
+    "shading.eval_samples": 128,
+    "inter_reflection.mode": "hard",
+    "inter_reflection.rays_per_point": 0.25,
+    "loss.unit": "median",
+    "loss.volume": 2.0,
+    "loss.eikonal": 0.05,
+    "loss.hessian": 2e-4,
+    "loss.hessian_growth": 8.0,
+    "loss.hessian_joint": 1.6e-3,
+    "loss.surface": 1e-2,
+    "loss.surface_joint": 1e-3,
+    "loss.mask": 0.1,
+    "loss.smoothness": 0.0,
+    "loss.lambertian": 0.0,
+    "loss.position_gradient": 0.0,
+    "loss.normal_gradient": 0.1,
+    # The joint stage is short: geometry goes on at the rate that SDF init ended with, and is not stirred up again.
+    "optimizer.geometry": 2e-2,
+    "optimizer.radiance": 5e-3,
+    "optimizer.brdf": 5e-3,
+    "optimizer.light": 3e-2,
+    "optimizer.background": 1e-3,
+    "optimizer.beta": 1e-3,
+    "optimizer.joint": 0.1,
+    "optimizer.background_from": 0.5,
+    "train.sdf_steps": 2_000,
+    "train.material_steps": 1_500,
+    "train.joint_steps": 100,
+    "train.rays": 512,
+    "train.fresh": 0.25,
+}
 
 
 def fast() -> NeilfConfig:
     """Minutes on the two cores of a laptop: the same method with small hash grids, few rays, and as much light as most
     scenes need: an environment map, what the scene reflects, and lamps close by where the images ask for them. `free_light`
     has the paper's light field for it."""
-    grid = HashGridConfig(levels=8, log2_entries=16, base_resolution=16, max_resolution=256)
-    return NeilfConfig(
-        preset="fast",
-        # The surface is all of a scene that is seen, and a table without collisions costs no more to read.
-        sdf=SdfConfig(
-            encoding="hash", grid=dataclasses.replace(grid, log2_entries=18), layers=1, width=64, skip=None, feature_width=15
-        ),
-        radiance=OutgoingRadianceConfig(
-            encoding="hash",
-            grid=grid,
-            layers=2,
-            width=64,
-            direction="mirrored",
-            direction_encoding="spherical_harmonics",
-        ),
-        brdf=BrdfConfig(
-            encoding="hash",
-            initial_base_color=0.3,
-            initial_metallic=0.1,
-            grid=grid,
-            activation="relu",
-            layers=2,
-            width=64,
-            skip=None,
-        ),
-        light=IncidentLightConfig(
-            kind="auto",
-            environment_height=48,
-            fit=LightFitConfig(smoothness=0.02, every=150),
-            layers=4,
-            width=64,
-            direction_encoding="spherical_harmonics",
-            direction_degree=5,
-        ),
-        background=BackgroundConfig(layers=4, width=64, samples=16),
-        volume=VolumeConfig(
-            radius=1.75,
-            beta_init=0.05,
-            skip_empty=True,
-            initial_samples=64,
-            narrowed_samples=32,
-            rounds=2,
-            bisections=5,
-            samples=32,
-            normal_radius=0.15,
-        ),
-        shading=ShadingConfig(sampler="mis", train_samples=32, eval_samples=128),
-        inter_reflection=InterReflectionConfig(mode="hard", rays_per_point=0.25),
-        loss=LossConfig(
-            unit="median",
-            volume=2.0,
-            eikonal=0.05,
-            hessian=2e-4,
-            hessian_growth=8.0,
-            hessian_joint=1.6e-3,
-            surface=1e-2,
-            surface_joint=1e-3,
-            mask=0.1,
-            smoothness=0.0,
-            lambertian=0.0,
-            position_gradient=0.0,
-            normal_gradient=0.1,
-            hessian_method="finite_difference",
-        ),
-        # The joint stage is short: geometry goes on at the rate that SDF init ended with, and is not stirred up again.
-        optimizer=OptimizerConfig(
-            geometry=2e-2,
-            radiance=5e-3,
-            brdf=5e-3,
-            light=3e-2,
-            background=1e-3,
-            beta=1e-3,
-            joint=0.1,
-            background_from=0.5,
-        ),
-        train=TrainConfig(sdf_steps=2_000, material_steps=1_500, joint_steps=100, rays=512, fresh=0.25),
-    )
+    return changed(NeilfConfig(), FAST)
 
 
 PRESETS: Mapping[str, Callable[[], NeilfConfig]] = {
@@ -179,17 +190,24 @@ def preset(name: str) -> NeilfConfig:
     return PRESETS[name]()
 
 
+# Beside fast. A network takes smaller steps than the texels of a map.
+FREE_LIGHT: Mapping[str, Any] = {
+    "light": {
+        "kind": "free",
+        "layers": 4,
+        "width": 64,
+    },
+    "inter_reflection.mode": "soft",
+    "optimizer.light": 5e-3,
+}
+
+
 def free_light(config: NeilfConfig) -> NeilfConfig:
     """`fast` with the paper's light: a field that is free at every point, tied to the scene by L_ref.
 
-    It asks nothing of the host but `render`. A network takes smaller steps than the texels of a map.
+    It asks nothing of the host but `render`.
     """
-    return dataclasses.replace(
-        config,
-        light=dataclasses.replace(config.light, kind="free"),
-        inter_reflection=dataclasses.replace(config.inter_reflection, mode="soft"),
-        optimizer=dataclasses.replace(config.optimizer, light=5e-3),
-    )
+    return changed(config, FREE_LIGHT)
 
 
 def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
@@ -201,43 +219,53 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
     from L_ref (METHOD §2, §4). Its normals are taken as they are, so R need not help to find them. R is new as well, so
     there are twice as many steps with a material. Rays through a mesh are cheap, so light is solved for more often.
     """
-    replace, train = dataclasses.replace, config.train
-    given = replace(
-        config,
-        preset=f"{config.preset}-mesh",
-        host="mesh",
-        radiance=replace(
-            config.radiance,
-            encoding=config.sdf.encoding,
-            frequencies=config.sdf.frequencies,
-            layers=8,
-            width=128,
-            direction="outgoing",
-        ),
-        light=replace(config.light, fit=replace(config.light.fit, every=100)),
-        volume=replace(config.volume, normal_radius=0.0),
-        inter_reflection=replace(config.inter_reflection, radiance_gradient=0.7, offset=2e-3),
-        loss=replace(config.loss, lambertian=10.0 * config.loss.lambertian),
-        train=replace(
-            train,
-            sdf_steps=train.sdf_steps // 10,
-            material_steps=2 * (train.material_steps + train.joint_steps),
-            joint_steps=0,
-        ),
-    )
+    train = config.train
+    mesh = {
+        "preset": f"{config.preset}-mesh",
+        "host": {"kind": MeshConfig().kind},
+        "radiance": {"positions": "encoded", "layers": 8, "width": 128, "direction": "outgoing"},
+        "volume.normal_radius": 0.0,
+        "inter_reflection": {"radiance_gradient": 0.7, "offset": 2e-3},
+        "loss.lambertian": 10.0 * config.loss.lambertian,
+        "train.sdf_steps": train.sdf_steps // 10,
+        "train.material_steps": 2 * (train.material_steps + train.joint_steps),
+        "train.joint_steps": 0,
+    }
+    if config.light.kind != "free":
+        mesh["light.fit.every"] = 100
+    given = changed(config, mesh)
     return as_published_on_a_mesh(given) if config.preset.startswith("paper-") else given
 
 
+# Beside what a mesh changes in a preset of the paper: light in colour, three stages at one rate, more rays.
+PAPER_MESH: Mapping[str, Any] = {
+    "background.kind": "auto",
+    "loss.smoothness": 5e-4,
+    "loss.lambertian": 5e-3,
+    "loss.position_gradient": 0.0,
+    "loss.normal_gradient": 0.0,
+    "optimizer.geometry": 2e-3,
+    "optimizer.radiance": 2e-3,
+    "optimizer.brdf": 2e-3,
+    "optimizer.light": 2e-3,
+    "optimizer.background": 2e-3,
+    "optimizer.beta": 2e-3,
+    "optimizer.joint": 1.0,
+    "optimizer.final": (1.0, 1.0, 0.04),
+    "optimizer.drops": (0, 0, 2),
+    "optimizer.warm_up": 0,
+    "train.sdf_steps": 5_000,
+    "train.material_steps": 1_000,
+    "train.joint_steps": 30_000,
+    "train.rays": 8192,
+}
+
+
 def as_published_on_a_mesh(config: NeilfConfig) -> NeilfConfig:
-    """What the published run on given geometry sets in its own way: light in colour, three stages at one rate, more rays."""
-    replace, sine = dataclasses.replace, config.brdf.activation == "sine"
-    slow = 2e-3 / SINE_FREQUENCY if sine else 2e-3
-    rates = replace(OptimizerConfig(*(6 * [2e-3])), brdf=slow, light=slow, final=(1.0, 1.0, 0.04), drops=(0, 0, 2))
-    return replace(
-        config,
-        light=replace(config.light, monochrome=False),
-        background=replace(config.background, kind="auto"),
-        loss=replace(config.loss, smoothness=5e-4, lambertian=5e-3, position_gradient=0.0, normal_gradient=0.0),
-        optimizer=rates,
-        train=replace(config.train, sdf_steps=5_000, material_steps=1_000, joint_steps=30_000, rays=8192),
-    )
+    """What the published run on given geometry sets in its own way."""
+    published = dict(PAPER_MESH)
+    if isinstance(config.encoding, FrequencyConfig):
+        published |= {name: 2e-3 / SINE_FREQUENCY for name in ("optimizer.brdf", "optimizer.light")}
+    if config.light.kind == "free":
+        published["light.monochrome"] = False
+    return changed(config, published)

@@ -7,7 +7,9 @@ effect that is switched off asks no network and traces no ray.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 __all__ = ["NeilfConfig"]
 
@@ -16,93 +18,72 @@ __all__ = ["NeilfConfig"]
 
 
 @dataclass(frozen=True)
-class HashGridConfig:
-    """Multiresolution hash grid (Müller et al. 2022)."""
+class FrequencyConfig:
+    """Positions by sines and cosines, six octaves: the paper's MLP setting. B's hidden units are sines (SIREN) then."""
 
+    kind: Literal["frequency"] = "frequency"
+    """frequency or hash: how G, R and B see positions."""
+
+
+@dataclass(frozen=True)
+class HashGridConfig:
+    """Positions by multiresolution hash grids, one for each of G, B and, where it has an encoding, R (Müller et al. 2022)."""
+
+    kind: Literal["hash"] = "hash"
+    """frequency or hash: how G, R and B see positions."""
     levels: int = 16
     """Number of grids, coarse to fine."""
-    features: int = 2
-    """Features per grid vertex."""
     log2_entries: int = 19
     """Table size of one level, as a power of two."""
-    base_resolution: int = 16
-    """Cells along an edge of the scene's cube at the coarsest level."""
+    sdf_log2_entries: int = 19
+    """The same for G. The surface is all of a scene that is seen, and a table without collisions costs no more to read."""
     max_resolution: int = 4096
-    """Cells along an edge at the finest level."""
-    backend: Literal["auto", "reference", "cpu", "triton"] = "auto"
-    """Who computes it. auto: the fastest that runs on the device. reference: plain torch. cpu: Numba. triton: CUDA."""
+    """Cells along an edge of the scene's cube at the finest level; at the coarsest there are 16."""
+
+
+EncodingConfig = Annotated[FrequencyConfig | HashGridConfig, tyro.conf.AvoidSubcommands]
 
 
 @dataclass(frozen=True)
 class SdfConfig:
     """G: position → signed distance and a feature for R (METHOD §5)."""
 
-    encoding: Literal["frequency", "hash"] = "frequency"
-    """How positions are encoded."""
-    frequencies: int = 6
-    """Octaves of the frequency encoding."""
-    grid: HashGridConfig = field(default_factory=HashGridConfig)
-    """The grid, where `encoding` is hash."""
     layers: int = 8
     """Hidden layers."""
     width: int = 256
     """Units of a hidden layer."""
-    skip: int | None = 4
-    """The layer that sees the encoded position again."""
     feature_width: int = 256
     """Length of the feature handed to R."""
-    sphere_radius: float = 0.6
-    """Radius of the sphere that the field starts as."""
 
 
 @dataclass(frozen=True)
 class OutgoingRadianceConfig:
     """R: position, direction, normal and feature of G → linear RGB (METHOD §5)."""
 
-    encoding: Literal["raw", "frequency", "hash"] = "raw"
-    """How positions are encoded."""
-    frequencies: int = 6
-    """Octaves of the frequency encoding of positions."""
-    grid: HashGridConfig = field(default_factory=HashGridConfig)
-    """The grid, where `encoding` is hash."""
+    positions: Literal["raw", "encoded"] = "raw"
+    """raw: R has no encoding of its own, and reads that of G by the feature. encoded: it has one of the kind that `encoding`
+    says, as it always has where there is no feature."""
     direction: Literal["outgoing", "mirrored"] = "outgoing"
     """Which direction is encoded: the outgoing one, as in the paper, or the one that it mirrors about the normal. What a shiny
     surface sends changes evenly with the latter, so its normals are found (Verbin et al. 2022, "Ref-NeRF")."""
-    direction_encoding: Literal["frequency", "spherical_harmonics"] = "frequency"
-    """How directions are encoded."""
-    direction_degree: int = 4
-    """Octaves of the frequency encoding, or bands of the spherical harmonics."""
     layers: int = 4
     """Hidden layers."""
     width: int = 256
     """Units of a hidden layer."""
-    scale: float | None = None
-    """Largest radiance that the sigmoid can reach; none: 1 for LDR; for HDR twenty times the median of the images, or more
-    where they hold more."""
 
 
 @dataclass(frozen=True)
 class BrdfConfig:
     """B: position → base colour, roughness, metallic (METHOD §5)."""
 
-    encoding: Literal["frequency", "hash"] = "frequency"
-    """How positions are encoded."""
     initial_base_color: float = 0.5
     """What the base colour starts as. Light and base colour share a scale that images hardly tell, so it stays near this."""
     initial_metallic: float = 0.5
     """What metallic starts as. Most surfaces are no metals, and a light that is found under metals is too weak for others."""
-    frequencies: int = 6
-    """Octaves of the frequency encoding."""
-    grid: HashGridConfig = field(default_factory=HashGridConfig)
-    """The grid, where `encoding` is hash."""
-    activation: Literal["sine", "relu"] = "sine"
-    """Hidden units; sine is SIREN's, with ω = 30."""
     layers: int = 8
     """Hidden layers."""
     width: int = 512
     """Units of a hidden layer."""
-    skip: int | None = 4
-    """The layer that sees the encoded position again."""
 
 
 @dataclass(frozen=True)
@@ -115,41 +96,23 @@ class LightFitConfig:
     """Steps between two fits."""
     steps: int = 100
     """Steps of a fit."""
-    rate: float = 0.1
-    """Rate of log radiance at the start of a fit."""
     smoothness: float = 0.03
     """Weight of the total variation of log radiance, per texel, against the relative error."""
-    sky: float = 1.0
-    """Weight of the difference between the map's log radiance and what cameras saw beyond the scene, per texel, against the
-    relative error. It counts where there is a background to see (`background.kind` inverted_sphere)."""
     whiteness: float = 0.05
     """Weight of the tint of all light that reaches the points, against the relative error: images hardly tell the tint of the
     light from that of the surfaces."""
     evenness: float = 0.3
     """Weight of the mean difference of log base colour between neighbouring points, against the relative error. The base colour
     of every point is free while light is fitted; 0: it is what surfaces have learned, up to a factor per channel."""
-    sparsity: float = 0.001
-    """Weight of the lamps, by the logarithm of their shares of all light, against the relative error."""
-    candidates: int = 256
-    """Places for lamps that one fit tries."""
-    lamps: int = 8
-    """Most lamps."""
-    lamp_radius: float = 0.06
-    """Of every lamp, scene units."""
-    floor: float = 0.1
-    """Errors are relative to the pixel and this share of a typical one."""
-    outlier: float = 0.1
-    """Relative errors beyond this count by their size rather than by their square."""
 
 
 @dataclass(frozen=True)
-class IncidentLightConfig:
-    """L: position, direction → linear RGB that arrives (METHOD §5): sharp in direction, smooth in position."""
+class MapLightConfig:
+    """L: an environment map, and perhaps lamps before it. It goes with inter-reflection hard or off."""
 
-    kind: Literal["free", "distant", "distant_near", "auto"] = "free"
-    """free: the paper's field, its own light at every point. distant: an environment map. distant_near: a map, and lamps
-    close to the scene. auto: a map, and lamps where points that were kept back from the fit ask for them. All but free go
-    with inter-reflection hard or off."""
+    kind: Literal["distant", "distant_near", "auto"] = "auto"
+    """free: its own light at every point (the paper). distant: an environment map. distant_near: a map, and lamps close to the
+    scene. auto: a map, and lamps where points that were kept back from the fit ask for them."""
     environment_height: int = 32
     """Rows of the environment map; it has twice as many columns."""
     map: str | None = None
@@ -157,20 +120,26 @@ class IncidentLightConfig:
     before it are sought where `kind` says so."""
     fit: LightFitConfig = field(default_factory=LightFitConfig)
     """How the map is found."""
+
+
+@dataclass(frozen=True)
+class FreeLightConfig:
+    """L: the paper's field, its own light at every point (METHOD §5): sharp in direction, smooth in position."""
+
+    kind: Literal["free"] = "free"
+    """free: its own light at every point (the paper). distant: an environment map. distant_near: a map, and lamps close to the
+    scene. auto: a map, and lamps where points that were kept back from the fit ask for them."""
     activation: Literal["sine", "relu"] = "sine"
     """Hidden units; sine is SIREN's, with ω = 30."""
-    direction_encoding: Literal["frequency", "spherical_harmonics"] = "frequency"
-    """How directions are encoded."""
-    direction_degree: int = 6
-    """Octaves of the frequency encoding, or bands of the spherical harmonics."""
     layers: int = 8
     """Hidden layers; the position enters at the middle one."""
     width: int = 128
     """Units of a hidden layer."""
     monochrome: bool = False
     """One channel for all three colours, for LDR input."""
-    base: float | None = None
-    """Base of the exponential at the end; none: e for LDR, 10 for HDR captures (METHOD §5)."""
+
+
+IncidentLightConfig = Annotated[FreeLightConfig | MapLightConfig, tyro.conf.AvoidSubcommands]
 
 
 @dataclass(frozen=True)
@@ -194,13 +163,26 @@ class BackgroundConfig:
 
 
 @dataclass(frozen=True)
-class MeshConfig:
-    """The mesh host: geometry is given."""
+class VolSdfConfig:
+    """Geometry is found: a distance field that is rendered as a volume (`volume`)."""
 
+    kind: Literal["volsdf"] = "volsdf"
+    """volsdf or mesh: where geometry comes from."""
+    sdf: SdfConfig = field(default_factory=SdfConfig)
+
+
+@dataclass(frozen=True)
+class MeshConfig:
+    """Geometry is given: triangles as they are."""
+
+    kind: Literal["mesh"] = "mesh"
+    """volsdf or mesh: where geometry comes from."""
     path: str | None = None
-    """The triangle mesh, in the world frame of the capture; none: the capture's inputs/model/mesh.ply."""
-    smooth_normals: bool = True
-    """Normals interpolated between the vertices, edges kept; off: those of the triangles."""
+    """The triangle mesh, in the world frame of the capture; none: the capture's inputs/model/mesh.ply. Normals are interpolated
+    between its vertices, edges kept."""
+
+
+HostConfig = Annotated[VolSdfConfig | MeshConfig, tyro.conf.AvoidSubcommands]
 
 
 @dataclass(frozen=True)
@@ -211,28 +193,19 @@ class VolumeConfig:
     """Where the scene ends."""
     beta_init: float = 0.1
     """Scale of the Laplace density at the start."""
-    beta_floor: float = 1e-4
-    """Its smallest value."""
-    sampler: Literal["error_bounded", "uniform"] = "error_bounded"
-    """Algorithm 1 of VolSDF, or stratified samples alone."""
     skip_empty: bool = False
     """In training, rays skip what a coarse grid of the SDF shows to be empty. Evaluation takes whole rays."""
     initial_samples: int = 128
-    """SDF queries per ray of the first round; also those added in each refinement."""
-    narrowed_samples: int = 64
-    """The same for rays that skip empty space: what is left of them is short."""
+    """SDF queries per ray of the first round; also those added in each refinement. Half as many for rays that skip empty space:
+    what is left of them is short."""
     rounds: int = 5
     """Most refinement rounds."""
     bisections: int = 10
     """Bisection steps on β."""
-    epsilon: float = 0.1
-    """Bound on the opacity's error."""
     samples: int = 98
     """Samples per ray that are rendered: two thirds where it is stopped, the rest spread between, both ends among them."""
     normal_radius: float = 0.0
     """Surfaces are shaded with the normal of a neighbourhood of this radius, edges kept; 0: with that of the hit alone."""
-    hit_radius: float = 0.05
-    """The blending weight within this distance of the blended hit is its concentration: a sharp surface has nearly all."""
 
 
 # --------------------------------------------------------------------------------------------------------------- shading
@@ -263,14 +236,10 @@ class InterReflectionConfig:
 
     mode: Literal["off", "soft", "hard"] = "soft"
     """soft: the paper's loss. hard: a direction that meets the scene brings R from there; only the others ask the light."""
-    grid_resolution: int = 96
-    """Vertices along an edge of the grid that hard inter-reflection traces in a distance field."""
     rays_per_point: float = 1.0
     """Traced directions per surface point and step, in expectation."""
     radiance_gradient: float = 0.0
     """Scale of the gradient that reaches R; 0 detaches it, 0.7 suits fixed geometry."""
-    max_angle_deg: float = 80.0
-    """Largest angle from the normal at which a direction is traced."""
     offset: float = 0.02
     """Least displacement off the surface; it grows with β and as 1/cos towards grazing."""
 
@@ -280,13 +249,13 @@ class InterReflectionConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the losses (METHOD §4); `schedule.py` says in which stage each counts. 0 switches a loss off."""
+    """Weights of the losses (METHOD §4) beside L_phys, which has 1; `schedule.py` says in which stage each counts. 0 switches a
+    loss off."""
 
     unit: Literal["activation", "median"] = "activation"
     """What radiance is measured in. activation: L_vol in the range of R's output, all else absolute, as the paper has it.
     median: all in the median of the images, so that the weights depend neither on the exposure nor on what cameras store."""
     volume: float = 1.0
-    physical: float = 1.0
     eikonal: float = 0.1
     hessian: float = 1e-3
     hessian_growth: float = 1.0
@@ -301,13 +270,10 @@ class LossConfig:
     lambertian: float = 5e-4
     mask: float = 0.0
     """Opacity against the object mask, where the capture has masks or shows exactly its background."""
-    hessian_method: Literal["analytic", "finite_difference"] = "analytic"
-    """How second derivatives of G are taken."""
     points: Literal["scene", "rays"] = "rays"
     """Where L_Eik, L_Hess and L_surf look. scene: at points all over the scene, more of them about the object, and L_Eik at
-    one sample of each ray as well (published code). rays: at the samples of the rays, and L_Hess about their hits."""
-    surface_epsilon: float = 0.05
-    """Width of the smoothed delta of L_surf."""
+    one sample of each ray as well; L_surf is so wide then that it hardly has a slope (published code). rays: at the samples
+    of the rays, and L_Hess about their hits."""
     position_gradient: float = 0.1
     """Scale of the gradient from the material into the hit position, joint stage."""
     normal_gradient: float = 1.0
@@ -355,8 +321,6 @@ class TrainConfig:
     """Every random number of step k follows from seed and k alone."""
     checkpoint_every: int = 500
     """Steps between checkpoints."""
-    log_every: int = 50
-    """Steps between TensorBoard scalars."""
     eval_chunk: int = 2048
     """Rays rendered at once in evaluation; bounds the memory."""
 
@@ -367,17 +331,20 @@ class NeilfConfig:
 
     preset: str = "custom"
     """The preset that the settings started from; a label."""
-    host: Literal["volsdf", "mesh"] = "volsdf"
-    """Where geometry comes from: volsdf trains a distance field; mesh takes triangles as they are."""
-    sdf: SdfConfig = field(default_factory=SdfConfig)
+    host: HostConfig = field(default_factory=VolSdfConfig)
+    encoding: EncodingConfig = field(default_factory=FrequencyConfig)
     radiance: OutgoingRadianceConfig = field(default_factory=OutgoingRadianceConfig)
     brdf: BrdfConfig = field(default_factory=BrdfConfig)
-    light: IncidentLightConfig = field(default_factory=IncidentLightConfig)
+    light: IncidentLightConfig = field(default_factory=FreeLightConfig)
     background: BackgroundConfig = field(default_factory=BackgroundConfig)
     volume: VolumeConfig = field(default_factory=VolumeConfig)
-    mesh: MeshConfig = field(default_factory=MeshConfig)
     shading: ShadingConfig = field(default_factory=ShadingConfig)
     inter_reflection: InterReflectionConfig = field(default_factory=InterReflectionConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
+
+    @property
+    def known_map(self) -> str | None:
+        """The environment map that is given; none: the light is recovered."""
+        return self.light.map if isinstance(self.light, MapLightConfig) else None

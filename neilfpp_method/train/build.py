@@ -38,10 +38,9 @@ SEEN_EVERY = 67
 def scene_facts(capture: Capture, pixels: PixelDataset, config: NeilfConfig) -> SceneFacts:
     """What the training images decide before training; see `SceneFacts`."""
     response = "linear" if capture.hdr else "srgb"
-    scale, median = config.radiance.scale, pixels.median_radiance()
-    if scale is None:
-        hdr = max(HDR_MEDIANS * median, pixels.radiance_quantile(BRIGHT_QUANTILE))
-        scale = LDR_SCALE if response == "srgb" else hdr
+    median = pixels.median_radiance()
+    hdr = max(HDR_MEDIANS * median, pixels.radiance_quantile(BRIGHT_QUANTILE))
+    scale = LDR_SCALE if response == "srgb" else hdr
     kind, color = config.background.kind, config.background.color
     if kind == "auto":
         kind = "inverted_sphere" if color is None and pixels.border_color() is None else "constant"
@@ -56,7 +55,7 @@ def build_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> Nei
     Raises:
         UserError: the settings ask for a point cloud or a mesh that the capture does not have.
     """
-    return NeilfModel(HOSTS[config.host](capture, facts, config), config, facts)
+    return NeilfModel(HOSTS[config.host.kind](capture, facts, config), config, facts)
 
 
 def show_known_light(model: NeilfModel) -> None:
@@ -67,8 +66,8 @@ def show_known_light(model: NeilfModel) -> None:
     Raises:
         UserError: the map cannot be used.
     """
-    if model.config.light.map is not None:
-        model.light.show(read_environment(Path(model.config.light.map)))
+    if model.config.known_map is not None:
+        model.light.show(read_environment(Path(model.config.known_map)))
 
 
 def _volsdf(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> VolSdfHost:
@@ -77,7 +76,7 @@ def _volsdf(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> VolSdfH
 
 
 def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
-    path = config.mesh.path
+    path = config.host.path
     mesh = Truth(capture).mesh() if path is None else read_mesh(Path(path), capture.normalisation)
     if mesh is None:
         raise UserError(f"{capture.root}: no inputs/model/mesh.ply for the mesh host", "name a mesh with --mesh PATH")

@@ -175,17 +175,15 @@ def _launch(place: torch.device, devices: int) -> Fabric:
 def _check(config: NeilfConfig) -> None:
     if min(stage_steps(config.train).values()) < 0 or sum(stage_steps(config.train).values()) == 0:
         raise UserError("the stages have no steps", "set --config.train.sdf-steps and the others to 0 or more")
-    for name in ("rays", "checkpoint_every", "log_every", "eval_chunk"):
+    for name in ("rays", "checkpoint_every", "eval_chunk"):
         if getattr(config.train, name) < 1:
             option = f"--config.train.{name.replace('_', '-')}"
             raise UserError(f"{option} is {getattr(config.train, name)}", "set it to 1 or more")
     check_config(config)
-    if config.light.map is not None:
-        check_environment(Path(config.light.map))
-    steps = config.train
-    for name, needed in {"volume": steps.sdf_steps, "physical": steps.material_steps + steps.joint_steps}.items():
-        if needed and getattr(config.loss, name) <= 0.0:
-            raise UserError(f"--config.loss.{name} is off, so nothing compares with the images", "set it above 0")
+    if config.known_map is not None:
+        check_environment(Path(config.known_map))
+    if config.train.sdf_steps and config.loss.volume <= 0.0:
+        raise UserError("--config.loss.volume is off, so nothing compares with the images", "set it above 0")
 
 
 def _load_pixels(capture: Capture, fabric: Fabric, console: Console) -> PixelDataset:

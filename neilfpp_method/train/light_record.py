@@ -10,7 +10,7 @@ from pathlib import Path
 from neilfpp_method.errors import UserError
 from neilfpp_method.lighting.fit import MIN_POINTS, Evidence
 from neilfpp_method.settings.plain import from_dict
-from neilfpp_method.settings.types import IncidentLightConfig
+from neilfpp_method.settings.types import FreeLightConfig, MapLightConfig
 from neilfpp_method.train.run import read_json, write_json
 
 __all__ = ["LightFit", "in_words", "note_fit", "read_fits", "write_fits"]
@@ -69,9 +69,9 @@ def read_fits(run: Path, before: int) -> list[LightFit]:
     return [fit for fit in fits if fit.step < before]
 
 
-def in_words(config: IncidentLightConfig, fits: Sequence[LightFit]) -> str:
+def in_words(config: FreeLightConfig | MapLightConfig, fits: Sequence[LightFit]) -> str:
     """The light that a run came to, and why, in one line; without a reason where the settings had decided."""
-    if config.kind == "free":
+    if isinstance(config, FreeLightConfig):
         return "a field that is free at every point"
     sky = "an environment map" if config.map is None else "the given environment map"
     if not fits:

@@ -19,7 +19,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from torch.utils.tensorboard import SummaryWriter
+from tensorboardX import SummaryWriter
 
 __all__ = ["Reporter", "reporting"]
 

@@ -27,6 +27,7 @@ from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.images import replacing
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.schedule import has_material
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.plain import from_dict, to_dict
 from neilfpp_method.settings.types import NeilfConfig
@@ -88,7 +89,24 @@ class CaptureSource:
 
 @dataclass(frozen=True)
 class Run:
-    """A trained run, ready to be asked: `model` is in evaluation mode and holds the weights of step `step`."""
+    """A trained run, loaded from its folder by `load_run`.
+
+    Attributes:
+        path: the run folder.
+        config: every setting that it was trained with.
+        capture: the images that it was trained on, with their cameras in the world frame; `capture.normalisation` leads from
+            there to the scene frame, in which all fields of the model live.
+        facts: what the images decided before training, such as the unit of radiance and the background.
+        model: in evaluation mode, with the weights of step `step`. `model.materials(x)`, `model.incident_light(x, wi)` and
+            `model.maps(rays)` answer for points and rays in the scene frame.
+        step: how many steps of training the weights have seen.
+
+    Example:
+        >>> run = load_run("runs/teapot")                                              # doctest: +SKIP
+        >>> material = run.model.materials(run.capture.normalisation.to_scene(x_world))  # doctest: +SKIP
+        >>> material.base_color.shape                                                    # doctest: +SKIP
+        torch.Size([N, 3])
+    """
 
     path: Path
     config: NeilfConfig
@@ -96,6 +114,11 @@ class Run:
     facts: SceneFacts
     model: NeilfModel
     step: int
+
+    @property
+    def has_material(self) -> bool:
+        """Whether a step has moved the material and the light; before that they are what they start as."""
+        return has_material(self.step, self.config.train)
 
 
 def check_free(path: Path) -> None:

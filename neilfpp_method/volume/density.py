@@ -14,6 +14,9 @@ CLOSE = 0.03
 """Ends of an interval that differ by less than this share of β: their divided difference loses digits, and Simpson's rule
 is exact to 1e-5 even across the kink of the density."""
 
+BETA_FLOOR = 1e-4
+"""The smallest β, scene units (VolSDF): below it a ray of 128 cuts cannot find the surface."""
+
 
 def laplace_density(sdf: Float[Tensor, "*shape"], beta: Float[Tensor, "*#shape"]) -> Float[Tensor, "*shape"]:
     """σ = α Ψ_β(−sdf), α = 1/β, with Ψ_β the CDF of a zero-mean Laplace distribution of scale β (VolSDF eq. 2, 3).
@@ -86,12 +89,12 @@ class LaplaceDensity(nn.Module):
         UserError: β would start at its floor, or below, where it cannot move, or the floor is not positive.
     """
 
-    def __init__(self, beta_init: float, beta_floor: float) -> None:
+    def __init__(self, beta_init: float, beta_floor: float = BETA_FLOOR) -> None:
         super().__init__()
         if not 0.0 < beta_floor < beta_init:
             raise UserError(
-                f"volume.beta_init = {beta_init} and volume.beta_floor = {beta_floor} are out of order",
-                "choose 0 < beta_floor < beta_init",
+                f"volume.beta_init = {beta_init}: β must start above its floor, {beta_floor}, which must be above 0",
+                f"choose a volume.beta_init above {BETA_FLOOR}",
             )
         self.beta_floor = beta_floor
         self.above_floor = nn.Parameter(torch.tensor(beta_init - beta_floor))

@@ -23,7 +23,10 @@ from neilfpp_method.structures import Indexable, RayBatch
 from neilfpp_method.volume.compositing import render_weights
 from neilfpp_method.volume.density import laplace_density
 
-__all__ = ["ErrorBoundedSamples", "error_bounded_samples", "inverse_cdf_samples", "uniform_samples"]
+__all__ = ["OPACITY_ERROR", "ErrorBoundedSamples", "error_bounded_samples", "inverse_cdf_samples", "uniform_samples"]
+
+OPACITY_ERROR = 0.1
+"""ε, the bound on the opacity's error (VolSDF)."""
 
 SPREAD = 1 / 3
 """Share of the samples that are spread over the cuts of a ray: 32 of 96 in the published code."""
@@ -156,7 +159,7 @@ def bounded_beta(
     low, high = beta.expand_as(beta_plus), beta_plus
     for _ in range(config.bisections):
         middle = (low * high).sqrt()
-        is_bounded = log_error_bound(partition, middle) <= math.log(config.epsilon)
+        is_bounded = log_error_bound(partition, middle) <= math.log(OPACITY_ERROR)
         low, high = torch.where(is_bounded, low, middle), torch.where(is_bounded, middle, high)
     return high
 
@@ -168,7 +171,7 @@ def bounded_beta(
 class ErrorBoundedSamples:
     """Samples of each ray, what they cost, and how far the opacity they were drawn from can be from the truth.
 
-    `distances` ascend. `error_bound` is that of `log_error_bound` at the true β, at most 1: above `config.epsilon` the
+    `distances` ascend. `error_bound` is that of `log_error_bound` at the true β, at most 1: above `OPACITY_ERROR` the
     rounds were used up, and the samples follow a wider density. It holds where |∇ sdf| ≤ 1. `sdf_queries` is the number
     of SDF queries per ray, a mean over the rays.
     """
@@ -203,7 +206,7 @@ def error_bounded_samples(
         origins, directions: the rays; unit directions.
         near, far: where they enter and leave the scene; near = far for a ray that misses it.
         beta: scale of the density, scene units.
-        config: `initial_samples`, `rounds`, `bisections`, `epsilon`, `samples`.
+        config: `initial_samples`, `rounds`, `bisections`, `samples`.
         stochastic: jitter the first cuts, the new cuts and the samples, or choose the middles.
     """
     rays = RayBatch(origins, directions)
@@ -215,13 +218,13 @@ def error_bounded_samples(
     partition = first_cuts(sdf, rays, near, far, config.initial_samples, stochastic)
     queries = partition.distances.numel()
     # The bound at this scale is ≤ ε even if the surface touched every interval (VolSDF Lemma 2).
-    worst = partition.width.square().sum(dim=-1, keepdim=True).div(4.0 * math.log1p(config.epsilon)).sqrt()
+    worst = partition.width.square().sum(dim=-1, keepdim=True).div(4.0 * math.log1p(OPACITY_ERROR)).sqrt()
     beta_plus = torch.maximum(worst, beta)
 
     for rounds_left in reversed(range(config.rounds + 1)):
         log_bound = log_error_bound(partition, beta)
         error_bound[rows] = log_bound[:, 0].exp().clamp_max(1.0)
-        converged = log_bound <= math.log(config.epsilon)
+        converged = log_bound <= math.log(OPACITY_ERROR)
         beta_plus = torch.where(converged, beta, beta_plus)
         if can_leave_early(near.device):
             done, left = converged[:, 0], ~converged[:, 0]

@@ -12,6 +12,7 @@ from benchmarks.straightforward import straightforward
 from neilfpp_method.incident.traced import trace_light
 from neilfpp_method.schedule import Stage
 from neilfpp_method.settings.presets import paper_mlp
+from neilfpp_method.settings.types import SdfConfig, VolSdfConfig
 from neilfpp_method.structures import PixelBatch
 from tests.scenes import sphere_batch, sphere_model, tiny_config
 
@@ -21,9 +22,9 @@ def small_paper():
     config, tiny = paper_mlp(), tiny_config()
     return dataclasses.replace(
         config,
-        sdf=dataclasses.replace(config.sdf, layers=4, width=32, skip=2, feature_width=8),
+        host=VolSdfConfig(sdf=SdfConfig(layers=4, width=32, feature_width=8)),
         radiance=dataclasses.replace(config.radiance, layers=2, width=32),
-        brdf=dataclasses.replace(config.brdf, layers=4, width=32, skip=2),
+        brdf=dataclasses.replace(config.brdf, layers=4, width=32),
         light=dataclasses.replace(config.light, layers=4, width=32),
         volume=dataclasses.replace(tiny.volume, initial_samples=32, rounds=3, samples=32, beta_init=0.01),
         shading=dataclasses.replace(config.shading, eval_samples=16, train_samples=16),

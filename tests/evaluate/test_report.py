@@ -25,6 +25,7 @@ from neilfpp_method.evaluate.render_views import render_run, view_names
 from neilfpp_method.evaluate.report import write_light_picture, write_report
 from neilfpp_method.evaluate.views import RenderedView, known_test_views, render_test_views, render_view
 from neilfpp_method.fields.lamps import Lamps
+from neilfpp_method.settings.types import MapLightConfig
 from neilfpp_method.train.light_record import LightFit, write_fits
 from neilfpp_method.train.run import Run
 from tests.data.make_capture import make_capture
@@ -231,7 +232,7 @@ def test_the_light_is_drawn_alone(root: Path, tmp_path: Path):
 
 def test_the_report_says_what_spoke_for_lamps(root: Path, tmp_path: Path):
     run = make_run(root)
-    light = replace(run.config.light, kind="auto")
+    light = MapLightConfig(kind="auto")
     run = replace(run, path=tmp_path, config=replace(run.config, light=light))
     write_fits(tmp_path, [LightFit(5, 0.02, 0.004, 204, 3), LightFit(run.step, -0.001, 0.003, 204, 0)])
     text = Page(write_report(run, tmp_path, {}, {}).read_text()).text

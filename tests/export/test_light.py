@@ -18,6 +18,7 @@ from neilfpp_method.export.light import export_light
 from neilfpp_method.export.probes import spread, spread_over_surface
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.types import MapLightConfig
 from neilfpp_method.structures import OrientedPoints, RayBatch, SurfaceHits
 from neilfpp_method.train.run import Run
 from tests.data.make_capture import CENTRE, SCALE, make_capture
@@ -50,7 +51,7 @@ def make_run(folder: Path, kind: str, step: int = 12, radius: float = RADIUS) ->
     config = tiny_config()
     config = dataclasses.replace(
         config,
-        light=dataclasses.replace(config.light, kind=kind, environment_height=9),
+        light=config.light if kind == "free" else MapLightConfig(kind=kind, environment_height=9),
         inter_reflection=dataclasses.replace(config.inter_reflection, mode="off"),
     )
     torch.manual_seed(0)

@@ -7,12 +7,11 @@ import torch
 
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.settings.presets import preset
-from neilfpp_method.settings.types import BrdfConfig, HashGridConfig
+from neilfpp_method.settings.types import BrdfConfig, FrequencyConfig, HashGridConfig
 
-GRID = HashGridConfig(levels=3, log2_entries=9, base_resolution=4, max_resolution=16)
 SMALL = {
-    "sine": BrdfConfig(frequencies=2, layers=3, width=16, skip=2),
-    "hash": BrdfConfig(encoding="hash", grid=GRID, activation="relu", layers=2, width=16, skip=None),
+    "sine": (BrdfConfig(layers=4, width=16), FrequencyConfig()),
+    "hash": (BrdfConfig(layers=2, width=16), HashGridConfig(levels=3, log2_entries=9, max_resolution=32)),
 }
 
 
@@ -24,7 +23,7 @@ def positions(count: int = 8) -> torch.Tensor:
 def test_starts_at_the_middle_and_at_the_base_colour_that_is_set(name):
     torch.manual_seed(0)
     config = preset(name)
-    material = BrdfField(config.brdf, config.volume.radius)(positions(200).float())
+    material = BrdfField(config.brdf, config.encoding, config.volume.radius)(positions(200).float())
     starts = {
         "base_color": (3, config.brdf.initial_base_color),
         "roughness": (1, 0.5),
@@ -39,7 +38,7 @@ def test_starts_at_the_middle_and_at_the_base_colour_that_is_set(name):
 @pytest.mark.parametrize("kind", SMALL)
 def test_gradients_agree_with_autograd(kind):
     torch.manual_seed(0)
-    field, x = BrdfField(SMALL[kind], 1.75).double(), positions().requires_grad_()
+    field, x = BrdfField(*SMALL[kind], 1.75).double(), positions().requires_grad_()
     with torch.no_grad():
         field.mlp.layers[-1].weight.mul_(50)  # away from grey, where tanh bends
     sample = field.with_gradients(x)
@@ -53,7 +52,7 @@ def test_gradients_agree_with_autograd(kind):
 
 @pytest.mark.parametrize("kind", SMALL)
 def test_range_holds_for_any_output(kind):
-    field = BrdfField(SMALL[kind], 1.75)
+    field = BrdfField(*SMALL[kind], 1.75)
     with torch.no_grad():
         field.mlp.layers[-1].weight.normal_(std=1e3)
     material = field(positions(100).float())

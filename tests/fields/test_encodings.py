@@ -9,9 +9,9 @@ from scipy.special import roots_legendre, sph_harm_y
 
 from neilfpp_method.errors import UserError
 from neilfpp_method.fields.encodings import FrequencyEncoding, HashGrid, Raw, SphericalHarmonics, pull_back
-from neilfpp_method.settings.types import HashGridConfig
+from neilfpp_method.kernels import grid_spec
 
-GRID = HashGridConfig(levels=3, log2_entries=8, base_resolution=2, max_resolution=16)
+GRID = grid_spec(levels=3, log2_entries=8, max_resolution=16, base_resolution=2)
 
 
 def positions(count: int = 6) -> torch.Tensor:

@@ -23,8 +23,8 @@ def inputs(feature_width: int) -> list[torch.Tensor]:
 def test_starts_near_what_is_asked_and_below_its_scale(name, scale, asked, start):
     torch.manual_seed(0)
     config = preset(name)
-    width = config.sdf.feature_width
-    color = OutgoingRadianceField(config.radiance, width, config.volume.radius, scale, asked)(*inputs(width))
+    width = config.host.sdf.feature_width
+    color = OutgoingRadianceField(config.radiance, config.encoding, width, config.volume.radius, scale, asked)(*inputs(width))
     assert color.shape == (50, 3)
     assert color.min() > 0
     assert color.max() < scale
@@ -35,7 +35,7 @@ def test_starts_near_what_is_asked_and_below_its_scale(name, scale, asked, start
 def test_depends_on_all_that_it_is_given(name):
     torch.manual_seed(0)
     config = preset(name)
-    field = OutgoingRadianceField(config.radiance, 15, 3.0, 1.0)
+    field = OutgoingRadianceField(config.radiance, config.encoding, 15, 3.0, 1.0)
     with torch.no_grad():
         for table in field.position.parameters():
             table.normal_()
@@ -46,7 +46,7 @@ def test_depends_on_all_that_it_is_given(name):
 
 def test_what_a_mirror_sends_moves_as_the_directions_that_it_mirrors():
     torch.manual_seed(0)
-    field = OutgoingRadianceField(preset("fast").radiance, 15, 3.0, 1.0).double()
+    field = OutgoingRadianceField(preset("fast").radiance, preset("fast").encoding, 15, 3.0, 1.0).double()
     x, wo, normal, feature = (t.double() for t in inputs(15))
     wo, normal = (torch.nn.functional.normalize(t, dim=-1) for t in (wo, normal))
     seen = {}
@@ -59,7 +59,7 @@ def test_what_a_mirror_sends_moves_as_the_directions_that_it_mirrors():
 
 def test_derivatives_of_a_mirrored_direction():
     torch.manual_seed(0)
-    field = OutgoingRadianceField(preset("fast").radiance, 2, 3.0, 1.0).double()
+    field = OutgoingRadianceField(preset("fast").radiance, preset("fast").encoding, 2, 3.0, 1.0).double()
     x, wo, normal, feature = (t[:4].double() for t in inputs(2))
     wo, normal = wo.requires_grad_(), normal.requires_grad_()
     assert torch.autograd.gradcheck(lambda wo, normal: field(x, wo, normal, feature), (wo, normal))

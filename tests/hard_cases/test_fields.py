@@ -10,7 +10,7 @@ from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.incident_light import IncidentLightField
 from neilfpp_method.fields.outgoing_radiance import OutgoingRadianceField
 from neilfpp_method.fields.sdf import SdfField
-from neilfpp_method.settings.presets import preset
+from neilfpp_method.settings.presets import free_light, preset
 from neilfpp_method.settings.types import BackgroundConfig
 
 # The origin, faces, edges and corners of the scene cube, vertices of the grid, far outside, almost nothing.
@@ -35,6 +35,9 @@ def assert_bounded(*tensors: torch.Tensor, bound: float = 1e9) -> None:
         assert tensor.abs().max() < bound
 
 
+LIT = {"fast": free_light(preset("fast")), "paper-mlp": preset("paper-mlp")}
+
+
 def gradients(loss: torch.Tensor, module: torch.nn.Module, *inputs: torch.Tensor) -> list[torch.Tensor]:
     targets = [*module.parameters(), *inputs]
     return list(torch.autograd.grad(loss, targets, allow_unused=True, materialize_grads=True))
@@ -44,7 +47,7 @@ def gradients(loss: torch.Tensor, module: torch.nn.Module, *inputs: torch.Tensor
 @pytest.mark.parametrize("name", ["fast", "paper-mlp"])
 def test_sdf(name, dtype):
     torch.manual_seed(0)
-    field = SdfField(preset(name).sdf, 1.75).to(dtype)
+    field = SdfField(preset(name).host.sdf, preset(name).encoding, 1.75).to(dtype)
     x = POSITIONS.to(dtype).requires_grad_()
     sample = field.with_gradient(x)
     assert sample.distance.dtype == sample.gradient.dtype == dtype
@@ -56,7 +59,7 @@ def test_sdf(name, dtype):
 @pytest.mark.parametrize("name", ["fast", "paper-mlp"])
 def test_hessian(name, method):
     torch.manual_seed(0)
-    field = SdfField(preset(name).sdf, 1.75)
+    field = SdfField(preset(name).host.sdf, preset(name).encoding, 1.75)
     hessian = field.hessian(POSITIONS[:6], method)
     assert_bounded(hessian, *gradients(hessian.abs().mean(), field))
 
@@ -65,7 +68,7 @@ def test_hessian(name, method):
 @pytest.mark.parametrize("name", ["fast", "paper-mlp"])
 def test_brdf(name, dtype):
     torch.manual_seed(0)
-    field = BrdfField(preset(name).brdf, 1.75).to(dtype)
+    field = BrdfField(preset(name).brdf, preset(name).encoding, 1.75).to(dtype)
     x = POSITIONS[:6].to(dtype).requires_grad_()
     sample = field.with_gradients(x)
     loss = sample.material.base_color.sum() + sample.roughness_gradient.square().sum() + sample.metallic_gradient.sum()
@@ -77,7 +80,7 @@ def test_brdf(name, dtype):
 def test_outgoing_radiance(name, dtype):
     torch.manual_seed(0)
     config = preset(name)
-    field = OutgoingRadianceField(config.radiance, 15, 1.75, 3.0).to(dtype)
+    field = OutgoingRadianceField(config.radiance, config.encoding, 15, 1.75, 3.0).to(dtype)
     x = POSITIONS.to(dtype).requires_grad_()
     zero = torch.zeros_like(x)  # a normal that vanished, a direction that was never set
     color = field(x, zero, zero, torch.zeros(len(x), 15, dtype=dtype))
@@ -88,7 +91,7 @@ def test_outgoing_radiance(name, dtype):
 @pytest.mark.parametrize("name", ["fast", "paper-mlp"])
 def test_incident_light(name, dtype):
     torch.manual_seed(0)
-    field = IncidentLightField(preset(name).light, 10.0, 1.0).to(dtype)
+    field = IncidentLightField(LIT[name].light, LIT[name].encoding, 10.0, 1.0).to(dtype)
     x = POSITIONS[:6].to(dtype).requires_grad_()
     light = field.radiance(x, torch.eye(3, dtype=dtype).expand(6, 3, 3))
     assert light.min() > 0
@@ -110,6 +113,7 @@ def test_background_from_the_centre_and_from_the_rim(dtype):
 def test_no_points_are_no_trouble():
     none = torch.zeros(0, 3)
     for encoding in ("fast", "paper-mlp"):
-        sample = SdfField(preset(encoding).sdf, 1.75).with_gradient(none)
+        sample = SdfField(preset(encoding).host.sdf, preset(encoding).encoding, 1.75).with_gradient(none)
         assert sample.gradient.shape == (0, 3)
-    assert IncidentLightField(preset("fast").light, 10.0, 1.0).radiance(none, torch.zeros(0, 4, 3)).shape == (0, 4, 3)
+    light = IncidentLightField(LIT["fast"].light, LIT["fast"].encoding, 10.0, 1.0)
+    assert light.radiance(none, torch.zeros(0, 4, 3)).shape == (0, 4, 3)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from neilfpp_method.hosts.volsdf import VolSdfHost
+from neilfpp_method.incident import traced
 from neilfpp_method.incident.traced import trace_light
 from neilfpp_method.volume import empty_space
 from tests.scenes import sphere_batch, tiny_config
@@ -54,7 +55,7 @@ def test_hits_stay_where_they_are():
     assert (one.position - other.position)[solid].norm(dim=-1).median() < 0.03
 
 
-def test_traced_rays_that_meet_nothing_are_not_rendered():
+def test_traced_rays_that_meet_nothing_are_not_rendered(monkeypatch):
     """On a sphere no ray meets anything: none is rendered. Where the start lies before it, all are, and hit as they did."""
     skipping, plain = host().train(), host(skip=False).train()
     plain.load_state_dict(skipping.state_dict(), strict=False)
@@ -62,12 +63,14 @@ def test_traced_rays_that_meet_nothing_are_not_rendered():
     plain.density.above_floor.data.fill_(2e-3)
     out = torch.nn.functional.normalize(torch.randn(200, 3), dim=-1)
     settings = tiny_config().inter_reflection
-    above = trace_light(skipping, 0.6 * out, out, dataclasses.replace(settings, max_angle_deg=60.0), hit_share=0.8)
+    monkeypatch.setattr(traced, "MAX_ANGLE_DEG", 60.0)
+    above = trace_light(skipping, 0.6 * out, out, settings, hit_share=0.8)
     assert len(above.hit) < 20
+    monkeypatch.setattr(traced, "MAX_ANGLE_DEG", 20.0)
     torch.manual_seed(1)
-    towards = trace_light(skipping, 1.2 * out, -out, dataclasses.replace(settings, max_angle_deg=20.0), hit_share=0.8)
+    towards = trace_light(skipping, 1.2 * out, -out, settings, hit_share=0.8)
     torch.manual_seed(1)
-    all_of_them = trace_light(plain, 1.2 * out, -out, dataclasses.replace(settings, max_angle_deg=20.0), hit_share=0.8)
+    all_of_them = trace_light(plain, 1.2 * out, -out, settings, hit_share=0.8)
     assert len(towards.hit) == len(all_of_them.hit)
     assert abs(towards.hit.float().mean() - all_of_them.hit.float().mean()) < 0.05
 

@@ -12,6 +12,7 @@ from torch.nn.functional import normalize
 from neilfpp_method.fields.sdf import SdfSample
 from neilfpp_method.hosts.base import HasParameterGroups, HasSurfaceWidth, Host, Regularised
 from neilfpp_method.hosts.volsdf import VolSdfHost
+from neilfpp_method.settings.presets import preset
 from neilfpp_method.structures import OrientedPoints, RayBatch
 from neilfpp_method.volume.density import laplace_density
 from tests.scenes import sphere_batch, sphere_model, tiny_config
@@ -118,11 +119,11 @@ def test_only_the_named_losses_are_computed(sharp):
 def test_regularisers_look_all_over_the_scene():
     """On G = c · x the losses are known at any place, so what is averaged, and how often, shows where they look."""
     config = tiny_config()
-    config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, points="scene", surface_epsilon=10.0))
+    config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, points="scene"))
     host, batch, asked = sphere_model(config).train().host, sphere_batch(16), []
     slope = torch.tensor([0.0, 0.0, 2.0])
     host.sdf_field.with_gradient = lambda x: asked.append(x) or SdfSample(x @ slope, slope.expand_as(x), torch.zeros(len(x), 4))
-    host.sdf_field.hessian = lambda x, method: asked.append(x) or torch.zeros(len(x), 3, 3)
+    host.sdf_field.hessian = lambda x: asked.append(x) or torch.zeros(len(x), 3, 3)
     terms = host.render_regularised(batch, ["eikonal", "surface", "hessian"]).terms
     _, points, curved = asked
     assert points is curved

@@ -20,12 +20,11 @@ from neilfpp_method import kernels
 from neilfpp_method.errors import UserError
 from neilfpp_method.kernels import encode, function, grid_spec
 from neilfpp_method.kernels.threads import for_each, shares
-from neilfpp_method.settings.types import HashGridConfig
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 BACKEND = "triton" if INTERPRETED else "cpu"
 # Dense and hashed levels, an odd number of features, a finest level that is no power of two.
-SPEC = grid_spec(HashGridConfig(levels=4, features=3, log2_entries=8, base_resolution=3, max_resolution=50, backend=BACKEND))
+SPEC = grid_spec(levels=4, features=3, log2_entries=8, base_resolution=3, max_resolution=50, backend=BACKEND)
 
 
 def table(seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -90,12 +89,10 @@ def test_many_points_at_one_place_add_up():
     seed=st.integers(0, 9),
 )
 def test_any_grid(levels, features, log2_entries, base, growth, seed):
-    config = HashGridConfig(levels, features, log2_entries, base, base * growth, BACKEND)
+    spec = grid_spec(levels, log2_entries, base * growth, base, features, BACKEND)
     x, generator = scattered(40, seed), torch.Generator().manual_seed(seed)
-    rows = torch.randn(grid_spec(config).entries, features, dtype=torch.float64, generator=generator)
-    got, expected = (
-        encode(x, rows, grid_spec(dataclasses.replace(config, backend=name)), True) for name in (BACKEND, "reference")
-    )
+    rows = torch.randn(spec.entries, features, dtype=torch.float64, generator=generator)
+    got, expected = (encode(x, rows, dataclasses.replace(spec, backend=name), True) for name in (BACKEND, "reference"))
     torch.testing.assert_close(got.features, expected.features, atol=1e-10, rtol=1e-10)
     torch.testing.assert_close(got.jacobian, expected.jacobian, atol=1e-8, rtol=1e-8)
 

@@ -17,12 +17,12 @@ from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.objective import Objective
 from neilfpp_method.lighting.solve import solve_light
 from neilfpp_method.lighting.transport import from_lamps, from_texels
-from neilfpp_method.settings.types import IncidentLightConfig, LightFitConfig
+from neilfpp_method.settings.types import LightFitConfig, MapLightConfig
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.structures import Material, Observed
 from tests.lighting.surfaces import material, patches
 
-CONFIG = IncidentLightConfig(kind="auto", environment_height=12, fit=LightFitConfig(points=800, steps=150))
+CONFIG = MapLightConfig(kind="auto", environment_height=12, fit=LightFitConfig(points=800, steps=150))
 KNOWN = dataclasses.replace(CONFIG, fit=dataclasses.replace(CONFIG.fit, evenness=0.0, whiteness=0.0))
 """Base colour is what surfaces have learned, and nothing else is known of the tint of light."""
 LAMP = torch.tensor([[0.3, -0.2, 0.5]])
@@ -63,14 +63,14 @@ def solve(
     seen: Observed,
     of: Material,
     unit: float,
-    config: IncidentLightConfig,
+    config: MapLightConfig,
     first: bool,
 ) -> Evidence | None:
     objective = Objective("linear", unit, config.fit)
     return solve_light(LightModel(environment, lamps), seen, of, GGX, None, objective, config, first)
 
 
-def solved(seen: Observed, of: Material, rounds: int, config: IncidentLightConfig = CONFIG) -> tuple[Lamps, object]:
+def solved(seen: Observed, of: Material, rounds: int, config: MapLightConfig = CONFIG) -> tuple[Lamps, object]:
     torch.manual_seed(0)
     environment, lamps = EnvironmentLight(12, 0.7), Lamps(4, 0.06)
     for number in range(rounds):

@@ -22,7 +22,6 @@ WRONG = {
     "no rays are fresh": (preset("fast"), "train", {"fresh": 0.0}, "train.fresh is 0"),
     "more than all are fresh": (preset("fast"), "train", {"fresh": 1.5}, "train.fresh is 1.5"),
     "a map that L_ref cannot teach": (preset("fast"), "inter_reflection", {"mode": "soft"}, "L_ref"),
-    "a map for a light that has none": (preset("paper-mlp"), "light", {"map": "sky.exr"}, "takes no map"),
 }
 
 

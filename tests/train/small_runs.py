@@ -33,11 +33,11 @@ def small_config(**train) -> NeilfConfig:
 def solved_light(config: NeilfConfig) -> NeilfConfig:
     """The settings with the light of `fast`: a small map and lamps, fitted every third step, and traced visibility."""
     fast = preset("fast")
-    fit = dataclasses.replace(fast.light.fit, points=32, candidates=8, every=3, steps=5)
+    fit = dataclasses.replace(fast.light.fit, points=32, every=3, steps=5)
     return dataclasses.replace(
         config,
         light=dataclasses.replace(fast.light, environment_height=4, fit=fit),
-        inter_reflection=dataclasses.replace(fast.inter_reflection, grid_resolution=24),
+        inter_reflection=fast.inter_reflection,
     )
 
 

@@ -14,7 +14,7 @@ from neilfpp_method.data.images import read_image
 from neilfpp_method.errors import UserError
 from neilfpp_method.lighting.solver import NothingToSolve
 from neilfpp_method.settings.presets import PRESETS
-from neilfpp_method.settings.types import IncidentLightConfig, LightFitConfig, NeilfConfig
+from neilfpp_method.settings.types import FreeLightConfig, LightFitConfig, MapLightConfig, NeilfConfig
 from neilfpp_method.train.light_record import LightFit, in_words, read_fits, write_fits
 from neilfpp_method.train.run import load_run
 from tests.data.make_capture import make_capture
@@ -24,10 +24,10 @@ from tests.train.small_runs import small_config
 def mapped_config() -> NeilfConfig:
     """Milliseconds a step, with an environment map and lamps that are fitted at every other step."""
     config = small_config()
-    fit = LightFitConfig(points=60, every=2, steps=4, candidates=8)
+    fit = LightFitConfig(points=60, every=2, steps=4)
     return dataclasses.replace(
         config,
-        light=dataclasses.replace(config.light, kind="auto", environment_height=6, fit=fit),
+        light=MapLightConfig(kind="auto", environment_height=6, fit=fit),
         inter_reflection=dataclasses.replace(config.inter_reflection, mode="off"),
     )
 
@@ -128,13 +128,13 @@ FITS = [LightFit(0, 0.021, 0.004, 204, 3), LightFit(100, -0.001, 0.003, 204, 0)]
 
 
 def test_the_record_says_why():
-    auto = IncidentLightConfig(kind="auto")
+    auto = MapLightConfig(kind="auto")
     assert in_words(auto, FITS) == "an environment map; lamps were not needed (error +0.1 ± 0.3 % at 204 points kept back)"
     assert in_words(auto, FITS[:1]) == "an environment map and 3 lamps before it (error −2.1 ± 0.4 % at 204 points kept back)"
     given = dataclasses.replace(auto, map="sky.exr")
     assert in_words(given, [dataclasses.replace(FITS[0], lamps=1)]).startswith("the given environment map and 1 lamp before")
     assert in_words(auto, []) == "an environment map"
-    assert in_words(IncidentLightConfig(kind="free"), []) == "a field that is free at every point"
+    assert in_words(FreeLightConfig(), []) == "a field that is free at every point"
 
 
 @pytest.mark.parametrize(

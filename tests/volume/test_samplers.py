@@ -14,7 +14,14 @@ from neilfpp_method.settings.types import VolumeConfig
 from neilfpp_method.volume import samplers
 from neilfpp_method.volume.compositing import render_weights
 from neilfpp_method.volume.density import laplace_density
-from neilfpp_method.volume.samplers import SPREAD, cut, error_bounded_samples, inverse_cdf_samples, uniform_samples
+from neilfpp_method.volume.samplers import (
+    OPACITY_ERROR,
+    SPREAD,
+    cut,
+    error_bounded_samples,
+    inverse_cdf_samples,
+    uniform_samples,
+)
 
 F64 = torch.float64
 CONFIG = VolumeConfig()
@@ -183,12 +190,12 @@ def test_the_opacity_is_within_the_bound_and_the_bound_within_epsilon(sdf, beta,
         error = opacity_error(sdf, ray, beta, torch.cat(asked).sort().values)
         assert error <= found.error_bound.item() + 1e-5
         if rounds:
-            assert found.error_bound.item() <= config.epsilon
+            assert found.error_bound.item() <= OPACITY_ERROR
 
 
 def test_the_bound_says_when_the_rounds_were_too_few():
     found = sample(sphere, ray_bundle(16), 1e-4, dataclasses.replace(CONFIG, rounds=0))
-    assert (found.error_bound > CONFIG.epsilon).any()
+    assert (found.error_bound > OPACITY_ERROR).any()
     assert found.distances.isfinite().all()
 
 
@@ -274,7 +281,7 @@ def test_without_leaving_early_the_bound_is_met_as_well(monkeypatch):
     monkeypatch.setattr(samplers, "can_leave_early", lambda device: False)
     found = sample(sphere, ray_bundle(50), 0.01)
     assert found.sdf_queries == 128 * (1 + 5)
-    assert (found.error_bound <= CONFIG.epsilon).all()
+    assert (found.error_bound <= OPACITY_ERROR).all()
     assert (found.distances.diff(dim=-1) >= 0.0).all()
 
 
@@ -288,7 +295,7 @@ def test_new_cuts_pay_more_than_cuts_in_proportion_to_the_bound(monkeypatch):
     ours = sample(sphere, ray_bundle(200), 0.01)
     monkeypatch.setattr(samplers, "bound_shares", bound_itself)
     papers = sample(sphere, ray_bundle(200), 0.01)
-    assert (ours.error_bound <= CONFIG.epsilon).float().mean() >= (papers.error_bound <= CONFIG.epsilon).float().mean()
+    assert (ours.error_bound <= OPACITY_ERROR).float().mean() >= (papers.error_bound <= OPACITY_ERROR).float().mean()
     assert ours.sdf_queries < papers.sdf_queries
 
 

@@ -1,0 +1,83 @@
+"""Settings from a file: YAML or JSON, all or some of them; the `config.json` of a run folder is one."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Hashable, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from neilfpp_method.errors import UserError
+
+__all__ = ["read_settings"]
+
+LARGEST = 1 << 20
+"""Bytes: a thousand times what all settings take."""
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML with the plain values of YAML 1.2: `off`, `on`, `no` and `12:30` are words, `5e-4` is a number, and no name comes
+    twice in a mapping. (YAML 1.1 takes `mode: off` for false and `5e-4` for a word.)"""
+
+    yaml_implicit_resolvers: dict[str, list] = {}  # noqa: RUF012 (PyYAML keeps its resolvers in the class)
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        names: list[Any] = []
+        for key, _ in node.value:
+            name = self.construct_object(key, deep=True)
+            if name in names:
+                raise yaml.constructor.ConstructorError(None, None, f"'{name}' is set twice", key.start_mark)
+            names.append(name)
+        return super().construct_mapping(node, deep)
+
+
+PLAIN = {
+    "null": (r"~|null|Null|NULL|none|None|", ["~", "n", "N", ""]),
+    "bool": (r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    "int": (r"[-+]?[0-9]+(_[0-9]+)*", list("-+0123456789")),
+    "float": (r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", list("-+.0123456789")),
+}
+"""The plain values that are no words, and the characters that they begin with."""
+for _name, (_pattern, _first) in PLAIN.items():
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_name}", re.compile(f"^(?:{_pattern})$"), _first)
+_Loader.add_constructor("tag:yaml.org,2002:float", lambda loader, node: float(loader.construct_scalar(node)))
+_Loader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(loader.construct_scalar(node)))
+
+
+def read_settings(path: Path) -> Mapping[str, Any]:
+    """The settings that a file names: nested, or with dots in their names. A run folder's `config.json` gives its own.
+
+    Raises:
+        UserError: there is no such file, or it holds no settings.
+    """
+    if path.suffix not in (".yaml", ".yml", ".json"):
+        raise UserError(f"{path}: settings are read from .yaml and .json files", "give it one of these names")
+    try:
+        if path.stat().st_size > LARGEST:
+            raise UserError(f"{path}: too large for a file of settings", "name the file of settings with --config")
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: no such file", "name a file of settings with --config") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: not a text file", "name a file of settings with --config") from error
+    try:
+        content = json.loads(text) if path.suffix == ".json" else yaml.load(text, Loader=_Loader)
+    except json.JSONDecodeError as error:
+        raise UserError(f"{path}:{error.lineno}: not JSON ({error.msg})", "correct the file") from error
+    except yaml.MarkedYAMLError as error:
+        line = f":{error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise UserError(f"{path}{line}: not YAML ({error.problem})", "correct the file") from error
+    except (yaml.YAMLError, RecursionError) as error:
+        raise UserError(f"{path}: not a file of settings", "correct the file") from error
+    if content is None:
+        return {}
+    if not isinstance(content, Mapping):
+        raise UserError(f"{path}: holds no settings", "write names and values, such as `train: {rays: 512}`")
+    # What `train` writes into a run folder has the settings beside the format of the folder.
+    inner = content.get("config") if content.keys() <= {"format", "config"} else content
+    if not isinstance(inner, Mapping):
+        raise UserError(f"{path}: holds no settings", "write names and values, such as `train: {rays: 512}`")
+    return inner

@@ -1,0 +1,71 @@
+"""Settings to and from plain values, and changed by them: what is wrong is told in one line that names the setting."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from neilfpp_method.errors import UserError
+from neilfpp_method.settings.count import leaves
+from neilfpp_method.settings.plain import changed, from_dict, to_dict
+from neilfpp_method.settings.presets import PRESETS, fixed_geometry, free_light, preset
+from neilfpp_method.settings.types import FreeLightConfig, HashGridConfig, MapLightConfig, MeshConfig, NeilfConfig
+
+EVERY = [preset(name) for name in PRESETS] + [fixed_geometry(preset(name)) for name in PRESETS] + [free_light(preset("fast"))]
+
+
+def test_there_are_not_too_many_settings():
+    names = list(leaves(NeilfConfig))
+    assert len(names) == len(set(names)) <= 90
+
+
+def test_settings_of_every_kind_count_once():
+    names = set(leaves(NeilfConfig))
+    assert {"light.kind", "light.map", "light.width", "host.sdf.layers", "host.path", "encoding.levels"} <= names
+
+
+@pytest.mark.parametrize("config", EVERY, ids=lambda config: f"{config.preset}-{config.light.kind}")
+def test_settings_survive_json(config):
+    assert from_dict(NeilfConfig, json.loads(json.dumps(to_dict(config)))) == config
+    assert changed(NeilfConfig(), json.loads(json.dumps(to_dict(config)))) == config
+
+
+def test_a_change_leaves_all_else():
+    config = changed(preset("fast"), {"train.rays": 7, "light": {"fit": {"points": 3}}, "host": {"sdf.width": 9}})
+    assert (config.train.rays, config.light.fit.points, config.host.sdf.width) == (7, 3, 9)
+    back = {"train.rays": 512, "light.fit.points": 1024, "host.sdf.width": 64}
+    assert changed(config, back) == preset("fast")
+
+
+def test_a_kind_brings_its_own_settings():
+    fast = preset("fast")
+    assert changed(fast, {"light.kind": "distant"}).light == MapLightConfig("distant", 48, None, fast.light.fit)
+    assert changed(fast, {"light": {"kind": "free", "width": 8}}).light == FreeLightConfig(width=8)
+    assert changed(fast, {"host.kind": "mesh", "host.path": "a.ply"}).host == MeshConfig(path="a.ply")
+    assert changed(NeilfConfig(), {"encoding.kind": "hash", "encoding.levels": 4}).encoding == HashGridConfig(levels=4)
+
+
+@pytest.mark.parametrize(
+    ("values", "complaint"),
+    [
+        ({"trian": {"rays": 3}}, "config: unknown setting 'trian'; did you mean 'train'?"),
+        ({"train.ray": 3}, "config.train: unknown setting 'ray'; did you mean 'rays'?"),
+        ({"light.width": 3}, "config.light: unknown setting 'width'"),
+        ({"light.kind": "sun"}, "config.light.kind: 'sun' is not a choice"),
+        ({"light.kind": ["free"]}, "config.light.kind"),
+        ({"train.rays": "many"}, "config.train.rays: 'many' where int belongs"),
+        ({"train.rays": True}, "config.train.rays: True where int belongs"),
+        ({"train.rays": [1, 2]}, "config.train.rays: a list where one value belongs"),
+        ({"train": 3}, "config.train: 3 where settings belong"),
+        ({"train.rays": 3, "train": 4}, "config.train is set twice"),
+        ({"background.color": [1.0, 2.0]}, "config.background.color: 2 numbers where 3 belong"),
+        ({"background.color": [1.0, 2.0, "red"]}, "config.background.color: 'red' where float belongs"),
+        ({"inter_reflection.mode": False}, "config.inter_reflection.mode: 'False' is not a choice"),
+    ],
+)
+def test_what_is_wrong_is_named(values, complaint):
+    with pytest.raises(UserError) as error:
+        changed(preset("fast"), values)
+    assert complaint in str(error.value)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,37 @@
+"""What a package promises to who installs it: its public names, its types, its licence."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import neilfpp_method
+from neilfpp_method.train.run import Run
+
+ROOT = Path(__file__).parent.parent
+
+
+def test_dir_shows_the_public_names():
+    """Before any of them is loaded, so in a process of its own; and each name is there."""
+    asks = "import sys, neilfpp_method as n; print(*dir(n)); sys.exit('torch' in sys.modules)"
+    shown = subprocess.run(
+        [sys.executable, "-c", asks], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert shown.stdout.split() == sorted(neilfpp_method.__all__)
+    assert all(getattr(neilfpp_method, name) is not None for name in neilfpp_method.__all__)
+
+
+def test_a_run_says_what_it_holds():
+    for name in Run.__dataclass_fields__:
+        assert f"        {name}: " in (Run.__doc__ or "")
+
+
+def test_type_checkers_may_read_the_annotations():
+    assert (Path(neilfpp_method.__file__).parent / "py.typed").is_file()
+
+
+def test_licence_and_citation_name_the_same_version():
+    assert (ROOT / "LICENSE").read_text().startswith("MIT License")
+    assert f"version: {neilfpp_method.__version__}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f'version = "{neilfpp_method.__version__}"\n' in (ROOT / "pyproject.toml").read_text()
