@@ -127,7 +127,7 @@ def _training(
         if position.step == 0:
             model.train().freeze_for(position.stage)
         seed_step(config.train.seed, step)
-        set_rates(optimizer, config.optimizer, position.stage, position.share)
+        set_rates(optimizer, config.optimizer, position)
         optimizer.zero_grad(set_to_none=True)
         computed = model.step(pixels.sample(config.train.rays), position.stage)
         weigh(computed.terms, active_losses(position.stage, config, model.stages, position.share)).loss.backward()

@@ -168,7 +168,8 @@ class AttachedNeilf(nn.Module):
         rows = torch.nonzero(hits.is_hit(settings.hit_share))[:, 0]
         position = hits.position[rows]
         samples = settings.train_samples if self.training else settings.eval_samples
-        shading = self.model.shade(position, hits.normal[rows], wo[rows], self.materials(position), samples)
+        normal = self.model.shading_normals(position, hits.normal[rows])
+        shading = self.model.shade(position, normal, wo[rows], self.materials(position), samples)
         nothing = torch.zeros_like(wo)
         return Shading(*(nothing.index_put((rows,), part) for part in (shading.color, shading.diffuse, shading.specular)))
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from neilfpp_method.shading.color import apply_response
+from neilfpp_method.shading.color import apply_response, luminance
 from neilfpp_method.structures import LossTerm, Material
 
 __all__ = [
@@ -43,7 +43,8 @@ def photometric(
     1 / (p / unit + `RELATIVE_FLOOR`): about 3.3 where it is black, 0.77 at the unit, 0.01 at a hundred units. Highlights of
     hundreds of units would otherwise be most of the loss, and most of its gradient, though they are few pixels (Mildenhall et
     al. 2022, "NeRF in the Dark", which divides by the render; the pixel is what is known from the first step on). The
-    weights are constants, and their sum is divided out (`LossTerm.mean`), so L_vol keeps its size beside the other losses.
+    weights are constants. Their sum is not divided out: black pixels beside the object, which nothing can be wrong about,
+    would then make the object count for less, and no surface would form.
 
     Args:
         radiance: what the model sees, linear.
@@ -56,13 +57,13 @@ def photometric(
         >>> render, pixel = torch.tensor([[1.1] * 3, [22.0] * 3]), torch.tensor([[1.0] * 3, [20.0] * 3])
         >>> round(photometric(render, pixel, "linear").mean().item(), 3)  # (0.1 + 2) / 2
         1.05
-        >>> round(photometric(render, pixel, "linear", relative=True).mean().item(), 3)  # weights 1 / 1.3 and 1 / 20.3
-        0.214
+        >>> round(photometric(render, pixel, "linear", relative=True).mean().item(), 3)  # (0.1 / 1.3 + 2 / 20.3) / 2
+        0.088
     """
     error = (apply_response(radiance, response) - pixel).abs() / unit
     if not relative:
         return LossTerm(error)
-    return LossTerm(error, 1.0 / (pixel.mean(-1, keepdim=True) / unit + RELATIVE_FLOOR))
+    return LossTerm(error, 1.0 / (pixel.mean(-1, keepdim=True) / unit + RELATIVE_FLOOR), divided=False)
 
 
 def mask(
@@ -98,8 +99,15 @@ def point_cloud(distance: Float[Tensor, " P"], gradient: Float[Tensor, "P 3"], n
     return LossTerm(distance.abs() + (1.0 - cosine))
 
 
-def inter_reflection(incident: Float[Tensor, "K 3"], outgoing: Float[Tensor, "K 3"], unit: float = 1.0) -> LossTerm:
-    """L_ref = ‖L(x₁, ωi) − R(x₂, −ωi)‖₁ for rays that leave x₁ along ωi and meet the surface at x₂, in a unit of radiance."""
+def inter_reflection(
+    incident: Float[Tensor, "K 3"], outgoing: Float[Tensor, "K 3"], unit: float = 1.0, monochrome: bool = False
+) -> LossTerm:
+    """L_ref = ‖L(x₁, ωi) − R(x₂, −ωi)‖₁ for rays that leave x₁ along ωi and meet the surface at x₂, in a unit of radiance.
+
+    A light without colour is compared by luminance: no L can meet three channels that differ.
+    """
+    if monochrome:
+        incident, outgoing = luminance(incident)[:, None], luminance(outgoing)[:, None]
     return LossTerm((incident - outgoing).abs() / unit)
 
 

@@ -113,7 +113,7 @@ class NeilfModel(nn.Module):
         self.lobe = lobe if config.shading.specular else None
         self.brdf = BrdfField(config.brdf, config.encoding, config.volume.radius)
         albedo = initial_albedo(config.brdf.initial_base_color, config.brdf.initial_metallic, self.lobe)
-        parts = make_light(config.light, facts.response, facts.median_radiance / albedo)
+        parts = make_light(config, facts.response, facts.median_radiance / albedo)
         self.light, self.lamps = parts.light, parts.lamps
         # The surface of a borrowed host moves as its own trainer likes.
         stands_still = not borrowed and not self.stages[Stage.MATERIAL_INIT].moves_host
@@ -208,7 +208,7 @@ class NeilfModel(nn.Module):
         traced = trace_light(self.host, position, normal, self.config.inter_reflection, self.config.shading.hit_share)
         hit = torch.nonzero(traced.hit)[:, 0]
         incident = self.light.radiance(traced.position[hit], traced.wi[hit][:, None])[:, 0]
-        return losses.inter_reflection(incident, traced.radiance[hit], self.units.incident)
+        return losses.inter_reflection(incident, traced.radiance[hit], self.units.incident, self.config.light.monochrome)
 
     def _beyond(self, batch: PixelBatch, hits: SurfaceHits) -> PixelBatch:
         """Pixels off the object, as far as masks tell, whose rays pass the scene by."""

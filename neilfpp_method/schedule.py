@@ -20,7 +20,7 @@ from enum import Enum
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.settings.types import NeilfConfig, TrainConfig
+from neilfpp_method.settings.types import NeilfConfig, OptimizerConfig, TrainConfig
 from neilfpp_method.structures import LossTerms
 
 __all__ = [
@@ -33,6 +33,7 @@ __all__ = [
     "StageTable",
     "Total",
     "active_losses",
+    "rate_factor",
     "stage_at",
     "stage_steps",
     "weigh",
@@ -157,6 +158,27 @@ def stage_at(step: int, config: TrainConfig) -> StagePosition:
         start += length
     stage, length = lengths[-1]
     return StagePosition(stage, length, length)
+
+
+WARM_UP_START = 0.1
+"""Rate at the first step of a warm-up over the rate that it rises to (published code)."""
+
+
+def rate_factor(config: OptimizerConfig, position: StagePosition) -> float:
+    """What a learning rate is multiplied by at a step of a stage: the stage's own factor, its fall, and its warm-up.
+
+    Example:
+        >>> halfway = StagePosition(Stage.SDF_INIT, step=50, length=100)
+        >>> rate_factor(OptimizerConfig(final=(0.01, 1.0, 1.0)), halfway)
+        0.1
+        >>> rate_factor(OptimizerConfig(final=(0.01, 1.0, 1.0), drops=(1, 0, 0)), halfway)  # it drops there, at once
+        0.01
+    """
+    stage = list(Stage).index(position.stage)
+    final, drops = config.final[stage], config.drops[stage]
+    fallen = min(position.step * (drops + 1) // position.length, drops) / drops if drops else position.share
+    start = WARM_UP_START ** max(0.0, 1.0 - position.step / config.warm_up) if config.warm_up else 1.0
+    return (config.joint if position.stage is Stage.JOINT else 1.0) * start * final**fallen
 
 
 def active_losses(stage: Stage, config: NeilfConfig, stages: StageTable = STAGES, share: float = 0.0) -> Mapping[str, float]:

@@ -78,7 +78,7 @@ class PixelBatch(Indexable):
     one.
     `mask` is 1 on the object and 0 off it, as far as `mask_known` is 1: everywhere in a capture with masks, only where the
     image shows exactly its background in one without (there the other pixels have mask 1). `image_gradient` is the length
-    of the gradient of the image's luminance at the pixel, per pixel.
+    of the gradient of the image's luminance at the pixel, by Scharr's filter: 32 times the change per pixel.
     """
 
     origins: Float[Tensor, "N 3"]
@@ -205,17 +205,21 @@ SceneTracer = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N S 3"]], SceneLigh
 class LossTerm(NamedTuple):
     """One loss before reduction: `values` of any shape and, where not all count alike, `weights` that broadcast to it.
 
+    `weights` say which values count, and their sum is divided out; or how much, and with `divided` off it is not.
     A named tuple, because the wrappers of data-parallel training look for tensors in those and not in frozen dataclasses.
     """
 
     values: Float[Tensor, ...]
     weights: Float[Tensor, ...] | Bool[Tensor, ...] | None = None
+    divided: bool = True
 
     def mean(self) -> Float[Tensor, ""]:
         """The weighted mean; 0, with a zero gradient, when nothing counts."""
         if self.weights is None:
             return self.values.mean() if self.values.numel() else self.values.sum()
         weights = self.weights.to(self.values.dtype).expand_as(self.values)
+        if not self.divided:
+            return LossTerm(self.values * weights).mean()
         return (self.values * weights).sum() / weights.sum().clamp_min(1e-6)
 
 

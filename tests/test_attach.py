@@ -183,6 +183,22 @@ def test_shading_is_that_of_the_maps_and_nothing_where_nothing_is_hit():
     assert not shading.color[~hit].any()
 
 
+class TiltedBall(BallHost):
+    """A ball that knows better normals than those of its hits."""
+
+    def smooth_normals(self, position, normal):
+        return torch.nn.functional.normalize(normal + torch.tensor([0.5, 0.0, 0.0]), dim=-1)
+
+
+def test_shading_takes_the_normals_of_the_maps():
+    neilf = attach_neilf(TiltedBall(), tiny_config()).eval()
+    batch = pixels()
+    hits = neilf.model.host.render(batch.rays)
+    shading, maps = neilf.shade(hits, -batch.directions), neilf.model.maps(batch.rays)
+    assert (maps.normal * hits.normal).sum(-1).median() < 0.95
+    torch.testing.assert_close(shading.color, maps.rgb)
+
+
 def test_material_and_light_at_points():
     neilf = attach_neilf(Ball(), tiny_config())
     x = torch.rand(5, 3)

@@ -9,6 +9,7 @@ from collections import Counter
 import pytest
 import torch
 
+from neilfpp_method import losses
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.base import LightsItself
 from neilfpp_method.incident.traced import trace_light
@@ -49,6 +50,8 @@ def _counted(function, counts, name):
 
 def test_an_effect_that_is_off_asks_nothing():
     base = tiny_config()
+    # With β = 0.02 a quarter of a ray's weight lies further than 0.05 from its hit.
+    base = dataclasses.replace(base, shading=dataclasses.replace(base.shading, hit_share=0.5))
     off = dataclasses.replace(base.inter_reflection, mode="off")
     batch = sphere_batch()
 
@@ -144,22 +147,53 @@ def test_traced_light_is_what_the_wall_sends_back():
     assert cosine.mean().item() == pytest.approx((1.0 + least.item()) / 2.0, abs=0.02)
 
 
+class Recorder(Room):
+    """The room with a surface layer of a width; keeps the rays that it was asked for."""
+
+    def __init__(self, width: float) -> None:
+        self.width = torch.tensor(width)
+
+    def surface_width(self):
+        return self.width
+
+    def render(self, rays):
+        self.rays = rays
+        return super().render(rays)
+
+
 def test_a_ray_starts_further_out_towards_grazing_and_for_a_thicker_surface():
-    class Recorder(Room):
-        width = torch.tensor(0.01)
-
-        def surface_width(self):
-            return self.width
-
-        def render(self, rays):
-            self.rays = rays
-            return super().render(rays)
-
-    host, settings = Recorder(), dataclasses.replace(tiny_config().inter_reflection, rays_per_point=1.0)
+    host, settings = Recorder(0.003), dataclasses.replace(tiny_config().inter_reflection, rays_per_point=1.0)
     normal = torch.tensor([[0.0, 0.0, 1.0]]).expand(200, 3)
     trace_light(host, torch.zeros(200, 3), normal, settings, 0.8)
-    torch.testing.assert_close(host.rays.origins[:, 2], torch.full((200,), settings.offset + 4 * 0.01))
+    torch.testing.assert_close(host.rays.origins[:, 2], torch.full((200,), settings.offset + 4 * 0.003))
     assert host.rays.origins.norm(dim=-1).max() > 2.0 * host.rays.origins.norm(dim=-1).min()
+
+
+def test_no_ray_starts_further_out_than_the_published_bound():
+    """β = 0.03 asks for 0.14 of height: 0.73 at 79°. From 46° on the bound of 0.2 would start a ray within the layer."""
+    torch.manual_seed(0)
+    host, settings = Recorder(0.03), dataclasses.replace(tiny_config().inter_reflection, rays_per_point=1.0)
+    normal = torch.tensor([[0.0, 0.0, 1.0]]).expand(500, 3)
+    traced = trace_light(host, torch.zeros(500, 3), normal, settings, 0.8)
+    assert host.rays.origins.norm(dim=-1).max() <= 0.2
+    steepest = (settings.offset + 4 * 0.03) / 0.2
+    assert traced.wi[:, 2].min().item() == pytest.approx(steepest, abs=0.02)
+    assert len(traced.wi) == pytest.approx(500 * (1 - steepest) / (1 - math.cos(math.radians(80))), rel=0.15)
+
+
+def test_a_light_without_colour_is_compared_by_luminance():
+    """Red, green and blue of one luminance are all met by the grey light of that luminance."""
+    config = tiny_config()
+    model = sphere_model(dataclasses.replace(config, light=dataclasses.replace(config.light, monochrome=True)))
+    grey, colors = torch.full((3, 3), 0.05), torch.diag(0.05 / torch.tensor([0.2126, 0.7152, 0.0722]))
+    assert losses.inter_reflection(grey, colors, monochrome=True).mean() < 1e-6
+    assert losses.inter_reflection(grey, colors).mean() > 0.05
+    model.light.radiance = lambda x, wi: torch.full((*wi.shape[:2], 3), 0.05)
+    model.host.render = lambda rays: SurfaceHits(
+        colors[:1].expand(len(rays), 3), rays.origins, rays.directions, *torch.ones(2, len(rays))
+    )
+    at = torch.tensor([[0.0, 0.0, 0.6]]).expand(8, 3)
+    assert model._inter_reflection(at, at / 0.6).mean() < 1e-6
 
 
 def test_the_gradient_into_outgoing_radiance_is_scaled():
@@ -245,7 +279,7 @@ def test_hard_inter_reflection_asks_the_scene_first_and_the_light_for_the_rest()
 def test_an_sdf_host_sees_itself_by_its_grid():
     """From a point on a sphere no direction meets it again; from between two plates every steep one does."""
     config = tiny_config()
-    hard = dataclasses.replace(config.inter_reflection, mode="hard", grid_resolution=48)
+    hard = dataclasses.replace(config.inter_reflection, mode="hard")
     config = dataclasses.replace(config, inter_reflection=hard)
     host = sphere_model(config).host
     assert isinstance(host, LightsItself)
@@ -263,7 +297,7 @@ def test_an_sdf_host_sees_itself_by_its_grid():
 
 def test_the_tracing_grid_is_renewed_as_the_geometry_moves_and_survives_a_checkpoint():
     config = tiny_config()
-    hard = dataclasses.replace(config.inter_reflection, mode="hard", grid_resolution=16)
+    hard = dataclasses.replace(config.inter_reflection, mode="hard")
     model = sphere_model(dataclasses.replace(config, inter_reflection=hard))
     model.losses(sphere_batch(), Stage.MATERIAL_INIT)
     assert model.host.grid_age == 0

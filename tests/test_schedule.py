@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.schedule import Stage, active_losses, stage_at, weigh
+from neilfpp_method.schedule import Stage, StagePosition, active_losses, rate_factor, stage_at, weigh
 from neilfpp_method.settings.plain import from_dict, to_dict
 from neilfpp_method.settings.presets import PRESETS, preset
-from neilfpp_method.settings.types import TrainConfig
+from neilfpp_method.settings.types import OptimizerConfig, TrainConfig
 from neilfpp_method.structures import LossTerm
 
 # Table 1 of the paper, in its own words.
@@ -43,6 +43,24 @@ def test_the_weight_of_the_hessian_grows_in_sdf_init_alone():
     assert weights[2]["hessian"] == pytest.approx(weights[0]["hessian"] * growth)
     assert [w["eikonal"] for w in weights] == [config.loss.eikonal] * 3
     assert active_losses(Stage.JOINT, config, share=1.0)["hessian"] == config.loss.hessian_joint
+
+
+def factors(config: OptimizerConfig, stage: Stage, steps: list[int], length: int) -> list[float]:
+    return [rate_factor(config, StagePosition(stage, step, length)) for step in steps]
+
+
+def test_rates_fall_smoothly_or_in_drops():
+    config = OptimizerConfig(joint=0.5, final=(0.01, 0.1, 0.01), drops=(0, 1, 2))
+    assert factors(config, Stage.SDF_INIT, [0, 50, 100], 100) == pytest.approx([1.0, 0.1, 0.01])
+    assert factors(config, Stage.MATERIAL_INIT, [0, 49, 50, 99, 100], 100) == pytest.approx([1.0, 1.0, 0.1, 0.1, 0.1])
+    assert factors(config, Stage.JOINT, [0, 29, 30, 59, 60, 90], 90) == pytest.approx([0.5, 0.5, 0.05, 0.05, 0.005, 0.005])
+
+
+def test_rates_rise_from_a_tenth():
+    """The published code multiplies the rate by 10^(1/100) from one step to the next."""
+    config = OptimizerConfig(joint=1.0, final=(1.0, 1.0, 1.0), warm_up=100)
+    found = factors(config, Stage.JOINT, [0, 1, 50, 99, 100, 101], 1000)
+    assert found == pytest.approx([0.1, 0.1 * 10**0.01, 0.1 * 10**0.5, 10**-0.01, 1.0, 1.0])
 
 
 def test_an_effect_that_is_off_has_no_loss():
@@ -99,5 +117,5 @@ def test_settings_of_another_version_are_refused_by_name():
 
 
 def test_an_unknown_preset_is_named():
-    with pytest.raises(UserError, match=r"unknown preset 'turbo'; choose one of fast, paper-mlp, paper-ngp"):
+    with pytest.raises(UserError, match=r"unknown preset 'turbo'; choose one of fast, paper-mlp, paper-ngp, paper-ngp-hdr"):
         preset("turbo")

@@ -32,7 +32,7 @@ class Train:
     out: Path | None = None
     """The run's folder; none: runs/CAPTURE-PRESET."""
     preset: str | None = None
-    """fast (minutes on a laptop's CPU), paper-mlp or paper-ngp (the published settings); none: fast."""
+    """fast (minutes on a laptop's CPU), paper-mlp, paper-ngp or paper-ngp-hdr (the published settings); none: fast."""
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
     """Settings from a .yaml or .json file, all or some; a run folder's config.json is one. Options here win over it."""
     host: Literal["volsdf", "mesh"] = "volsdf"
@@ -133,7 +133,9 @@ def _base(name: str | None, host: str | None, stored: Mapping[str, Any], where: 
     mesh = host == "mesh" or (isinstance(kind, Mapping) and kind.get("kind") == "mesh") or stored.get("host.kind") == "mesh"
     if not isinstance(label, str):
         raise UserError(f"{where}.preset: {label!r} where a name belongs", f"choose one of {', '.join(PRESETS)}")
-    config = preset(label.removesuffix("-mesh") if name is None else label)
+    label = label.removesuffix("-mesh") if name is None else label
+    # What no preset made has the label of the settings' own defaults.
+    config = NeilfConfig() if name is None and label == NeilfConfig().preset else preset(label)
     config = fixed_geometry(config) if mesh else config
     light = stored.get("light", {})
     free = isinstance(light, Mapping) and light.get("kind") == "free" and config.light.kind != "free"

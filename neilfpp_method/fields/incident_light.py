@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from neilfpp_method.fields.encodings import direction_encoding
 from neilfpp_method.fields.mlp import Mlp
-from neilfpp_method.settings.types import FreeLightConfig
+from neilfpp_method.settings.types import FreeLightConfig, FrequencyConfig, HashGridConfig
 
 __all__ = ["IncidentLightField", "exponential"]
 
@@ -26,15 +26,22 @@ DIRECTION_OCTAVES, DIRECTION_BANDS = 6, 5
 class IncidentLightField(nn.Module):
     """radiance = initial_radiance · base^output. The outputs start near 0.
 
+    Beside a frequency encoding of positions directions are encoded by frequencies too, beside a hash grid by spherical
+    harmonics, as in R (NeILF++ §5).
+
     The middle layer is linear in what it sees, so the share of the direction and the share of the position are computed
     apart and added: the position costs one small product per point, and the directions can be shared between points.
     """
 
-    def __init__(self, config: FreeLightConfig, base: float, initial_radiance: float) -> None:
+    def __init__(
+        self, config: FreeLightConfig, encoding: FrequencyConfig | HashGridConfig, base: float, initial_radiance: float
+    ) -> None:
         super().__init__()
         self.log_base = math.log(base)
         self.initial_radiance = initial_radiance
-        self.direction = direction_encoding(config.direction_encoding, DIRECTION_OCTAVES, DIRECTION_BANDS)
+        self.direction = direction_encoding(
+            "frequency" if isinstance(encoding, FrequencyConfig) else "spherical_harmonics", DIRECTION_OCTAVES, DIRECTION_BANDS
+        )
         middle, width = config.layers // 2, config.width
         self.direction_part = Mlp(self.direction.width, width, middle, width, config.activation, skip=middle)
         self.position_part = nn.Linear(3, width, bias=False)

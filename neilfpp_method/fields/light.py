@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.incident_light import IncidentLightField
 from neilfpp_method.fields.lamps import Lamps
-from neilfpp_method.settings.types import FreeLightConfig, MapLightConfig
+from neilfpp_method.settings.types import FreeLightConfig, NeilfConfig
 from neilfpp_method.shading.sampling import Technique
 
 __all__ = ["Light", "LightModel", "make_light"]
@@ -46,9 +46,11 @@ class LightModel:
     lamps: Lamps
 
 
-def make_light(config: FreeLightConfig | MapLightConfig, response: str, initial_radiance: float) -> LightModel:
+def make_light(config: NeilfConfig, response: str, initial_radiance: float) -> LightModel:
     """An untrained light that sends `initial_radiance` from everywhere; `response` is "linear" or "srgb"."""
-    if isinstance(config, FreeLightConfig):
-        return LightModel(IncidentLightField(config, FREE_BASE[response], initial_radiance), Lamps(0, LAMP_RADIUS))
-    lamps = Lamps(0 if config.kind == "distant" else MOST_LAMPS, LAMP_RADIUS)
-    return LightModel(EnvironmentLight(config.environment_height, initial_radiance), lamps)
+    settings = config.light
+    if isinstance(settings, FreeLightConfig):
+        field = IncidentLightField(settings, config.encoding, FREE_BASE[response], initial_radiance)
+        return LightModel(field, Lamps(0, LAMP_RADIUS))
+    lamps = Lamps(0 if settings.kind == "distant" else MOST_LAMPS, LAMP_RADIUS)
+    return LightModel(EnvironmentLight(settings.environment_height, initial_radiance), lamps)

@@ -18,8 +18,8 @@ from neilfpp_method.hosts.smooth_normals import smooth_normals
 from neilfpp_method.settings.types import NeilfConfig, VolumeConfig
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayBatch, SceneLight, SurfaceHits
-from neilfpp_method.volume.compositing import Weights, composite, optical_depth, render_weights
-from neilfpp_method.volume.density import LaplaceDensity, laplace_density
+from neilfpp_method.volume.compositing import Weights, composite, depth_weights, sample_weights, share_near
+from neilfpp_method.volume.density import LaplaceDensity, laplace_depth
 from neilfpp_method.volume.distance_grid import cell_size, sample_grid, trace_grid
 from neilfpp_method.volume.empty_space import EmptySpace
 from neilfpp_method.volume.free_space import FreeSpace, cameras_within
@@ -28,21 +28,35 @@ from neilfpp_method.volume.samplers import error_bounded_samples
 
 __all__ = ["VolSdfHost"]
 
+POINTS_ABOUT_OBJECT = 2
+"""Points for regularisers per ray in the cube about the object, beside one in the cube about the scene: 8192 and 4096 in
+the published code."""
 HIT_RADIUS = 0.05
 """Scene units: the blending weight within this distance of the blended hit is its concentration (METHOD §2)."""
+SURFACE_WIDTH = {"scene": 10.0, "rays": 0.05}
+"""Scene units, by `loss.points`: width of the smoothed delta of L_surf. The former is the published one."""
+GRID_RESOLUTION = 96
+"""Vertices along an edge of the grid that hard inter-reflection traces."""
 GRID_LIFE = 100
 """Steps in which the geometry moves before the distance grid is sampled again."""
 
 
 @dataclass(frozen=True)
 class March:
-    """Samples along rays: where they are, what G says there, and how much each counts."""
+    """Samples along rays, from near to far: where they are, and what G says there."""
 
     distances: Float[Tensor, "N M"]
-    points: Float[Tensor, "N M 3"]
     surface: SdfSample
-    weights: Weights
     hits: SurfaceHits
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where the regularisers look: ∇G for L_Eik, G for L_surf, and points for L_Hess."""
+
+    gradient: Float[Tensor, "A 3"]
+    distance: Float[Tensor, " B"]
+    curved: Float[Tensor, "C 3"]
 
 
 class VolSdfHost(nn.Module):
@@ -88,7 +102,7 @@ class VolSdfHost(nn.Module):
         self.free_space = FreeSpace(within, radius) if len(within) else None
         self.empty_space = EmptySpace(radius) if config.volume.skip_empty else None
         hard = config.inter_reflection.mode == "hard"
-        resolution = config.inter_reflection.grid_resolution if hard else 0
+        resolution = GRID_RESOLUTION if hard else 0
         # Kept in checkpoints, with its age: a resumed run must trace the very same grid.
         self.register_buffer("distance_grid", torch.zeros(resolution, resolution, resolution))
         self.grid_age: int | None = None
@@ -103,7 +117,9 @@ class VolSdfHost(nn.Module):
         In evaluation without gradients, with `volume.skip_empty`, only the parts of rays are looked at that may show
         something, on a grid of the field as it is.
         """
-        if self.training or torch.is_grad_enabled() or self.empty_space is None:
+        # Without a background R paints the scene sphere, so no ray shows nothing.
+        whole = self.empty_space is None or self.background_kind == "none"
+        if self.training or torch.is_grad_enabled() or whole:
             return self._march(rays).hits
         return self._still(rays)
 
@@ -177,44 +193,28 @@ class VolSdfHost(nn.Module):
 
     def _grid(self) -> Float[Tensor, "R R R"]:
         if self.grid_age is None or self.grid_age >= GRID_LIFE:
-            fresh = sample_grid(self._solid, self.config.volume.radius, self.distance_grid.shape[0], self.distance_grid)
+            fresh = sample_grid(self.sdf, self.config.volume.radius, self.distance_grid.shape[0], self.distance_grid)
             self.distance_grid.copy_(fresh)
             self.grid_age = 0
         return self.distance_grid
 
     def sdf(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-        """Signed distance of the scene's surface: G, with free space cut out of it; with no background model the scene sphere
-        closes it (VolSDF §3.1)."""
-        distance = self._solid(x)
-        return torch.minimum(distance, self._to_sphere(x)) if self.background_kind == "none" else distance
-
-    def _solid(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
+        """Signed distance of the scene's surface: G, with free space cut out of it."""
         distance = self.sdf_field(x)
         return distance if self.free_space is None else torch.maximum(distance, self.free_space(x).depth.to(distance.dtype))
 
     def _surface(self, x: Float[Tensor, "P 3"]) -> SdfSample:
+        """As `sdf`, with its gradient and the feature for R."""
         sample = self.sdf_field.with_gradient(x)
-        if self.free_space is not None:
-            free = self.free_space(x)
-            within = free.depth > sample.distance
-            sample = SdfSample(
-                torch.where(within, free.depth, sample.distance),
-                torch.where(within[:, None], free.gradient, sample.gradient),
-                sample.feature,
-            )
-        if self.background_kind != "none":
+        if self.free_space is None:
             return sample
-        to_sphere = self._to_sphere(x)
-        beyond = to_sphere < sample.distance
-        inward = -safe_normalize(x)
+        free = self.free_space(x)
+        within = free.depth > sample.distance
         return SdfSample(
-            torch.where(beyond, to_sphere, sample.distance),
-            torch.where(beyond[:, None], inward, sample.gradient),
+            torch.where(within, free.depth, sample.distance),
+            torch.where(within[:, None], free.gradient, sample.gradient),
             sample.feature,
         )
-
-    def _to_sphere(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-        return self.config.volume.radius - x.square().sum(-1).clamp_min(1e-12).sqrt()
 
     # --------------------------------------------------------------------------------------------------------- rendering
 
@@ -247,19 +247,21 @@ class VolSdfHost(nn.Module):
         interval = part or sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
         volume, narrowed = self.config.volume, part is not None
         if self.empty_space is not None and self.training:
-            interval, narrowed = self.empty_space.narrow(self.sdf, rays, interval, self.surface_width()), True
+            narrow = self.empty_space.narrow(self.sdf, rays, interval, self.surface_width())
+            # Without a background R paints the scene sphere: rays go on to it.
+            interval = Interval(narrow.near, interval.far) if self.background_kind == "none" else narrow
+            narrowed = True
         if narrowed:
             volume = replace(volume, initial_samples=max(volume.initial_samples // 2, 1))
         distances = self._sample(rays, interval, volume)
         points = rays.origins[:, None] + distances[..., None] * rays.directions[:, None]
         surface = self._surface(points.reshape(-1, 3))
-        density = self.density(surface.distance).reshape(distances.shape)
-        weights = render_weights(density, distances, interval.far)
+        weights = depth_weights(self.density(surface.distance.reshape(distances.shape), distances))
         normals = safe_normalize(surface.gradient)
         wo = (-rays.directions)[:, None].expand_as(points).reshape(-1, 3)
         radiance = self.radiance_field(points.reshape(-1, 3), wo, normals, surface.feature)
-        hits = self._blend(rays, points, distances, weights, normals, radiance)
-        return March(distances, points, surface, weights, hits)
+        hits = self._blend(rays, distances, weights, normals.view_as(points), radiance.view_as(points))
+        return March(distances, surface, hits)
 
     def _sample(self, rays: RayBatch, interval: Interval, volume: VolumeConfig) -> Float[Tensor, "N M"]:
         near, far = interval.near, interval.far
@@ -271,35 +273,31 @@ class VolSdfHost(nn.Module):
     def _blend(
         self,
         rays: RayBatch,
-        points: Float[Tensor, "N M 3"],
         distances: Float[Tensor, "N M"],
-        weights: Weights,
-        normals: Float[Tensor, "P 3"],
-        radiance: Float[Tensor, "P 3"],
+        intervals: Weights,
+        normals: Float[Tensor, "N M 3"],
+        radiance: Float[Tensor, "N M 3"],
     ) -> SurfaceHits:
-        color = composite(weights.weights, radiance.reshape(points.shape)) + self._beyond(rays, weights.transmittance)
-        surface_weights = weights.weights * self._on_object(points)
-        opacity = surface_weights.sum(-1)
+        weights, opacity = sample_weights(intervals.weights), intervals.opacity
         # A ray without weight ends at its last sample: a position that is finite and far from every surface.
         spare = 1e-6
-        depth = ((surface_weights * distances).sum(-1) + spare * distances[:, -1]) / (opacity + spare)
-        near_hit = (distances - depth[:, None]).abs() <= HIT_RADIUS
+        depth = ((weights * distances).sum(-1) + spare * distances[:, -1]) / (opacity + spare)
         return SurfaceHits(
-            color=color,
+            color=composite(weights, radiance) + self._beyond(rays, intervals.transmittance, radiance[:, -1]),
             position=rays.origins + depth[:, None] * rays.directions,
-            normal=safe_normalize(composite(surface_weights, normals.reshape(points.shape))),
+            normal=safe_normalize(composite(weights, normals)),
             opacity=opacity,
-            concentration=(surface_weights.detach() * near_hit).sum(-1),
+            concentration=share_near(distances, intervals.weights.detach(), depth.detach(), HIT_RADIUS),
         )
 
-    def _on_object(self, points: Float[Tensor, "N M 3"]) -> Bool[Tensor, "N M"] | float:
-        """The sphere that closes a scene without background is painted by R, but it is no surface of the object."""
-        if self.background_kind != "none":
-            return 1.0
-        return self._to_sphere(points.flatten(0, 1)).view(points.shape[:2]) > HIT_RADIUS
+    def _beyond(self, rays: RayBatch, transmittance: Float[Tensor, " N"], at_far: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """What still arrives from the scene sphere: from beyond it, or where there is no background from R on the sphere.
 
-    def _beyond(self, rays: RayBatch, transmittance: Float[Tensor, " N"]) -> Float[Tensor, "N 3"]:
-        """What still arrives from beyond the scene sphere."""
+        The published code makes the sphere a surface of the distance field that nothing passes; a ray that reaches it
+        shows R there, `at_far`. It is no surface of the object: opacity and hit leave it out.
+        """
+        if self.background_kind == "none":
+            return transmittance[:, None] * at_far
         if self.background is not None:
             return transmittance[:, None] * self.background(rays.origins, rays.directions)
         return transmittance[:, None] * self.background_color
@@ -307,15 +305,14 @@ class VolSdfHost(nn.Module):
     # ------------------------------------------------------------------------------------------------------- regularisers
 
     def _regularisers(self, march: March, batch: PixelBatch, names: Collection[str]) -> dict[str, LossTerm]:
-        settings = self.config.loss
         terms = {}
+        places = self._places(march) if {"eikonal", "surface", "hessian"} & set(names) else None
         if "eikonal" in names:
-            terms["eikonal"] = losses.eikonal(march.surface.gradient)
+            terms["eikonal"] = losses.eikonal(places.gradient)
         if "surface" in names:
-            terms["surface"] = losses.surface(march.surface.distance, settings.surface_epsilon)
+            terms["surface"] = losses.surface(places.distance, SURFACE_WIDTH[self.config.loss.points])
         if "hessian" in names:
-            hessian = self.sdf_field.hessian(self._near_surface(march.hits))
-            terms["hessian"] = losses.hessian(hessian)
+            terms["hessian"] = losses.hessian(self.sdf_field.hessian(places.curved))
         if "point_cloud" in names and self.point_position is not None:
             rows = torch.randint(len(self.point_position), (len(batch),), device=self.point_position.device)
             sample = self.sdf_field.with_gradient(self.point_position[rows])
@@ -325,10 +322,20 @@ class VolSdfHost(nn.Module):
         return terms
 
     def _depth_of_object(self, march: March) -> Float[Tensor, " N"]:
-        """The optical depth of what is sampled of the object. A mask moves surfaces, it makes no fog of them: β is given."""
-        density = laplace_density(march.surface.distance, self.density.beta().detach()).view_as(march.distances)
-        return optical_depth(density * self._on_object(march.points), march.distances)
+        """The optical depth of rays. A mask moves surfaces, it makes no fog of them: β is given."""
+        distance = march.surface.distance.view_as(march.distances)
+        return laplace_depth(distance, march.distances, self.density.beta().detach()).sum(-1)
 
-    def _near_surface(self, hits: SurfaceHits) -> Float[Tensor, "N 3"]:
-        """One point per ray, scattered about its hit: where second derivatives shape the surface."""
-        return hits.position.detach() + HIT_RADIUS * torch.randn_like(hits.position)
+    def _places(self, march: March) -> Places:
+        """Where the regularisers of G look (`loss.points`)."""
+        position = march.hits.position.detach()
+        if self.config.loss.points == "rays":
+            near_surface = position + HIT_RADIUS * torch.randn_like(position)
+            return Places(march.surface.gradient, march.surface.distance, near_surface)
+        about_object = torch.empty_like(position).repeat(POINTS_ABOUT_OBJECT, 1).uniform_(-1.0, 1.0)
+        anywhere = torch.empty_like(position).uniform_(-1.0, 1.0) * self.config.volume.radius
+        points = torch.cat((about_object, anywhere))
+        sample = self.sdf_field.with_gradient(points)
+        rays, count = march.distances.shape
+        one_of_ray = torch.arange(rays, device=points.device) * count + torch.randint(count, (rays,), device=points.device)
+        return Places(torch.cat((sample.gradient, march.surface.gradient[one_of_ray])), sample.distance, points)

@@ -149,7 +149,7 @@ class NeilfMethod(Model):
             self.neilf.freeze_for(position.stage)
             self.set_up_for = position.stage
         for optimizer in optimizers.optimizers.values():
-            set_rates(optimizer, self.rates, position.stage, position.step / position.length)
+            set_rates(optimizer, self.rates, position)
         seed_step(settings.seed, step)
 
     def _solve_light(self, step: int) -> None:

@@ -1,4 +1,4 @@
-"""The presets: the published settings, and one for a laptop. Each is written as what it changes."""
+"""The presets: the published settings (`docs/paper.md`), and one for a laptop. Each is written as what it changes."""
 
 from __future__ import annotations
 
@@ -7,14 +7,35 @@ from typing import Any
 
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.plain import changed
-from neilfpp_method.settings.types import MeshConfig, NeilfConfig
+from neilfpp_method.settings.types import FrequencyConfig, MeshConfig, NeilfConfig
 
 __all__ = ["PRESETS", "fixed_geometry", "free_light", "preset"]
 
+SINE_FREQUENCY = 30.0
+"""ω of the sine layers sin(ω (W x + b)) of B and L. In the published code ω is part of W and b, so that a step of Adam there
+is one of 1/ω here."""
+
+# Beside the settings' own defaults.
+PAPER_MLP: Mapping[str, Any] = {
+    "preset": "paper-mlp",
+    "light.monochrome": True,
+    "background.kind": "none",
+    "loss.points": "scene",
+    "loss.normal_gradient": 0.1,
+    "optimizer.brdf": 1e-3 / SINE_FREQUENCY,
+    "optimizer.light": 1e-3 / SINE_FREQUENCY,
+    "optimizer.joint": 0.3,
+    "optimizer.final": (0.1, 1.0, 0.1),
+    "optimizer.drops": (1, 0, 1),
+    "train.sdf_steps": 8_000,
+    "train.material_steps": 8_000,
+    "train.joint_steps": 80_000,
+}
+
 
 def paper_mlp() -> NeilfConfig:
-    """The paper's MLP setting: 80k steps, 24 h on a V100. The settings' own defaults."""
-    return NeilfConfig()
+    """The published MLP setting, for display images: 96k steps, 24 h on a V100. `docs/paper.md` has it line by line."""
+    return changed(NeilfConfig(), PAPER_MLP)
 
 
 # Beside paper-mlp: hash grids with small networks behind them, and the rates and the steps that suit them.
@@ -23,45 +44,76 @@ PAPER_NGP: Mapping[str, Any] = {
     "encoding.kind": "hash",
     "host.sdf.layers": 2,
     "host.sdf.width": 64,
-    "host.sdf.feature_width": 15,
+    "host.sdf.feature_width": 64,
     "radiance.width": 64,
     "brdf.layers": 2,
-    "brdf.width": 64,
+    "brdf.width": 120,
     "light.activation": "relu",
-    "light.direction_encoding": "spherical_harmonics",
     "loss.point_cloud": 0.1,
+    "loss.surface": 1e-2,
     "loss.position_gradient": 0.0,
-    "loss.normal_gradient": 0.1,
     "optimizer.geometry": 1e-2,
     "optimizer.radiance": 1e-2,
     "optimizer.brdf": 1e-2,
-    "optimizer.light": 1e-3,
-    "optimizer.background": 1e-3,
-    "optimizer.beta": 1e-3,
-    "train.sdf_steps": 15_000,
-    "train.material_steps": 7_500,
-    "train.joint_steps": 7_500,
+    "optimizer.light": 1e-2,
+    "optimizer.background": 1e-2,
+    "optimizer.beta": 1e-2,
+    "optimizer.joint": 0.1,
+    "optimizer.final": (0.1, 0.1, 0.01),
+    "optimizer.drops": (1, 1, 2),
+    "optimizer.warm_up": 100,
+    "train.sdf_steps": 5_000,
+    "train.material_steps": 5_000,
+    "train.joint_steps": 30_000,
 }
 
 
 def paper_ngp() -> NeilfConfig:
-    """The paper's hash-grid setting: 30k steps, 4 h on a V100; it asks for a point cloud in SDF init."""
+    """The published hash-grid setting, for display images: 40k steps, 4 h on a V100; it asks for a point cloud."""
     return changed(paper_mlp(), PAPER_NGP)
 
 
 # Beside paper-ngp.
+PAPER_NGP_HDR: Mapping[str, Any] = {
+    "preset": "paper-ngp-hdr",
+    "background.kind": "inverted_sphere",
+    "background.layers": 2,
+    "background.width": 64,
+    "loss.surface": 1e-3,
+    "loss.smoothness": 0.0,
+    "loss.lambertian": 0.0,
+    "loss.position_gradient": 0.1,
+    "optimizer.final": (0.1, 0.1, 1e-3),
+    "optimizer.drops": (1, 1, 3),
+    "train.joint_steps": 40_000,
+}
+
+
+def paper_ngp_hdr() -> NeilfConfig:
+    """The published hash-grid setting for photographs of linear radiance with a background: 50k steps."""
+    return changed(paper_ngp(), PAPER_NGP_HDR)
+
+
+# Beside the settings' own defaults.
 FAST: Mapping[str, Any] = {
     "preset": "fast",
+    "encoding.kind": "hash",
     "encoding.levels": 8,
     "encoding.log2_entries": 16,
     "encoding.sdf_log2_entries": 18,
     "encoding.max_resolution": 256,
     "host.sdf.layers": 1,
     "host.sdf.start": "silhouettes",
+    "host.sdf.width": 64,
+    "host.sdf.feature_width": 15,
+    "radiance.positions": "encoded",
     "radiance.direction": "mirrored",
     "radiance.layers": 2,
+    "radiance.width": 64,
     "brdf.initial_base_color": 0.3,
     "brdf.initial_metallic": 0.1,
+    "brdf.layers": 2,
+    "brdf.width": 64,
     "light": {
         "kind": "auto",
         "environment_height": 48,
@@ -91,15 +143,18 @@ FAST: Mapping[str, Any] = {
     "loss.hessian_joint": 1.6e-3,
     "loss.surface": 1e-2,
     "loss.surface_joint": 1e-3,
-    "loss.point_cloud": 0.0,
     "loss.mask": 0.1,
     "loss.smoothness": 0.0,
     "loss.lambertian": 0.0,
+    "loss.position_gradient": 0.0,
+    "loss.normal_gradient": 0.1,
     # The joint stage is short: geometry goes on at the rate that SDF init ended with, and is not stirred up again.
     "optimizer.geometry": 2e-2,
     "optimizer.radiance": 5e-3,
     "optimizer.brdf": 5e-3,
     "optimizer.light": 3e-2,
+    "optimizer.background": 1e-3,
+    "optimizer.beta": 1e-3,
     "optimizer.joint": 0.1,
     "optimizer.background_from": 0.5,
     "train.sdf_steps": 2_000,
@@ -114,10 +169,15 @@ def fast() -> NeilfConfig:
     """Minutes on the two cores of a laptop: the same method with small hash grids, few rays, and as much light as most
     scenes need: an environment map, what the scene reflects, and lamps close by where the images ask for them. `free_light`
     has the paper's light field for it."""
-    return changed(paper_ngp(), FAST)
+    return changed(NeilfConfig(), FAST)
 
 
-PRESETS: Mapping[str, Callable[[], NeilfConfig]] = {"fast": fast, "paper-mlp": paper_mlp, "paper-ngp": paper_ngp}
+PRESETS: Mapping[str, Callable[[], NeilfConfig]] = {
+    "fast": fast,
+    "paper-mlp": paper_mlp,
+    "paper-ngp": paper_ngp,
+    "paper-ngp-hdr": paper_ngp_hdr,
+}
 
 
 def preset(name: str) -> NeilfConfig:
@@ -137,7 +197,6 @@ FREE_LIGHT: Mapping[str, Any] = {
         "kind": "free",
         "layers": 4,
         "width": 64,
-        "direction_encoding": "spherical_harmonics",
     },
     "inter_reflection.mode": "soft",
     "optimizer.light": 5e-3,
@@ -165,7 +224,7 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
     mesh = {
         "preset": f"{config.preset}-mesh",
         "host": {"kind": MeshConfig().kind},
-        "radiance": {"layers": 8, "width": 128, "direction": "outgoing"},
+        "radiance": {"positions": "encoded", "layers": 8, "width": 128, "direction": "outgoing"},
         "volume.normal_radius": 0.0,
         "inter_reflection": {"radiance_gradient": 0.7, "offset": 2e-3},
         "loss.lambertian": 10.0 * config.loss.lambertian,
@@ -175,4 +234,39 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
     }
     if config.light.kind != "free":
         mesh["light.fit.every"] = 100
-    return changed(config, mesh)
+    given = changed(config, mesh)
+    return as_published_on_a_mesh(given) if config.preset.startswith("paper-") else given
+
+
+# Beside what a mesh changes in a preset of the paper: light in colour, three stages at one rate, more rays.
+PAPER_MESH: Mapping[str, Any] = {
+    "background.kind": "auto",
+    "loss.smoothness": 5e-4,
+    "loss.lambertian": 5e-3,
+    "loss.position_gradient": 0.0,
+    "loss.normal_gradient": 0.0,
+    "optimizer.geometry": 2e-3,
+    "optimizer.radiance": 2e-3,
+    "optimizer.brdf": 2e-3,
+    "optimizer.light": 2e-3,
+    "optimizer.background": 2e-3,
+    "optimizer.beta": 2e-3,
+    "optimizer.joint": 1.0,
+    "optimizer.final": (1.0, 1.0, 0.04),
+    "optimizer.drops": (0, 0, 2),
+    "optimizer.warm_up": 0,
+    "train.sdf_steps": 5_000,
+    "train.material_steps": 1_000,
+    "train.joint_steps": 30_000,
+    "train.rays": 8192,
+}
+
+
+def as_published_on_a_mesh(config: NeilfConfig) -> NeilfConfig:
+    """What the published run on given geometry sets in its own way."""
+    published = dict(PAPER_MESH)
+    if isinstance(config.encoding, FrequencyConfig):
+        published |= {name: 2e-3 / SINE_FREQUENCY for name in ("optimizer.brdf", "optimizer.light")}
+    if config.light.kind == "free":
+        published["light.monochrome"] = False
+    return changed(config, published)

@@ -27,7 +27,7 @@ class FrequencyConfig:
 
 @dataclass(frozen=True)
 class HashGridConfig:
-    """Positions by multiresolution hash grids, one for each of G, R and B (Müller et al. 2022)."""
+    """Positions by multiresolution hash grids, one for each of G, B and, where it has an encoding, R (Müller et al. 2022)."""
 
     kind: Literal["hash"] = "hash"
     """frequency or hash: how G, R and B see positions."""
@@ -62,6 +62,9 @@ class SdfConfig:
 class OutgoingRadianceConfig:
     """R: position, direction, normal and feature of G → linear RGB (METHOD §5)."""
 
+    positions: Literal["raw", "encoded"] = "raw"
+    """raw: R has no encoding of its own, and reads that of G by the feature. encoded: it has one of the kind that `encoding`
+    says, as it always has where there is no feature."""
     direction: Literal["outgoing", "mirrored"] = "outgoing"
     """Which direction is encoded: the outgoing one, as in the paper, or the one that it mirrors about the normal. What a shiny
     surface sends changes evenly with the latter, so its normals are found (Verbin et al. 2022, "Ref-NeRF")."""
@@ -130,8 +133,6 @@ class FreeLightConfig:
     scene. auto: a map, and lamps where points that were kept back from the fit ask for them."""
     activation: Literal["sine", "relu"] = "sine"
     """Hidden units; sine is SIREN's, with ω = 30."""
-    direction_encoding: Literal["frequency", "spherical_harmonics"] = "frequency"
-    """How directions are encoded: six octaves, or five bands."""
     layers: int = 8
     """Hidden layers; the position enters at the middle one."""
     width: int = 128
@@ -148,7 +149,7 @@ class BackgroundConfig:
     """What a ray sees beyond the scene."""
 
     kind: Literal["auto", "none", "constant", "inverted_sphere"] = "auto"
-    """none: the scene sphere is a surface that closes the scene (VolSDF). constant: one colour. inverted_sphere: a NeRF++
+    """none: R paints the scene sphere, which closes the scene. constant: one colour. inverted_sphere: a NeRF++
     field. auto: constant where one colour is all that the borders of the images show behind the scene, else inverted_sphere."""
     color: tuple[float, float, float] | None = None
     """Linear RGB of a constant background, and what an inverted_sphere starts as; none: read from the borders of the images."""
@@ -203,8 +204,8 @@ class VolumeConfig:
     """Most refinement rounds."""
     bisections: int = 10
     """Bisection steps on β."""
-    samples: int = 64
-    """Final samples per ray."""
+    samples: int = 98
+    """Samples per ray that are rendered: two thirds where it is stopped, the rest spread between, both ends among them."""
     normal_radius: float = 0.0
     """Surfaces are shaded with the normal of a neighbourhood of this radius, edges kept; 0: with that of the hit alone."""
 
@@ -237,8 +238,6 @@ class InterReflectionConfig:
 
     mode: Literal["off", "soft", "hard"] = "soft"
     """soft: the paper's loss. hard: a direction that meets the scene brings R from there; only the others ask the light."""
-    grid_resolution: int = 96
-    """Vertices along an edge of the grid that hard inter-reflection traces in a distance field."""
     rays_per_point: float = 1.0
     """Traced directions per surface point and step, in expectation."""
     radiance_gradient: float = 0.0
@@ -273,8 +272,10 @@ class LossConfig:
     lambertian: float = 5e-4
     mask: float = 0.0
     """Opacity against the object mask, where the capture has masks or shows exactly its background."""
-    surface_epsilon: float = 0.05
-    """Width of the smoothed delta of L_surf."""
+    points: Literal["scene", "rays"] = "rays"
+    """Where L_Eik, L_Hess and L_surf look. scene: at points all over the scene, more of them about the object, and L_Eik at
+    one sample of each ray as well; L_surf is so wide then that it hardly has a slope (published code). rays: at the samples
+    of the rays, and L_Hess about their hits."""
     position_gradient: float = 0.1
     """Scale of the gradient from the material into the hit position, joint stage."""
     normal_gradient: float = 1.0
@@ -283,18 +284,22 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """Adam, one learning rate per field; each falls exponentially to `final` of its start over a stage."""
+    """Adam, one learning rate per field, which falls in the course of each stage."""
 
-    geometry: float = 5e-4
-    radiance: float = 5e-4
-    brdf: float = 5e-4
-    light: float = 5e-4
-    background: float = 5e-4
-    beta: float = 5e-4
-    joint: float = 0.5
+    geometry: float = 1e-3
+    radiance: float = 1e-3
+    brdf: float = 1e-3
+    light: float = 1e-3
+    background: float = 1e-3
+    beta: float = 1e-3
+    joint: float = 1.0
     """Factor on all rates in the joint stage."""
-    final: float = 0.1
-    """Rate at the end of a stage over its start."""
+    final: tuple[float, float, float] = (0.1, 0.1, 0.1)
+    """Rate at the end of each of the three stages over its start."""
+    drops: tuple[int, int, int] = (0, 0, 0)
+    """In how many equal steps, evenly spaced, the rate falls in each stage; 0: exponentially all along."""
+    warm_up: int = 0
+    """Steps at the start of each stage in which the rate rises from a tenth."""
     background_from: float = 0.0
     """Share of SDF init that is over when the field beyond the scene starts to move. Until then it is the colour that it starts
     as, so that what lies within the scene is made of surfaces: a field that is seen from everywhere can paint it as well."""
@@ -326,7 +331,7 @@ class TrainConfig:
 class NeilfConfig:
     """Everything that decides a run, besides the capture."""
 
-    preset: str = "paper-mlp"
+    preset: str = "custom"
     """The preset that the settings started from; a label."""
     host: HostConfig = field(default_factory=VolSdfConfig)
     encoding: EncodingConfig = field(default_factory=FrequencyConfig)

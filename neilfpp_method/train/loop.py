@@ -17,7 +17,7 @@ from neilfpp_method.errors import Diverged, Stopped, UserError
 from neilfpp_method.health.watch import Watch
 from neilfpp_method.lighting.solver import LightSolver
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, stage_at, stage_steps, weigh
+from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, rate_factor, stage_at, stage_steps, weigh
 from neilfpp_method.settings.facts import RadianceUnits
 from neilfpp_method.settings.types import NeilfConfig, OptimizerConfig
 from neilfpp_method.structures import LossTerms, StepResult
@@ -93,7 +93,7 @@ def _train_stage(run: Training, model: NeilfModel, optimizer: torch.optim.Optimi
     for number in range(position.step, position.length):
         seed_step(settings.seed, step, run.fabric.global_rank)
         share = number / position.length
-        set_rates(optimizer, run.config.optimizer, stage, share)
+        set_rates(optimizer, run.config.optimizer, StagePosition(stage, number, position.length))
         batch = run.pixels.sample(settings.rays)
         computed = wrapped(batch, stage)
         total = weigh(computed.terms, active_losses(stage, run.config, model.stages, share))
@@ -190,10 +190,10 @@ def adam(groups: Sequence[Mapping[str, object]]) -> torch.optim.Adam:
     return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
 
-def set_rates(optimizer: torch.optim.Optimizer, config: OptimizerConfig, stage: Stage, share: float) -> None:
-    """The rate of each field when `share` of a stage is over."""
-    factor = (config.joint if stage is Stage.JOINT else 1.0) * config.final**share
-    waits = stage is Stage.SDF_INIT and share < config.background_from
+def set_rates(optimizer: torch.optim.Optimizer, config: OptimizerConfig, position: StagePosition) -> None:
+    """The rate of each field at a step of a stage."""
+    factor = rate_factor(config, position)
+    waits = position.stage is Stage.SDF_INIT and position.share < config.background_from
     for group in optimizer.param_groups:
         name = group["name"]
         group["lr"] = 0.0 if waits and name == "background" else getattr(config, name) * factor

@@ -1,4 +1,4 @@
-"""Adding up along a ray: emission and absorption with piecewise constant density (METHOD §3)."""
+"""Adding up along a ray: emission and absorption (METHOD §3)."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["Weights", "composite", "optical_depth", "render_weights"]
+__all__ = ["Weights", "composite", "depth_weights", "render_weights", "sample_weights", "share_near"]
 
 
 @dataclass(frozen=True)
 class Weights:
-    """How much each sample of a ray counts, what passes them all, and what they stop.
+    """How much each interval, or sample, of a ray counts, what passes them all, and what they stop.
 
     Σ weights = opacity = 1 − transmittance; the opacity is accurate also where it is tiny.
     """
@@ -23,11 +23,42 @@ class Weights:
     opacity: Float[Tensor, " N"]
 
 
-def render_weights(density: Float[Tensor, "N M"], distances: Float[Tensor, "N M"], far: Float[Tensor, " N"]) -> Weights:
-    """w_i = T_i (1 − exp(−σ_i δ_i)), T_i = exp(−Σ_{j<i} σ_j δ_j), δ_i = t_{i+1} − t_i (Max 1995).
+def depth_weights(depth: Float[Tensor, "N K"]) -> Weights:
+    """w_i = T_i (1 − exp(−τ_i)), T_i = exp(−Σ_{j<i} τ_j), for intervals of optical depth τ_i ≥ 0 (Max 1995).
 
     Optical depths are added before any exponential is taken, and 1 − exp is `expm1`: thin media keep their precision,
     opaque ones do not overflow. Half-precision inputs are added up in float32, and stay float32.
+    """
+    depth = depth.to(torch.promote_types(depth.dtype, torch.float32))
+    # Summed afresh from a leading 0, not as "inclusive minus own": that cancels behind an opaque interval.
+    depth_before = torch.nn.functional.pad(depth, (1, 0)).cumsum(dim=-1)
+    weights = torch.exp(-depth_before[:, :-1]) * -torch.expm1(-depth)
+    total = depth_before[:, -1]
+    return Weights(weights, torch.exp(-total), -torch.expm1(-total))
+
+
+def sample_weights(weights: Float[Tensor, "N K"]) -> Float[Tensor, "N K+1"]:
+    """The weights of the samples at the ends of intervals: half of each interval's goes to either end.
+
+    Example:
+        >>> sample_weights(torch.tensor([[0.5, 0.2]]))
+        tensor([[0.2500, 0.3500, 0.1000]])
+    """
+    return 0.5 * (torch.nn.functional.pad(weights, (1, 0)) + torch.nn.functional.pad(weights, (0, 1)))
+
+
+def share_near(
+    distances: Float[Tensor, "N M"], weights: Float[Tensor, "N M-1"], depth: Float[Tensor, " N"], radius: float
+) -> Float[Tensor, " N"]:
+    """The weight of intervals that lies within `radius` of a depth; an interval that reaches out of it counts by its part."""
+    start = torch.maximum(distances[:, :-1], depth[:, None] - radius)
+    end = torch.minimum(distances[:, 1:], depth[:, None] + radius)
+    width = distances.diff(dim=-1).clamp_min(torch.finfo(distances.dtype).tiny)
+    return (weights * ((end - start) / width).clamp(0.0, 1.0)).sum(-1)
+
+
+def render_weights(density: Float[Tensor, "N M"], distances: Float[Tensor, "N M"], far: Float[Tensor, " N"]) -> Weights:
+    """`depth_weights` of a density that is constant from one sample to the next: τ_i = σ_i δ_i, δ_i = t_{i+1} − t_i.
 
     Args:
         density: σ_i ≥ 0 between sample i and the next, 1 / scene unit.
@@ -36,17 +67,7 @@ def render_weights(density: Float[Tensor, "N M"], distances: Float[Tensor, "N M"
     """
     widths = torch.cat([distances, far[:, None]], dim=-1).diff(dim=-1)
     # Rounding in a sampler can swap neighbours by one unit in the last place; a negative width would emit.
-    depth = density.to(torch.promote_types(density.dtype, torch.float32)) * widths.clamp_min(0.0)
-    # Summed afresh from a leading 0, not as "inclusive minus own": that cancels behind an opaque interval.
-    depth_before = torch.nn.functional.pad(depth, (1, 0)).cumsum(dim=-1)
-    weights = torch.exp(-depth_before[:, :-1]) * -torch.expm1(-depth)
-    total = depth_before[:, -1]
-    return Weights(weights, torch.exp(-total), -torch.expm1(-total))
-
-
-def optical_depth(density: Float[Tensor, "N M"], distances: Float[Tensor, "N M"]) -> Float[Tensor, " N"]:
-    """τ = Σ σ_i δ_i from the first sample of a ray to the last."""
-    return (density[:, :-1] * distances.diff(dim=-1).clamp_min(0.0)).sum(-1)
+    return depth_weights(density.to(torch.promote_types(density.dtype, torch.float32)) * widths.clamp_min(0.0))
 
 
 def composite(weights: Float[Tensor, "N M"], values: Float[Tensor, "N M C"]) -> Float[Tensor, "N C"]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import OpenEXR
 import pytest
@@ -17,6 +18,7 @@ from neilfpp_method.data.lens import Lens
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.demo.command import demo_scene
 from neilfpp_method.errors import UserError
+from neilfpp_method.shading.color import tone_map
 from tests.data.make_capture import RADIUS, SCALE, make_capture, radiance, srgb
 from tests.data.skies import GROUND, make_sky_capture
 
@@ -116,8 +118,12 @@ def test_image_gradient_of_a_ramp_is_that_of_the_picture_whatever_its_exposure(t
     write_exr(root / "inputs" / "images" / "000.exr", {"RGB": np.repeat(linear[..., None], 3, axis=2)})
     capture = load_capture(root)
     gradient = PixelDataset(capture, [capture.views[0]]).view(0).image_gradient.reshape(HEIGHT, WIDTH)
-    assert np.allclose(gradient[1:-1, 1:-1], np.hypot(0.02, 0.01), rtol=0.02)  # the median is next to middle grey
-    assert np.allclose(gradient[1:-1, 0], np.hypot(0.01, 0.01), rtol=0.02)  # half a difference at the border
+    # The median is next to middle grey. Scharr's weights 3, 10, 3 and the two pixels between make 32 (published code).
+    assert np.allclose(gradient[1:-1, 1:-1], 32 * np.hypot(0.02, 0.01), rtol=0.02)
+    assert np.allclose(gradient[1:-1, 0], 32 * np.hypot(0.01, 0.01), rtol=0.02)  # half a difference at the border
+    shown = tone_map(torch.from_numpy(linear / np.median(linear) * 0.18)).numpy().astype(np.float32)
+    right, down = (cv2.Sobel(shown, cv2.CV_32F, *axis, ksize=cv2.FILTER_SCHARR) for axis in ((1, 0), (0, 1)))
+    assert np.allclose(gradient[1:-1, 1:-1], np.hypot(right, down)[1:-1, 1:-1], rtol=0.02)
 
 
 # ------------------------------------------------------------------------------------- invalid pixels, exposure, balance

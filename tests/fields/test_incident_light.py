@@ -7,9 +7,10 @@ import torch
 
 from neilfpp_method.fields.incident_light import IncidentLightField
 from neilfpp_method.settings.presets import free_light, preset
-from neilfpp_method.settings.types import FreeLightConfig
+from neilfpp_method.settings.types import FreeLightConfig, FrequencyConfig
 
-LIGHTS = {name: preset(name).light for name in ("paper-mlp", "paper-ngp")} | {"fast": free_light(preset("fast")).light}
+CONFIGS = {name: preset(name) for name in ("paper-mlp", "paper-ngp")} | {"fast": free_light(preset("fast"))}
+WAVES = FrequencyConfig()
 
 
 def rays(points: int = 5, directions: int = 7) -> tuple[torch.Tensor, torch.Tensor]:
@@ -21,7 +22,7 @@ def rays(points: int = 5, directions: int = 7) -> tuple[torch.Tensor, torch.Tens
 @pytest.mark.parametrize("base", [2.718281828, 10.0])
 def test_starts_near_the_initial_radiance(name, base):
     torch.manual_seed(0)
-    light = IncidentLightField(LIGHTS[name], base, initial_radiance=0.7).radiance(*rays(50, 20))
+    light = IncidentLightField(CONFIGS[name].light, CONFIGS[name].encoding, base, initial_radiance=0.7).radiance(*rays(50, 20))
     assert light.shape == (50, 20, 3)
     assert light.min() > 0
     assert light.mean().item() == pytest.approx(0.7, rel=0.25)
@@ -31,7 +32,7 @@ def test_starts_near_the_initial_radiance(name, base):
 def test_position_and_direction_enter_where_the_paper_says():
     """The network, written again as one chain of layers over concatenated inputs."""
     torch.manual_seed(0)
-    field = IncidentLightField(FreeLightConfig(layers=6, width=16), base=10.0, initial_radiance=2.0).double()
+    field = IncidentLightField(FreeLightConfig(layers=6, width=16), WAVES, base=10.0, initial_radiance=2.0).double()
     x, wi = (t.double() for t in rays())
     direction = field.direction(wi)
     hidden = direction
@@ -50,7 +51,7 @@ def test_position_and_direction_enter_where_the_paper_says():
 
 def test_directions_can_be_shared_between_points():
     """The half of the network that sees the direction alone then runs once a direction, not once a pair."""
-    field = IncidentLightField(free_light(preset("fast")).light, 10.0, 1.0)
+    field = IncidentLightField(CONFIGS["fast"].light, CONFIGS["fast"].encoding, 10.0, 1.0)
     x, wi = rays()
     every = wi[:1].expand_as(wi)
     seen = []
@@ -60,14 +61,14 @@ def test_directions_can_be_shared_between_points():
 
 
 def test_monochrome_light_is_grey():
-    light = IncidentLightField(FreeLightConfig(monochrome=True), 2.718281828, 1.0).radiance(*rays())
+    light = IncidentLightField(FreeLightConfig(monochrome=True), WAVES, 2.718281828, 1.0).radiance(*rays())
     assert light.shape == (5, 7, 3)
     assert (light == light[..., :1]).all()
 
 
 @pytest.mark.parametrize("output", [-1e4, 1e4])
 def test_an_output_beyond_the_limit_stays_finite_and_can_return(output):
-    field = IncidentLightField(free_light(preset("fast")).light, 10.0, 1.0)
+    field = IncidentLightField(CONFIGS["fast"].light, CONFIGS["fast"].encoding, 10.0, 1.0)
     with torch.no_grad():
         field.tail.layers[-1].bias.fill_(output)
     light = field.radiance(*rays())

@@ -37,7 +37,8 @@ def test_depends_on_all_that_it_is_given(name):
     config = preset(name)
     field = OutgoingRadianceField(config.radiance, config.encoding, 15, 3.0, 1.0)
     with torch.no_grad():
-        field.position.table.normal_()
+        for table in field.position.parameters():
+            table.normal_()
     given = [t.requires_grad_() for t in inputs(15)]
     for gradient in torch.autograd.grad(field(*given).sum(), given):
         assert (gradient.abs().amax(1) > 0).all()

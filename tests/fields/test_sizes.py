@@ -47,15 +47,17 @@ def test_brdf_of_the_mlp_setting():
 @pytest.mark.parametrize(("name", "direction"), [("paper-mlp", WAVES_6), ("paper-ngp", 25)])
 def test_incident_light_of_both_settings(name, direction):
     middle = linear(128 + direction + 3, 128)
-    expected = linear(direction, 128) + 3 * linear(128, 128) + middle + 3 * linear(128, 128) + linear(128, 3)
-    assert count(IncidentLightField(preset(name).light, 10.0, 1.0)) == expected
+    expected = linear(direction, 128) + 3 * linear(128, 128) + middle + 3 * linear(128, 128) + linear(128, 1)  # one channel
+    assert count(IncidentLightField(preset(name).light, preset(name).encoding, 10.0, 1.0)) == expected
 
 
 def test_grids_of_the_ngp_setting():
     config = preset("paper-ngp")
-    sdf = linear(GRID, 64) + linear(64, 64) + linear(64, 1 + 15)
-    radiance = linear(GRID + 16 + 3 + 15, 64) + 3 * linear(64, 64) + linear(64, 3)
-    brdf = linear(GRID, 64) + linear(64, 64) + linear(64, 5)
+    sdf = linear(GRID, 64) + linear(64, 64) + linear(64, 1 + 64)
+    radiance = linear(3 + 16 + 3 + 64, 64) + 3 * linear(64, 64) + linear(64, 3)  # no grid of its own
+    brdf = linear(GRID, 120) + linear(120, 120) + linear(120, 5)
+    three_heads = 3 * (linear(GRID, 64) + linear(64, 64)) + linear(64, 5)
+    assert abs(brdf / three_heads - 1) < 0.02  # as many weights as in the published code
     assert count(SdfField(config.host.sdf, config.encoding, 3.0)) == TABLE + sdf
-    assert count(OutgoingRadianceField(config.radiance, config.encoding, 15, 3.0, 1.0)) == TABLE + radiance
+    assert count(OutgoingRadianceField(config.radiance, config.encoding, 64, 3.0, 1.0)) == radiance
     assert count(BrdfField(config.brdf, config.encoding, 3.0)) == TABLE + brdf

@@ -35,7 +35,7 @@ def assert_bounded(*tensors: torch.Tensor, bound: float = 1e9) -> None:
         assert tensor.abs().max() < bound
 
 
-LIGHTS = {"fast": free_light(preset("fast")).light, "paper-mlp": preset("paper-mlp").light}
+LIT = {"fast": free_light(preset("fast")), "paper-mlp": preset("paper-mlp")}
 
 
 def gradients(loss: torch.Tensor, module: torch.nn.Module, *inputs: torch.Tensor) -> list[torch.Tensor]:
@@ -91,7 +91,7 @@ def test_outgoing_radiance(name, dtype):
 @pytest.mark.parametrize("name", ["fast", "paper-mlp"])
 def test_incident_light(name, dtype):
     torch.manual_seed(0)
-    field = IncidentLightField(LIGHTS[name], 10.0, 1.0).to(dtype)
+    field = IncidentLightField(LIT[name].light, LIT[name].encoding, 10.0, 1.0).to(dtype)
     x = POSITIONS[:6].to(dtype).requires_grad_()
     light = field.radiance(x, torch.eye(3, dtype=dtype).expand(6, 3, 3))
     assert light.min() > 0
@@ -115,4 +115,5 @@ def test_no_points_are_no_trouble():
     for encoding in ("fast", "paper-mlp"):
         sample = SdfField(preset(encoding).host.sdf, preset(encoding).encoding, 1.75).with_gradient(none)
         assert sample.gradient.shape == (0, 3)
-    assert IncidentLightField(LIGHTS["fast"], 10.0, 1.0).radiance(none, torch.zeros(0, 4, 3)).shape == (0, 4, 3)
+    light = IncidentLightField(LIT["fast"].light, LIT["fast"].encoding, 10.0, 1.0)
+    assert light.radiance(none, torch.zeros(0, 4, 3)).shape == (0, 4, 3)

@@ -6,11 +6,15 @@ import dataclasses
 
 import pytest
 import torch
+from torch import Tensor
 from torch.nn.functional import normalize
 
+from neilfpp_method.fields.sdf import SdfSample
 from neilfpp_method.hosts.base import HasParameterGroups, HasSurfaceWidth, Host, Regularised
 from neilfpp_method.hosts.volsdf import VolSdfHost
+from neilfpp_method.settings.presets import preset
 from neilfpp_method.structures import OrientedPoints, RayBatch
+from neilfpp_method.volume.density import laplace_density
 from tests.scenes import sphere_batch, sphere_model, tiny_config
 
 RADIUS = 0.6
@@ -58,20 +62,77 @@ def test_a_miss_is_no_hit_and_shows_the_background(sharp):
     assert hits.position.isfinite().all()
 
 
-def test_without_a_background_the_sphere_of_the_scene_closes_it():
-    host = sphere_model(background="none").eval().host
-    hits = host.render(sphere_batch(spread=4.0).rays)
-    beyond = hits.position.norm(dim=-1) > 1.0
-    assert beyond.any()
-    assert not hits.is_hit(0.8)[beyond].any()  # painted by R, but no surface of the object
-    x = torch.tensor([[1.7, 0.0, 0.0], [0.0, 0.0, 0.9]])
-    torch.testing.assert_close(host.sdf(x), torch.tensor([1.75 - 1.7, 0.9 - RADIUS]), atol=0.1, rtol=0.0)
+@pytest.mark.parametrize("skip_empty", [False, True])
+def test_without_a_background_the_sphere_of_the_scene_closes_it(skip_empty):
+    config = tiny_config()
+    config = dataclasses.replace(config, volume=dataclasses.replace(config.volume, skip_empty=skip_empty))
+    host = sphere_model(config, background="none").train().host
+    host.radiance_field.forward = lambda x, wo, normal, feature: x.norm(dim=-1, keepdim=True).expand(-1, 3)  # how far out
+    rays = RayBatch(torch.tensor([[0.0, 1.2, -1.0], [0.0, 0.0, -3.0]]), torch.tensor([[0.0, 0.0, 1.0]] * 2))
+    past, onto = host.render(rays).color[:, 0]
+    assert past.item() == pytest.approx(config.volume.radius, abs=1e-3)
+    assert onto.item() == pytest.approx(RADIUS, abs=0.1)
+    assert host.render(rays).opacity[0] < 1e-3  # painted by R, but no surface of the object
+
+
+# ------------------------------------------------------------------------------------------------------- silhouettes
+
+
+def true_opacity(gap: Tensor, beta: float) -> Tensor:
+    """Opacity of rays that pass the middle of the sphere at a distance `gap`: the density summed over 40,000 steps, float64."""
+    along = torch.linspace(-1.7, 1.7, 40_001, dtype=torch.float64)
+    distance = (gap.double()[:, None].square() + along.square()).sqrt() - RADIUS
+    density = laplace_density(distance, torch.tensor(beta, dtype=torch.float64))
+    return -torch.expm1(-density.sum(-1) * (along[1] - along[0]))
+
+
+@pytest.mark.parametrize(
+    ("name", "beta", "error"),
+    [("fast", 0.003, 0.02), ("fast", 0.03, 0.004), ("paper-mlp", 0.003, 0.002), ("paper-mlp", 0.03, 0.002)],
+)
+@pytest.mark.parametrize("training", [True, False])
+def test_the_opacity_of_rays_that_graze_a_sphere_is_true(name, beta, error, training):
+    """What is rendered, not what the sampler knows: rays that a thin layer covers in part, of a sphere that is exact."""
+    volume = dataclasses.replace(preset(name).volume, beta_init=beta)
+    host = sphere_model(tiny_config(volume=volume)).train(training).host
+    exact = lambda x: x.norm(dim=-1) - RADIUS  # noqa: E731
+    host.sdf_field.forward = exact
+    host.sdf_field.with_gradient = lambda x: SdfSample(exact(x), normalize(x, dim=-1), torch.zeros(len(x), 4))
+    gap = RADIUS + beta * torch.linspace(-2.0, 7.0, 64)
+    origins = torch.stack([gap, torch.zeros(64), torch.full((64,), -2.5)], dim=-1)
+    hits = host.render(RayBatch(origins, torch.tensor([[0.0, 0.0, 1.0]]).expand(64, 3)))
+    expected = true_opacity(gap, beta)
+    partly = (expected > 0.05) & (expected < 0.95)
+    assert partly.sum() > 20
+    off = hits.opacity[partly] - expected[partly]
+    assert off.square().mean().sqrt() < error
+    depth = hits.position[partly, 2]
+    assert depth.abs().max() < 3.0 * (2.0 * RADIUS * beta) ** 0.5  # as far as the layer reaches along such a ray
 
 
 def test_only_the_named_losses_are_computed(sharp):
     batch = sphere_batch(8)
     assert set(sharp.render_regularised(batch, ["eikonal", "surface"]).terms) == {"eikonal", "surface"}
     assert sharp.render_regularised(batch, []).terms == {}
+
+
+def test_regularisers_look_all_over_the_scene():
+    """On G = c · x the losses are known at any place, so what is averaged, and how often, shows where they look."""
+    config = tiny_config()
+    config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, points="scene"))
+    host, batch, asked = sphere_model(config).train().host, sphere_batch(16), []
+    slope = torch.tensor([0.0, 0.0, 2.0])
+    host.sdf_field.with_gradient = lambda x: asked.append(x) or SdfSample(x @ slope, slope.expand_as(x), torch.zeros(len(x), 4))
+    host.sdf_field.hessian = lambda x: asked.append(x) or torch.zeros(len(x), 3, 3)
+    terms = host.render_regularised(batch, ["eikonal", "surface", "hessian"]).terms
+    _, points, curved = asked
+    assert points is curved
+    assert points.shape == (3 * 16, 3)  # 8192 about the object and 4096 in the scene for 4096 rays
+    assert points[:32].abs().max() <= 1.0
+    assert 1.0 < points[32:].abs().max() <= config.volume.radius
+    assert terms["eikonal"].values.shape == (4 * 16,)  # one sample of each ray as well
+    assert terms["eikonal"].mean().item() == pytest.approx(1.0)
+    torch.testing.assert_close(terms["surface"].values, 10.0 / (torch.pi * (100.0 + (points @ slope) ** 2)))
 
 
 @pytest.mark.parametrize("background", ["constant", "none"])

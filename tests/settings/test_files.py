@@ -53,7 +53,10 @@ def test_without_a_preset_a_file_changes_the_usual_one(tmp_path):
     assert free == changed(free_light(preset("fast")), {"light.width": 32})
 
 
-@pytest.mark.parametrize("config", [preset("paper-mlp"), fixed_geometry(preset("fast")), free_light(preset("fast"))])
+ROUND_TRIPS = [NeilfConfig(), preset("paper-mlp"), fixed_geometry(preset("fast")), free_light(preset("fast"))]
+
+
+@pytest.mark.parametrize("config", ROUND_TRIPS)
 def test_the_file_of_a_run_folder_gives_its_settings(tmp_path, config):
     path = written(tmp_path, json.dumps({"format": 2, "config": to_dict(config)}), "config.json")
     assert settings_of("--config", str(path)) == config

@@ -37,7 +37,7 @@ def solved_light(config: NeilfConfig) -> NeilfConfig:
     return dataclasses.replace(
         config,
         light=dataclasses.replace(fast.light, environment_height=4, fit=fit),
-        inter_reflection=dataclasses.replace(fast.inter_reflection, grid_resolution=24),
+        inter_reflection=fast.inter_reflection,
     )
 
 

@@ -11,7 +11,7 @@ import torch
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.model import CLEAR_OPACITY
-from neilfpp_method.schedule import Stage
+from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import OptimizerConfig
 from neilfpp_method.train.build import scene_facts
@@ -44,7 +44,7 @@ def test_it_waits_until_there_are_surfaces(stage, share, moves):
     model = sphere_model(background="inverted_sphere")
     config = OptimizerConfig(background_from=0.4)
     optimizer = make_optimizer(model, config)
-    set_rates(optimizer, config, stage, share)
+    set_rates(optimizer, config, StagePosition(stage, step=round(100 * share), length=100))
     rates = {group["name"]: group["lr"] for group in optimizer.param_groups}
     assert (rates.pop("background") > 0) == moves
     assert all(rate > 0 for rate in rates.values())

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from neilfpp_method.volume.compositing import composite, optical_depth, render_weights
+from neilfpp_method.volume.compositing import composite, depth_weights, render_weights, sample_weights, share_near
 
 
 def product_formula(density, distances, far):
@@ -52,12 +52,19 @@ def test_a_homogeneous_slab_is_beer_lambert_however_it_is_cut(sigma):
     assert found.transmittance.item() == pytest.approx(math.exp(-sigma * length), rel=1e-6)
 
 
-def test_optical_depth_is_that_of_a_slab_and_ends_at_the_last_sample():
-    cuts = torch.tensor([[1.0, 1.01, 1.5, 1.5, 2.2]])
-    assert optical_depth(torch.full((1, 5), 300.0), cuts).item() == pytest.approx(300.0 * 1.2, rel=1e-6)
-    density, distances = map(torch.from_numpy, rays()[:2])
-    opacity = render_weights(density, distances, distances[:, -1]).opacity
-    torch.testing.assert_close(-torch.expm1(-optical_depth(density, distances)), opacity)
+def test_half_of_an_interval_counts_at_either_end():
+    intervals = depth_weights(torch.tensor([[math.log(2.0), math.log(4.0)]]))  # let through one half, then one quarter
+    torch.testing.assert_close(intervals.weights, torch.tensor([[0.5, 0.5 * 0.75]]))
+    at_samples = sample_weights(intervals.weights)
+    torch.testing.assert_close(at_samples, torch.tensor([[0.25, 0.25 + 0.1875, 0.1875]]))
+    torch.testing.assert_close(at_samples.sum(-1), intervals.opacity)
+
+
+def test_the_share_near_a_depth_takes_parts_of_intervals():
+    distances, weights = torch.tensor([[0.0, 1.0, 3.0, 3.0, 4.0]]), torch.tensor([[0.1, 0.4, 0.0, 0.3]])
+    near = share_near(distances, weights, torch.tensor([2.0]), 1.5)  # from 0.5 to 3.5
+    assert near.item() == pytest.approx(0.5 * 0.1 + 0.4 + 0.5 * 0.3)
+    assert share_near(distances, weights, torch.tensor([9.0]), 1.5).item() == 0.0
 
 
 def test_an_opaque_sample_hides_what_is_behind_it():

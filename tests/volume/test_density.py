@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import quad
 from scipy.stats import laplace
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.volume.density import LaplaceDensity, laplace_density
+from neilfpp_method.volume.density import LaplaceDensity, laplace_density, laplace_depth
 
 
 @pytest.mark.parametrize("beta", [0.5, 0.1, 0.003])
@@ -36,10 +37,41 @@ def test_slope_on_the_surface_is_that_of_the_laplace_density():
     assert sdf.grad.item() == pytest.approx(-1.0 / (2 * 0.1**2))  # −α · 1/(2β)
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize(
+    "ends", [(0.5, 0.2), (0.3, -0.4), (-0.1, -2.0), (0.01, 0.0102), (-1e-4, 1e-4), (0.0, 0.0), (-3.0, 40.0)]
+)
+def test_depth_is_the_integral_of_the_density_of_a_linear_distance(ends, dtype):
+    beta, width = 0.1, 0.7
+    inner = 0.5 if ends[0] == ends[1] else np.clip(ends[0] / (ends[0] - ends[1]), 0.0, 1.0)  # the kink of the density
+    slope = ends[1] - ends[0]
+    expected, _ = quad(
+        lambda t: laplace.cdf(-(ends[0] + slope * t), scale=beta) / beta, 0.0, 1.0, points=[inner], epsabs=0.0, epsrel=1e-10
+    )
+    found = laplace_depth(
+        torch.tensor([ends], dtype=dtype), torch.tensor([[2.0, 2.0 + width]], dtype=dtype), torch.tensor(beta)
+    )
+    assert found.item() == pytest.approx(width * expected, rel=1e-6 if dtype is torch.float64 else 2e-5)
+
+
+def test_depth_does_not_depend_on_the_cuts_of_a_linear_distance():
+    cuts = torch.tensor([0.0, 0.1, 0.1, 0.33, 0.34, 0.9, 1.0], dtype=torch.float64)
+    through = laplace_depth(0.4 - cuts, cuts, torch.tensor(0.05, dtype=torch.float64)).sum()
+    ends = cuts[[0, -1]]
+    torch.testing.assert_close(through, laplace_depth(0.4 - ends, ends, torch.tensor(0.05, dtype=torch.float64))[0])
+
+
+def test_depth_has_gradients_also_along_a_surface():
+    sdf = torch.tensor([[0.3, 0.3, -0.2, -0.21, -0.21, 0.05]], dtype=torch.float64, requires_grad=True)
+    cuts = torch.tensor([[0.0, 0.2, 0.5, 0.7, 1.0, 1.4]], dtype=torch.float64)
+    beta = torch.tensor(0.2, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda s, b: laplace_depth(s, cuts, b), (sdf, beta))
+
+
 def test_beta_starts_where_told_and_stays_above_its_floor():
     density = LaplaceDensity(beta_init=0.1, beta_floor=1e-4)
     assert density.beta().item() == pytest.approx(0.1)
-    assert density(torch.zeros(1)).item() == pytest.approx(0.5 / 0.1)
+    assert density(torch.zeros(1, 2), torch.tensor([[1.0, 3.0]])).item() == pytest.approx(2.0 * 0.5 / 0.1)
     with torch.no_grad():
         density.above_floor.fill_(-0.2)
     assert density.beta().item() == pytest.approx(0.2 + 1e-4)

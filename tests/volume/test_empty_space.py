@@ -13,7 +13,8 @@ from torch.nn.functional import normalize
 from neilfpp_method.settings.types import VolumeConfig
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume import empty_space
-from neilfpp_method.volume.density import laplace_density
+from neilfpp_method.volume.compositing import depth_weights
+from neilfpp_method.volume.density import laplace_density, laplace_depth
 from neilfpp_method.volume.distance_grid import cell_size
 from neilfpp_method.volume.empty_space import EmptySpace
 from neilfpp_method.volume.intersect import sphere_interval
@@ -115,7 +116,7 @@ def test_a_ray_that_meets_nothing_keeps_its_interval():
 
 @pytest.mark.parametrize("sdf", [sphere, plate(0.3 * CELL)], ids=["sphere", "foil"])
 def test_fewer_queries_find_the_same_surface(sdf):
-    """The median of the samples against that of the true weights, from the part and from the whole ray."""
+    """The rendered median depth against that of the true weights, from the part and from the whole ray."""
     rays, beta = bundle(), 0.01
     whole, part = narrowed(sdf, rays, beta)
     place, weight = true_weights(sdf, rays, beta, whole)
@@ -128,7 +129,14 @@ def test_fewer_queries_find_the_same_surface(sdf):
         found = error_bounded_samples(
             sdf, rays.origins, rays.directions, interval.near, interval.far, torch.tensor(beta), config, False
         )
-        return (found.distances[opaque].quantile(0.5, dim=-1) - truth).abs(), found.sdf_queries
+        t = found.distances
+        points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
+        depth = laplace_depth(sdf(points.reshape(-1, 3)).view_as(t), t, torch.tensor(beta))
+        reached = torch.nn.functional.pad(depth_weights(depth).weights, (1, 0)).cumsum(-1)
+        first = torch.searchsorted(reached, torch.full_like(t[:, :1], 0.5)).clamp(1, t.shape[1] - 1)
+        low, high = reached.gather(-1, first - 1), reached.gather(-1, first)
+        median = torch.lerp(t.gather(-1, first - 1), t.gather(-1, first), (0.5 - low) / (high - low).clamp_min(1e-9))
+        return (median[opaque, 0] - truth).abs(), found.sdf_queries
 
     (exact, more), (narrow, fewer) = run(whole), run(part)
     assert exact.max() < 0.5 * beta

@@ -14,7 +14,14 @@ from neilfpp_method.settings.types import VolumeConfig
 from neilfpp_method.volume import samplers
 from neilfpp_method.volume.compositing import render_weights
 from neilfpp_method.volume.density import laplace_density
-from neilfpp_method.volume.samplers import OPACITY_ERROR, cut, error_bounded_samples, inverse_cdf_samples, uniform_samples
+from neilfpp_method.volume.samplers import (
+    OPACITY_ERROR,
+    SPREAD,
+    cut,
+    error_bounded_samples,
+    inverse_cdf_samples,
+    uniform_samples,
+)
 
 F64 = torch.float64
 CONFIG = VolumeConfig()
@@ -52,14 +59,14 @@ def sample(sdf, rays, beta, config=CONFIG, stochastic=False):
 # ------------------------------------------------------------------------------------------------------ simple samplers
 
 
-def test_uniform_samples_are_the_middles_of_equal_parts():
-    samples = uniform_samples(torch.tensor([0.0, 1.0]), torch.tensor([4.0, 1.0]), 4, False)
-    assert samples.tolist() == [[0.5, 1.5, 2.5, 3.5], [1.0, 1.0, 1.0, 1.0]]
+def test_uniform_samples_are_both_ends_and_the_middles_of_equal_parts():
+    samples = uniform_samples(torch.tensor([0.0, 1.0]), torch.tensor([4.0, 1.0]), 6, False)
+    assert samples.tolist() == [[0.0, 0.5, 1.5, 2.5, 3.5, 4.0], [1.0] * 6]
 
 
 def test_uniform_samples_at_random_fall_evenly_one_in_each_part():
     torch.manual_seed(0)
-    samples = uniform_samples(torch.full((4000,), 2.0), torch.full((4000,), 6.0), 4, True)
+    samples = uniform_samples(torch.full((4000,), 2.0), torch.full((4000,), 6.0), 6, True)[:, 1:-1]
     assert (samples.floor() == torch.tensor([2.0, 3.0, 4.0, 5.0])).all()
     assert kstest((samples - samples.floor()).flatten().numpy(), "uniform").pvalue > 1e-3
 
@@ -238,8 +245,13 @@ def test_samples_follow_the_true_opacity():
     t = found.distances[0].numpy()
     # The antiderivative of Ψ(t − 1)/β: ½ e^{(t−1)/β} before the plane, ½ e^{−(t−1)/β} + (t − 1)/β behind it.
     depth = np.where(t < 1, 0.5 * np.exp((t - 1) / beta), 0.5 * np.exp(-(t - 1) / beta) + (t - 1) / beta)
-    share = (np.arange(512) + 0.5) / 512
-    assert np.abs(share + np.expm1(-(depth - 0.5 * math.exp(-1 / beta)))).max() <= found.error_bound.item()
+    opacity = -np.expm1(-(depth - 0.5 * math.exp(-1 / beta)))
+    share = (np.arange(510) + 0.5) / 510
+    # The spread third follows the cuts, which lie nearly evenly here; two ends beside.
+    spread = (t[1:-1] / 4.0 - opacity[1:-1]) * SPREAD
+    assert np.abs(share - opacity[1:-1] - spread).max() <= found.error_bound.item()
+    assert t[0] == 0.0
+    assert t[-1] == 4.0
 
 
 def test_queries_are_counted_and_asked_only_once():

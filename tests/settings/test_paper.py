@@ -1,0 +1,94 @@
+"""docs/paper.md against the presets: the tables are read, so neither can change without the other."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from neilfpp_method.settings.presets import fixed_geometry, preset
+from neilfpp_method.settings.types import NeilfConfig
+
+PAGE = Path(__file__).parents[2] / "docs" / "paper.md"
+BASED_ON = {"paper-ngp": "paper-mlp", "paper-ngp-hdr": "paper-ngp", "paper-mlp-mesh": "paper-mlp"}
+PRESETS = ("paper-mlp", *BASED_ON)
+ROOMS = ("radiance", "brdf", "volume", "shading", "inter_reflection", "loss", "optimizer")
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """A line of a table: what the code has (none: nothing to compare with), what we have, and why."""
+
+    published: object
+    ours: object
+    why: str
+
+
+def value(cell: str) -> object:
+    """The literal of a cell; none of them is a string that says n/a."""
+    return None if cell == "n/a" else ast.literal_eval(re.fullmatch(r"`(.+)`", cell)[1])
+
+
+def table(name: str) -> Mapping[str, Row]:
+    """The rows under the heading of a preset, by setting, on top of those of the preset that it is based on."""
+    section = PAGE.read_text(encoding="utf-8").split(f"## `{name}`\n")[1].split("\n## ")[0]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in section.splitlines() if line.startswith("| `")]
+    assert rows
+    assert len({row[0] for row in rows}) == len(rows)
+    found = {path.strip("`"): Row(value(code), value(ours), why) for path, _, code, ours, why in rows}
+    return {**(table(BASED_ON[name]) if name in BASED_ON else {}), **found}
+
+
+def settings(name: str) -> NeilfConfig:
+    return fixed_geometry(preset("paper-mlp")) if name == "paper-mlp-mesh" else preset(name)
+
+
+def rows_of(name: str) -> Mapping[str, Row]:
+    """Those of settings that the preset has: G has none on a mesh."""
+    given = name.endswith("-mesh")
+    return {path: row for path, row in table(name).items() if not (given and path.startswith("host.sdf."))}
+
+
+def setting(config: NeilfConfig, path: str) -> object:
+    found: object = config
+    for part in path.split("."):
+        found = getattr(found, part)
+    return found
+
+
+def equal(one: object, other: object) -> bool:
+    return one == (pytest.approx(other, rel=1e-4) if isinstance(other, float | tuple) else other)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_the_preset_is_what_the_table_says(name):
+    config = settings(name)
+    wrong = {path: setting(config, path) for path, row in rows_of(name).items() if not equal(setting(config, path), row.ours)}
+    assert not wrong
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_difference_from_the_published_code_has_its_reason(name):
+    unexplained = [path for path, row in table(name).items() if not equal(row.published, row.ours) and len(row.why) < 9]
+    assert not unexplained
+
+
+def test_no_setting_of_what_is_computed_is_left_out():
+    config = preset("paper-mlp")
+    expected = {f"{room}.{leaf.name}" for room in ROOMS for leaf in dataclasses.fields(getattr(config, room))}
+    assert expected <= set(table("paper-mlp"))
+
+
+def test_a_table_that_says_something_else_is_noticed(monkeypatch, tmp_path):
+    page = tmp_path / "paper.md"
+    row = "| `loss.eikonal` | 0.1 | `0.1` | `0.1` |"
+    text = PAGE.read_text(encoding="utf-8")
+    assert row in text
+    page.write_text(text.replace(row, "| `loss.eikonal` | 0.1 | `0.1` | `0.2` |"), encoding="utf-8")
+    monkeypatch.setattr("tests.settings.test_paper.PAGE", page)
+    with pytest.raises(AssertionError):
+        test_the_preset_is_what_the_table_says("paper-mlp")
