@@ -31,7 +31,7 @@ def test_relative_errors_count_beside_the_brightness_of_their_pixel():
     # The weights are 1 / (0 / 2 + 0.3) and 1 / (4 / 2 + 0.3); the mean is over six channels.
     dark, bright = 1 / 0.3, 1 / 2.3
     assert term.weights[:, 0].tolist() == pytest.approx([dark, bright])
-    assert term.mean().item() == pytest.approx((3 * 0.1 * dark + 2.0 * bright) / (3 * dark + 3 * bright))
+    assert term.mean().item() == pytest.approx((3 * 0.1 * dark + 2.0 * bright) / 6)
 
 
 def test_relative_errors_that_are_in_proportion_to_bright_pixels_count_alike():
