@@ -227,7 +227,7 @@ class VolSdfHost(nn.Module):
         span = self._pictured[1].may_show(self.sdf, rays, interval, self.surface_width())
         nothing = torch.zeros_like(interval.far)
         missed = SurfaceHits(
-            color=self._beyond(rays, torch.ones_like(nothing)),
+            color=self._beyond(rays, torch.ones_like(nothing), at_far=torch.zeros_like(rays.origins)),
             position=rays.origins + interval.far[:, None] * rays.directions,
             normal=torch.zeros_like(rays.origins),
             opacity=nothing,
