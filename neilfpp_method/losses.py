@@ -25,45 +25,17 @@ __all__ = [
     "surface",
 ]
 
-RELATIVE_FLOOR = 0.3
-"""Share of the unit that is added to a pixel's brightness where errors are relative to it: what is darker than that counts
-by its error alone, and noise in the dark does not come to weigh without bound."""
 
-
-def photometric(
-    radiance: Float[Tensor, "N 3"],
-    pixel: Float[Tensor, "N 3"],
-    response: str,
-    unit: float = 1.0,
-    relative: bool = False,
-) -> LossTerm:
+def photometric(radiance: Float[Tensor, "N 3"], pixel: Float[Tensor, "N 3"], response: str, unit: float = 1.0) -> LossTerm:
     """L_vol and L_phys: L1 between a render and the pixel.
-
-    Without `relative` all pixels count alike. With it a pixel of brightness p, the mean of its channels, has the weight
-    1 / (p / unit + `RELATIVE_FLOOR`): about 3.3 where it is black, 0.77 at the unit, 0.01 at a hundred units. Highlights of
-    hundreds of units would otherwise be most of the loss, and most of its gradient, though they are few pixels (Mildenhall et
-    al. 2022, "NeRF in the Dark", which divides by the render; the pixel is what is known from the first step on). The
-    weights are constants. Their sum is not divided out: black pixels beside the object, which nothing can be wrong about,
-    would then make the object count for less, and no surface would form.
 
     Args:
         radiance: what the model sees, linear.
         pixel: what the file holds, in the capture's `response`.
         response: "linear" compares radiance; "srgb" clips the render and encodes it first (METHOD §6).
         unit: what the difference is measured in: with the range of an output activation, the gradient keeps its size.
-        relative: whether an error counts beside the brightness of its pixel.
-
-    Example:
-        >>> render, pixel = torch.tensor([[1.1] * 3, [22.0] * 3]), torch.tensor([[1.0] * 3, [20.0] * 3])
-        >>> round(photometric(render, pixel, "linear").mean().item(), 3)  # (0.1 + 2) / 2
-        1.05
-        >>> round(photometric(render, pixel, "linear", relative=True).mean().item(), 3)  # (0.1 / 1.3 + 2 / 20.3) / 2
-        0.088
     """
-    error = (apply_response(radiance, response) - pixel).abs() / unit
-    if not relative:
-        return LossTerm(error)
-    return LossTerm(error, 1.0 / (pixel.mean(-1, keepdim=True) / unit + RELATIVE_FLOOR), divided=False)
+    return LossTerm((apply_response(radiance, response) - pixel).abs() / unit)
 
 
 def mask(

@@ -143,8 +143,7 @@ class NeilfModel(nn.Module):
         # 1. The host renders colour, hit position and normal.
         hits, terms = self._render_host(batch, plan, names, hits)
         if "volume" in names:
-            unit, relative = self.units.volume, self.units.relative
-            terms["volume"] = losses.photometric(hits.color, batch.color, self.facts.response, unit, relative)
+            terms["volume"] = losses.photometric(hits.color, batch.color, self.facts.response, self.units.volume)
         if not plan.moves_material:
             return StepResult.of(terms, SurfacePixels.none_of(batch), batch[:0])
 

@@ -205,21 +205,17 @@ SceneTracer = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N S 3"]], SceneLigh
 class LossTerm(NamedTuple):
     """One loss before reduction: `values` of any shape and, where not all count alike, `weights` that broadcast to it.
 
-    `weights` say which values count, and their sum is divided out; or how much, and with `divided` off it is not.
     A named tuple, because the wrappers of data-parallel training look for tensors in those and not in frozen dataclasses.
     """
 
     values: Float[Tensor, ...]
     weights: Float[Tensor, ...] | Bool[Tensor, ...] | None = None
-    divided: bool = True
 
     def mean(self) -> Float[Tensor, ""]:
         """The weighted mean; 0, with a zero gradient, when nothing counts."""
         if self.weights is None:
             return self.values.mean() if self.values.numel() else self.values.sum()
         weights = self.weights.to(self.values.dtype).expand_as(self.values)
-        if not self.divided:
-            return LossTerm(self.values * weights).mean()
         return (self.values * weights).sum() / weights.sum().clamp_min(1e-6)
 
 

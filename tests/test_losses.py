@@ -23,24 +23,6 @@ def test_photometric_clips_and_encodes_for_ldr_pixels():
     assert term.values.abs().max() < 1e-5  # sRGB(0.5) = 0.735357; 7 clips to 1
 
 
-def test_relative_errors_count_beside_the_brightness_of_their_pixel():
-    pixel = torch.tensor([[0.0, 0.0, 0.0], [2.0, 4.0, 6.0]])
-    render = torch.tensor([[0.2, 0.2, 0.2], [4.0, 4.0, 4.0]])
-    term = losses.photometric(render, pixel, "linear", unit=2.0, relative=True)
-    assert term.values.tolist() == [pytest.approx([0.1] * 3), pytest.approx([1.0, 0.0, 1.0])]
-    # The weights are 1 / (0 / 2 + 0.3) and 1 / (4 / 2 + 0.3); the mean is over six channels.
-    dark, bright = 1 / 0.3, 1 / 2.3
-    assert term.weights[:, 0].tolist() == pytest.approx([dark, bright])
-    assert term.mean().item() == pytest.approx((3 * 0.1 * dark + 2.0 * bright) / 6)
-
-
-def test_relative_errors_that_are_in_proportion_to_bright_pixels_count_alike():
-    pixel = torch.tensor([[10.0] * 3, [1000.0] * 3])
-    term = losses.photometric(1.1 * pixel, pixel, "linear", relative=True)
-    counts = (term.values * term.weights)[:, 0]
-    assert counts.tolist() == pytest.approx([0.1, 0.1], rel=0.04)
-
-
 def test_eikonal_is_the_distance_of_the_slope_from_one():
     gradient = torch.tensor([[3.0, 4.0, 0.0], [0.0, 1.0, 0.0]])
     assert losses.eikonal(gradient).values.tolist() == pytest.approx([4.0, 0.0])
@@ -111,13 +93,6 @@ def test_a_zero_gradient_of_the_field_is_no_trap(loss):
     gradient = torch.zeros(2, 3, requires_grad=True)
     loss(gradient).values.sum().backward()
     assert gradient.grad.isfinite().all()
-
-
-def test_the_relative_loss_is_differentiable():
-    torch.manual_seed(0)
-    render = torch.rand(5, 3, dtype=torch.float64, requires_grad=True)
-    pixel = 3 * torch.rand(5, 3, dtype=torch.float64)
-    assert torch.autograd.gradcheck(lambda x: losses.photometric(x, pixel, "linear", 0.4, True).mean(), render)
 
 
 def test_losses_are_differentiable():

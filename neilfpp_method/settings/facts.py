@@ -22,8 +22,6 @@ class SceneFacts:
         radiance_scale: the largest radiance that R can reach.
         background: "none", "constant" or "inverted_sphere".
         background_color: linear RGB of a constant background, and what an inverted sphere starts as.
-        has_highlights: the brightest hundredth of the object of a linear capture lies above five medians, as on metal that
-            mirrors a sky with its sun.
     """
 
     response: str
@@ -31,32 +29,25 @@ class SceneFacts:
     radiance_scale: float
     background: str
     background_color: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    has_highlights: bool = False
 
 
 @dataclass(frozen=True)
 class RadianceUnits:
-    """What the losses on radiance are measured in, each in the units that it compares (METHOD §4, last line).
-
-    `relative`: the errors of L_vol count beside the brightness of their pixel (`losses.photometric`).
-    """
+    """What the losses on radiance are measured in, each in the units that it compares (METHOD §4, last line)."""
 
     volume: float
     physical: float
     incident: float
-    relative: bool = False
 
 
 def radiance_units(config: NeilfConfig, facts: SceneFacts) -> RadianceUnits:
     """The units that `config.loss.unit` names.
 
     "median": an error of as much as the median radiance is 1, whether the camera stores radiance or display values. The sRGB
-    curve halves all contrasts; in units of the pixel, what speaks against noise would count twice as much. Where the images
-    have highlights, L_vol is relative as well; where they have none that only makes dark pixels count for more, and normals
-    were 0.5 to 1° worse on table tops.
+    curve halves all contrasts; in units of the pixel, what speaks against noise would count twice as much.
     """
     if config.loss.unit == "activation":
         return RadianceUnits(facts.radiance_scale, 1.0, 1.0)
     pixel = apply_response(torch.tensor(facts.median_radiance), facts.response)
     unit = response_slope(pixel, facts.response).item()
-    return RadianceUnits(unit, unit, facts.median_radiance, facts.has_highlights)
+    return RadianceUnits(unit, unit, facts.median_radiance)

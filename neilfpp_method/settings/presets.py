@@ -127,7 +127,6 @@ FAST: Mapping[str, Any] = {
     "volume.skip_empty": True,
     "volume.initial_samples": 64,
     "volume.rounds": 2,
-    "volume.bisections": 5,
     "volume.samples": 32,
     "volume.normal_radius": 0.15,
     "shading.sampler": "mis",

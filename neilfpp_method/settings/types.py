@@ -202,8 +202,6 @@ class VolumeConfig:
     what is left of them is short."""
     rounds: int = 5
     """Most refinement rounds."""
-    bisections: int = 10
-    """Bisection steps on β."""
     samples: int = 98
     """Samples per ray that are rendered: two thirds where it is stopped, the rest spread between, both ends among them."""
     normal_radius: float = 0.0

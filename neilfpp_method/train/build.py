@@ -32,11 +32,6 @@ LDR_SCALE = 1.0
 HDR_MEDIANS = 20.0
 BRIGHT_QUANTILE = 0.999
 
-# Highlights: the brightest hundredth of the object. 6.9 medians where metal mirrors a sky with its sun (`spot_city`), 4.0 on
-# paint under a sky (`spot_paint`), 2.4 and 3.5 on table tops, one of them with lamps.
-HIGHLIGHT_QUANTILE = 0.99
-HIGHLIGHT_MEDIANS = 5.0
-
 # Of the pixels of every view, one in so many asks whether a mesh is where the cameras look.
 SEEN_EVERY = 67
 
@@ -47,13 +42,12 @@ def scene_facts(capture: Capture, pixels: PixelDataset, config: NeilfConfig) -> 
     median = pixels.median_radiance()
     hdr = max(HDR_MEDIANS * median, pixels.radiance_quantile(BRIGHT_QUANTILE))
     scale = LDR_SCALE if response == "srgb" else hdr
-    highlights = capture.hdr and pixels.radiance_quantile(HIGHLIGHT_QUANTILE) > HIGHLIGHT_MEDIANS * median
     kind, color = config.background.kind, config.background.color
     if kind == "auto":
         kind = "inverted_sphere" if color is None and pixels.border_color() is None else "constant"
     if color is None and kind != "none":
         color = tuple(pixels.border_median().tolist())
-    return SceneFacts(response, median, scale, kind, color or (0.0, 0.0, 0.0), highlights)
+    return SceneFacts(response, median, scale, kind, color or (0.0, 0.0, 0.0))
 
 
 def build_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> NeilfModel:

@@ -28,6 +28,9 @@ __all__ = ["OPACITY_ERROR", "ErrorBoundedSamples", "error_bounded_samples", "inv
 OPACITY_ERROR = 0.1
 """ε, the bound on the opacity's error (VolSDF)."""
 
+BISECTIONS = 10
+"""Halvings of the interval in which β is sought (published code)."""
+
 SPREAD = 1 / 3
 """Share of the samples that are spread over the cuts of a ray: 32 of 96 in the published code."""
 
@@ -157,7 +160,7 @@ def bounded_beta(
     The steps halve the ratio, not the difference, of the ends: the two may lie decades apart.
     """
     low, high = beta.expand_as(beta_plus), beta_plus
-    for _ in range(config.bisections):
+    for _ in range(BISECTIONS):
         middle = (low * high).sqrt()
         is_bounded = log_error_bound(partition, middle) <= math.log(OPACITY_ERROR)
         low, high = torch.where(is_bounded, low, middle), torch.where(is_bounded, middle, high)
@@ -206,7 +209,7 @@ def error_bounded_samples(
         origins, directions: the rays; unit directions.
         near, far: where they enter and leave the scene; near = far for a ray that misses it.
         beta: scale of the density, scene units.
-        config: `initial_samples`, `rounds`, `bisections`, `samples`.
+        config: `initial_samples`, `rounds`, `samples`.
         stochastic: jitter the first cuts, the new cuts and the samples, or choose the middles.
     """
     rays = RayBatch(origins, directions)

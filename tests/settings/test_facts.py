@@ -24,12 +24,6 @@ def test_an_error_of_radiance_counts_the_same_whatever_the_camera_stores(median)
     assert found == pytest.approx([0.02, 0.02], rel=0.02)
 
 
-def test_errors_are_relative_where_there_are_highlights_and_the_unit_is_the_median():
-    for name, highlights, relative in (("fast", True, True), ("fast", False, False), ("paper-mlp", True, False)):
-        facts = SceneFacts("linear", 0.2, 9.0, "none", has_highlights=highlights)
-        assert radiance_units(preset(name), facts).relative == relative
-
-
 def test_the_papers_units():
     units = radiance_units(preset("paper-mlp"), SceneFacts("linear", 0.2, 4.0, "none"))
     assert (units.volume, units.physical, units.incident) == (4.0, 1.0, 1.0)
