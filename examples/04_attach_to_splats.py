@@ -11,9 +11,9 @@ from torch.nn.functional import normalize
 
 from neilfpp_method import attach_neilf, preset
 from neilfpp_method.attach import pixel_batch
-from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.data.views import Camera, camera_rays
 from neilfpp_method.hosts.image import image_hits
+from neilfpp_method.settings.types import LightFitConfig
 
 
 class Surfels(nn.Module):
@@ -54,9 +54,10 @@ torch.manual_seed(0)
 host, red = Surfels(), torch.tensor([0.4, 0.1, 0.05])
 cameras = [camera_at(2.5 * np.array([np.cos(a), np.sin(a), 0.4])) for a in np.arange(0.0, 6.0, 1.0)]
 settings = preset("fast")
-settings = dataclasses.replace(  # a small map, seldom fitted, for an example of seconds
+fit = LightFitConfig(points=128, every=30, steps=20)  # a small map, seldom fitted, for an example of seconds
+settings = dataclasses.replace(
     settings,
-    light=dataclasses.replace(settings.light, kind="distant", environment_height=8, fit=LightFitConfig(points=128, every=30, steps=20)),
+    light=dataclasses.replace(settings.light, kind="distant", environment_height=8, fit=fit),
     shading=dataclasses.replace(settings.shading, train_samples=16),
     train=dataclasses.replace(settings.train, sdf_steps=0, material_steps=60),
 )

@@ -21,8 +21,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from neilfpp_method.data.environment_map import read_environment
-from neilfpp_method.errors import UserError
 from neilfpp_method.data.views import Camera
+from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.answers import Rendered, as_hits
 from neilfpp_method.hosts.base import HasParameterGroups, Host, ImageHost, KnowsRadiance, LightsItself
 from neilfpp_method.hosts.first_look import FirstLook, check_batch, check_points, check_rows

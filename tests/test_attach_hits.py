@@ -14,8 +14,8 @@ from neilfpp_method.data.views import Camera, camera_rays
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.image import image_hits
-from neilfpp_method.settings.presets import preset
 from neilfpp_method.schedule import Stage
+from neilfpp_method.settings.presets import preset
 from neilfpp_method.structures import PixelBatch, RayBatch, SurfaceHits
 from tests.hosts.balls import Ball, BallHost, ball_rays
 from tests.hosts.table import TableTop
@@ -54,7 +54,8 @@ class Counted(Ball):
 @pytest.mark.parametrize("form", ["hits", "dictionary", "tuple"])
 def test_hits_that_are_handed_in_are_not_rendered_again_and_change_nothing(form):
     host, rays = Counted(), ball_rays(64, 0.8)
-    config = dataclasses.replace(tiny_config(), inter_reflection=dataclasses.replace(tiny_config().inter_reflection, mode="off"))
+    config = tiny_config()
+    config = dataclasses.replace(config, inter_reflection=dataclasses.replace(config.inter_reflection, mode="off"))
     neilf = attach_neilf(host, config)
     color, position, normal = host(rays.origins, rays.directions)
     depth = ((position - rays.origins) * rays.directions).sum(-1, keepdim=True)

@@ -1,8 +1,8 @@
 """Whole images as hits: what a rasteriser draws (splats, meshes), a row per pixel.
 
-    hits = image_hits(camera, color, depth, opacity)        # (H, W, 3), (H, W), (H, W) as the rasteriser returns them
-    batch = pixel_batch(rays.origins, rays.directions, photograph.reshape(-1, 3))       # rays = camera_rays(camera)
-    loss = loss + neilf.losses(batch[rows], step, hits[rows]).loss
+hits = image_hits(camera, color, depth, opacity)        # (H, W, 3), (H, W), (H, W) as the rasteriser returns them
+batch = pixel_batch(rays.origins, rays.directions, photograph.reshape(-1, 3))       # rays = camera_rays(camera)
+loss = loss + neilf.losses(batch[rows], step, hits[rows]).loss
 """
 
 from __future__ import annotations
@@ -57,7 +57,8 @@ def image_hits(
     for name, value in maps.items():
         wanted = (*size, 3) if name in ("color", "normal") else size
         if tuple(value.shape) != wanted:
-            raise UserError(f"the {name} of an image has the shape {tuple(value.shape)}", f"give {wanted}, as the camera has it")
+            shape = tuple(value.shape)
+            raise UserError(f"the {name} of an image has the shape {shape}", f"give {wanted}, as the camera has it")
     rays = rays_like(camera, color)
     axis = torch.as_tensor(camera.w2c[2, :3], dtype=color.dtype, device=color.device)
     distance = depth.reshape(-1) if along_ray else depth.reshape(-1) / (rays.directions @ axis)

@@ -49,9 +49,7 @@ class HostReport:
     trains_geometry: bool
 
 
-def check_host(
-    host: Host | RenderFunction, rays: RayBatch, parameters: Sequence[nn.Parameter] | None = None
-) -> HostReport:
+def check_host(host: Host | RenderFunction, rays: RayBatch, parameters: Sequence[nn.Parameter] | None = None) -> HostReport:
     """Hold a host to `hosts.base.Host`.
 
     Args:

@@ -130,5 +130,5 @@ def test_points_of_an_image_are_named():
         check_points("x", torch.zeros(2, 2, 3))
     with pytest.raises(UserError, match=r"wi has the shape \(4, 3\), not \(N, S, 3\)"):
         check_points("wi", torch.zeros(4, 3), axes=3)
-    with pytest.raises(UserError, match="x is torch.int64; give floats"):
+    with pytest.raises(UserError, match=r"x is torch\.int64; give floats"):
         check_points("x", torch.zeros(2, 3, dtype=torch.long))
