@@ -149,6 +149,11 @@ def shifts_its_input(host: Scene, rays: RayBatch) -> Outputs:
     return outputs
 
 
+def counted(host: Scene, rays: RayBatch) -> Outputs:
+    outputs = host.clean(rays)
+    return outputs | {"color": outputs["color"] * (1 + 0.1 * host.calls)}
+
+
 def recomputed(rays: RayBatch, outputs: Outputs) -> Mapping[str, Tensor]:
     with torch.enable_grad():
         return {"normal": outputs["normal"] * torch.ones((), requires_grad=True)}
@@ -197,9 +202,7 @@ DEFECTS: Mapping[str, Callable[[Scene, RayBatch], Outputs]] = {
     "positions behind the camera": after(lambda r, o: along(r, o, -1.0)),
     "axes y and z exchanged in positions": after(lambda r, o: {"position": o["position"][:, [0, 2, 1]]}),
     "positions with noise of 0.03": after(lambda r, o: along(r, o, 1 + 0.012 * torch.randn(len(r), 1))),
-    "positions with noise of their own": after(
-        lambda r, o: along(r, o, 1 + 0.01 * (torch.empty(()).uniform_(generator=OWN) - 0.5))
-    ),
+    "positions with noise of their own": after(lambda r, o: along(r, o, 1 + 0.01 * torch.rand((), generator=OWN))),
     "scene five times too large": partial(scaled, factor=5.0, shift=0.0),
     "scene 4 beside the origin": partial(scaled, factor=1.0, shift=4.0),
     "the far side of surfaces": inside_out,
@@ -236,9 +239,7 @@ DEFECTS: Mapping[str, Callable[[Scene, RayBatch], Outputs]] = {
     "calls eval()": with_call(lambda host: host.eval()),
     "calls manual_seed": with_call(lambda host: torch.manual_seed(0)),
     "switches gradients on for good": with_call(lambda host: torch.set_grad_enabled(True)),
-    "counts its calls in the colour": lambda host, rays: (
-        host.clean(rays) | {"color": host.clean(rays)["color"] * (1 + 0.1 * host.calls)}
-    ),
+    "counts its calls in the colour": counted,
     "changes its input": shifts_its_input,
     "another colour without gradients": coarse,
     # gradients
@@ -292,7 +293,7 @@ def main() -> None:
     shown = [o for o in found if o.check is None] if "--missed" in sys.argv[1:] else found
     print("| defect | found by | what is said |\n|---|---|---|")
     for outcome in shown:
-        said = outcome.message.splitlines()[0] if outcome.message else ""
+        said = outcome.message.partition("\n")[0]
         print(f"| {outcome.defect} | {outcome.check or '**nothing**'} | {said} |")
     print(f"\n{sum(o.check is not None for o in found)} of {len(found)} defects are found; the whole host passes.")
 

@@ -7,10 +7,11 @@ from torch import nn
 from torch.func import grad, vmap
 from torch.nn.functional import normalize
 
-from neilfpp_method import attach_neilf
+from neilfpp_method import attach_neilf, preset
 from neilfpp_method.attach import pixel_batch
 from neilfpp_method.hosts.testing import check_host
 from neilfpp_method.schedule import Stage
+from neilfpp_method.settings.presets import free_light
 from neilfpp_method.structures import RayBatch, SurfaceHits
 
 
@@ -48,7 +49,7 @@ origins = 3.0 * normalize(torch.randn(256, 3), dim=-1)
 rays = RayBatch(origins, normalize(0.3 * torch.randn(256, 3) - origins, dim=-1))
 batch = pixel_batch(rays.origins, rays.directions, torch.tensor([[0.4, 0.3, 0.2]]).expand(256, 3))
 print(check_host(host := Blob(), rays))
-neilf = attach_neilf(host)
+neilf = attach_neilf(host, free_light(preset("fast")))  # the light of the paper: nothing is fitted in so few steps
 optimizer = torch.optim.Adam(neilf.parameters(), lr=2e-3)
 for stage in Stage:
     for _ in range(30):

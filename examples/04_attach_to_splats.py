@@ -53,8 +53,8 @@ def camera_at(eye, size: int = 32) -> Camera:
 torch.manual_seed(0)
 host, red = Surfels(), torch.tensor([0.4, 0.1, 0.05])
 cameras = [camera_at(2.5 * np.array([np.cos(a), np.sin(a), 0.4])) for a in np.arange(0.0, 6.0, 1.0)]
-settings = preset("fast")  # with a small map, seldom fitted, for an example of seconds
-fit = LightFitConfig(points=128, every=30, steps=20)
+settings = preset("fast")
+fit = LightFitConfig(points=128, every=30, steps=20)  # a small map, seldom fitted, for an example of seconds
 settings = dataclasses.replace(
     settings,
     light=dataclasses.replace(settings.light, kind="distant", environment_height=8, fit=fit),

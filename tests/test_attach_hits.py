@@ -54,8 +54,8 @@ class Counted(Ball):
 @pytest.mark.parametrize("form", ["hits", "dictionary", "tuple"])
 def test_hits_that_are_handed_in_are_not_rendered_again_and_change_nothing(form):
     host, rays = Counted(), ball_rays(64, 0.8)
-    off = dataclasses.replace(tiny_config().inter_reflection, mode="off")
-    config = dataclasses.replace(tiny_config(), inter_reflection=off)
+    config = tiny_config()
+    config = dataclasses.replace(config, inter_reflection=dataclasses.replace(config.inter_reflection, mode="off"))
     neilf = attach_neilf(host, config)
     color, position, normal = host(rays.origins, rays.directions)
     depth = ((position - rays.origins) * rays.directions).sum(-1, keepdim=True)

@@ -95,8 +95,8 @@ def _first(name: str, outputs: Mapping[str, Tensor], names: Sequence[str]) -> Te
     if isinstance(found, Tensor):
         return found
     wanted = " or ".join(f"'{wanted}'" for wanted in names)
-    given = ", ".join(outputs) or "nothing"
-    raise UserError(f"{name}: its outputs have no tensor {wanted}, but {given}", "add one, a row per ray")
+    held = ", ".join(outputs) or "nothing"
+    raise UserError(f"{name}: its outputs have no tensor {wanted}, but {held}", "add one, a row per ray")
 
 
 def _column(name: str, output: str, rays: RayBatch, value: Tensor) -> Float[Tensor, " N"]:

@@ -1,4 +1,4 @@
-"""A traceable stand-in for the surface of a host that cannot trace cheaply, gathered from the training rays.
+"""A traceable stand-in for the surface of a host that cannot trace cheaply, gathered from the rays of training.
 
 Hits of camera rays are oriented points; the newest of them are fused into a grid of distances (`volume.fusion`) with the mean
 of the radiance that was seen there. Rays that leave a surface are sphere-traced in the grid. So visibility, hard

@@ -11,12 +11,11 @@ import sys
 STEP = """
 import torch
 from torch._dynamo.utils import counters
-from neilfpp_method.settings.types import HashGridConfig
 from neilfpp_method.kernels import encode, grid_spec
 from neilfpp_method.kernels.softplus import softplus, softplus_and_slope
 from neilfpp_method.volume.distance_grid import sample_grid, trace_grid
 
-spec = grid_spec(HashGridConfig(levels=2, log2_entries=8, max_resolution=32))
+spec = grid_spec(levels=2, log2_entries=8, max_resolution=32)
 table = torch.rand(spec.entries, spec.features)
 ball = sample_grid(lambda x: x.norm(dim=-1) - 0.5, 1.0, 12, torch.zeros(1))
 start, up = torch.tensor([0.0, 0.0, -0.9]), torch.eye(3)[2].expand(6, 3)
