@@ -36,6 +36,7 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import Material, PixelBatch, RayBatch, Shading, SurfaceHits
+from neilfpp_method.volume.distance_grid import GRID_RESOLUTION
 
 __all__ = ["AttachedNeilf", "CallableHost", "attach_neilf", "missing_capabilities", "pixel_batch"]
 
@@ -295,7 +296,7 @@ def _proxy(host: object, config: NeilfConfig) -> SurfaceProxy | None:
     if isinstance(host, LightsItself) or not (asked or settings.mode == "hard"):
         return None
     radiance = host.radiance if isinstance(host, KnowsRadiance) else None
-    return SurfaceProxy(config.volume.radius, settings.grid_resolution, config.shading.hit_share, radiance)
+    return SurfaceProxy(config.volume.radius, GRID_RESOLUTION, config.shading.hit_share, radiance)
 
 
 def _what_comes(attached: AttachedNeilf, borrowed: bool) -> str:

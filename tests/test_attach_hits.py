@@ -32,7 +32,7 @@ def hard_config():
     return dataclasses.replace(
         config,
         light=dataclasses.replace(fast.light, kind="distant", environment_height=8),
-        inter_reflection=dataclasses.replace(fast.inter_reflection, grid_resolution=40),
+        inter_reflection=fast.inter_reflection,
         train=dataclasses.replace(config.train, sdf_steps=0),
     )
 

@@ -20,7 +20,7 @@ from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayBatch, SceneLight, SurfaceHits
 from neilfpp_method.volume.compositing import Weights, composite, depth_weights, sample_weights, share_near
 from neilfpp_method.volume.density import LaplaceDensity, laplace_depth
-from neilfpp_method.volume.distance_grid import cell_size, sample_grid, trace_grid
+from neilfpp_method.volume.distance_grid import GRID_RESOLUTION, cell_size, sample_grid, trace_grid
 from neilfpp_method.volume.empty_space import EmptySpace
 from neilfpp_method.volume.free_space import FreeSpace, cameras_within
 from neilfpp_method.volume.intersect import Interval, sphere_interval
@@ -35,8 +35,6 @@ HIT_RADIUS = 0.05
 """Scene units: the blending weight within this distance of the blended hit is its concentration (METHOD §2)."""
 SURFACE_WIDTH = {"scene": 10.0, "rays": 0.05}
 """Scene units, by `loss.points`: width of the smoothed delta of L_surf. The former is the published one."""
-GRID_RESOLUTION = 96
-"""Vertices along an edge of the grid that hard inter-reflection traces."""
 GRID_LIFE = 100
 """Steps in which the geometry moves before the distance grid is sampled again."""
 

@@ -15,8 +15,10 @@ from torch.nn import functional
 
 from neilfpp_method.kernels import ray_tracer
 
-__all__ = ["GridHits", "cell_size", "look_up", "sample_grid", "trace_grid"]
+__all__ = ["GRID_RESOLUTION", "GridHits", "cell_size", "look_up", "sample_grid", "trace_grid"]
 
+GRID_RESOLUTION = 96
+"""Vertices along an edge of the grid that hard inter-reflection traces."""
 CHUNK = 65_536
 STEPS = 40
 """Most steps of a ray; one that has not ended by then passes close to a surface without meeting it."""
