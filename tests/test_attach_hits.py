@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from neilfpp_method import attach
 from neilfpp_method.attach import attach_neilf, pixel_batch
 from neilfpp_method.data.views import Camera, camera_rays
 from neilfpp_method.errors import UserError
@@ -20,6 +21,12 @@ from neilfpp_method.structures import PixelBatch, RayBatch, SurfaceHits
 from tests.hosts.balls import Ball, BallHost, ball_rays
 from tests.hosts.table import TableTop
 from tests.scenes import tiny_config
+
+
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch):
+    """A grid that few rays fill."""
+    monkeypatch.setattr(attach, "GRID_RESOLUTION", 40)
 
 
 def pixels(rays: RayBatch) -> PixelBatch:

@@ -52,7 +52,7 @@ class Train:
     scale: float | None = None
     """Size of the images over that of their files, 1: as they are; none: as large as the training's rays can use."""
     strict: bool = False
-    """End with exit status 1 where the result is of no use: no surface, fog, nothing shaded (docs/health.md)."""
+    """End with exit status 1 where the result is of no use (docs/health.md)."""
     device: Device = "auto"
     """Where to train; auto takes a GPU where there is one."""
     devices: int = 1

@@ -27,9 +27,8 @@ BORDER_TOLERANCE = 0.02
 BORDER_SHARE = 0.5
 DARK = 1e-3
 MIDDLE_GREY = 0.18
-SCHARR = torch.tensor([[-3.0, 0.0, 3.0], [-10.0, 0.0, 10.0], [-3.0, 0.0, 3.0]])
 NEIGHBOURS = np.array([(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1)])
-"""Where the nine entries of the kernel lie about a pixel."""
+"""Rows and columns of the nine values about a pixel."""
 MOST_COUNTED = 2**20
 """Pixels of the object, evenly over all views, that statistics are taken of; all where there are no more."""
 
@@ -154,8 +153,7 @@ class PixelDataset:
         rows = np.clip(row + NEIGHBOURS[:, 0, None], 0, last[:, 1])
         around = self.store.starts[views] + rows * size[:, 0] + columns
         seen = self._seen(self.store.colors(around, np.broadcast_to(views, around.shape)))
-        right, down = (kernel.reshape(-1) @ seen for kernel in (SCHARR, SCHARR.T))
-        return torch.hypot(right, down)
+        return _scharr(seen.unbind(0))
 
     # ------------------------------------------------------------------------------------------------------- statistics
 
@@ -249,10 +247,19 @@ class PixelDataset:
 
 
 def _gradient(values: Float32[Tensor, "H W"]) -> Float32[Tensor, "H W"]:
-    """The length of the Scharr gradient, without its 1/32: a ramp of 0.01 a pixel has 0.32. The borders are continued.
+    """`_scharr` of a whole image; the borders are continued."""
+    padded = torch.nn.functional.pad(values[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
+    height, width = values.shape
+    return _scharr([padded[1 + row : 1 + row + height, 1 + column : 1 + column + width] for row, column in NEIGHBOURS])
+
+
+def _scharr(about: Sequence[Float32[Tensor, "*shape"]]) -> Float32[Tensor, "*shape"]:
+    """The length of the Scharr gradient from the nine values about each pixel, in the order of `NEIGHBOURS`.
+
+    Without its factor of 1/32: a ramp of 0.01 a pixel has 0.32.
 
     L_smth weighs by its exponential (published code); with the factor no edge of a picture would count.
     """
-    padded = torch.nn.functional.pad(values[None, None], (1, 1, 1, 1), mode="replicate")
-    right, down = torch.nn.functional.conv2d(padded, torch.stack([SCHARR, SCHARR.T])[:, None].to(values))[0]
+    right = 3 * (about[2] - about[0]) + 10 * (about[5] - about[3]) + 3 * (about[8] - about[6])
+    down = 3 * (about[6] - about[0]) + 10 * (about[7] - about[1]) + 3 * (about[8] - about[2])
     return torch.hypot(right, down)

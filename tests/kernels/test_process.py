@@ -54,13 +54,14 @@ def test_a_command_that_computes_makes_them(words, does):
         pytest.skip("this processor has no such setting")
     module, name = f"neilfpp_method.{does}".rsplit(".", 1)
     program = f"""{SMALL}
-import {module} as place, neilfpp_method.train.run as run
+import {module} as place, neilfpp_method.evaluate.size as size, neilfpp_method.train.run as run
 from neilfpp_method.cli import main
 def tell(*_, **__):
     print(small())
     raise KeyboardInterrupt
 place.{name} = tell
 run.load_run = lambda *_: None
+size.at_size, size.size_in_words = lambda run, *_: run, lambda run: ""
 main({words!r})
 print(small())
 """
