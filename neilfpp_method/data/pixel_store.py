@@ -27,8 +27,7 @@ from jaxtyping import Bool, Float32, Float64, Int, Shaped, UInt8
 from neilfpp_method.data.drawing import BLOCK, KNOWN, MASK, NEAR, VALID, near_object
 from neilfpp_method.data.images import replacing
 from neilfpp_method.data.pixel_encoding import ENCODINGS, Encoding, encodings_for
-from neilfpp_method.data.scaling import area_average, file_size, scaled_camera
-from neilfpp_method.data.silhouettes import Outline
+from neilfpp_method.data.scaling import file_size
 from neilfpp_method.data.view_pixels import read_view
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
@@ -85,27 +84,6 @@ class PixelStore:
     def view_colors(self, i: int) -> Float32[np.ndarray, "N 3"]:
         """The colours of a view."""
         return self.encoding.decode(np.asarray(self.codes[self.rows(i)]), self.scales[i])
-
-    def masks(self, max_side: int = 256) -> tuple[Outline, ...]:
-        """The silhouettes of the views in which the object is known, at no more than `max_side` pixels a side.
-
-        A pixel of a silhouette is inside where half of its area is. The view of an outline has a camera of the mask's size.
-
-        >>> store.masks(128)[0].inside.shape  # doctest: +SKIP
-        (96, 128)
-        """
-        outlines = []
-        for i, view in enumerate(self.views):
-            bits = self.bits[self.rows(i)]
-            if not (bits & KNOWN).any():
-                continue
-            height, width = view.camera.height, view.camera.width
-            share = min(1.0, max_side / max(height, width))
-            size = (max(1, round(width * share)), max(1, round(height * share)))
-            inside = ((bits & MASK) > 0).reshape(height, width).astype(np.float32)
-            small = View(view.name, view.index, scaled_camera(view.camera, *size), view.image, file_size=file_size(view))
-            outlines.append(Outline(small, area_average(inside, *size) >= 0.5))
-        return tuple(outlines)
 
     def release(self) -> None:
         """Give pages of the files that are mapped back; what is read next is mapped again."""

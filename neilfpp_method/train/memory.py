@@ -13,7 +13,7 @@ from neilfpp_method.data.views import View
 __all__ = ["check_training_memory", "training_bytes"]
 
 READING = 48
-"""Bytes to a pixel of the largest file while it is decoded, made linear, averaged and encoded (benchmarks/memory.py)."""
+"""Bytes to a pixel of the largest file while it is decoded, made linear, averaged and encoded. An estimate."""
 COUNTED = 3 * 8 / 1024
 """Bytes to a pixel of all views: counts of three sets of pixels, by block."""
 LOADED = 0.8e9

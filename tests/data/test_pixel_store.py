@@ -100,20 +100,6 @@ def test_single_pixels_are_those_of_their_views(tmp_path: Path) -> None:
     assert edges.any(), "gradients at the border are compared, too"
 
 
-def test_masks_at_a_small_size(tmp_path: Path) -> None:
-    capture = load_capture(make_capture(tmp_path / "c", size=(96, 72), masks=True))
-    outlines = PixelDataset(capture, capture.views).store.masks(max_side=24)
-    assert len(outlines) == 6
-    for outline, view in zip(outlines, capture.views, strict=True):
-        full = read_image(view.mask).pixels[..., 0] > 0.5
-        assert outline.inside.shape == (18, 24) == (outline.view.camera.height, outline.view.camera.width)
-        assert np.array_equal(outline.inside, full.reshape(18, 4, 24, 4).mean(axis=(1, 3)) >= 0.5)
-        assert outline.view.camera.fx == view.camera.fx / 4
-    bare = load_capture(make_capture(tmp_path / "d", hdr=False))
-    write_png(bare.views[0].image, np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8))
-    assert PixelDataset(bare, bare.views[:1]).store.masks() == ()
-
-
 # ---------------------------------------------------------------------------------------------- found again, made anew
 
 
