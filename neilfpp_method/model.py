@@ -45,6 +45,7 @@ from neilfpp_method.structures import (
     SurfaceHits,
     SurfacePixels,
 )
+from neilfpp_method.timing.ledger import doing
 
 __all__ = ["Maps", "NeilfModel"]
 
@@ -164,6 +165,7 @@ class NeilfModel(nn.Module):
             terms["inter_reflection"] = self._inter_reflection(surface.position, surface.normal)
         return StepResult.of(terms, rendered, self._beyond(batch, hits))
 
+    @doing("rendering")
     def _render_host(
         self, batch: PixelBatch, plan: StagePlan, names: Mapping[str, float], hits: SurfaceHits | None
     ) -> tuple[SurfaceHits, dict[str, LossTerm]]:
@@ -182,6 +184,7 @@ class NeilfModel(nn.Module):
                 observe(batch, hits)
         return hits, terms
 
+    @doing("shading")
     def _surface_pixels(self, hits: SurfaceHits, pixels: PixelBatch) -> SurfacePixels:
         settings = self.config.loss
         return SurfacePixels(
@@ -192,9 +195,11 @@ class NeilfModel(nn.Module):
             image_gradient=pixels.image_gradient,
         )
 
+    @doing("shading")
     def _material_and_priors(self, surface: SurfacePixels, names: Mapping[str, float], terms: dict[str, LossTerm]) -> Material:
         if "smoothness" in names:
-            sample = self.brdf.with_gradients(surface.position)
+            with doing("regularisers"):
+                sample = self.brdf.with_gradients(surface.position)
             material, slopes = sample.material, (sample.roughness_gradient, sample.metallic_gradient)
             terms["smoothness"] = losses.smoothness(*slopes, surface.image_gradient)
         else:
@@ -203,6 +208,7 @@ class NeilfModel(nn.Module):
             terms["lambertian"] = losses.lambertian(material)
         return material
 
+    @doing("tracing")
     def _inter_reflection(self, position: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]) -> LossTerm:
         traced = trace_light(self.host, position, normal, self.config.inter_reflection, self.config.shading.hit_share)
         hit = torch.nonzero(traced.hit)[:, 0]
@@ -248,6 +254,7 @@ class NeilfModel(nn.Module):
         """Linear radiance that arrives at x from wi: from light and lamps, or from the scene before them."""
         return incident_radiance(self.sources, x, wi)
 
+    @doing("shading")
     def shade(
         self,
         position: Float[Tensor, "N 3"],

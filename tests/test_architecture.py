@@ -18,7 +18,7 @@ SOURCES = {
 
 # A room may import what stands to its left, and itself; rooms of one step know nothing of one another. Lower is right.
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("errors", "structures"),
+    ("errors", "structures", "timing"),
     ("settings",),
     ("kernels", "lighting.ring"),
     ("shading", "volume", "schedule"),

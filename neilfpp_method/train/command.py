@@ -27,6 +27,7 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, stage_steps
 from neilfpp_method.settings.check import check_config
 from neilfpp_method.settings.types import NeilfConfig
+from neilfpp_method.timing.ledger import Ledger, doing, listening
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.health_record import in_words as health_in_words
@@ -45,6 +46,7 @@ from neilfpp_method.train.run import (
     read_description,
 )
 from neilfpp_method.train.start import start_geometry
+from neilfpp_method.train.work_record import read_work, waiting, write_work
 
 __all__ = ["run_training"]
 
@@ -81,6 +83,7 @@ def run_training(
         Unsound: `strict`, and a finding is severe; the run is kept.
     """
     place = pick_device(device)
+    ledger = Ledger(synchronise=waiting(place))
     # Whatever the headers and the settings can tell is told before other processes start.
     if resume:
         if out is None:
@@ -91,6 +94,7 @@ def run_training(
         if _is_finished(out, config):
             console.print(f"run folder {out}: finished already, nothing to continue", soft_wrap=True)
             return out
+        ledger.add(read_work(out))
     else:
         if data is None or config is None:
             raise UserError("no capture given", "name its folder with --data DIR")
@@ -105,7 +109,7 @@ def run_training(
         capture = at_scale(capture, source.scale)
     check_training_memory(capture)
     fabric = _launch(place, devices)
-    with _nothing_left_on_failure(out):
+    with listening(ledger), _nothing_left_on_failure(out):
         pixels = _load_pixels(capture, out / PIXELS, fabric, console)
         facts = described.facts if resume else scene_facts(capture, pixels, config)
         seed_step(config.train.seed, step=-1)
@@ -126,11 +130,15 @@ def run_training(
             console.print(started.text, style="yellow" if started.warning else None, soft_wrap=True)
     fabric.barrier()
     continue_with = _continue_with(command, out, device, devices)
-    with reporting(out, console, fabric.is_global_zero) as reporter, _stop_request() as stopped:
+    with listening(ledger), reporting(out, console, fabric.is_global_zero) as reporter, _stop_request() as stopped:
         preview = _preview(out, capture, fabric, reporter)
         solver, watch = model.light_solver(), _watch(pixels, config, reporter)
-        training = Training(out, config, model, pixels, fabric, reporter, stopped, preview, continue_with, solver, watch)
+        training = Training(
+            out, config, model, pixels, fabric, reporter, stopped, preview, continue_with, solver, watch, ledger
+        )
         train(training)
+    if fabric.is_global_zero:
+        write_work(out, ledger)  # with the last checkpoint and picture
     if fabric.is_global_zero and training.fits:
         console.print(f"light: {in_words(config.light, training.fits)}", soft_wrap=True)
     findings = list(watch.findings.values())
@@ -231,6 +239,7 @@ def _nothing_left_on_failure(out: Path) -> Iterator[None]:
         raise
 
 
+@doing("data", apart=True)
 def _load_pixels(capture: Capture, folder: Path, fabric: Fabric, console: Console) -> PixelDataset:
     """One process reads the images, and all find them in the folder; what is wrong with them is wrong for all."""
     problem: tuple[str, str] | None = None

@@ -21,10 +21,12 @@ from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, 
 from neilfpp_method.settings.facts import RadianceUnits
 from neilfpp_method.settings.types import NeilfConfig, OptimizerConfig
 from neilfpp_method.structures import LossTerms, StepResult
+from neilfpp_method.timing.ledger import Ledger, doing
 from neilfpp_method.train.health_record import read_findings, write_findings
 from neilfpp_method.train.light_record import LightFit, note_fit, read_fits, write_fits
 from neilfpp_method.train.progress import Reporter
 from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, save_checkpoint, write_json
+from neilfpp_method.train.work_record import write_work
 
 __all__ = ["Training", "adam", "make_optimizer", "seed_step", "set_rates", "train"]
 
@@ -49,6 +51,7 @@ class Training:
     continue_with: str
     light_solver: LightSolver
     watch: Watch
+    ledger: Ledger = field(default_factory=Ledger)
     fits: list[LightFit] = field(default_factory=list)
     skipped: int = 0
     skipped_in_a_row: int = 0
@@ -73,11 +76,13 @@ def train(run: Training) -> None:
         position = stage_at(step, settings)
         step = _train_stage(run, model, optimizer, step, position)
         if run.fabric.is_global_zero:
-            run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
+            with doing("looks", apart=True):
+                run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
         _save(run, optimizer, step, also=position.stage.value)
-        model.eval()
-        run.preview(model, position.stage)
-        model.train()
+        with doing("looks", apart=True):
+            model.eval()
+            run.preview(model, position.stage)
+            model.train()
 
 
 def _train_stage(run: Training, model: NeilfModel, optimizer: torch.optim.Optimizer, step: int, position: StagePosition) -> int:
@@ -87,18 +92,21 @@ def _train_stage(run: Training, model: NeilfModel, optimizer: torch.optim.Optimi
     model.freeze_for(stage)
     # Set up anew in each stage: data-parallel wrappers fix the set of moving parameters when they are made.
     wrapped = run.fabric.setup_module(model, move_to_device=False)
+    run.ledger.enter(stage.value)
     run.reporter.begin_stage(stage.value, position.step, position.length)
     started = time.perf_counter()
     before = run.seconds.get(stage.value, 0.0)
     for number in range(position.step, position.length):
-        seed_step(settings.seed, step, run.fabric.global_rank)
-        share = number / position.length
-        set_rates(optimizer, run.config.optimizer, StagePosition(stage, number, position.length))
-        batch = run.pixels.sample(settings.rays)
-        computed = wrapped(batch, stage)
-        total = weigh(computed.terms, active_losses(stage, run.config, model.stages, share))
-        stop = _update(run, model, optimizer, computed.terms, total, step)
-        _solve_light(run, model, computed, step)
+        with run.ledger.step(number):
+            seed_step(settings.seed, step, run.fabric.global_rank)
+            share = number / position.length
+            set_rates(optimizer, run.config.optimizer, StagePosition(stage, number, position.length))
+            with doing("data"):
+                batch = run.pixels.sample(settings.rays)
+            computed = wrapped(batch, stage)
+            total = weigh(computed.terms, active_losses(stage, run.config, model.stages, share))
+            stop = _update(run, model, optimizer, computed.terms, total, step)
+            _solve_light(run, model, computed, step)
         run.watch.after_step(model.stages[stage], computed, step)
         step += 1
         run.seconds[stage.value] = before + time.perf_counter() - started
@@ -115,17 +123,21 @@ def _solve_light(run: Training, model: NeilfModel, computed: StepResult, step: i
     """Show the light solver what a step showed; when it is time, it sets the light. The first process does it for all."""
     fabric, solver = run.fabric, run.light_solver
     if fabric.is_global_zero:
-        solver.observe(computed)
+        with doing("light_fits"):
+            solver.observe(computed)
     if not fabric.broadcast(solver.due):
         return
     if fabric.is_global_zero:
         run.watch.after_fit(solver.points, step)
-        note_fit(run.fits, solver.solve(model.brdf, model.scene), model.lamps.lit, step)
+        with doing("light_fits", apart=True):
+            found = solver.solve(model.brdf, model.scene)
+        note_fit(run.fits, found, model.lamps.lit, step)
     if fabric.world_size > 1:
         for part in (model.light, model.lamps):
             part.load_state_dict(fabric.broadcast(part.state_dict()))
 
 
+@doing("optimiser")
 def _update(
     run: Training, model: NeilfModel, optimizer: torch.optim.Optimizer, terms: LossTerms, total: Total, step: int
 ) -> bool:
@@ -135,7 +147,8 @@ def _update(
     """
     optimizer.zero_grad(set_to_none=True)
     if total.loss.requires_grad:
-        run.fabric.backward(total.loss)
+        with doing("gradients"):
+            run.fabric.backward(total.loss)
     norms = _gradient_norms(model)
     psnr = _psnr(terms, run.model.units)
     stop = torch.full_like(psnr, run.should_stop())
@@ -227,6 +240,7 @@ def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
 # ----------------------------------------------------------------------------------------------------- state and record
 
 
+@doing("saving", apart=True)
 def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str | None = None) -> None:
     if run.fabric.is_global_zero:
         try:
@@ -236,6 +250,7 @@ def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str 
             for name in filter(None, (also, "last")):
                 save_checkpoint(run.path / "checkpoints" / f"{name}.pt", run.model, run.light_solver, optimizer, step)
             write_json(run.path / "timing.json", run.seconds)
+            write_work(run.path, run.ledger)
         except UserError as error:
             raise UserError(error.problem, f"make room, and continue with: {run.continue_with}") from error
     run.fabric.barrier()

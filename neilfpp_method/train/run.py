@@ -5,6 +5,7 @@ capture.json      where the images are        timing.json       seconds of each 
 scene.json        what the images decided     checkpoints/      last.pt, and one at the end of each stage
 previews/         a picture per stage         tensorboard/      scalars and pictures
 pixels/           of the training views; can be deleted, and is made again when training goes on
+work.json         seconds of each stage by kind of work (docs/budget.md)
 light.json        what spoke for lamps, fit by fit; not there where the settings had decided
 """
 
