@@ -105,13 +105,12 @@ class NeilfModel(nn.Module):
             object.__setattr__(self, "host", host)  # past nn.Module, which would take it in
         else:
             self.host = host
-        self.config, self.facts, self.borrowed = config, facts, borrowed
+        self.facts, self.borrowed = facts, borrowed
         self.units = radiance_units(config, facts)
         self.stages = host.stages if isinstance(host, HasStages) else BORROWED_HOST if borrowed else STAGES
         self.check_outputs = OutputCheck(host, config.shading.hit_share)
         self.observers: list[Callable[[PixelBatch, SurfaceHits], None]] = []
-        lobe = LOBES[config.shading.lobe]
-        self.lobe = lobe if config.shading.specular else None
+        self.use(config)
         self.brdf = BrdfField(config.brdf, config.encoding, config.volume.radius)
         albedo = initial_albedo(config.brdf.initial_base_color, config.brdf.initial_metallic, self.lobe)
         parts = make_light(config, facts.response, facts.median_radiance / albedo)
@@ -119,6 +118,11 @@ class NeilfModel(nn.Module):
         # The surface of a borrowed host moves as its own trainer likes.
         stands_still = not borrowed and not self.stages[Stage.MATERIAL_INIT].moves_host
         self.replay = Replay(config.train.fresh if stands_still else 1.0, config.train.rays)
+
+    def use(self, config: NeilfConfig) -> None:
+        """Compute with these settings from now on. They switch effects; sizes of fields stay what they were built with."""
+        self.config = config
+        self.lobe = LOBES[config.shading.lobe] if config.shading.specular else None
 
     # -------------------------------------------------------------------------------------------------------- one step
 

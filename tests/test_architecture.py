@@ -26,7 +26,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("hosts.base", "lighting"),
     ("hosts", "incident"),
     ("model",),
-    ("health",),
+    ("health", "effects"),
     ("attach", "train"),
     ("export",),
     ("evaluate",),
