@@ -20,13 +20,13 @@ from pathlib import Path
 from typing import Literal
 
 import tyro
+from neilfpp_method.evaluate.report import write_report
 from rich.console import Console
 from torch import Tensor
 
 from benchmarks.measure import hardware, revision
 from benchmarks.tables import COLUMNS, RESULTS, Result, Row, markdown, write_result
 from neilfpp_method.evaluate.protocols import evaluate
-from neilfpp_method.evaluate.report import write_report
 from neilfpp_method.schedule import Stage, stage_steps
 from neilfpp_method.settings.presets import fixed_geometry, free_light, preset
 from neilfpp_method.settings.types import NeilfConfig

@@ -76,7 +76,7 @@ def check_wheel(wheel: Path) -> None:
         metadata = message_from_bytes(
             archive.read(next(n for n in names if n.endswith(".dist-info/METADATA")))
         )
-    for ending in ("neilfpp_method/py.typed", "demo/scene/split.json", "licenses/LICENSE"):
+    for ending in ("neilfpp_method/py.typed", "demo/scene/split.json", "report/static/viewer.js", "licenses/LICENSE"):
         assert any(name.endswith(ending) for name in names), f"{wheel.name} lacks {ending}"
     description = str(metadata.get_payload())
     relative = [

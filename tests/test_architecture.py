@@ -31,6 +31,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("export",),
     ("evaluate",),
     ("relight",),
+    ("report",),
     ("demo", "plugin", "inspection", "prepare"),
     ("commands",),
     ("cli",),

@@ -43,7 +43,7 @@ class Render:
 
 def run(options: Render) -> None:
     from neilfpp_method.evaluate.render_views import render_run
-    from neilfpp_method.evaluate.report import write_light_picture
+    from neilfpp_method.evaluate.sheet import write_light_picture
     from neilfpp_method.evaluate.size import at_size, size_in_words
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.device import pick_device

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from neilfpp_method.commands.command import Command, Device, terminal
+from neilfpp_method.commands.report import after_training
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.files import read_settings
 from neilfpp_method.settings.plain import changed
@@ -58,6 +59,8 @@ class Train:
     """End with exit status 1 where the result is of no use (docs/health.md)."""
     device: Device = "auto"
     """Where to train; auto takes a GPU where there is one."""
+    report: bool = True
+    """Write RUN/report.html at the end (docs/report.md)."""
     devices: int = 1
     """Processes that share the work, one per GPU (or CPU process)."""
 
@@ -97,6 +100,7 @@ def run(options: TrainWithSettings) -> None:
             strict=options.strict,
             effects=asked,
             console=terminal(),
+            at_end=(lambda path: after_training(path, options.device)) if options.report else None,
         )
 
 

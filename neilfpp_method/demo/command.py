@@ -10,18 +10,21 @@ from rich.console import Console
 
 from neilfpp_method.effects.asked import read_asked
 from neilfpp_method.evaluate.protocols import evaluate, write_metrics
-from neilfpp_method.evaluate.report import write_report
+from neilfpp_method.evaluate.sheet import write_contact_sheet
 from neilfpp_method.evaluate.views import render_test_views
+from neilfpp_method.report.write import REPORT, ReportOptions, write_report
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.device import pick_device
-from neilfpp_method.train.run import load_run, read_json
+from neilfpp_method.train.run import load_run
 
 __all__ = ["demo_config", "demo_scene", "run_demo"]
 
 STEPS = {"sdf_steps": 1600, "material_steps": 1200, "joint_steps": 100}
 """Of the three stages: some less than the preset has, for five to ten minutes on two cores of today."""
+VIEWS = 3
+"""In the report."""
 SHORT = 20
 """A short demo takes one step in so many."""
 
@@ -59,6 +62,7 @@ def run_demo(out: Path, *, short: bool, resume: bool, device: str, console: Cons
     metrics = evaluate(run, rendered=rendered)
     write_metrics(out / "metrics.json", run, metrics)
     console.print("drawing the report …")
-    report = write_report(run, out, metrics, read_json(out / "timing.json"), rendered)
+    write_contact_sheet(run, out / "contact_sheet.png", rendered)
+    report = write_report(out, out / REPORT, ReportOptions(VIEWS, confidence=True), str(pick_device(device)))
     console.print(f"done: open {report}", soft_wrap=True)
     return report

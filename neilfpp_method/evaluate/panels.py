@@ -31,7 +31,7 @@ from neilfpp_method.shading.color import srgb_to_linear
 from neilfpp_method.structures import OrientedPoints
 from neilfpp_method.train.run import Run
 
-__all__ = ["albedo_scale", "light_sections", "view_sections"]
+__all__ = ["ComparedMap", "Comparison", "albedo_scale", "compared_maps", "light_sections", "view_sections"]
 
 POINTS = 4
 POINTS_PER_SECTION = 2
@@ -45,17 +45,21 @@ SHADE = (232, 232, 229)
 
 @dataclass(frozen=True)
 class Comparison:
-    """One map of one view, ready to be shown."""
+    """One map of one view, ready to be shown; where the estimate and the truth have a surface, if not all of it counts."""
 
     estimate: UInt8[np.ndarray, "H W 3"]
     truth: UInt8[np.ndarray, "H W 3"] | None = None
     error: UInt8[np.ndarray, "H W 3"] | None = None
+    hit: Bool[np.ndarray, "H W"] | None = None
+    known: Bool[np.ndarray, "H W"] | None = None
 
 
 @dataclass(frozen=True)
 class ComparedMap:
-    """One map over all shown views. `largest` is the error at the bright end of its scale, `unit` that of the error."""
+    """One map over all shown views, by its name in `model.Maps`. `largest` is the error at the bright end of its scale, `unit`
+    that of the error."""
 
+    name: str
     title: str
     note: str
     comparisons: tuple[Comparison, ...]
@@ -80,12 +84,7 @@ def view_sections(
     run: Run, rendered: Sequence[RenderedView], known: Sequence[KnownView], scale: Float[np.ndarray, " 3"] | None
 ) -> list[Section]:
     """Maps with a truth in three columns a view; those without in one."""
-    maps = [
-        _image_map(run, rendered, known),
-        *_material_maps(run, rendered, known, scale),
-        *_deviation_maps(rendered),
-        _normal_map(rendered, known),
-    ]
+    maps = [m for m in compared_maps(run, rendered, known, scale) if m.name != "rgb_volume" or not run.has_material]
     compared = tuple(m.row for m in maps if m.has_truth)
     alone = tuple(m.estimates for m in maps if not m.has_truth)
     titles = [f"View {view.name}" for view in rendered]
@@ -93,17 +92,30 @@ def view_sections(
     return sections + ([Section(tuple(Group(title, ("estimate",)) for title in titles), alone)] if alone else [])
 
 
-def _image_map(run: Run, rendered: Sequence[RenderedView], known: Sequence[KnownView]) -> ComparedMap:
+def compared_maps(
+    run: Run, rendered: Sequence[RenderedView], known: Sequence[KnownView], scale: Float[np.ndarray, " 3"] | None
+) -> list[ComparedMap]:
+    """Every map that the views have: images, the material with its expected errors, normals."""
+    images = ("rgb", "rgb_volume") if run.has_material else ("rgb_volume",)
+    return [
+        *(_image_map(run, name, rendered, known) for name in images),
+        *_material_maps(run, rendered, known, scale),
+        *_deviation_maps(rendered),
+        _normal_map(rendered, known),
+    ]
+
+
+def _image_map(run: Run, name: str, rendered: Sequence[RenderedView], known: Sequence[KnownView]) -> ComparedMap:
     images = [k.image if run.capture.hdr else srgb_to_linear(torch.from_numpy(k.image)).numpy() for k in known]
     seen = np.concatenate([image[k.mask] for image, k in zip(images, known, strict=True)])
     exposure = auto_exposure(seen) if run.capture.hdr else 1.0
     comparisons = []
     for view, image in zip(rendered, images, strict=True):
-        shown, truth = display_color(view.maps["rgb"], exposure), display_color(image, exposure)
+        shown, truth = display_color(view.maps[name], exposure), display_color(image, exposure)
         comparisons.append(Comparison(shown, truth, display_error(_difference(shown, truth), 0.25)))
-    source = "rendering equation" if run.has_material else "volume rendering"
+    source = "rendering equation" if name == "rgb" else "volume rendering"
     note = f"{source}\nexposure {exposure:.2g}" if run.capture.hdr else source
-    return ComparedMap("Image", note, tuple(comparisons), 0.25)
+    return ComparedMap(name, "Image", note, tuple(comparisons), 0.25)
 
 
 def _material_maps(
@@ -131,34 +143,39 @@ def _material_map(
     comparisons = []
     for view, k in zip(rendered, known, strict=True):
         shown = display(name, view.maps[name] * factor)
-        comparison = Comparison(cut_out(shown, view.maps["base_color"].any(-1)))
+        hit = view.maps["base_color"].any(-1)
+        comparison = Comparison(cut_out(shown, hit), hit=hit)
         if k.material is not None:
             truth = display(name, k.material[name])
             error = cut_out(display_error(_difference(shown, truth), 0.5), k.mask)
-            comparison = replace(comparison, truth=cut_out(truth, k.mask), error=error)
+            comparison = replace(comparison, truth=cut_out(truth, k.mask), error=error, known=k.mask)
         comparisons.append(comparison)
-    return ComparedMap(title, note, tuple(comparisons), 0.5)
+    return ComparedMap(name, title, note, tuple(comparisons), 0.5)
 
 
 def _deviation_maps(rendered: Sequence[RenderedView]) -> Iterator[ComparedMap]:
     """How far off the material may be, on the scale of its errors, of views that have been asked."""
     for title, name in (("Base colour", "base_color_std"), ("Roughness", "roughness_std"), ("Metallic", "metallic_std")):
         if all(name in view.maps for view in rendered):
-            shown = tuple(Comparison(cut_out(display_error(view.maps[name][..., 0], 0.5), _hit(view))) for view in rendered)
-            yield ComparedMap(f"{title} ±", "expected error\ndark 0, bright 0.5", shown, 0.5)
+            shown = tuple(
+                Comparison(cut_out(display_error(view.maps[name][..., 0], 0.5), _hit(view)), hit=_hit(view))
+                for view in rendered
+            )
+            yield ComparedMap(name, f"{title} ±", "expected error\ndark 0, bright 0.5", shown, 0.5)
 
 
 def _normal_map(rendered: Sequence[RenderedView], known: Sequence[KnownView]) -> ComparedMap:
     comparisons = []
     for view, k in zip(rendered, known, strict=True):
         normal = view.maps["normal"]
-        comparison = Comparison(cut_out(display("normal", normal), _hit(view)))
+        comparison = Comparison(cut_out(display("normal", normal), _hit(view)), hit=_hit(view))
         if k.normal is not None:
             angle = np.degrees(np.arccos(np.clip((normal * k.normal).sum(-1), -1.0, 1.0)))
             error = cut_out(display_error(angle, 45.0), k.mask)
-            comparison = replace(comparison, truth=cut_out(display("normal", k.normal), k.mask), error=error)
+            truth = cut_out(display("normal", k.normal), k.mask)
+            comparison = replace(comparison, truth=truth, error=error, known=k.mask)
         comparisons.append(comparison)
-    return ComparedMap("Normal", "scene axes as colours", tuple(comparisons), 45.0, "°")
+    return ComparedMap("normal", "Normal", "scene axes as colours", tuple(comparisons), 45.0, "°")
 
 
 def _hit(view: RenderedView) -> Bool[np.ndarray, "H W"]:

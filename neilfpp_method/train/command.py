@@ -72,6 +72,7 @@ def run_training(
     strict: bool = False,
     effects: Asked | None = None,
     command: str = "neilfpp train",
+    at_end: Callable[[Path], None] | None = None,
 ) -> Path:
     """Train a run to its end and return its folder. A run that is finished is left as it is.
 
@@ -82,6 +83,7 @@ def run_training(
         strict: end with an error where the result is of no use.
         effects: which effects are simulated (`effects.asked`); none: those of the settings, or with `resume` of the run.
         command: what a person types to get here, for the line that says how a stopped run continues.
+        at_end: called with the folder of a run that came to its end, sound or not, by the first process.
 
     Raises:
         UserError: bad input; no run folder is left behind.
@@ -163,6 +165,8 @@ def run_training(
     findings = list(watch.findings.values())
     if fabric.is_global_zero:
         console.print(f"health: {health_in_words(findings)}", soft_wrap=True, markup=False)
+        if at_end is not None:
+            at_end(out)
     if strict and verdict_of(findings) == "failed":
         raise Unsound(f"{out}: {findings[0].what}", findings[0].remedy)
     return out

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from neilfpp_method.evaluate.report import write_report
 from torch.nn.functional import normalize
 
 from neilfpp_method.cli import main
 from neilfpp_method.data.mesh import Mesh
-from neilfpp_method.evaluate.report import write_report
 from neilfpp_method.hosts import mesh_tracing
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.hosts.mesh_tracing import build_tree, embree_tracer, tree_tracer

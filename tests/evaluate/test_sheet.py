@@ -1,12 +1,9 @@
-"""The report and the renders of a small run: a sphere, untrained, before a capture whose truth is known."""
+"""The contact sheet and the renders of a small run: a sphere, untrained, before a capture whose truth is known."""
 
 from __future__ import annotations
 
-import base64
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import cv2
@@ -17,16 +14,12 @@ import torch
 
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.errors import UserError
-from neilfpp_method.evaluate import protocols
-from neilfpp_method.evaluate.glossary import explain
 from neilfpp_method.evaluate.panels import albedo_scale, light_sections, view_sections
 from neilfpp_method.evaluate.pictures import display
 from neilfpp_method.evaluate.render_views import render_run, view_names
-from neilfpp_method.evaluate.report import write_light_picture, write_report
+from neilfpp_method.evaluate.sheet import write_contact_sheet, write_light_picture
 from neilfpp_method.evaluate.views import RenderedView, known_test_views, render_test_views, render_view
 from neilfpp_method.fields.lamps import Lamps
-from neilfpp_method.settings.types import MapLightConfig
-from neilfpp_method.train.light_record import LightFit, write_fits
 from neilfpp_method.train.run import Run
 from tests.data.make_capture import make_capture
 from tests.scenes import sphere_model, tiny_config
@@ -55,63 +48,19 @@ def sections_of(run: Run):
     return view_sections(run, rendered, known, albedo_scale(rendered, known))
 
 
-class Page(HTMLParser):
-    """The text of a page, its pictures, and whatever it would load from elsewhere."""
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.text, self.pictures, self.loaded = "", [], []
-        self.feed(html)
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
-
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        sources = [value for name, value in attributes if name in ("src", "href")]
-        self.pictures += [value for value in sources if value.startswith("data:image/png;base64,")]
-        self.loaded += [value for value in sources if not value.startswith("data:")]
-        self.loaded += [tag] if tag in ("script", "link") else []
-
-
 # --------------------------------------------------------------------------------------------------------------- report
 
 
-def test_report_holds_its_pictures_and_explains_every_figure(root: Path, tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(protocols, "SURFACE_POINTS", 1000)
-    monkeypatch.setattr(protocols, "MESH_RESOLUTION", 32)
-    run = make_run(root)
-    figures = protocols.evaluate(run)
-    path = write_report(run, tmp_path, figures, {"sdf_init": 61.0, "material_init": 3601.0, "joint": 0.25})
-    page = Page(path.read_text())
-    assert page.loaded == []
-    assert "ball & <stick>" in page.text
-    assert "4 views of 24×18, 2 to train on and 2 to test on" in page.text
-    for duration in ("1 min 01 s", "1 h 00 min", "0.2 s"):
-        assert duration in page.text
-    for name, value in figures.items():
-        entry = explain(name.removesuffix("_frame"))
-        assert entry.meaning, name
-        assert entry.format(value) in page.text, name
-    assert len(page.pictures) == 2
-    for picture in page.pictures:
-        data = base64.b64decode(picture.split(",")[1], validate=True)
-        assert data.startswith(b"\x89PNG\r\n")
-        assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).std() > 5
-    assert cv2.imread(str(tmp_path / "contact_sheet.png")).shape[1] > 1000
+def test_contact_sheet_shows_views_and_light(root: Path, tmp_path: Path):
+    write_contact_sheet(make_run(root), tmp_path / "sheet.png")
+    sheet = cv2.imread(str(tmp_path / "sheet.png"))
+    assert sheet.shape[1] > 1000
+    assert sheet.std() > 5
 
 
-def test_report_of_a_run_without_material_shows_geometry_alone(root: Path, tmp_path: Path):
-    run = make_run(root, step=4)
-    titles = [row.title for section in sections_of(run) for row in section.rows]
+def test_a_run_without_material_shows_geometry_alone(root: Path):
+    titles = [row.title for section in sections_of(make_run(root, step=4)) for row in section.rows]
     assert titles == ["Image", "Normal"]
-    assert len(Page(write_report(run, tmp_path, {}, {}).read_text()).pictures) == 1
-
-
-def test_report_of_a_capture_that_holds_nothing_out_shows_training_views(root: Path, tmp_path: Path):
-    run = replace(make_run(root), capture=load_capture(root, test_every=0))
-    page = Page(write_report(run, tmp_path, {}, {}).read_text())
-    assert len(page.pictures) == 2
-    assert "4 to train on and 0 to test on" in page.text
 
 
 def test_maps_without_truth_have_no_truth_column(root: Path, tmp_path: Path):
@@ -228,15 +177,6 @@ def test_the_light_is_drawn_alone(root: Path, tmp_path: Path):
     path.unlink()
     assert not write_light_picture(make_run(root, step=4), path)  # no stage has moved the light
     assert not path.exists()
-
-
-def test_the_report_says_what_spoke_for_lamps(root: Path, tmp_path: Path):
-    run = make_run(root)
-    light = MapLightConfig(kind="auto")
-    run = replace(run, path=tmp_path, config=replace(run.config, light=light))
-    write_fits(tmp_path, [LightFit(5, 0.02, 0.004, 204, 3), LightFit(run.step, -0.001, 0.003, 204, 0)])
-    text = Page(write_report(run, tmp_path, {}, {}).read_text()).text
-    assert "an environment map and 3 lamps before it (error −2.0 ± 0.4 % at 204 points kept back)" in text
 
 
 # -------------------------------------------------------------------------------------------------------------- renders

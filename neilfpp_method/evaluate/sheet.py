@@ -1,0 +1,66 @@
+"""Pictures of a run for documents: a contact sheet of views and light beside the truth, and the light alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from neilfpp_method.data.images import write_png
+from neilfpp_method.evaluate.confidence import gather_evidence, with_deviation
+from neilfpp_method.evaluate.panels import albedo_scale, light_sections, view_sections
+from neilfpp_method.evaluate.pictures import contact_sheet
+from neilfpp_method.evaluate.views import RenderedView, known_test_views, render_view
+from neilfpp_method.schedule import stage_steps
+from neilfpp_method.train.run import Run
+
+__all__ = ["write_contact_sheet", "write_light_picture"]
+
+SHOWN_VIEWS = 3
+CONFIDENCE_STEP = 2
+"""One pixel in so many by so many is asked how far off it may be."""
+
+
+def write_contact_sheet(run: Run, path: Path, rendered: Sequence[RenderedView] = ()) -> None:
+    """Write up to three views of a run with the light at four points, as a PNG.
+
+    Args:
+        run: the run; its test views are shown, its training views where none is held out.
+        path: the file.
+        rendered: views that somebody has rendered already; the others are rendered here.
+    """
+    shown = _with_shown_views(run)
+    at_hand = {view.name: view for view in rendered}
+    rendered = [at_hand.get(view.name) or render_view(run, run.capture.views.index(view)) for view in shown.capture.test_views]
+    known = known_test_views(shown, rendered).views
+    scale = albedo_scale(rendered, known) if run.has_material else None
+    if run.has_material and run.capture.train_views:
+        evidence = gather_evidence(run)
+        rendered = [with_deviation(run, evidence, view, CONFIDENCE_STEP) for view in rendered]
+    views = view_sections(shown, rendered, known, scale)
+    light = light_sections(shown, rendered, scale) if run.has_material else []
+    title = f"{run.capture.root.resolve().name}, {run.config.preset}"
+    subtitle = f"step {run.step} of {sum(stage_steps(run.config.train).values())}"
+    write_png(path, contact_sheet(title, subtitle, [*views, *light]))
+
+
+def write_light_picture(run: Run, path: Path) -> bool:
+    """Write the pictures of incident light alone, as a PNG. Returns whether the run has any to show."""
+    if not run.has_material:
+        return False
+    shown = _with_shown_views(run)
+    rendered = [render_view(run, run.capture.views.index(view)) for view in shown.capture.test_views]
+    scale = albedo_scale(rendered, known_test_views(shown, rendered).views)
+    sections = light_sections(shown, rendered, scale)
+    if sections:
+        write_png(path, contact_sheet("", "", sections))
+    return bool(sections)
+
+
+def _with_shown_views(run: Run) -> Run:
+    """The run with up to three views held out, spread over those that are, or over the training views where none is."""
+    views = run.capture.test_views or run.capture.train_views
+    rows = np.linspace(0, len(views) - 1, SHOWN_VIEWS).round().astype(int)
+    return replace(run, capture=replace(run.capture, test=frozenset(views[row].name for row in rows)))

@@ -1,0 +1,133 @@
+"""What lies in a run's folder besides its model: how far it came, figures, times, findings, effects, settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from neilfpp_method.errors import UserError
+from neilfpp_method.health.cases import Finding
+from neilfpp_method.schedule import stage_steps
+from neilfpp_method.settings.plain import to_dict
+from neilfpp_method.settings.presets import PRESETS, fixed_geometry, free_light
+from neilfpp_method.settings.types import MeshConfig, NeilfConfig
+from neilfpp_method.train.health_record import read_findings
+from neilfpp_method.train.run import read_description, read_json
+from neilfpp_method.train.work_record import read_work
+
+__all__ = ["Changed", "Files", "changed_settings", "read_files"]
+
+Read = TypeVar("Read")
+
+
+@dataclass(frozen=True)
+class Changed:
+    """A setting that is not that of the preset; `usual` is none where the preset does not have it."""
+
+    name: str
+    value: str
+    usual: str | None
+
+
+@dataclass(frozen=True)
+class Files:
+    """What the files of a run say.
+
+    Attributes:
+        path: the run's folder.
+        config: its settings.
+        steps: of the whole training.
+        findings: of its health; none: it has no record.
+        metrics, protocol: of `neilfpp eval`; empty where it was not called.
+        measured_before: whether the figures are older than the checkpoint.
+        timing: seconds of each stage.
+        work: seconds of each stage by kind of work.
+        effects: a row per effect, as `effects.json` has them.
+        machine: versions and hardware.
+        notes: what could not be read.
+    """
+
+    path: Path
+    config: NeilfConfig
+    steps: int
+    findings: list[Finding] | None
+    metrics: Mapping[str, float]
+    protocol: Mapping[str, str]
+    measured_before: bool
+    timing: Mapping[str, float]
+    work: Mapping[str, Mapping[str, float]]
+    effects: list[Mapping[str, Any]]
+    machine: Mapping[str, Any]
+    notes: list[str]
+
+
+def read_files(path: Path) -> Files:
+    """The files of a run. A damaged one besides its settings is left out, and a note says so.
+
+    Raises:
+        UserError: there is no run, or its settings cannot be read.
+    """
+    config = read_description(path).config
+    notes: list[str] = []
+
+    def tried(read: Callable[[], Read], else_: Read) -> Read:
+        try:
+            return read()
+        except UserError as error:
+            notes.append(str(error))
+            return else_
+
+    def optional(name: str) -> dict[str, Any]:
+        return tried(lambda: read_json(path / name), {}) if (path / name).is_file() else {}
+
+    last, figures = path / "checkpoints" / "last.pt", path / "metrics.json"
+    before = last.is_file() and figures.is_file() and figures.stat().st_mtime < last.stat().st_mtime
+    rows = optional("effects.json").get("effects")
+    return Files(
+        path=path,
+        config=config,
+        steps=sum(stage_steps(config.train).values()),
+        findings=tried(lambda: read_findings(path), None),
+        metrics=_numbers(optional("metrics.json")),
+        protocol={name: str(text) for name, text in optional("metrics-protocol.json").items()},
+        measured_before=before,
+        timing=_numbers(optional("timing.json")),
+        work=tried(lambda: read_work(path), {}),
+        effects=[row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else [],
+        machine=optional("environment.json"),
+        notes=notes,
+    )
+
+
+def changed_settings(config: NeilfConfig) -> list[Changed] | None:
+    """The settings that are not those of the preset; none where the preset is not known."""
+    name = config.preset.removesuffix("-mesh")
+    if name in PRESETS:
+        base = PRESETS[name]()
+    elif name == NeilfConfig().preset:
+        base = NeilfConfig()
+    else:
+        return None
+    base = fixed_geometry(base) if isinstance(config.host, MeshConfig) else base
+    base = free_light(base) if config.light.kind == "free" and base.light.kind != "free" else base
+    own, usual = _flat(to_dict(config)), _flat(to_dict(base))
+    return [
+        Changed(key, str(value), None if key not in usual else str(usual[key]))
+        for key, value in own.items()
+        if key not in usual or usual[key] != value
+    ]
+
+
+def _flat(values: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        found |= _flat(value, f"{where}{name}.") if isinstance(value, Mapping) else {f"{where}{name}": value}
+    return found
+
+
+def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
+    return {
+        key: float(v) for key, v in values.items() if isinstance(v, int | float) and not isinstance(v, bool)
+    }
