@@ -90,11 +90,12 @@ def _train_stage(run: Training, model: NeilfModel, optimizer: torch.optim.Optimi
     run.reporter.begin_stage(stage.value, position.step, position.length)
     started = time.perf_counter()
     before = run.seconds.get(stage.value, 0.0)
+    gradients = "smoothness" in active_losses(stage, run.config, model.stages)  # nothing else asks for them
     for number in range(position.step, position.length):
         seed_step(settings.seed, step, run.fabric.global_rank)
         share = number / position.length
         set_rates(optimizer, run.config.optimizer, StagePosition(stage, number, position.length))
-        batch = run.pixels.sample(settings.rays)
+        batch = run.pixels.sample(settings.rays, gradients)
         computed = wrapped(batch, stage)
         total = weigh(computed.terms, active_losses(stage, run.config, model.stages, share))
         stop = _update(run, model, optimizer, computed.terms, total, step)
