@@ -45,6 +45,7 @@ from neilfpp_method.structures import (
     SurfaceHits,
     SurfacePixels,
 )
+from neilfpp_method.timing.ledger import doing
 
 __all__ = ["Maps", "NeilfModel"]
 
@@ -104,13 +105,12 @@ class NeilfModel(nn.Module):
             object.__setattr__(self, "host", host)  # past nn.Module, which would take it in
         else:
             self.host = host
-        self.config, self.facts, self.borrowed = config, facts, borrowed
+        self.facts, self.borrowed = facts, borrowed
         self.units = radiance_units(config, facts)
         self.stages = host.stages if isinstance(host, HasStages) else BORROWED_HOST if borrowed else STAGES
         self.check_outputs = OutputCheck(host, config.shading.hit_share)
         self.observers: list[Callable[[PixelBatch, SurfaceHits], None]] = []
-        lobe = LOBES[config.shading.lobe]
-        self.lobe = lobe if config.shading.specular else None
+        self.use(config)
         self.brdf = BrdfField(config.brdf, config.encoding, config.volume.radius)
         albedo = initial_albedo(config.brdf.initial_base_color, config.brdf.initial_metallic, self.lobe)
         parts = make_light(config, facts.response, facts.median_radiance / albedo)
@@ -118,6 +118,11 @@ class NeilfModel(nn.Module):
         # The surface of a borrowed host moves as its own trainer likes.
         stands_still = not borrowed and not self.stages[Stage.MATERIAL_INIT].moves_host
         self.replay = Replay(config.train.fresh if stands_still else 1.0, config.train.rays)
+
+    def use(self, config: NeilfConfig) -> None:
+        """Compute with these settings from now on. They switch effects; sizes of fields stay what they were built with."""
+        self.config = config
+        self.lobe = LOBES[config.shading.lobe] if config.shading.specular else None
 
     # -------------------------------------------------------------------------------------------------------- one step
 
@@ -164,6 +169,7 @@ class NeilfModel(nn.Module):
             terms["inter_reflection"] = self._inter_reflection(surface.position, surface.normal)
         return StepResult.of(terms, rendered, self._beyond(batch, hits))
 
+    @doing("rendering")
     def _render_host(
         self, batch: PixelBatch, plan: StagePlan, names: Mapping[str, float], hits: SurfaceHits | None
     ) -> tuple[SurfaceHits, dict[str, LossTerm]]:
@@ -182,6 +188,7 @@ class NeilfModel(nn.Module):
                 observe(batch, hits)
         return hits, terms
 
+    @doing("shading")
     def _surface_pixels(self, hits: SurfaceHits, pixels: PixelBatch) -> SurfacePixels:
         settings = self.config.loss
         return SurfacePixels(
@@ -192,9 +199,11 @@ class NeilfModel(nn.Module):
             image_gradient=pixels.image_gradient,
         )
 
+    @doing("shading")
     def _material_and_priors(self, surface: SurfacePixels, names: Mapping[str, float], terms: dict[str, LossTerm]) -> Material:
         if "smoothness" in names:
-            sample = self.brdf.with_gradients(surface.position)
+            with doing("regularisers"):
+                sample = self.brdf.with_gradients(surface.position)
             material, slopes = sample.material, (sample.roughness_gradient, sample.metallic_gradient)
             terms["smoothness"] = losses.smoothness(*slopes, surface.image_gradient)
         else:
@@ -203,6 +212,7 @@ class NeilfModel(nn.Module):
             terms["lambertian"] = losses.lambertian(material)
         return material
 
+    @doing("tracing")
     def _inter_reflection(self, position: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]) -> LossTerm:
         traced = trace_light(self.host, position, normal, self.config.inter_reflection, self.config.shading.hit_share)
         hit = torch.nonzero(traced.hit)[:, 0]
@@ -248,6 +258,7 @@ class NeilfModel(nn.Module):
         """Linear radiance that arrives at x from wi: from light and lamps, or from the scene before them."""
         return incident_radiance(self.sources, x, wi)
 
+    @doing("shading")
     def shade(
         self,
         position: Float[Tensor, "N 3"],

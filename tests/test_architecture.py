@@ -18,7 +18,7 @@ SOURCES = {
 
 # A room may import what stands to its left, and itself; rooms of one step know nothing of one another. Lower is right.
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("errors", "structures"),
+    ("errors", "structures", "timing"),
     ("settings",),
     ("kernels", "lighting.ring"),
     ("shading", "volume", "schedule"),
@@ -26,7 +26,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("hosts.base", "lighting"),
     ("hosts", "incident"),
     ("model",),
-    ("health",),
+    ("health", "effects"),
     ("attach", "train"),
     ("export",),
     ("evaluate",),

@@ -51,6 +51,9 @@ class Train:
     """What the pixels are: linear radiance (HDR) or sRGB (LDR); auto: told from the files."""
     scale: float | None = None
     """Size of the images over that of their files, 1: as they are; none: as large as the training's rays can use."""
+    effects: str | None = None
+    """What is simulated: auto (evidence decides), all, none, as-set (the settings decide), or a list such as auto,-lamps
+    (docs/effects.md); none: auto, and as-set for the published presets."""
     strict: bool = False
     """End with exit status 1 where the result is of no use (docs/health.md)."""
     device: Device = "auto"
@@ -68,12 +71,17 @@ class TrainWithSettings(Train):
 
 
 def run(options: TrainWithSettings) -> None:
+    from neilfpp_method.effects.asked import read_asked
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.command import run_training
 
     config = _with_files(options)
     named = options.preset is not None or options.config_file is not None
     as_before = options.resume and not named and config == preset(DEFAULT_PRESET)
+    published = config.preset.startswith("paper-")
+    asked = None if options.resume and options.effects is None else read_asked(
+        options.effects or ("as-set" if published else "auto")
+    )
     with computing_fast():
         run_training(
             data=options.data,
@@ -87,6 +95,7 @@ def run(options: TrainWithSettings) -> None:
             device=options.device,
             devices=options.devices,
             strict=options.strict,
+            effects=asked,
             console=terminal(),
         )
 
@@ -164,6 +173,7 @@ COMMAND = Command(
         "neilfpp train --data captures/teapot --light studio.exr",
         "neilfpp train --data captures/teapot --scale 1   (images at their full size)",
         "neilfpp train --out runs/teapot --resume",
+        "neilfpp train --data captures/teapot --effects auto,-lamps   (evidence decides, but no lamps)",
         "neilfpp train --data captures/teapot --config.train.joint-steps 0   (the separate pipeline)",
         "neilfpp train --data captures/teapot --config.inter-reflection.mode off",
     ],

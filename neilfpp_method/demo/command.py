@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from neilfpp_method.effects.asked import read_asked
 from neilfpp_method.evaluate.protocols import evaluate, write_metrics
 from neilfpp_method.evaluate.report import write_report
 from neilfpp_method.evaluate.views import render_test_views
@@ -49,6 +50,7 @@ def run_demo(out: Path, *, short: bool, resume: bool, device: str, console: Cons
         device=device,
         devices=1,
         console=console,
+        effects=None if resume else read_asked("auto"),
         command="neilfpp demo",
     )
     run = load_run(out, pick_device(device))

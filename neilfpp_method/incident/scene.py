@@ -9,6 +9,7 @@ from torch import Tensor
 from neilfpp_method.hosts.base import HasSurfaceWidth, Host, LightsItself
 from neilfpp_method.settings.types import InterReflectionConfig
 from neilfpp_method.structures import RayBatch, SceneLight, SceneTracer
+from neilfpp_method.timing.ledger import doing
 
 __all__ = ["off_surface", "scene_light", "scene_tracer"]
 
@@ -28,6 +29,7 @@ def scene_tracer(host: Host, config: InterReflectionConfig, hit_share: float) ->
     return lambda x, wi: scene_light(host, x, wi, config, hit_share)
 
 
+@doing("tracing")
 @torch.no_grad()
 def scene_light(
     host: Host,

@@ -48,6 +48,10 @@ class LightSolver(Protocol):
         """Remember what a training step showed of the surface and of the light beyond it."""
         ...
 
+    def use(self, config: FreeLightConfig | MapLightConfig, lobe: Lobe | None) -> None:
+        """Solve with these settings, and for surfaces of this lobe, from now on; what is remembered stays."""
+        ...
+
     def solve(self, brdf: BrdfField, scene: SceneTracer | None) -> Evidence | None:
         """Set the light to what explains the remembered points, when it is time.
 
@@ -68,6 +72,9 @@ class NothingToSolve(nn.Module):
 
     def observe(self, step: StepResult) -> None:
         """Nothing is remembered."""
+
+    def use(self, config: FreeLightConfig | MapLightConfig, lobe: Lobe | None) -> None:
+        """Nothing depends on the settings."""
 
     def solve(self, brdf: BrdfField, scene: SceneTracer | None) -> None:
         """Nothing is solved for."""
@@ -97,7 +104,7 @@ class MapSolver(nn.Module):
     @property
     def due(self) -> bool:
         """Whether `solve` would solve now."""
-        return self.memory.due
+        return self.memory.due and not _is_given(self.config)
 
     @property
     def points(self) -> int:
@@ -111,6 +118,10 @@ class MapSolver(nn.Module):
         self.memory.remember(step.surface)
         if self.sky is not None:
             self.sky.remember(*step.beyond_rows.split(3, -1))
+
+    def use(self, config: MapLightConfig, lobe: Lobe | None) -> None:
+        """As of `LightSolver`."""
+        self.config, self.lobe = config, lobe
 
     @torch.no_grad()
     def solve(self, brdf: BrdfField, scene: SceneTracer | None) -> Evidence | None:
@@ -127,6 +138,11 @@ def make_light_solver(
     config: FreeLightConfig | MapLightConfig, facts: SceneFacts, units: RadianceUnits, light: LightModel, lobe: Lobe | None
 ) -> MapSolver | NothingToSolve:
     """The solver that a light needs; arguments as of `MapSolver`."""
-    if isinstance(config, FreeLightConfig) or (config.map is not None and config.kind == "distant"):
+    if isinstance(config, FreeLightConfig) or _is_given(config):
         return NothingToSolve()
     return MapSolver(config, facts, units, light, lobe)
+
+
+def _is_given(config: MapLightConfig) -> bool:
+    """Whether the map is known and nothing is sought before it."""
+    return config.map is not None and config.kind == "distant"

@@ -20,6 +20,10 @@ from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.environment_map import check_environment
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import at_scale, scale_for_rays
+from neilfpp_method.effects.asked import Asked, check_asked
+from neilfpp_method.effects.looks import note_facts
+from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.table import table
 from neilfpp_method.errors import Unsound, UserError
 from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.health.watch import LOOKED_AT, Watch
@@ -27,8 +31,10 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, stage_steps
 from neilfpp_method.settings.check import check_config
 from neilfpp_method.settings.types import NeilfConfig
+from neilfpp_method.timing.ledger import Ledger, doing, listening
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.device import pick_device
+from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.health_record import in_words as health_in_words
 from neilfpp_method.train.light_record import in_words
 from neilfpp_method.train.loop import Training, seed_step, train
@@ -45,6 +51,7 @@ from neilfpp_method.train.run import (
     read_description,
 )
 from neilfpp_method.train.start import start_geometry
+from neilfpp_method.train.work_record import read_work, waiting, write_work
 
 __all__ = ["run_training"]
 
@@ -63,6 +70,7 @@ def run_training(
     format: str | None = None,
     scale: float | None = None,
     strict: bool = False,
+    effects: Asked | None = None,
     command: str = "neilfpp train",
 ) -> Path:
     """Train a run to its end and return its folder. A run that is finished is left as it is.
@@ -72,6 +80,7 @@ def run_training(
         format: the capture's format; none: told from what is in the folder.
         scale: size of the images over that of their files; none: as large as the rays of the training can use.
         strict: end with an error where the result is of no use.
+        effects: which effects are simulated (`effects.asked`); none: those of the settings, or with `resume` of the run.
         command: what a person types to get here, for the line that says how a stopped run continues.
 
     Raises:
@@ -81,19 +90,28 @@ def run_training(
         Unsound: `strict`, and a finding is severe; the run is kept.
     """
     place = pick_device(device)
+    ledger = Ledger(synchronise=waiting(place))
     # Whatever the headers and the settings can tell is told before other processes start.
     if resume:
         if out is None:
             raise UserError("--resume needs the run's folder", "give it with --out RUN")
         described = read_description(out)
         _refuse_changes(out, described, data, config, test_every, response, format, scale)
-        config, source = described.config, described.source
+        plan, source = read_plan(out, described.config), described.source
+        if effects not in (None, plan.asked):
+            raise UserError(f"{out}: its effects are '{plan.asked}'", "leave --effects out, or start a new run")
+        config = plan.config_of_model
         if _is_finished(out, config):
             console.print(f"run folder {out}: finished already, nothing to continue", soft_wrap=True)
             return out
+        ledger.add(read_work(out))
     else:
         if data is None or config is None:
             raise UserError("no capture given", "name its folder with --data DIR")
+        asked = effects or Asked("as-set")
+        check_asked(asked, config)
+        plan = Plan.begin(asked, config)
+        settings, config = config, plan.config
         _check(config)
         source = CaptureSource(str(data.resolve()), test_every, response, format)
         out = out or Path("runs") / f"{data.resolve().name}-{config.preset}"
@@ -105,9 +123,11 @@ def run_training(
         capture = at_scale(capture, source.scale)
     check_training_memory(capture)
     fabric = _launch(place, devices)
-    with _nothing_left_on_failure(out):
+    with listening(ledger), _nothing_left_on_failure(out):
         pixels = _load_pixels(capture, out / PIXELS, fabric, console)
         facts = described.facts if resume else scene_facts(capture, pixels, config)
+        note_facts(plan, facts)
+        config = plan.config_of_model
         seed_step(config.train.seed, step=-1)
         model = build_model(capture, facts, config)
         begins = not (out / "checkpoints" / "last.pt").exists()
@@ -115,7 +135,8 @@ def run_training(
             show_known_light(model)
         if fabric.is_global_zero:
             if not resume:
-                create_run(out, config, source, facts)
+                create_run(out, settings, source, facts)
+                write_plan(out, plan)
             console.print(capture.summary, soft_wrap=True)
             if source.scale < 1 and not resume:
                 console.print(_scaled(source.scale, len(pixels), rays), soft_wrap=True)
@@ -126,13 +147,19 @@ def run_training(
             console.print(started.text, style="yellow" if started.warning else None, soft_wrap=True)
     fabric.barrier()
     continue_with = _continue_with(command, out, device, devices)
-    with reporting(out, console, fabric.is_global_zero) as reporter, _stop_request() as stopped:
+    with listening(ledger), reporting(out, console, fabric.is_global_zero) as reporter, _stop_request() as stopped:
         preview = _preview(out, capture, fabric, reporter)
         solver, watch = model.light_solver(), _watch(pixels, config, reporter)
-        training = Training(out, config, model, pixels, fabric, reporter, stopped, preview, continue_with, solver, watch)
+        training = Training(
+            out, config, model, pixels, fabric, reporter, stopped, preview, continue_with, solver, watch, plan, ledger
+        )
         train(training)
+    if fabric.is_global_zero:
+        write_work(out, ledger)  # with the last checkpoint and picture
     if fabric.is_global_zero and training.fits:
         console.print(f"light: {in_words(config.light, training.fits)}", soft_wrap=True)
+    if fabric.is_global_zero and training.plan.asked.base != "as-set":
+        console.print(table(training.plan))
     findings = list(watch.findings.values())
     if fabric.is_global_zero:
         console.print(f"health: {health_in_words(findings)}", soft_wrap=True, markup=False)
@@ -231,6 +258,7 @@ def _nothing_left_on_failure(out: Path) -> Iterator[None]:
         raise
 
 
+@doing("data", apart=True)
 def _load_pixels(capture: Capture, folder: Path, fabric: Fabric, console: Console) -> PixelDataset:
     """One process reads the images, and all find them in the folder; what is wrong with them is wrong for all."""
     problem: tuple[str, str] | None = None

@@ -13,6 +13,8 @@ from lightning_fabric import Fabric
 from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.effects.looks import LOOKED_AT, after_fit, look_at_surface, wants_surface
+from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.errors import Diverged, Stopped, UserError
 from neilfpp_method.health.watch import Watch
 from neilfpp_method.lighting.solver import LightSolver
@@ -21,10 +23,13 @@ from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, 
 from neilfpp_method.settings.facts import RadianceUnits
 from neilfpp_method.settings.types import NeilfConfig, OptimizerConfig
 from neilfpp_method.structures import LossTerms, StepResult
+from neilfpp_method.timing.ledger import Ledger, doing
+from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.health_record import read_findings, write_findings
 from neilfpp_method.train.light_record import LightFit, note_fit, read_fits, write_fits
 from neilfpp_method.train.progress import Reporter
 from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, save_checkpoint, write_json
+from neilfpp_method.train.work_record import write_work
 
 __all__ = ["Training", "adam", "make_optimizer", "seed_step", "set_rates", "train"]
 
@@ -49,6 +54,8 @@ class Training:
     continue_with: str
     light_solver: LightSolver
     watch: Watch
+    plan: Plan
+    ledger: Ledger = field(default_factory=Ledger)
     fits: list[LightFit] = field(default_factory=list)
     skipped: int = 0
     skipped_in_a_row: int = 0
@@ -69,15 +76,22 @@ def train(run: Training) -> None:
     step = _restore(run, optimizer)
     total = sum(stage_steps(settings).values())
     optimizer = run.fabric.setup_optimizers(optimizer)
+    if step == 0 and model.stages[stage_at(0, settings).stage].moves_material:
+        _look_at_effects(run, model, 0)
     while step < total:
         position = stage_at(step, settings)
         step = _train_stage(run, model, optimizer, step, position)
         if run.fabric.is_global_zero:
-            run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
+            with doing("looks", apart=True):
+                run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
+        if step < total:
+            with doing("looks", apart=True):
+                _look_at_effects(run, model, step)
         _save(run, optimizer, step, also=position.stage.value)
-        model.eval()
-        run.preview(model, position.stage)
-        model.train()
+        with doing("looks", apart=True):
+            model.eval()
+            run.preview(model, position.stage)
+            model.train()
 
 
 def _train_stage(run: Training, model: NeilfModel, optimizer: torch.optim.Optimizer, step: int, position: StagePosition) -> int:
@@ -87,19 +101,22 @@ def _train_stage(run: Training, model: NeilfModel, optimizer: torch.optim.Optimi
     model.freeze_for(stage)
     # Set up anew in each stage: data-parallel wrappers fix the set of moving parameters when they are made.
     wrapped = run.fabric.setup_module(model, move_to_device=False)
+    run.ledger.enter(stage.value)
     run.reporter.begin_stage(stage.value, position.step, position.length)
     started = time.perf_counter()
     before = run.seconds.get(stage.value, 0.0)
-    gradients = "smoothness" in active_losses(stage, run.config, model.stages)  # nothing else asks for them
+    gradients = "smoothness" in active_losses(stage, model.config, model.stages)  # nothing else asks for them
     for number in range(position.step, position.length):
-        seed_step(settings.seed, step, run.fabric.global_rank)
-        share = number / position.length
-        set_rates(optimizer, run.config.optimizer, StagePosition(stage, number, position.length))
-        batch = run.pixels.sample(settings.rays, gradients)
-        computed = wrapped(batch, stage)
-        total = weigh(computed.terms, active_losses(stage, run.config, model.stages, share))
-        stop = _update(run, model, optimizer, computed.terms, total, step)
-        _solve_light(run, model, computed, step)
+        with run.ledger.step(number):
+            seed_step(settings.seed, step, run.fabric.global_rank)
+            share = number / position.length
+            set_rates(optimizer, run.config.optimizer, StagePosition(stage, number, position.length))
+            with doing("data"):
+                batch = run.pixels.sample(settings.rays, gradients)
+            computed = wrapped(batch, stage)
+            total = weigh(computed.terms, active_losses(stage, model.config, model.stages, share))
+            stop = _update(run, model, optimizer, computed.terms, total, step)
+            _solve_light(run, model, computed, step)
         run.watch.after_step(model.stages[stage], computed, step)
         step += 1
         run.seconds[stage.value] = before + time.perf_counter() - started
@@ -116,17 +133,49 @@ def _solve_light(run: Training, model: NeilfModel, computed: StepResult, step: i
     """Show the light solver what a step showed; when it is time, it sets the light. The first process does it for all."""
     fabric, solver = run.fabric, run.light_solver
     if fabric.is_global_zero:
-        solver.observe(computed)
+        with doing("light_fits"):
+            solver.observe(computed)
     if not fabric.broadcast(solver.due):
         return
     if fabric.is_global_zero:
         run.watch.after_fit(solver.points, step)
-        note_fit(run.fits, solver.solve(model.brdf, model.scene), model.lamps.lit, step)
+        with doing("light_fits", apart=True):
+            found = solver.solve(model.brdf, model.scene)
+        note_fit(run.fits, found, model.lamps.lit, step)
+        _tell(run, after_fit(run.plan, found, model.lamps.lit, step + 1))
     if fabric.world_size > 1:
         for part in (model.light, model.lamps):
             part.load_state_dict(fabric.broadcast(part.state_dict()))
 
 
+def _look_at_effects(run: Training, model: NeilfModel, step: int) -> None:
+    """Let the surface decide what is simulated from here on, where that is open. The first process decides for all."""
+    if not wants_surface(run.plan):
+        return
+    decisions: list[Decision] = []
+    if run.fabric.is_global_zero:
+        seed_step(run.config.train.seed, -3 - step)
+        decisions = look_at_surface(run.plan, model, run.pixels.sample(LOOKED_AT), step)
+        _tell(run, decisions)
+    decisions = run.fabric.broadcast(decisions)
+    if not run.fabric.is_global_zero:
+        run.plan.decisions += decisions
+    _use(run, model)
+
+
+def _use(run: Training, model: NeilfModel) -> None:
+    """Compute as the plan says."""
+    config = run.plan.config
+    model.use(config)
+    run.light_solver.use(config.light, model.lobe)
+
+
+def _tell(run: Training, decisions: Sequence[Decision]) -> None:
+    for decision in decisions:
+        run.reporter.say(f"effects: {decision.effect} {'on' if decision.on else 'off'}, {decision.reason}")
+
+
+@doing("optimiser")
 def _update(
     run: Training, model: NeilfModel, optimizer: torch.optim.Optimizer, terms: LossTerms, total: Total, step: int
 ) -> bool:
@@ -136,7 +185,8 @@ def _update(
     """
     optimizer.zero_grad(set_to_none=True)
     if total.loss.requires_grad:
-        run.fabric.backward(total.loss)
+        with doing("gradients"):
+            run.fabric.backward(total.loss)
     norms = _gradient_norms(model)
     psnr = _psnr(terms, run.model.units)
     stop = torch.full_like(psnr, run.should_stop())
@@ -228,15 +278,18 @@ def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
 # ----------------------------------------------------------------------------------------------------- state and record
 
 
+@doing("saving", apart=True)
 def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str | None = None) -> None:
     if run.fabric.is_global_zero:
         try:
             # Fits first: extra ones are dropped on resume, gaps cannot be recovered.
             write_fits(run.path, run.fits)
             write_findings(run.path, run.watch)
+            write_plan(run.path, run.plan)
             for name in filter(None, (also, "last")):
                 save_checkpoint(run.path / "checkpoints" / f"{name}.pt", run.model, run.light_solver, optimizer, step)
             write_json(run.path / "timing.json", run.seconds)
+            write_work(run.path, run.ledger)
         except UserError as error:
             raise UserError(error.problem, f"make room, and continue with: {run.continue_with}") from error
     run.fabric.barrier()
@@ -253,6 +306,8 @@ def _restore(run: Training, optimizer: torch.optim.Optimizer) -> int:
     if (run.path / "timing.json").exists():
         run.seconds.update(read_json(run.path / "timing.json"))
     run.fits += read_fits(run.path, saved["step"])
+    run.plan = read_plan(run.path, run.plan.settings, saved["step"])
+    _use(run, run.model)
     run.watch.findings |= {finding.case: finding for finding in read_findings(run.path) or ()}
     return saved["step"]
 

@@ -58,6 +58,11 @@ class Reporter:
         if self.writer is not None:
             self.writer.add_image(name, pixels, step, dataformats="HWC")
 
+    def say(self, text: str) -> None:
+        """A line for the person, above the bars, of something that is as it should be."""
+        if self.progress is not None:
+            self.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
     def warn(self, text: str) -> None:
         """A line for the person, above the bars."""
         if self.progress is not None:

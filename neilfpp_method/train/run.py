@@ -5,13 +5,14 @@ capture.json      where the images are        timing.json       seconds of each 
 scene.json        what the images decided     checkpoints/      last.pt, and one at the end of each stage
 previews/         a picture per stage         tensorboard/      scalars and pictures
 pixels/           of the training views; can be deleted, and is made again when training goes on
+work.json         seconds of each stage by kind of work (docs/budget.md)
+effects.json      which effects are simulated, and why
 light.json        what spoke for lamps, fit by fit; not there where the settings had decided
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import platform
 import sys
@@ -34,6 +35,8 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.plain import from_dict, to_dict
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model
+from neilfpp_method.train.effects_record import read_plan
+from neilfpp_method.train.json_files import read_json, write_json
 
 __all__ = [
     "PIXELS",
@@ -100,7 +103,7 @@ class Run:
 
     Attributes:
         path: the run folder.
-        config: every setting that it was trained with.
+        config: every setting that it was trained with, the effects as they were decided last.
         capture: the images that it was trained on, with their cameras in the world frame; `capture.normalisation` leads from
             there to the scene frame, in which all fields of the model live.
         facts: what the images decided before training, such as the unit of radiance and the background.
@@ -186,9 +189,11 @@ def load_run(path: Path | str, device: torch.device | str = "cpu", checkpoint: s
     described = read_description(path)
     saved = load_checkpoint(path / "checkpoints" / f"{checkpoint}.pt")
     capture = described.source.load_again(path)
-    model = build_model(capture, described.facts, described.config)
+    plan = read_plan(path, described.config, saved["step"])
+    model = build_model(capture, described.facts, plan.config_of_model)
     load_weights(model, saved["model"], path)
-    return Run(path, described.config, capture, described.facts, model.to(device).eval(), saved["step"])
+    model.use(plan.config)
+    return Run(path, plan.config, capture, described.facts, model.to(device).eval(), saved["step"])
 
 
 @dataclass(frozen=True)
@@ -281,27 +286,6 @@ def load_weights(module: nn.Module, weights: Mapping[str, Any], run: Path) -> No
 
 
 # ---------------------------------------------------------------------------------------------------------------- files
-
-
-def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """A JSON object, in one step."""
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n")
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object.
-
-    Raises:
-        UserError: missing or malformed.
-    """
-    try:
-        value = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path}: not readable as JSON ({error})", "restore the file or train again") from error
-    if not isinstance(value, dict):
-        raise UserError(f"{path}: holds no JSON object", "restore the file or train again")
-    return value
 
 
 def environment() -> dict[str, Any]:

@@ -11,6 +11,8 @@ from rich.console import Console
 
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.effects.asked import Asked
+from neilfpp_method.effects.plan import Plan
 from neilfpp_method.health.watch import Watch
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
@@ -64,7 +66,9 @@ def small_training(root: Path, out: Path, config: NeilfConfig) -> Training:
     model = build_model(capture, scene_facts(capture, pixels, config), config)
     fabric, listener = Fabric(accelerator="cpu", devices=1), Listener()
     solver, watch = model.light_solver(), Watch(pixels.sample(64), listener.warn)
-    return Training(out, config, model, pixels, fabric, listener, lambda: False, lambda model, stage: None, "", solver, watch)
+    plan = Plan.begin(Asked("as-set"), config)
+    quiet = (lambda: False, lambda model, stage: None, "")
+    return Training(out, config, model, pixels, fabric, listener, *quiet, solver, watch, plan)
 
 
 def differences(one: object, other: object, where: str = "") -> list[str]:

@@ -19,13 +19,14 @@ import torch
 from rich.console import Console
 
 from neilfpp_method.cli import main
+from neilfpp_method.effects.asked import read_asked
 from neilfpp_method.errors import Stopped, UserError
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train import loop
 from neilfpp_method.train.command import run_training
-from neilfpp_method.train.run import read_description
+from neilfpp_method.train.run import load_run, read_description
 from tests.data.make_capture import make_capture
-from tests.train.small_runs import differences, small_config
+from tests.train.small_runs import differences, small_config, solved_light
 
 # Four steps in each of three stages: 0–3, 4–7, 8–11.
 STEPS = 12
@@ -264,3 +265,29 @@ def test_ctrl_c_in_a_real_terminal_session(tmp_path, capture):
 def _start(command: list[str]) -> subprocess.Popen[str]:
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, cwd=Path(__file__).parents[2], **pipes)
+
+
+# -------------------------------------------------------------------------------------------------------------- effects
+
+
+def test_what_evidence_decided_is_read_from_the_run(tmp_path, capture, monkeypatch):
+    """A ball sees nothing of itself: nothing is traced after SDF init, in a run that was stopped as in one that was not."""
+    config = solved_light(small_config())
+    asked = read_asked("auto")
+    run(capture, tmp_path / "whole", config, effects=asked)
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 2, 6)
+        for resume in (False, True):
+            with pytest.raises(Stopped):
+                run(None if resume else capture, tmp_path / "run", None if resume else config, resume=resume, effects=asked)
+    run(None, tmp_path / "run", resume=True)
+    assert differences(state(tmp_path / "run"), state(tmp_path / "whole")) == []
+    records = [json.loads((tmp_path / name / "effects.json").read_text()) for name in ("run", "whole")]
+    assert records[0] == records[1]
+    decided = [entry for entry in records[0]["decisions"] if entry["effect"] == "inter-reflection"]
+    assert [entry["step"] for entry in decided] == [4, 8]
+    loaded = load_run(tmp_path / "run")
+    assert (loaded.config.inter_reflection.mode == "off") == (not decided[-1]["on"])
+    assert loaded.model.config == loaded.config
+    with pytest.raises(UserError, match="its effects are 'auto'"):
+        run(None, tmp_path / "run", resume=True, effects=read_asked("none"))

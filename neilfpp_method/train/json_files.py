@@ -1,0 +1,34 @@
+"""JSON objects in a run folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from neilfpp_method.data.images import replacing
+from neilfpp_method.errors import UserError
+
+__all__ = ["read_json", "write_json"]
+
+
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
+    """A JSON object, in one step."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object.
+
+    Raises:
+        UserError: missing or malformed.
+    """
+    try:
+        value = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: not readable as JSON ({error})", "restore the file or train again") from error
+    if not isinstance(value, dict):
+        raise UserError(f"{path}: holds no JSON object", "restore the file or train again")
+    return value

@@ -1,0 +1,51 @@
+"""Where the time of a run went, in `RUN/work.json`: seconds by stage and by kind of work (docs/budget.md)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from neilfpp_method.errors import UserError
+from neilfpp_method.timing.ledger import WORK, Ledger
+from neilfpp_method.train.run import read_json, write_json
+
+__all__ = ["FILE", "read_work", "waiting", "write_work"]
+
+FILE = "work.json"
+FORMAT = 1
+
+
+def write_work(run: Path, ledger: Ledger) -> None:
+    """The seconds so far, of all sessions of the run."""
+    write_json(run / FILE, {"format": FORMAT, "seconds": ledger.seconds()})
+
+
+def read_work(run: Path) -> dict[str, dict[str, float]]:
+    """Seconds by stage and by kind of work; empty where the run has no record.
+
+    Raises:
+        UserError: the file is damaged or of another version.
+    """
+    path = run / FILE
+    if not path.is_file():
+        return {}
+    stored = read_json(path)
+    if stored.get("format") != FORMAT:
+        raise UserError(f"{path}: a record of another version", "remove the file, or use the version that wrote it")
+    stages = stored.get("seconds")
+    if not isinstance(stages, dict) or not all(isinstance(parts, dict) for parts in stages.values()):
+        raise UserError(f"{path}: not a complete record", "remove the file, or train again")
+    for stage, parts in stages.items():
+        for work, seconds in parts.items():
+            good = isinstance(seconds, int | float) and math.isfinite(seconds) and seconds >= 0
+            if work not in WORK or not good:
+                raise UserError(f"{path}: {stage}.{work}: no time of a known kind", "remove the file, or train again")
+    return stages
+
+
+def waiting(device: torch.device) -> Callable[[], object] | None:
+    """What waits until a device has done its work; none where a call returns when it is done."""
+    return (lambda: torch.cuda.synchronize(device)) if device.type == "cuda" else None

@@ -1,0 +1,139 @@
+"""What is asked of effects, what evidence makes of it, and what an effect that is off costs."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from neilfpp_method.cli import main
+from neilfpp_method.effects.asked import check_asked, read_asked
+from neilfpp_method.effects.looks import after_fit, look_at_surface
+from neilfpp_method.effects.measurement import Measurement, mean_of
+from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.visibility import self_visibility
+from neilfpp_method.errors import UserError
+from neilfpp_method.lighting.fit import Evidence
+from neilfpp_method.schedule import Stage
+from neilfpp_method.settings.presets import preset
+from neilfpp_method.structures import SceneLight
+from tests.scenes import sphere_batch, sphere_model, tiny_config
+from tests.test_model import count_queries
+from tests.train.small_runs import solved_light
+
+
+def half_walls(share: float):
+    """A scene in which a `share` of all directions by the cosine, those nearest to the normal z, meet a wall."""
+
+    def scene_light(x, wi):
+        # By the cosine cos² θ is uniform, so a share has cos² θ > 1 − share.
+        hit = wi[..., 2].square() > 1 - share
+        return SceneLight(hit, torch.zeros_like(wi), torch.where(hit, 1.0, torch.inf))
+
+    return scene_light
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
+def test_self_visibility_is_the_share_by_the_cosine(share):
+    model = sphere_model(solved_light(tiny_config()))
+    model.host.scene_light = half_walls(share)
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(400, 3)
+    found = self_visibility(model, model.config.inter_reflection, up, up)
+    assert found.value == pytest.approx(share, abs=0.01)
+    assert found.favours(chosen=False) is (share > 0)
+
+
+def test_a_ball_sees_nothing_of_itself_so_nothing_is_traced():
+    config = solved_light(tiny_config())
+    config = dataclasses.replace(config, shading=dataclasses.replace(config.shading, hit_share=0.2))
+    model, plan = sphere_model(config), Plan.begin(read_asked("auto"), config)
+    torch.manual_seed(0)
+    (decision,) = look_at_surface(plan, model, sphere_batch(400), step=4)
+    assert not decision.on
+    assert decision.evidence.samples > 100
+
+    def traced():
+        return count_queries(model, lambda: model.losses(sphere_batch(), Stage.MATERIAL_INIT))
+
+    calls = []
+    original = model.host.scene_light
+    model.host.scene_light = lambda x, wi: calls.append(wi.shape) or original(x, wi)
+    traced()
+    assert calls
+    calls.clear()
+    model.use(plan.config)
+    counts = traced()
+    assert not calls
+    assert counts["rays"] == len(sphere_batch())
+
+
+def test_evidence_is_revised_and_said():
+    config = preset("fast")
+    plan = Plan.begin(read_asked("auto"), config)
+    few = Measurement("directions", 0.2, 0.01, 0.01, 400)
+    assert plan.decide("inter-reflection", few, 4).on
+    gone = plan.decide("inter-reflection", Measurement("directions", 0.001, 0.0005, 0.01, 400), 8)
+    assert not gone.on
+    assert gone.reason.startswith("revised: ")
+    assert plan.config.inter_reflection.mode == "off"
+    assert plan.config_of_model == config
+    unknown = plan.decide("inter-reflection", Measurement("directions", 0.5, 0.1, 0.01, 3), 9)
+    assert not unknown.on
+    assert "too few" in unknown.reason
+
+
+def test_lamps_are_noted_when_the_choice_changes():
+    plan = Plan.begin(read_asked("auto"), preset("fast"))
+    assert after_fit(plan, Evidence(0.001, 0.002, 200), 0, 5)[0].on is False
+    assert after_fit(plan, Evidence(0.001, 0.002, 200), 0, 9) == []
+    (found,) = after_fit(plan, Evidence(0.1, 0.002, 200), 2, 14)
+    assert found.on
+    assert found.reason.startswith("revised")
+    assert plan.config.light.kind == "auto"  # the solver goes on choosing
+    assert after_fit(Plan.begin(read_asked("-lamps"), preset("fast")), Evidence(0.1, 0.0, 200), 1, 5) == []
+
+
+def test_the_standard_error_is_that_of_the_mean():
+    found = mean_of(torch.tensor([0.0, 1.0, 2.0, 3.0]), "x", 0.1)
+    assert (found.value, found.deviation) == pytest.approx((1.5, (5 / 3) ** 0.5 / 2))
+    assert found.favours(True) is None  # four samples say nothing
+
+
+def test_names_switch_settings():
+    config = preset("fast")
+    none = Plan.begin(read_asked("none"), config).config
+    assert (none.inter_reflection.mode, none.light.kind, none.background.kind) == ("off", "distant", "constant")
+    everything = Plan.begin(read_asked("all,-lamps"), config).config
+    assert (everything.inter_reflection.mode, everything.light.kind) == ("hard", "distant")
+    assert Plan.begin(read_asked("as-set"), config).config == config
+    free = tiny_config()
+    assert Plan.begin(read_asked("as-set"), free).config == Plan.begin(read_asked("auto"), free).config == free
+    assert Plan.begin(read_asked("none,+inter-reflection"), none).config.inter_reflection.mode == "hard"
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("lamps", r"'lamps' has no sign; write \+lamps or -lamps"),
+        ("auto,-lamp", "no effect 'lamp'; did you mean 'lamps'"),
+        ("some", "'some' is no choice; give auto"),
+        ("", "nothing is given"),
+        ("+lamps,-lamps", "lamps is named twice"),
+        ("-response", "--response"),
+    ],
+)
+def test_bad_names_get_one_line(text, complaint):
+    with pytest.raises(UserError, match=complaint):
+        read_asked(text)
+
+
+def test_a_free_light_has_no_lamps_to_switch():
+    with pytest.raises(UserError, match="free at every point"):
+        check_asked(read_asked("+lamps"), tiny_config())
+
+
+def test_a_bad_name_ends_the_command(tmp_path, capsys):
+    assert main(["train", "--data", str(tmp_path), "--effects", "auto,-lamp"]) == 2
+    assert "did you mean 'lamps'" in capsys.readouterr().err
+

@@ -1,0 +1,100 @@
+"""A ledger on a clock that is set by hand: every second goes to one kind of work, and none is lost."""
+
+from __future__ import annotations
+
+import pytest
+
+from neilfpp_method.timing.ledger import EVERY, FIRST, Ledger, doing, listening
+
+
+class Clock:
+    """A clock that stands still until it is told; waiting for the device takes `lag` seconds if work is under way there."""
+
+    def __init__(self) -> None:
+        self.time = self.lag = 0.0
+        self.waits = 0
+
+    def __call__(self) -> float:
+        return self.time
+
+    def synchronise(self) -> None:
+        self.waits += 1
+        self.time, self.lag = self.time + self.lag, 0.0
+
+
+def test_work_within_work_is_told_apart():
+    clock = Clock()
+    with listening(Ledger(now=clock)) as ledger:
+        clock.time = 1.0
+        ledger.enter("joint")
+        with ledger.step(0), doing("shading"):
+            clock.time += 2.0
+            with doing("tracing"):
+                clock.time += 4.0
+            clock.time += 8.0
+        clock.time += 16.0
+    assert ledger.seconds() == {"preparation": {"rest": 1.0}, "joint": {"shading": 10.0, "tracing": 4.0, "rest": 16.0}}
+    assert ledger.total == 31.0
+
+
+def test_nothing_within_a_fit_is_told_apart_and_an_error_ends_it():
+    clock = Clock()
+
+    def fit():
+        with doing("light_fits", apart=True), doing("tracing"):
+            clock.time += 3.0
+            raise ValueError
+
+    with listening(Ledger(now=clock)) as ledger:
+        with pytest.raises(ValueError):
+            fit()
+        clock.time += 1.0
+    assert ledger.seconds() == {"preparation": {"light_fits": 3.0, "rest": 1.0}}
+
+
+def test_a_decorated_function_may_call_itself():
+    clock = Clock()
+
+    @doing("rendering")
+    def render(depth: int) -> None:
+        clock.time += 1.0
+        if depth:
+            render(depth - 1)
+
+    with listening(Ledger(now=clock)) as ledger:
+        render(2)
+        clock.time += 5.0
+    assert ledger.seconds() == {"preparation": {"rendering": 3.0, "rest": 5.0}}
+    render(1)  # nobody listens
+    assert ledger.seconds()["preparation"]["rendering"] == 3.0
+
+
+def test_what_was_counted_before_is_added():
+    clock = Clock()
+    ledger = Ledger(now=clock)
+    ledger.add({"preparation": {"rest": 2.0}, "joint": {"data": 1.5}})
+    clock.time = 4.0
+    assert ledger.seconds() == {"preparation": {"rest": 6.0}, "joint": {"data": 1.5}}
+
+
+def test_a_device_is_seldom_waited_for_and_its_time_is_shared_out():
+    """Work of a device shows up when it is waited for: 3 s of rendering and 1 s of shading in every step, 2 s in a fit."""
+    clock, steps = Clock(), EVERY + FIRST + 1
+    with listening(Ledger(synchronise=clock.synchronise, now=clock)) as ledger:
+        ledger.enter("joint")
+        for number in range(steps):
+            with ledger.step(number):
+                with doing("rendering"):
+                    clock.lag += 3.0
+                with doing("shading"):
+                    clock.lag += 1.0
+                if number == 5:
+                    clock.synchronise()
+                    with doing("light_fits", apart=True):
+                        clock.lag += 2.0
+        clock.synchronise()
+    seconds = ledger.seconds()["joint"]
+    assert seconds["light_fits"] == pytest.approx(2.0)
+    assert seconds["rendering"] == pytest.approx(3.0 * seconds["shading"])
+    assert ledger.total == pytest.approx(clock.time)
+    assert clock.waits < 0.1 * steps
