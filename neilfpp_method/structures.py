@@ -78,7 +78,8 @@ class PixelBatch(Indexable):
     one.
     `mask` is 1 on the object and 0 off it, as far as `mask_known` is 1: everywhere in a capture with masks, only where the
     image shows exactly its background in one without (there the other pixels have mask 1). `image_gradient` is the length
-    of the gradient of the image's luminance at the pixel, by Scharr's filter: 32 times the change per pixel.
+    of the gradient of the image's luminance at the pixel, by Scharr's filter: 32 times the change per pixel; 0 where no
+    loss needs it.
     """
 
     origins: Float[Tensor, "N 3"]

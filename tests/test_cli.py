@@ -11,14 +11,17 @@ import sys
 from collections.abc import Callable
 from contextlib import redirect_stdout
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
 import trimesh
 
 from neilfpp_method.cli import COMMANDS, main
+from neilfpp_method.commands.evaluate import Eval
 from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.evaluate import protocols
+from neilfpp_method.evaluate.published import PROTOCOLS
 from neilfpp_method.settings.presets import PRESETS
 from tests.data.make_capture import CENTRE, RADIUS, make_capture
 from tests.train.small_runs import small_config
@@ -92,6 +95,21 @@ def test_eval_writes_flat_finite_figures(trained, tmp_path, monkeypatch, capfd):
     out = tmp_path / "of_a_stage.json"
     assert main(["eval", str(trained), "--device", "cpu", "--checkpoint", "material_init", "--out", str(out)]) == 0
     assert wanted <= json.loads(out.read_text()).keys()
+
+
+def test_eval_by_a_published_protocol_has_a_file_of_its_own(trained, capfd):
+    before = (trained / "metrics.json").read_bytes() if (trained / "metrics.json").exists() else None
+    assert main(["eval", str(trained), "--device", "cpu", "--protocol", "shiny-normals"]) == 0
+    written = json.loads((trained / "eval" / "shiny-normals.json").read_text())
+    assert (written["protocol"], written["source"]) == ("shiny-normals", "google-research/multinerf eval.py")
+    assert 0 < written["figures"]["normal_mae_deg"] < 180
+    assert "normal_mae_deg" in capfd.readouterr().out
+    assert before == ((trained / "metrics.json").read_bytes() if before else None)
+    assert {path.name for path in (trained / "eval").iterdir()} == {"shiny-normals.json"}
+
+
+def test_every_protocol_can_be_asked_for():
+    assert {"neilfpp", *PROTOCOLS} == set(get_args(get_type_hints(Eval)["protocol"]))
 
 
 def test_render_writes_every_map(trained, tmp_path, capfd):

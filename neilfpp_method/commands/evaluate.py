@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -14,14 +15,17 @@ __all__ = ["COMMAND"]
 
 @dataclass
 class Eval:
-    """Measure a run on its test views; writes RUN/metrics.json."""
+    """Measure a run on its test views; writes RUN/metrics.json, with --protocol RUN/eval/NAME.json."""
 
     run: tyro.conf.Positional[Path]
     """The run's folder."""
+    protocol: Literal["neilfpp", "neilf-synthetic", "shiny-normals"] = "neilfpp"
+    """How to measure. neilfpp: this project's own figures. The others as the official code of that benchmark
+    does, at the size of the files (docs/protocols.md)."""
     checkpoint: Checkpoint = "last"
     """Which weights."""
     out: Path | None = None
-    """Where the figures go; none: RUN/metrics.json."""
+    """Where the figures go; none: RUN/metrics.json, or RUN/eval/NAME.json of a published protocol."""
     scale: float | None = None
     """Size of the views over that of their files; 1: every pixel. None: 131 thousand pixels a view, about 420×310, and no
     more than the run was trained at."""
@@ -32,6 +36,40 @@ class Eval:
 
 
 def run(options: Eval) -> None:
+    if options.protocol == "neilfpp":
+        _own(options)
+    else:
+        _published(options)
+
+
+def _published(options: Eval) -> None:
+    from neilfpp_method.evaluate.published import PROTOCOLS
+    from neilfpp_method.evaluate.published.protocol import write_figures
+    from neilfpp_method.evaluate.size import at_size, size_in_words
+    from neilfpp_method.evaluate.views import render_test_views
+    from neilfpp_method.kernels.process import computing_fast
+    from neilfpp_method.train.device import pick_device
+    from neilfpp_method.train.run import check_writable, load_run
+
+    protocol = PROTOCOLS[options.protocol]
+    scale = 1.0 if options.scale is None and options.width is None else options.scale
+    run = at_size(load_run(options.run, pick_device(options.device), options.checkpoint), scale, options.width)
+    out = options.out or options.run / "eval" / f"{protocol.name}.json"
+    check_writable(out)
+    protocol.check(run)
+    console = terminal()
+    if size := size_in_words(run):
+        console.print(f"{size}; published figures are at the size of the files", soft_wrap=True)
+    with computing_fast(), progress_bar("evaluating") as advance:
+        figures = protocol.measure(run, render_test_views(run, advance))
+    write_figures(out, protocol, run, figures)
+    console.print(f"protocol {protocol.name}, as {protocol.source}; left out: {protocol.left_out}", soft_wrap=True)
+    for name, value in figures.items():
+        console.print(f"{name:36} {value:8.3f}")
+    console.print(f"written to {out}", soft_wrap=True)
+
+
+def _own(options: Eval) -> None:
     from neilfpp_method.evaluate.protocols import evaluate, write_metrics
     from neilfpp_method.evaluate.size import at_size, size_in_words
     from neilfpp_method.kernels.process import computing_fast
@@ -55,5 +93,9 @@ def run(options: Eval) -> None:
 COMMAND = Command(
     Eval,
     run,
-    ["neilfpp eval runs/teapot", "neilfpp eval runs/teapot --checkpoint material_init --out sep.json"],
+    [
+        "neilfpp eval runs/teapot",
+        "neilfpp eval runs/teapot --checkpoint material_init --out sep.json",
+        "neilfpp eval runs/teapot --protocol neilf-synthetic",
+    ],
 )

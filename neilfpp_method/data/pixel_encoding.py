@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Shaped
 
-__all__ = ["ENCODINGS", "Encoded", "Encoding", "encodings_for"]
+__all__ = ["BYTES", "ENCODINGS", "Encoded", "Encoding", "encodings_for"]
 
 TOP = 32_768.0
 """What the brightest value of a view comes to in half precision, at most; half ends at 65 504."""
@@ -87,6 +87,8 @@ BYTES, WORDS = _levels(8), _levels(16)
 ENCODINGS = {encoding.name: encoding for encoding in (BYTES, WORDS, HALF, FLOAT)}
 
 
-def encodings_for(hdr: bool) -> tuple[Encoding, ...]:
-    """The encodings of a capture, from the smallest to one that holds everything."""
+def encodings_for(hdr: bool, exact: bool = False) -> tuple[Encoding, ...]:
+    """The encodings of a capture, from the smallest to one that holds everything; `exact`: that one alone."""
+    if exact:
+        return (FLOAT,)
     return (HALF, FLOAT) if hdr else (BYTES, WORDS, FLOAT)

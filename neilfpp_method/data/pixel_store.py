@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float32, Float64, Int, Shaped, UInt8
 
 from neilfpp_method.data.drawing import BLOCK, KNOWN, MASK, NEAR, VALID, near_object
 from neilfpp_method.data.images import replacing
-from neilfpp_method.data.pixel_encoding import ENCODINGS, Encoding, encodings_for
+from neilfpp_method.data.pixel_encoding import BYTES, ENCODINGS, Encoding, encodings_for
 from neilfpp_method.data.scaling import file_size
 from neilfpp_method.data.view_pixels import read_view
 from neilfpp_method.data.views import View
@@ -105,6 +105,7 @@ def load_pixels(
     shown: Callable[[int], Bool[np.ndarray, " N"]],
     folder: Path | None = None,
     on_view: Callable[[str], None] | None = None,
+    exact: bool = False,
 ) -> PixelStore:
     """The pixels of views: those of a folder, if it was made from the same, or else read from their files.
 
@@ -114,12 +115,15 @@ def load_pixels(
         shown: which pixels of a view its lens reaches.
         folder: where the pixels are kept; none: in memory.
         on_view: called with the name of each view that has been read.
+        exact: keep the values of the files in single precision, 13 bytes a pixel; in memory alone.
 
     Raises:
         UserError: an image cannot be used (see `PixelDataset`), or the folder cannot be written.
     """
+    if exact and folder is not None:
+        raise ValueError("exact pixels are kept in memory: a folder has those of a training")
     if folder is None:
-        return _in_any_encoding(views, hdr, shown, None, on_view)
+        return _in_any_encoding(views, encodings_for(hdr, exact), hdr, shown, None, on_view)
     made_from = _made_from(views, hdr)
     known = _open(folder, views, made_from)
     if known is not None:
@@ -128,7 +132,7 @@ def load_pixels(
     (folder / "store.json").unlink(missing_ok=True)
     with ExitStack() as files:
         paths = {name: files.enter_context(replacing(folder / f"{name}.npy")) for name in ("color", "bits")}
-        store = _in_any_encoding(views, hdr, shown, paths, on_view)
+        store = _in_any_encoding(views, encodings_for(hdr), hdr, shown, paths, on_view)
         description = {
             "format": FORMAT,
             "version": VERSION,
@@ -150,14 +154,14 @@ def load_pixels(
 
 def _in_any_encoding(
     views: Sequence[View],
+    ladder: Sequence[Encoding],
     hdr: bool,
     shown: Callable[[int], Bool[np.ndarray, " N"]],
     paths: dict[str, Path] | None,
     on_view: Callable[[str], None] | None,
 ) -> PixelStore:
     """In the smallest encoding that holds every view; when one turns out to need more, all are read once more."""
-    ladder = encodings_for(hdr)
-    if not hdr and any(view.file_size is not None for view in views):
+    if ladder[0] is BYTES and any(view.file_size is not None for view in views):
         ladder = ladder[1:]  # means of bytes are no bytes
     told: set[str] = set()
 

@@ -47,6 +47,7 @@ class PixelDataset:
         device: where batches go. Pixels are drawn, and read, on the CPU.
         on_view: called with the name of each view once it is read.
         folder: where the pixels are kept, and found again by the next who asks; none: in memory.
+        exact: keep colours in single precision, as the files have them, to compare with; needs `folder` to be none.
 
     Raises:
         UserError: an image cannot be read, has changed its size, or holds NaN, infinite or negative pixels that are not
@@ -61,6 +62,8 @@ class PixelDataset:
         device: torch.device | str = "cpu",
         on_view: Callable[[str], None] | None = None,
         folder: Path | None = None,
+        *,
+        exact: bool = False,
     ) -> None:
         if not views:
             raise UserError(f"{capture.root}: no views to load", "hold out fewer views, or more")
@@ -68,7 +71,7 @@ class PixelDataset:
         self.views = tuple(views)
         self.device = torch.device(device)
         self._rays = CameraRays([capture.normalisation.camera(view.camera) for view in views], device)
-        self.store: PixelStore = load_pixels(self.views, capture.hdr, self._shown, folder, on_view)
+        self.store: PixelStore = load_pixels(self.views, capture.hdr, self._shown, folder, on_view, exact)
         self._draws = PixelDraws(self.store.bits, len(self.store))
         if not self._draws.valid.count:
             raise UserError(f"{capture.root}: no pixel is valid", "check the validity masks: white is valid")
@@ -80,22 +83,33 @@ class PixelDataset:
     def __len__(self) -> int:
         return len(self.store)
 
-    def sample(self, count: int) -> PixelBatch:
-        """`count` valid pixels drawn by torch's global generator as `data.drawing` says: most on the object or near it."""
+    def sample(self, count: int, gradients: bool = True) -> PixelBatch:
+        """`count` valid pixels drawn by torch's global generator as `data.drawing` says: most on the object or near it.
+
+        Image gradients take nine reads a pixel; without `gradients` they are 0.
+        """
         numbers = self.draw(count).numpy()
         views = self._views_of(numbers)
-        return self._batch(numbers, views, self.store.colors(numbers, views), self._gradients_at(numbers, views))
+        colors = self.store.colors(numbers, views)
+        return self._batch(numbers, views, colors, self._gradients_at(numbers, views) if gradients else None)
 
     def draw(self, count: int) -> Int[Tensor, " count"]:
         """The numbers of the pixels that `sample` would return, from 0 to P − 1."""
         return self._draws.draw(count)
 
-    def view(self, i: int) -> PixelBatch:
-        """All pixels of `views[i]`, row by row; those that are not `valid` as well."""
+    def view(self, i: int, gradients: bool = True) -> PixelBatch:
+        """All pixels of `views[i]`, row by row; those that are not `valid` as well. Image gradients as in `sample`."""
         rows, camera = self.store.rows(i), self.views[i].camera
         numbers, colors = np.arange(rows.start, rows.stop), self.store.view_colors(i)
-        seen = self._seen(colors).view(camera.height, camera.width)
-        return self._batch(numbers, np.full(len(numbers), i), colors, _gradient(seen).reshape(-1))
+        shape = camera.height, camera.width
+        gradient = _gradient(self._seen(colors).view(shape)).reshape(-1) if gradients else None
+        return self._batch(numbers, np.full(len(numbers), i), colors, gradient)
+
+    def at(self, i: int, rows: Int[Tensor, " N"]) -> PixelBatch:
+        """Some pixels of `views[i]`, by their number in the view, row by row; without image gradients."""
+        numbers = self.store.rows(i).start + rows.cpu().numpy()
+        views = np.full(len(numbers), i)
+        return self._batch(numbers, views, self.store.colors(numbers, views), None)
 
     def valid(self, i: int) -> Bool[Tensor, " N"]:
         """Which pixels of `views[i]` count: all but those that its validity mask, or its lens, leaves out."""
@@ -116,7 +130,7 @@ class PixelDataset:
         numbers: Int[np.ndarray, " N"],
         views: Int[np.ndarray, " N"],
         colors: Float32[np.ndarray, "N 3"],
-        gradient: Float32[Tensor, " N"],
+        gradient: Float32[Tensor, " N"] | None,
     ) -> PixelBatch:
         bits = self.store.bits[numbers]
         view = torch.from_numpy(views).to(self.device)
@@ -127,7 +141,7 @@ class PixelDataset:
             color=torch.from_numpy(colors).to(self.device),
             mask=self._bit(bits, MASK).float(),
             mask_known=self._bit(bits, KNOWN).float(),
-            image_gradient=gradient.to(self.device),
+            image_gradient=torch.zeros(len(numbers), device=self.device) if gradient is None else gradient.to(self.device),
             view=view,
         )
 

@@ -54,7 +54,7 @@ class TrainingViews:
         each = max(1, count // len(self.cameras))
         batches = []
         for i in range(len(self.cameras)):
-            view = self.pixels.view(i)
+            view = self.pixels.view(i, gradients=False)
             rows = torch.nonzero((view.mask > 0.5) & self.pixels.valid(i))[:, 0]
             batches.append(view[rows[:: max(1, math.ceil(len(rows) / each))]])
         return PixelBatch(**{f.name: torch.cat([getattr(batch, f.name) for batch in batches]) for f in fields(PixelBatch)})
@@ -72,7 +72,7 @@ class TrainingViews:
             rows = torch.nonzero(~seen.all(1))[:, 0]
             if not len(rows):
                 break
-            view, index = self.pixels.view(i), _pixel_numbers(self.cameras[i], position[rows])
+            view, index = self.pixels.view(i, gradients=False), _pixel_numbers(self.cameras[i], position[rows])
             usable = (view.mask > 0.5) & self.pixels.valid(i) & (self.hdr | (view.color < 1).all(-1))
             towards = self.centres[i] - position[rows]
             distance = towards.norm(dim=-1)

@@ -112,7 +112,7 @@ def mask_source(capture: Capture) -> str:
     "true depth" where every view has it; else "capture masks" where there are any, or where pixels that show exactly the
     background stand for them; else "rendered opacity" above one half, which lets the estimate choose its pixels.
     """
-    return _mask_source(_known_depths(capture), PixelDataset(capture, capture.test_views))
+    return _mask_source(_known_depths(capture), _file_values(capture, capture.test_views))
 
 
 def known_test_views(run: Run, rendered: Sequence[RenderedView]) -> HeldOut:
@@ -121,11 +121,11 @@ def known_test_views(run: Run, rendered: Sequence[RenderedView]) -> HeldOut:
     Masks are as `mask_source` says, without the pixels that the capture marks as invalid.
     """
     capture, truth = run.capture, Truth(run.capture)
-    depths, stored = _known_depths(capture), PixelDataset(capture, capture.test_views)
+    depths, stored = _known_depths(capture), _file_values(capture, capture.test_views)
     source = _mask_source(depths, stored)
     masks = {
         "true depth": lambda i: depths[i] > 0,
-        "capture masks": lambda i: stored.view(i).mask > 0.5,
+        "capture masks": lambda i: stored.view(i, gradients=False).mask > 0.5,
         "rendered opacity": lambda i: torch.from_numpy(rendered[i].maps["opacity"] > 0.5),
     }[source]
     views = []
@@ -134,7 +134,7 @@ def known_test_views(run: Run, rendered: Sequence[RenderedView]) -> HeldOut:
         views.append(
             KnownView(
                 view=view,
-                image=_image(stored.view(i).color, view),
+                image=_image(stored.view(i, gradients=False).color, view),
                 mask=_image(masks(i).reshape(-1) & stored.valid(i), view)[..., 0],
                 depth=None if depths[i] is None else _image(depths[i], view)[..., 0],
                 normal=None if normal is None else _image(normal, view),
@@ -142,6 +142,11 @@ def known_test_views(run: Run, rendered: Sequence[RenderedView]) -> HeldOut:
             )
         )
     return HeldOut(tuple(views), source)
+
+
+def _file_values(capture: Capture, views: Sequence[View]) -> PixelDataset:
+    """The pixels of views as their files have them, which a training keeps in fewer bits."""
+    return PixelDataset(capture, views, exact=True)
 
 
 def _known_depths(capture: Capture) -> list[Float[Tensor, " P"] | None]:
@@ -152,7 +157,7 @@ def _known_depths(capture: Capture) -> list[Float[Tensor, " P"] | None]:
 def _mask_source(depths: Sequence[Tensor | None], stored: PixelDataset) -> str:
     if all(depth is not None for depth in depths):
         return "true depth"
-    masked = any((stored.view(i).mask < 1).any() for i in range(len(depths)))
+    masked = any((stored.view(i, gradients=False).mask < 1).any() for i in range(len(depths)))
     return "capture masks" if masked else "rendered opacity"
 
 
@@ -184,7 +189,7 @@ def mean_observed_color(capture: Capture, points: Float[Tensor, "P 3"]) -> Float
     views = [view for view in capture.train_views if truth.depth(view) is not None]
     if not views:
         return None
-    pixels = PixelDataset(capture, views)
+    pixels = _file_values(capture, views)
     total, count = torch.zeros_like(points), torch.zeros(len(points), 1)
     for i, view in enumerate(views):
         size = torch.tensor([view.camera.width, view.camera.height])
@@ -193,7 +198,7 @@ def mean_observed_color(capture: Capture, points: Float[Tensor, "P 3"]) -> Float
         column, row = torch.where(inside[:, None], seen.pixel, 0.0).long().unbind(-1)
         index = row * view.camera.width + column
         visible = inside & pixels.valid(i)[index] & ((truth.depth(view)[index] - seen.depth).abs() <= VISIBLE)
-        color = pixels.view(i).color[index]
+        color = pixels.view(i, gradients=False).color[index]
         total += visible[:, None] * (color if capture.hdr else srgb_to_linear(color))
         count += visible[:, None]
     mean = total / count.clamp_min(1)

@@ -59,7 +59,7 @@ class CaptureDataset(InputDataset):
 
     def get_image_float32(self, image_idx: int) -> Float[Tensor, "H W 3"]:
         """The image as its file holds it."""
-        return self._image(image_idx, self.pixels.view(image_idx).color)
+        return self._image(image_idx, self.pixels.view(image_idx, gradients=False).color)
 
     def get_metadata(self, data: dict[str, Any]) -> dict[str, Tensor]:
         """What the losses ask of each pixel, and which can be drawn, (H, W, 1)."""

@@ -174,7 +174,7 @@ def run_training(
 
 def _watch(pixels: PixelDataset, config: NeilfConfig, reporter: Reporter) -> Watch:
     seed_step(config.train.seed, step=-2)
-    return Watch(pixels.sample(LOOKED_AT), reporter.warn)
+    return Watch(pixels.sample(LOOKED_AT, gradients=False), reporter.warn)
 
 
 def _refuse_changes(

@@ -13,7 +13,7 @@ from lightning_fabric import Fabric
 from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.effects.looks import LOOKED_AT, after_fit, look_at_surface, wants_surface
+from neilfpp_method.effects.looks import after_fit, look_at_surface, wants_surface
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.errors import Diverged, Stopped, UserError
 from neilfpp_method.health.watch import Watch
@@ -105,13 +105,14 @@ def _train_stage(run: Training, model: NeilfModel, optimizer: torch.optim.Optimi
     run.reporter.begin_stage(stage.value, position.step, position.length)
     started = time.perf_counter()
     before = run.seconds.get(stage.value, 0.0)
+    gradients = "smoothness" in active_losses(stage, model.config, model.stages)  # nothing else asks for them
     for number in range(position.step, position.length):
         with run.ledger.step(number):
             seed_step(settings.seed, step, run.fabric.global_rank)
             share = number / position.length
             set_rates(optimizer, run.config.optimizer, StagePosition(stage, number, position.length))
             with doing("data"):
-                batch = run.pixels.sample(settings.rays)
+                batch = run.pixels.sample(settings.rays, gradients)
             computed = wrapped(batch, stage)
             total = weigh(computed.terms, active_losses(stage, model.config, model.stages, share))
             stop = _update(run, model, optimizer, computed.terms, total, step)
@@ -154,7 +155,7 @@ def _look_at_effects(run: Training, model: NeilfModel, step: int) -> None:
     decisions: list[Decision] = []
     if run.fabric.is_global_zero:
         seed_step(run.config.train.seed, -3 - step)
-        decisions = look_at_surface(run.plan, model, run.pixels.sample(LOOKED_AT), step)
+        decisions = look_at_surface(run.plan, model, run.pixels, step)
         _tell(run, decisions)
     decisions = run.fabric.broadcast(decisions)
     if not run.fabric.is_global_zero:

@@ -323,3 +323,14 @@ def test_exact_background_pixels_are_off_the_object(tmp_path: Path) -> None:
 def test_a_mask_file_is_known_everywhere(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path, masks=True))
     assert PixelDataset(capture, capture.views).view(0).mask_known.all()
+
+
+def test_exact_pixels_are_those_of_the_files(tmp_path: Path) -> None:
+    capture = load_capture(make_capture(tmp_path))
+    color = np.random.default_rng(0).uniform(0, 3, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    write_exr(tmp_path / "inputs" / "images" / "001.exr", {"RGB": color})
+    kept = [PixelDataset(capture, capture.views, exact=exact).view(1).color.numpy() for exact in (False, True)]
+    assert np.array_equal(kept[1], color.reshape(-1, 3))
+    assert not np.array_equal(kept[0], kept[1]), "a training keeps fewer bits"
+    with pytest.raises(ValueError, match="in memory"):
+        PixelDataset(capture, capture.views, folder=tmp_path / "pixels", exact=True)
