@@ -20,13 +20,13 @@ from pathlib import Path
 from typing import Literal
 
 import tyro
-from neilfpp_method.evaluate.report import write_report
 from rich.console import Console
 from torch import Tensor
 
 from benchmarks.measure import hardware, revision
 from benchmarks.tables import COLUMNS, RESULTS, Result, Row, markdown, write_result
 from neilfpp_method.evaluate.protocols import evaluate
+from neilfpp_method.report.write import REPORT, write_report
 from neilfpp_method.schedule import Stage, stage_steps
 from neilfpp_method.settings.presets import fixed_geometry, free_light, preset
 from neilfpp_method.settings.types import NeilfConfig
@@ -171,7 +171,7 @@ def main(options: Options) -> None:
                 Row(f"{STAGES[stage]}, {name}", {**values, "seconds": seconds_until(stage, seconds)}, capture.name)
                 for stage, values in figures.items()
             ]
-            write_report(load_run(run), run, final, seconds)
+            write_report(run, run / REPORT)
         # After every capture, so that what is measured is kept where a later one fails.
         table = "light-ladder" if options.compare == "ladder" else TABLES[options.host]
         result = Result(table, revision(), f"python -m benchmarks.results {shlex.join(sys.argv[1:])}", hardware(), tuple(rows))

@@ -58,8 +58,6 @@ class Train:
     """End with exit status 1 where the result is of no use (docs/health.md)."""
     device: Device = "auto"
     """Where to train; auto takes a GPU where there is one."""
-    report: bool = True
-    """Write RUN/report.html at the end (docs/report.md)."""
     devices: int = 1
     """Processes that share the work, one per GPU (or CPU process)."""
 
@@ -70,6 +68,8 @@ class TrainWithSettings(Train):
 
     config: NeilfConfig = field(default_factory=NeilfConfig)
     """Any setting of the preset."""
+    report: bool = True
+    """Write RUN/report.html at the end (docs/report.md)."""
 
 
 def run(options: TrainWithSettings) -> None:

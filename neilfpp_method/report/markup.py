@@ -6,7 +6,7 @@ import json
 from html import escape
 from typing import Any
 
-__all__ = ["Html", "data_block", "element", "joined", "table"]
+__all__ = ["Html", "cell", "data_block", "element", "joined", "table"]
 
 VOID = frozenset({"br", "hr", "img", "input", "link", "meta"})
 """Elements that hold nothing and have no end."""
@@ -52,6 +52,11 @@ def table(head: tuple[str, ...], *rows: Html, class_: str | None = None) -> Html
     titles = element("tr", *(element("th", title, scope="col") for title in head))
     inside = (element("thead", titles) if head else None, element("tbody", *rows))
     return element("div", element("table", *inside, class_=class_), class_="wide")
+
+
+def cell(text: str) -> Html:
+    """A cell of a table whose text may be long."""
+    return element("td", text, class_="long")
 
 
 def data_block(name: str, value: Any) -> Html:

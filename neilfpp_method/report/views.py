@@ -97,7 +97,7 @@ def show_views(run: Run, confidence: bool, on_progress: Callable[[float], None])
     maps = compared_maps(run, rendered, known, scale)
     layers = tuple(
         Layer(
-            TITLES.get(m.name, m.title),
+            TITLES.get(m.name, f"{m.title}, scaled" if m.note.startswith("scaled") else m.title),
             m.note.replace("\n", ", "),
             f"{m.largest:g}{m.unit}",
             tuple(

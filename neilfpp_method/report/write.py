@@ -10,11 +10,12 @@ import numpy as np
 
 from neilfpp_method.data.images import read_image, replacing
 from neilfpp_method.errors import UserError
-from neilfpp_method.report import page as html
+from neilfpp_method.report import pictures, tables
 from neilfpp_method.report.encoded import encoded
 from neilfpp_method.report.files import Files, changed_settings, read_files
 from neilfpp_method.report.light import lamps_of, picture_of_map
 from neilfpp_method.report.markup import Html
+from neilfpp_method.report.page import page
 from neilfpp_method.report.surface import packed_surface
 from neilfpp_method.report.views import Shown, show_views, shown_run
 from neilfpp_method.schedule import Stage
@@ -104,37 +105,37 @@ def _with_model(run: Run, files: Files, options: ReportOptions, on_progress: Cal
         else "no light has been estimated yet"
     )
     sections = [
-        ("health", "Health", html.health_section(files.findings, notes)),
-        ("views", "Views", html.views_section(shown, bool(run.capture.test_views))),
-        ("surface", "Surface", html.surface_section(surface, reason)),
-        ("light", "Light", html.light_section(words, picture_of_map(run), lamps_of(run), shown.light)),
-        ("figures", "Figures", html.figures_section(figures, said)),
+        ("health", "Health", tables.health_section(files.findings, notes)),
+        ("views", "Views", pictures.views_section(shown, bool(run.capture.test_views))),
+        ("surface", "Surface", pictures.surface_section(surface, reason)),
+        ("light", "Light", pictures.light_section(words, picture_of_map(run), lamps_of(run), shown.light)),
+        ("figures", "Figures", tables.figures_section(figures, said)),
         *_from_files(files),
-        ("reading", "How to read this", html.reading_section()),
-        ("facts", "What made it", html.facts_section({"Capture": run.capture.summary, **_facts(files)})),
+        ("reading", "How to read this", tables.reading_section()),
+        ("facts", "What made it", tables.facts_section({"Capture": run.capture.summary, **_facts(files)})),
     ]
     title = f"{run.capture.root.resolve().name}, {run.config.preset}"
-    return html.page(title, f"step {run.step} of {files.steps}", sections)
+    return page(title, f"step {run.step} of {files.steps}", sections)
 
 
 def _without_model(files: Files) -> str:
     go_on = f"neilfpp train --out {files.path} --resume"
     note = f"Training was stopped before its first checkpoint, so there is nothing to show yet; it goes on with: {go_on}"
     sections = [
-        ("health", "Health", html.health_section(files.findings, [note, *files.notes])),
+        ("health", "Health", tables.health_section(files.findings, [note, *files.notes])),
         *_from_files(files),
-        ("facts", "What made it", html.facts_section(_facts(files))),
+        ("facts", "What made it", tables.facts_section(_facts(files))),
     ]
-    return html.page(
+    return page(
         f"{files.path.resolve().name}, {files.config.preset}", f"step 0 of {files.steps}", sections
     )
 
 
 def _from_files(files: Files) -> list[tuple[str, str, Html]]:
     return [
-        ("time", "Time", html.time_section(files.timing, files.work, _previews(files.path))),
-        ("effects", "Effects", html.effects_section(files.effects)),
-        ("settings", "Settings", html.settings_section(files.config.preset, changed_settings(files.config))),
+        ("time", "Time", tables.time_section(files.timing, files.work, _previews(files.path))),
+        ("effects", "Effects", tables.effects_section(files.effects)),
+        ("settings", "Settings", tables.settings_section(files.config.preset, changed_settings(files.config))),
     ]
 
 

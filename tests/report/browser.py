@@ -1,0 +1,56 @@
+"""A page in a real browser: Chromium without a window.
+
+Nothing is needed but the browser: it prints the page as it stands after a script of the test has clicked through it.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+__all__ = ["BROWSER", "after"]
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--virtual-time-budget=8000",
+    "--dump-dom",
+)
+
+
+def after(page: Path, script: str, width: int = 1100) -> Any:
+    """What a script, which may await and ends in `return`, says of the page once it has loaded.
+
+    The page's policy lets no script run but its own two, so the copy that is tested has none.
+    """
+    html = page.read_text("utf-8")
+    policy = re.search(r'<meta http-equiv="Content-Security-Policy"[^>]*>', html)
+    assert policy
+    said = f"""<pre id=said></pre><script>
+      const tell = (value) => {{ said.textContent = said.textContent || JSON.stringify(value); }};
+      addEventListener("error", (event) => tell({{ error: event.message }}));
+      addEventListener("load", () => setTimeout(() => (async () => {{ {script} }})().then(tell), 500));
+    </script>"""
+    copy = page.with_name("tested.html")
+    copy.write_text(html.replace(policy[0], "").replace("<body>", f"<body>{said}", 1), "utf-8")
+    profile = page.parent / "browser"
+    command = [BROWSER, *FLAGS, f"--user-data-dir={profile}", f"--window-size={width},1200", copy.as_uri()]
+    dumped = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
+    found = re.search(r'<pre id="said">(.*?)</pre>', dumped, re.DOTALL)
+    assert found, dumped[:500]
+    assert found[1], "the script said nothing"
+    return json.loads(unescape(found[1]))
