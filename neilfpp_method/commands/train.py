@@ -52,8 +52,7 @@ class Train:
     scale: float | None = None
     """Size of the images over that of their files, 1: as they are; none: as large as the training's rays can use."""
     effects: str | None = None
-    """What is simulated: auto (evidence decides), all, none, as-set (the settings decide), or a list such as auto,-lamps
-    (docs/effects.md); none: auto, and as-set for the published presets."""
+    """auto, all, none, as-set, or as auto,-lamps."""
     strict: bool = False
     """End with exit status 1 where the result is of no use (docs/health.md)."""
     device: Device = "auto"
@@ -170,12 +169,8 @@ COMMAND = Command(
         "neilfpp train --data captures/teapot --preset paper-ngp --out runs/teapot",
         "neilfpp train --data captures/teapot --config settings.yaml",
         "neilfpp train --data captures/teapot --host mesh --mesh scans/teapot.ply",
-        "neilfpp train --data captures/teapot --light studio.exr",
-        "neilfpp train --data captures/teapot --scale 1   (images at their full size)",
         "neilfpp train --out runs/teapot --resume",
         "neilfpp train --data captures/teapot --effects auto,-lamps   (evidence decides, but no lamps)",
-        "neilfpp train --data captures/teapot --config.train.joint-steps 0   (the separate pipeline)",
-        "neilfpp train --data captures/teapot --config.inter-reflection.mode off",
     ],
     _starting_point,
     usual=Train,

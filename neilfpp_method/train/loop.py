@@ -13,7 +13,7 @@ from lightning_fabric import Fabric
 from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.effects.looks import LOOKED_AT, after_fit, look_at_surface, wants_surface
+from neilfpp_method.effects.looks import after_fit, look_at_surface, wants_surface
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.errors import Diverged, Stopped, UserError
 from neilfpp_method.health.watch import Watch
@@ -156,7 +156,7 @@ def _look_at_effects(run: Training, model: NeilfModel, step: int) -> None:
     decisions: list[Decision] = []
     if run.fabric.is_global_zero:
         seed_step(run.config.train.seed, -3 - step)
-        decisions = look_at_surface(run.plan, model, run.pixels.sample(LOOKED_AT), step)
+        decisions = look_at_surface(run.plan, model, run.pixels, step)
         _tell(run, decisions)
     decisions = run.fabric.broadcast(decisions)
     if not run.fabric.is_global_zero:
