@@ -11,6 +11,9 @@ from neilfpp_method.commands.command import Command, Device, progress_bar, termi
 
 __all__ = ["COMMAND", "after_training"]
 
+TELLING = 0.1
+"""Share of the work that must be done before the time of all of it can be told: loading and compiling come first."""
+
 
 @dataclass
 class Report:
@@ -41,7 +44,13 @@ def run(options: Report) -> None:
     out = options.out or options.run / REPORT
     check_writable(out)
     with computing_fast(), progress_bar("report") as advance:
-        write_report(options.run, out, chosen, str(pick_device(options.device)), advance)
+        write_report(
+            options.run,
+            out,
+            chosen,
+            str(pick_device(options.device)),
+            lambda share: advance(share) if share >= TELLING else None,
+        )
     terminal().print(f"written to {out}", soft_wrap=True)
 
 
