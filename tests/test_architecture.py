@@ -31,6 +31,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("export",),
     ("evaluate",),
     ("relight",),
+    ("view",),
     ("demo", "plugin", "inspection", "prepare"),
     ("commands",),
     ("cli",),

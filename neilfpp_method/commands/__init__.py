@@ -5,7 +5,7 @@ What a command needs to run is imported when it runs, so that help and a mistype
 
 from __future__ import annotations
 
-from neilfpp_method.commands import completion, demo, evaluate, export, inspect, prepare, relight, render, train
+from neilfpp_method.commands import completion, demo, evaluate, export, inspect, prepare, relight, render, train, view
 
 __all__ = ["COMMANDS"]
 
@@ -18,5 +18,6 @@ COMMANDS = {
     "render": render.COMMAND,
     "export": export.COMMAND,
     "relight": relight.COMMAND,
+    "view": view.COMMAND,
     "completion": completion.COMMAND,
 }
