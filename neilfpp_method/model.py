@@ -110,8 +110,8 @@ class NeilfModel(nn.Module):
         self.stages = host.stages if isinstance(host, HasStages) else BORROWED_HOST if borrowed else STAGES
         self.check_outputs = OutputCheck(host, config.shading.hit_share)
         self.observers: list[Callable[[PixelBatch, SurfaceHits], None]] = []
-        self.use(config)
         self.brdf = BrdfField(config.brdf, config.encoding, config.volume.radius)
+        self.use(config)
         albedo = initial_albedo(config.brdf.initial_base_color, config.brdf.initial_metallic, self.lobe)
         parts = make_light(config, facts.response, facts.median_radiance / albedo)
         self.light, self.lamps = parts.light, parts.lamps
@@ -123,6 +123,7 @@ class NeilfModel(nn.Module):
         """Compute with these settings from now on. They switch effects; sizes of fields stay what they were built with."""
         self.config = config
         self.lobe = LOBES[config.shading.lobe] if config.shading.specular else None
+        self.brdf.metals = config.brdf.metals
 
     # -------------------------------------------------------------------------------------------------------- one step
 

@@ -23,7 +23,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("kernels", "lighting.ring"),
     ("shading", "volume", "schedule"),
     ("fields", "data", "losses", "settings.facts"),
-    ("hosts.base", "lighting"),
+    ("hosts.base", "lighting", "inspection"),
     ("hosts", "incident"),
     ("model",),
     ("health", "effects"),
@@ -32,14 +32,14 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("evaluate",),
     ("relight",),
     ("view",),
-    ("demo", "plugin", "inspection", "prepare"),
+    ("demo", "plugin", "prepare"),
     ("commands",),
     ("cli",),
 )
 # Rooms that keep out of more than their layer says. Data is read and prepared without a network in sight, settings included.
 ONLY = {
     "data": {"errors", "structures", "shading.color"},
-    "prepare": {"errors", "structures", "shading.color", "data"},
+    "prepare": {"errors", "structures", "shading.color", "data", "inspection"},
     "inspection": {"errors", "structures", "shading.color", "data"},
     "structures": set(),
     "errors": set(),

@@ -105,6 +105,12 @@ class PixelDataset:
         gradient = _gradient(self._seen(colors).view(shape)).reshape(-1) if gradients else None
         return self._batch(numbers, np.full(len(numbers), i), colors, gradient)
 
+    def at(self, i: int, rows: Int[Tensor, " N"]) -> PixelBatch:
+        """Some pixels of `views[i]`, by their number in the view, row by row; without image gradients."""
+        numbers = self.store.rows(i).start + rows.cpu().numpy()
+        views = np.full(len(numbers), i)
+        return self._batch(numbers, views, self.store.colors(numbers, views), None)
+
     def valid(self, i: int) -> Bool[Tensor, " N"]:
         """Which pixels of `views[i]` count: all but those that its validity mask, or its lens, leaves out."""
         return self._bit(self.store.bits[self.store.rows(i)], VALID)

@@ -25,7 +25,7 @@ class Effect:
         obstacle: why it cannot be switched with these settings; empty: it can.
         cost: what it takes while a material is learned.
         risk: what goes wrong where it is left out of a scene that has it.
-        unjudged: why no evidence decides; empty: evidence does.
+        unjudged: why no evidence decides with these settings; empty: evidence does.
         solved: the light solver decides it again at each fit, so evidence changes no setting.
     """
 
@@ -37,7 +37,7 @@ class Effect:
     obstacle: Callable[[NeilfConfig], str]
     cost: Callable[[NeilfConfig], str]
     risk: str
-    unjudged: str = ""
+    unjudged: Callable[[NeilfConfig], str] = lambda config: ""
     solved: bool = False
 
 
@@ -90,6 +90,17 @@ EFFECTS: Mapping[str, Effect] = {
             cost=lambda config: f"a second fit of the light every {_every(config)} steps, and a shadow ray per point and lamp",
             risk="the glow of a lamp becomes base colour",
             solved=True,
+        ),
+        Effect(
+            name="metals",
+            title="metals",
+            is_on=lambda config: config.brdf.metals,
+            on=lambda config: {"brdf.metals": True},
+            off={"brdf.metals": False},
+            obstacle=lambda config: "" if config.shading.specular else "a surface without reflection shows no metal",
+            cost=lambda config: "one more unknown at every point",
+            risk="metal becomes dark gloss",
+            unjudged=_free_light("not judged: a light that is free at every point explains paint and metal alike"),
         ),
         Effect(
             name="background",

@@ -8,7 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.measurement import Measurement
+from neilfpp_method.effects.metals import metal_evidence
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.visibility import self_visibility
 from neilfpp_method.lighting.fit import MIN_GAIN, Evidence
@@ -42,26 +44,28 @@ def note_facts(plan: Plan, facts: SceneFacts) -> None:
 
 def wants_surface(plan: Plan) -> bool:
     """Whether a look at the surface could decide anything."""
-    return plan.is_open("inter-reflection")
+    return plan.is_open("inter-reflection") or plan.is_open("metals")
 
 
 @torch.no_grad()
-def look_at_surface(plan: Plan, model: NeilfModel, pixels: PixelBatch, step: int) -> list[Decision]:
+def look_at_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int) -> list[Decision]:
     """Decide what a surface tells, before a material is learned on it and again when it has moved.
 
     Args:
         plan: takes the decisions.
         model: as it is after `step` steps; it stays in the mode that it is in.
-        pixels: of training views, on the device of the model.
+        pixels: of the training views.
         step: how many steps have been trained.
     """
     mode = model.training
     model.eval()
-    surface = _surface_points(model, pixels)
+    surface = _surface_points(model, pixels.sample(LOOKED_AT, gradients=False))
     decisions = []
     if plan.is_open("inter-reflection"):
         measured = self_visibility(model, plan.settings.inter_reflection, surface.position, surface.normal)
         decisions.append(plan.decide("inter-reflection", measured, step))
+    if plan.is_open("metals") and plan.newest("metals") is None:
+        decisions.append(plan.decide("metals", metal_evidence(model, pixels, surface.position, surface.normal), step))
     model.train(mode)
     return decisions
 

@@ -89,8 +89,8 @@ class Plan:
                 plan.decisions.append(Decision(0, name, effect.is_on(settings), "settings", "as the settings say"))
             elif not effect.is_on(settings):
                 plan.decisions.append(Decision(0, name, False, "settings", "off in the settings"))
-            elif effect.unjudged:
-                plan.decisions.append(Decision(0, name, True, "settings", effect.unjudged))
+            elif effect.unjudged(settings):
+                plan.decisions.append(Decision(0, name, True, "settings", effect.unjudged(settings)))
         return plan
 
     @property

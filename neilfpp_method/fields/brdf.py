@@ -27,10 +27,14 @@ class BrdfSample:
 
 
 class BrdfField(nn.Module):
-    """Every parameter is ½ + ½ tanh of an output of the network; roughness starts close to ½, the others to what is set."""
+    """Every parameter is ½ + ½ tanh of an output of the network; roughness starts close to ½, the others to what is set.
+
+    `metals` off: metallic is 0 everywhere, with no gradient.
+    """
 
     def __init__(self, config: BrdfConfig, encoding: FrequencyConfig | HashGridConfig, radius: float) -> None:
         super().__init__()
+        self.metals = config.metals
         self.encoding = position_encoding(encoding, radius)
         # Sines reach the detail that six octaves do not; a grid has it already (NeILF++ §5).
         activation = "sine" if isinstance(encoding, FrequencyConfig) else "relu"
@@ -42,7 +46,7 @@ class BrdfField(nn.Module):
             self.mlp.layers[-1].bias[4] = math.atanh(2 * config.initial_metallic - 1)
 
     def forward(self, x: Float[Tensor, "N 3"]) -> Material:
-        return _material(torch.tanh(self.mlp(self.encoding(x))))
+        return self._material(torch.tanh(self.mlp(self.encoding(x))))
 
     def with_gradients(self, x: Float[Tensor, "N 3"]) -> BrdfSample:
         """The material and the gradients of roughness and metallic. A loss on them needs only first-order autograd."""
@@ -51,9 +55,8 @@ class BrdfField(nn.Module):
         saturation = torch.tanh(sample.value)
         slope = 0.5 * (1 - saturation[:, 3:].square())
         roughness, metallic = (slope[..., None] * pull_back(sample.gradient, encoded)).unbind(1)
-        return BrdfSample(_material(saturation), roughness, metallic)
+        return BrdfSample(self._material(saturation), roughness, metallic if self.metals else torch.zeros_like(metallic))
 
-
-def _material(saturation: Float[Tensor, "N 5"]) -> Material:
-    base_color, roughness, metallic = (0.5 + 0.5 * saturation).split((3, 1, 1), -1)
-    return Material(base_color, roughness, metallic)
+    def _material(self, saturation: Float[Tensor, "N 5"]) -> Material:
+        base_color, roughness, metallic = (0.5 + 0.5 * saturation).split((3, 1, 1), -1)
+        return Material(base_color, roughness, metallic if self.metals else torch.zeros_like(metallic))

@@ -19,8 +19,6 @@ from neilfpp_method.inspection.picture import draw
 __all__ = ["run_inspection", "to_json"]
 
 STYLES = {"problem": "bold red", "warning": "yellow", "good": "bold green", "limited": "bold yellow", "poor": "bold red"}
-SHOWN = 6
-
 
 def run_inspection(
     root: Path,
@@ -110,6 +108,4 @@ def _print(inspection: Inspection, console: Console) -> None:
     if not inspection.findings:
         say(("nothing is wrong with it", STYLES["good"]))
     for finding in inspection.findings:
-        rest = f" and {len(finding.views) - SHOWN} more" if len(finding.views) > SHOWN else ""
-        named = f" [{', '.join(finding.views[:SHOWN])}{rest}]" if finding.views else ""
-        say((finding.severity, STYLES[finding.severity]), f": {finding.text}{named}; {finding.remedy}")
+        say((finding.severity, STYLES[finding.severity]), f": {finding.line()}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,7 +14,7 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.inspection.measure import ViewFigures, measure
 from neilfpp_method.inspection.relations import Stand, duplicates, exposure_factors, stand
 
-__all__ = ["Finding", "Inspection", "Verdict", "inspect_capture"]
+__all__ = ["Finding", "Inspection", "Verdict", "inspect_capture", "problems", "to_leave_out"]
 
 Severity = Literal["problem", "warning"]
 Quality = Literal["good", "limited", "poor"]
@@ -30,6 +30,10 @@ EDGE, STRAY_POINTS, SMALL_CLOUD = 1.05, 0.1, 0.2
 FEW_LEVELS = 256
 ENOUGH = 16
 """Pixels a level, that their number means something."""
+BETTER_WITHOUT: Mapping[str, str] = {"black": "black", "blurred": "blurred", "duplicate": "the same picture as another"}
+"""Findings whose views a capture is better without, and why, in a word or two."""
+SHOWN = 6
+"""Views that a line names; the others are counted."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,12 @@ class Finding:
     text: str
     remedy: str
     views: tuple[str, ...] = ()
+
+    def line(self) -> str:
+        """For the terminal, without its severity."""
+        rest = f" and {len(self.views) - SHOWN} more" if len(self.views) > SHOWN else ""
+        named = f" [{', '.join(self.views[:SHOWN])}{rest}]" if self.views else ""
+        return f"{self.text}{named}; {self.remedy}"
 
 
 @dataclass(frozen=True)
@@ -85,6 +95,29 @@ def inspect_capture(capture: Capture, on_view: Callable[[str], None] = lambda na
     order = {"problem": 0, "warning": 1}
     ranked = tuple(sorted(findings, key=lambda finding: order[finding.severity]))
     return Inspection(capture, tuple(views), where, factors, ranked, verdict)
+
+
+def problems(inspection: Inspection) -> tuple[str, ...]:
+    """What spoils or prevents a result, in lines for people."""
+    return tuple(f"problem: {finding.line()}" for finding in inspection.findings if finding.severity == "problem")
+
+
+def to_leave_out(inspection: Inspection) -> Mapping[str, str]:
+    """The views that the capture is better without, and why: those that are black or blurred, and pictures that it has twice.
+
+    None where too few would remain.
+
+    Example:
+        >>> to_leave_out(inspect_capture(load_capture("captures/teapot")))
+        {'IMG_0017': 'blurred'}
+    """
+    proposed = {
+        name: BETTER_WITHOUT[finding.kind]
+        for finding in inspection.findings
+        if finding.kind in BETTER_WITHOUT
+        for name in finding.views
+    }
+    return proposed if len(inspection.views) - len(proposed) >= MIN_COUNT else {}
 
 
 def _of_views(views: Sequence[ViewFigures], factors: Sequence[float], capture: Capture) -> Iterator[Finding]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float, Int
+from torch import Tensor
 
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.candidates import merge, propose
@@ -20,6 +22,9 @@ CANDIDATES = 256
 """Places for lamps that one fit tries."""
 FOLDS = 5
 """One part in so many of the points is not fitted to, and decides between two lights; the first time each part in turn."""
+BLOCKS_OF_FOLD = 6
+"""Blocks of neighbouring points that make a part. Neighbours share the errors of their material, and a lamp that makes up for
+those would be confirmed by a neighbour that was kept back; so a block is kept back whole."""
 KNOWN_ROWS = 32
 """Rows of a known map as the fit of the lamps before it sees it: that fit traces every texel from every point."""
 
@@ -75,7 +80,7 @@ def solve_light(
         found, measured = fit_light(start, both, target, objective), None
     else:
         # A wrong first choice would last, as surfaces then learn what suits it: so it is made on all points in turn.
-        fold = torch.randperm(len(observed), device=observed.position.device) % FOLDS
+        fold = _folds(observed.position)
         gains = []
         for number in range(FOLDS if first else 1):
             kept_back, fitted = fold == number, fold != number
@@ -98,3 +103,9 @@ def solve_light(
     sought.copy_(found.log_radiance)
     lamps.place(lit.places.position, found.intensity, lit.places.axis)
     return measured
+
+
+def _folds(position: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
+    """Of each point the number of its part: that of the block about the nearest of some points drawn at random."""
+    drawn = torch.randperm(len(position), device=position.device)[: BLOCKS_OF_FOLD * FOLDS]
+    return torch.cdist(position, position[drawn]).argmin(1) % FOLDS

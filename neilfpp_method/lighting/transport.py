@@ -11,6 +11,7 @@ the scene's own surfaces add.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -21,9 +22,9 @@ from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import LampPlaces, rays_towards
 from neilfpp_method.shading.brdf import Lobe, diffuse_reflectance, normal_reflectance, specular_terms
 from neilfpp_method.shading.frame import dot
-from neilfpp_method.structures import Material, Observed, SceneTracer
+from neilfpp_method.structures import Material, Observed, SceneLight, SceneTracer
 
-__all__ = ["Transport", "from_lamps", "from_texels", "in_sight", "lamp_kernel"]
+__all__ = ["Transport", "from_lamps", "from_texels", "from_texels_at", "in_sight", "lamp_kernel"]
 
 PAIRS_AT_ONCE = 2**18
 """Pairs of a point and a direction that are traced together: what bounds the memory."""
@@ -104,22 +105,69 @@ def from_texels(
         scene: stands between the points and the map, and shines on them; none where inter-reflection is off.
     """
     texels = environment.log_radiance[0].numel()
-    sources, added = [], []
+    parts = []
     for part, rough in _chunks(observed, roughness, texels):
-        drawn = environment.texel_directions(part.position)
-        weight = dot(drawn.wi, part.normal).clamp_min(0) * drawn.solid_angle
-        # The map is even about every plane through its middle: half of its texels are above a horizon, up to grazing ones.
-        weight, above = weight.topk(texels // 2, dim=1)
-        wi = drawn.wi.gather(1, above[..., None].expand(-1, -1, 3))
-        kernel = _kernel(part, rough, wi, weight, lobe)
+        rays = _texel_rays(environment, part, scene)
+        parts.append(rays.carried(_kernel(part, rough, rays.wi, rays.weight, lobe)))
+    return _joined(parts)
+
+
+@torch.no_grad()
+def from_texels_at(
+    environment: EnvironmentLight,
+    observed: Observed,
+    roughnesses: Sequence[float],
+    lobe: Lobe,
+    scene: SceneTracer | None,
+) -> Transport:
+    """As `from_texels`, at several roughnesses for which each direction is traced once; `sources` in half precision.
+
+    Layer 0 is the diffuse part, layers 1 + 2k and 2 + 2k are the facing and the grazing part at roughness number k.
+    """
+    texels = environment.log_radiance[0].numel()
+    parts = []
+    for part, rough in _chunks(observed, observed.position[:, :1], texels):
+        rays = _texel_rays(environment, part, scene)
+        kernels = [_kernel(part, torch.full_like(rough, r), rays.wi, rays.weight, lobe) for r in roughnesses]
+        layers = [rays.carried(kernel if k == 0 else kernel[1:]) for k, kernel in enumerate(kernels)]
+        parts.append(Transport(torch.cat([x.sources.half() for x in layers]), torch.cat([x.scene for x in layers])))
+    return _joined(parts)
+
+
+@dataclass(frozen=True)
+class _TexelRays:
+    """For N points a direction in each texel above the horizon, its number among T texels, cosine times solid angle, and what
+    stands there of the scene."""
+
+    wi: Float[Tensor, "N S 3"]
+    number: Int[Tensor, "N S"]
+    weight: Float[Tensor, "N S"]
+    texels: int
+    met: SceneLight | None
+
+    def carried(self, kernel: Float[Tensor, "K N S"]) -> Transport:
+        """What leaves the points through a kernel."""
         sent = kernel.new_zeros(*kernel.shape[:2], 3)
-        if scene is not None:
-            met = scene(part.position, wi)
-            sent = torch.einsum("kns,nsc->knc", kernel, met.radiance.to(kernel.dtype))
-            kernel = kernel * ~met.hit
-        sources.append(kernel.new_zeros(*kernel.shape[:2], texels).scatter_(2, above.expand(len(kernel), -1, -1), kernel))
-        added.append(sent)
-    return Transport(torch.cat(sources, 1), torch.cat(added, 1))
+        if self.met is not None:
+            sent = torch.einsum("kns,nsc->knc", kernel, self.met.radiance.to(kernel.dtype))
+            kernel = kernel * ~self.met.hit
+        sources = kernel.new_zeros(*kernel.shape[:2], self.texels)
+        return Transport(sources.scatter_(2, self.number.expand(len(kernel), -1, -1), kernel), sent)
+
+
+def _texel_rays(environment: EnvironmentLight, observed: Observed, scene: SceneTracer | None) -> _TexelRays:
+    drawn = environment.texel_directions(observed.position)
+    texels = len(drawn.solid_angle)
+    weight = dot(drawn.wi, observed.normal).clamp_min(0) * drawn.solid_angle
+    # The map is even about every plane through its middle: half of its texels are above a horizon, up to grazing ones.
+    weight, number = weight.topk(texels // 2, dim=1)
+    wi = drawn.wi.gather(1, number[..., None].expand(-1, -1, 3))
+    met = None if scene is None else scene(observed.position, wi)
+    return _TexelRays(wi, number, weight, texels, met)
+
+
+def _joined(parts: Sequence[Transport]) -> Transport:
+    return Transport(torch.cat([part.sources for part in parts], 1), torch.cat([part.scene for part in parts], 1))
 
 
 @torch.no_grad()

@@ -18,6 +18,7 @@ from neilfpp_method.data.formats.write_transforms import write_transforms
 from neilfpp_method.data.point_cloud import WorldPoints, read_oriented_ply, write_oriented_ply
 from neilfpp_method.data.scene_box import SceneBox, find_box
 from neilfpp_method.data.views import CaptureFiles, View
+from neilfpp_method.inspection.findings import inspect_capture, problems, to_leave_out
 from neilfpp_method.prepare.dense_cloud import dense_cloud
 from neilfpp_method.prepare.options import Prepare
 from neilfpp_method.prepare.pictures import write_picture
@@ -56,7 +57,7 @@ def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
     """
     work, posed = options.out / WORK, source.posed
     step = begin(work / "views", source.step, undistort=options.undistort)
-    asked = {"test_every": options.test_every, "dense": options.dense, "also": options.also}
+    asked = {"test_every": options.test_every, "dense": options.dense, "also": options.also, "auto": options.auto}
     last = begin(work / "capture", step, **asked)
     if last.result is not None and recognise(options.out):
         return None
@@ -68,14 +69,22 @@ def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
         write_capture(step.folder, files, response="linear" if posed.linear else "srgb")
         step.complete({})
     prepared = load_capture(step.folder)
+    bar = open_bar("inspecting", len(prepared.views))
+    inspection = inspect_capture(prepared, lambda _: bar.advance())
+    spoilt = to_leave_out(inspection) if options.auto else {}
+    if spoilt:
+        prepared = replace(prepared, views=tuple(view for view in prepared.views if view.name not in spoilt))
+        inspection = inspect_capture(prepared)
+        remarks = (*source.remarks, *(f"left out: {name}, {reason}" for name, reason in spoilt.items()))
+        source = replace(source, remarks=remarks)
     cloud, kind = _cloud(source, prepared, options, step, open_bar)
-    return _publish(source, prepared, cloud, kind, options, last)
+    return _publish(source, prepared, cloud, kind, problems(inspection), options, last)
 
 
 def _cloud(source: Source, prepared: Capture, options: Prepare, after: Step, open_bar: Bars) -> tuple[WorldPoints, str]:
     """The oriented points, and what they are."""
     if options.dense:
-        step = begin(options.out / WORK / "dense", after)
+        step = begin(options.out / WORK / "dense", after, views=[view.name for view in prepared.views])
         path = step.folder / CLOUD
         if step.result is None:
             write_oriented_ply(path, dense_cloud(prepared, step.folder, open_bar))
@@ -88,14 +97,24 @@ def _cloud(source: Source, prepared: Capture, options: Prepare, after: Step, ope
     return WorldPoints(np.empty((0, 3)), np.empty((0, 3))), "none: poses came without points; --dense makes them"
 
 
-def _publish(source: Source, prepared: Capture, cloud: WorldPoints, kind: str, options: Prepare, last: Step) -> Summary:
+def _publish(
+    source: Source,
+    prepared: Capture,
+    cloud: WorldPoints,
+    kind: str,
+    problems: tuple[str, ...],
+    options: Prepare,
+    last: Step,
+) -> Summary:
     """Lay out the capture's folder; `capture.json` first goes, and comes back last."""
     out = options.out
     (out / FILE).unlink(missing_ok=True)
     for part in PARTS:
         shutil.rmtree(out / part, ignore_errors=True)
-        if (prepared.root / part).is_dir():
-            shutil.copytree(prepared.root / part, out / part)
+    for path in (path for view in prepared.views for path in (view.image, view.mask, view.valid) if path):
+        copy = out / path.relative_to(prepared.root)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(path, copy)
     points = write_oriented_ply(out / CLOUD, cloud) if len(cloud.position) else None
     views = tuple(_moved(view, prepared.root, out) for view in prepared.views)
     test = _test_views(source.posed, views, options.test_every)
@@ -110,6 +129,7 @@ def _publish(source: Source, prepared: Capture, cloud: WorldPoints, kind: str, o
         radius=box.scale,
         scene_from=prepared.scene_from,
         remarks=source.remarks,
+        problems=problems,
     )
     write_summary(out / "summary.json", summary)
     write_picture(out / "summary.png", views, test, cloud, box, source.placed)

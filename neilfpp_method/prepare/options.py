@@ -37,6 +37,8 @@ class Prepare:
     """Compute a dense oriented cloud by plane-sweep stereo; otherwise the sparse points are used."""
     test_every: int | None = None
     """Hold out every k-th view for testing, 0 none; none given: the split that poses came with, or every 8th."""
+    auto: bool = False
+    """Leave out the views that `neilfpp inspect` proposes to: black or blurred ones, and pictures that are there twice."""
     allow_partial: bool = False
     """Leave out images that cannot be read or placed, however many."""
     also: tuple[Literal["nerfstudio", "neilf"], ...] = ()

@@ -34,7 +34,8 @@ class Placement:
 
 @dataclass(frozen=True)
 class Summary:
-    """The outcome. `placements` is empty and `models` too where poses came with the images."""
+    """The outcome. `placements` is empty and `models` too where poses came with the images. `remarks` are what a person should
+    know, `problems` what `neilfpp inspect` says spoils or prevents a result."""
 
     placements: tuple[Placement, ...]
     models: tuple[int, ...]
@@ -45,6 +46,7 @@ class Summary:
     radius: float
     scene_from: SceneSource
     remarks: tuple[str, ...]
+    problems: tuple[str, ...] = ()
 
     @property
     def error(self) -> float | None:
@@ -63,7 +65,7 @@ class Summary:
         lines += [f"camera {camera['model']}: {camera['images']} images, {_parameters(camera)}" for camera in self.cameras]
         lines.append(f"point cloud: {self.points} points with normals ({self.cloud})")
         lines.append(f"radius of the scene: {self.radius:.4g}{FOUND[self.scene_from]}")
-        return [*lines, *(f"note: {remark}" for remark in self.remarks)]
+        return [*lines, *(f"note: {remark}" for remark in self.remarks), *self.problems]
 
 
 def placements(features: Mapping[str, int], model: pycolmap.Reconstruction) -> tuple[Placement, ...]:

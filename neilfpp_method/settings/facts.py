@@ -22,6 +22,7 @@ class SceneFacts:
         radiance_scale: the largest radiance that R can reach.
         background: "none", "constant" or "inverted_sphere".
         background_color: linear RGB of a constant background, and what an inverted sphere starts as.
+        far_points: points of the scene reach far beyond its box, to walls and trees: what lies behind has a shape.
     """
 
     response: str
@@ -29,6 +30,7 @@ class SceneFacts:
     radiance_scale: float
     background: str
     background_color: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    far_points: bool = False
 
 
 @dataclass(frozen=True)

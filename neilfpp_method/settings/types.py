@@ -82,6 +82,8 @@ class BrdfConfig:
     """What the base colour starts as. Light and base colour share a scale that images hardly tell, so it stays near this."""
     initial_metallic: float = 0.5
     """What metallic starts as. Most surfaces are no metals, and a light that is found under metals is too weak for others."""
+    metals: bool = True
+    """Whether there may be metal; off, metallic is 0 everywhere."""
     layers: int = 8
     """Hidden layers."""
     width: int = 512

@@ -47,7 +47,7 @@ def scene_facts(capture: Capture, pixels: PixelDataset, config: NeilfConfig) -> 
         kind = "inverted_sphere" if color is None and pixels.border_color() is None else "constant"
     if color is None and kind != "none":
         color = tuple(pixels.border_median().tolist())
-    return SceneFacts(response, median, scale, kind, color or (0.0, 0.0, 0.0))
+    return SceneFacts(response, median, scale, kind, color or (0.0, 0.0, 0.0), far_points=capture.scene_from == "focus")
 
 
 def build_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> NeilfModel:

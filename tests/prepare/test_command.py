@@ -7,6 +7,7 @@ import os
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -148,6 +149,34 @@ def test_a_stopped_command_says_how_it_continues_and_does(photos, tmp_path, monk
     assert prepare(more, out) == 0
     assert [view.name for view in load_capture(out).views] == [f"{i:03}" for i in range(1, VIEWS)]
     assert not (out / "images" / "000.exr").exists()
+
+
+def test_blurred_and_doubled_photographs_are_left_out_when_asked(own, tmp_path, capsys):
+    blurred, doubled = "004", "009"
+    pixels = read_image(own / f"{blurred}.exr").pixels
+    write_exr(own / f"{blurred}.exr", {"RGB": cv2.GaussianBlur(pixels, (0, 0), 1.5)})
+    shutil.copy(own / "006.exr", own / f"{doubled}.exr")
+    out = tmp_path / "out"
+    assert prepare(own, out) == 0
+    assert len(load_capture(out).views) == VIEWS + 1
+    assert "left out" not in capsys.readouterr().out
+
+    assert prepare(own, out, "--auto") == 0
+    kept = [view.name for view in load_capture(out).views]
+    assert kept == [f"{i:03}" for i in range(VIEWS) if i != int(blurred)]
+    assert sorted(path.stem for path in (out / "images").iterdir()) == kept
+    said = capsys.readouterr().out
+    assert f"left out: {blurred}, blurred" in said
+    assert f"left out: {doubled}, the same picture as another" in said
+
+
+def test_problems_of_the_photographs_are_said(own, tmp_path, capsys):
+    path = own / "002.exr"
+    write_exr(path, {"RGB": 4.0 * read_image(path).pixels})
+    assert prepare(own, tmp_path / "out") == 0
+    said = capsys.readouterr().out
+    assert "problem: brighter or darker than the views around them: 002" in said
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["problems"]
 
 
 def test_sub_folders_two_sizes_and_display_values(tmp_path):

@@ -50,6 +50,27 @@ def test_it_waits_until_there_are_surfaces(stage, share, moves):
     assert all(rate > 0 for rate in rates.values())
 
 
+def test_it_does_not_wait_where_points_were_found_behind(tmp_path):
+    capture = load_capture(make_sky_capture(tmp_path / "sky", views=6, size=(48, 36)))
+    pixels = PixelDataset(capture, capture.train_views)
+    far_points = [
+        scene_facts(dataclasses.replace(capture, scene_from=told_by), pixels, tiny_config()).far_points
+        for told_by in ("points", "focus")
+    ]
+    assert far_points == [False, True]
+    config = tiny_config()
+    config = dataclasses.replace(config, optimizer=dataclasses.replace(config.optimizer, background_from=1.0))
+    steps = dataclasses.replace(config.train, sdf_steps=3, material_steps=0, joint_steps=0)
+    config = dataclasses.replace(config, train=steps)
+    for far, name in ((False, "near"), (True, "far")):
+        training = small_training(capture.root, tmp_path / name, config)
+        training.model.facts = dataclasses.replace(training.model.facts, far_points=far)
+        before = [p.detach().clone() for p in training.model.host.background.parameters()]
+        train(training)
+        after = training.model.host.background.parameters()
+        assert any(not torch.equal(a, b) for a, b in zip(before, after, strict=True)) == far
+
+
 def test_a_sphere_under_a_sky_gets_a_surface(tmp_path):
     """With the settings of `fast` for what lies behind, and small networks."""
     config = tiny_config()
