@@ -31,7 +31,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("export",),
     ("evaluate",),
     ("relight",),
-    ("report",),
+    ("report", "view"),
     ("demo", "plugin", "prepare"),
     ("commands",),
     ("cli",),

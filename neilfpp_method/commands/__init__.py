@@ -5,7 +5,19 @@ What a command needs to run is imported when it runs, so that help and a mistype
 
 from __future__ import annotations
 
-from neilfpp_method.commands import completion, demo, evaluate, export, inspect, prepare, relight, render, report, train
+from neilfpp_method.commands import (
+    completion,
+    demo,
+    evaluate,
+    export,
+    inspect,
+    prepare,
+    relight,
+    render,
+    report,
+    train,
+    view,
+)
 
 __all__ = ["COMMANDS"]
 
@@ -19,5 +31,6 @@ COMMANDS = {
     "export": export.COMMAND,
     "relight": relight.COMMAND,
     "report": report.COMMAND,
+    "view": view.COMMAND,
     "completion": completion.COMMAND,
 }

@@ -1,0 +1,27 @@
+import pytest
+
+from neilfpp_method.view.pace import AT_ONCE, CHECKED, Pace, sizes
+
+
+def test_sizes_double_up_to_the_whole_window():
+    assert sizes(640, 480, 19_200) == [0.25, 0.5, 1.0]  # 640 · 480 / 16 = 19,200
+    assert sizes(640, 480, 640 * 480) == [1.0]
+    assert sizes(640, 480, 10**9) == [1.0]
+
+
+def test_the_first_picture_is_no_larger_than_can_be_there_at_once():
+    for at_once in (300, 5_000, 80_000):
+        first = sizes(1280, 720, at_once)[0]
+        assert at_once / 4.1 < first**2 * 1280 * 720 <= at_once * 1.01
+
+
+def test_the_number_of_rays_follows_the_measured_speed():
+    pace = Pace()
+    pace.note("normal", 100_000, 1.0)
+    assert pace.at_once("normal") == int(100_000 * AT_ONCE)
+    pace.note("normal", 300_000, 1.0)  # half of either: 200,000 a second
+    assert pace.at_once("normal") == int(200_000 * AT_ONCE)
+    assert pace.together("normal") == pytest.approx(200_000 * CHECKED)
+    pace.note("radiance", 1, 1.0)  # of each layer by itself, and never nothing
+    assert pace.at_once("radiance") == 256
+    assert pace.at_once("normal") == int(200_000 * AT_ONCE)

@@ -1,0 +1,104 @@
+import threading
+
+import pytest
+
+from neilfpp_method.view.painter import Painter
+
+WAIT = 10.0
+
+
+class Seen:
+    """What a painter has shown, and ways to wait for it."""
+
+    def __init__(self):
+        self.shown, self.failures, self.news = [], [], threading.Condition()
+
+    def show(self, frame):
+        with self.news:
+            self.shown.append(frame)
+            self.news.notify_all()
+
+    def failed(self, error):
+        with self.news:
+            self.failures.append(str(error))
+            self.news.notify_all()
+
+    def wait(self, condition):
+        with self.news:
+            assert self.news.wait_for(condition, WAIT), (self.shown, self.failures)
+
+
+@pytest.fixture
+def seen():
+    return Seen()
+
+
+@pytest.fixture
+def painting(seen):
+    made = []
+
+    def start(frames):
+        made.append(Painter(frames, seen.show, seen.failed, threading.Lock()))
+        return made[-1]
+
+    yield start
+    for painter in made:
+        painter.stop()
+
+
+def test_pictures_come_in_order(seen, painting):
+    painting(lambda wish: iter([None, f"{wish} coarse", None, f"{wish} fine"])).ask("a")
+    seen.wait(lambda: seen.shown == ["a coarse", "a fine"])
+
+
+def test_a_newer_wish_ends_the_refinement_of_the_older(seen, painting):
+    reached, newer = threading.Event(), threading.Event()
+
+    def frames(wish):
+        yield f"{wish} coarse"
+        if wish == "old":
+            reached.set()
+            assert newer.wait(WAIT)
+            yield None
+            yield "old fine"
+
+    painter = painting(frames)
+    painter.ask("old")
+    assert reached.wait(WAIT)
+    painter.ask("new")
+    newer.set()
+    seen.wait(lambda: seen.shown[-1] == "new coarse")
+    assert seen.shown == ["old coarse", "new coarse"]
+
+
+def test_the_first_picture_is_finished_and_wishes_in_between_are_skipped(seen, painting):
+    begun, asked = threading.Event(), threading.Event()
+
+    def frames(wish):
+        if wish == 0:
+            begun.set()
+            assert asked.wait(WAIT)
+        yield None  # here it could be given up
+        yield wish
+
+    painter = painting(frames)
+    painter.ask(0)
+    assert begun.wait(WAIT)
+    for wish in (1, 2, 3):
+        painter.ask(wish)
+    asked.set()
+    seen.wait(lambda: seen.shown[-1:] == [3])
+    assert seen.shown == [0, 3]
+
+
+def test_a_failure_is_told_and_the_next_wish_goes(seen, painting):
+    def frames(wish):
+        if wish == "bad":
+            raise ValueError("no such thing")
+        yield wish
+
+    painter = painting(frames)
+    painter.ask("bad")
+    seen.wait(lambda: seen.failures == ["no such thing"])
+    painter.ask("good")
+    seen.wait(lambda: seen.shown == ["good"])

@@ -1,0 +1,163 @@
+"""Pictures of layers against rays that trimesh casts, and light against constant surroundings."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from neilfpp_method.data.views import camera_rays
+from neilfpp_method.relight.cameras import turntable
+from neilfpp_method.relight.film import Budget, take_picture
+from neilfpp_method.relight.sky import Sky
+from neilfpp_method.train.run import load_run
+from neilfpp_method.view.incident_map import light_at, light_picture, point_under
+from neilfpp_method.view.pace import Pace
+from neilfpp_method.view.pictures import BOUNCES, FAR, Frame, Wish, frames
+from neilfpp_method.view.subject import Lighting, own_light, scene_of, subject_of
+
+
+@pytest.fixture(scope="module")
+def subject(found):
+    return subject_of(load_run(found), 32)
+
+
+@pytest.fixture(scope="module")
+def camera(subject):
+    return turntable(subject.run.capture, 2, None, 40)[0].camera
+
+
+def pictures(wish: Wish, count: int = 99) -> list[Frame]:
+    made = []
+    for frame in frames(wish, Pace({wish.layer: 2_000.0})):
+        if frame is not None:
+            made.append(frame)
+        if len(made) == count:
+            break
+    return made
+
+
+def cast(subject, camera):
+    """Which pixels meet the surface first from outside, where, and on which triangle, by trimesh."""
+    rays = camera_rays(camera)
+    corners = subject.surface.triangles.reshape(-1, 3).numpy()
+    mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+    place, ray, _ = mesh.ray.intersects_location(rays.origins.numpy(), rays.directions.numpy(), multiple_hits=False)
+    return rays, place, ray
+
+
+def srgb(linear):
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def test_pictures_become_finer_up_to_the_window(subject, camera):
+    made = pictures(Wish(subject, camera, "normal", own_light(subject.run)))
+    assert [frame.share for frame in made] == sorted(frame.share for frame in made)
+    assert made[0].share < 1 == made[-1].share
+    assert made[-1].image.shape == (camera.height, camera.width, 3)
+
+
+@pytest.mark.parametrize("layer", ["base_color", "roughness", "metallic"])
+def test_a_layer_is_the_material_of_what_a_pixel_sees(subject, camera, layer):
+    frame = pictures(Wish(subject, camera, layer, own_light(subject.run)))[-1]
+    _, place, ray = cast(subject, camera)
+    assert len(ray) > 100
+    with torch.no_grad():
+        material = getattr(subject.run.model.materials(torch.from_numpy(place).float()), layer).numpy()
+    true = 255 * (srgb(material) if layer == "base_color" else material)
+    shown = frame.image.reshape(-1, 3)[ray]
+    assert np.percentile(np.abs(shown - true), 98) <= 2  # a ray along the outline may meet another triangle
+    nothing = np.setdiff1d(np.arange(camera.width * camera.height), ray)
+    assert (frame.image.reshape(-1, 3)[nothing] == 237).all()
+
+
+def test_depth_is_along_the_axis(subject, camera):
+    frame = pictures(Wish(subject, camera, "normal", own_light(subject.run)))[-1]
+    _, place, ray = cast(subject, camera)
+    depth = (place @ camera.w2c[2, :3]) + camera.w2c[2, 3]
+    assert np.percentile(np.abs(frame.depth.reshape(-1)[ray] - depth), 98) < 1e-3
+    assert frame.depth.max() == FAR
+
+
+def test_pbr_comes_to_the_path_tracers_picture(subject, camera):
+    """Many samples of either, by other random numbers."""
+    light = own_light(subject.run)
+    made = [frame for frame in pictures(Wish(subject, camera, "pbr", light), 40) if frame.share == 1]
+    assert [frame.samples for frame in made] == list(range(1, len(made) + 1))
+    picture = take_picture(scene_of(subject, light), camera, Budget(64), BOUNCES, seed=7)
+    inside = (picture.alpha[..., 0] > 0.999).numpy()
+    true = 255 * srgb(picture.radiance.numpy()).clip(0, 1)
+    error = [np.abs(frame.image.astype(float) - true)[inside].mean() for frame in (made[0], made[-1])]
+    assert error[1] < error[0] / 2
+    assert abs((made[-1].image.astype(float) - true)[inside].mean()) < 1.5
+
+
+def test_twice_the_light_is_a_stop_more(subject, camera):
+    light = own_light(subject.run)
+    brighter = Lighting(replace(light.sky, radiance=2 * light.sky.radiance), None, own=False)
+    last = [
+        pictures(Wish(subject, camera, "pbr", shone, exposure), 6)[-1].image
+        for shone, exposure in ((brighter, 0.0), (light.with_lamps(None), 1.0))
+    ]
+    assert np.abs(last[0].astype(int) - last[1]).max() <= 1
+
+
+def test_a_free_light_shows_pbr_too(given, camera):
+    subject = subject_of(load_run(given), 32)
+    assert own_light(subject.run).sky is None
+    frame = pictures(Wish(subject, camera, "pbr", own_light(subject.run)))[-1]
+    assert frame.share == 1
+    assert frame.image.std() > 5
+
+
+def test_a_run_without_a_surface_shows_r_and_says_so(found, camera):
+    run = load_run(found)
+    run.model.host.sdf = lambda x: x.norm(dim=-1) + 1.0
+    empty = subject_of(run, 32)
+    assert empty.layers == ("radiance",)
+    assert "no surface" in empty.note
+    assert pictures(Wish(empty, camera, "radiance", own_light(run)))[-1].share == 1
+    assert point_under(empty, (3.0, 0.0, 0.0), (-1.0, 0.0, 0.0)) is None
+
+
+# ------------------------------------------------------------------------------------------------ light at a point
+
+
+def test_a_ray_picks_the_point_that_trimesh_finds(subject, camera):
+    rays, place, ray = cast(subject, camera)
+    k = len(ray) // 2
+    point = point_under(subject, tuple(rays.origins[ray[k]].tolist()), tuple((3 * rays.directions[ray[k]]).tolist()))
+    assert point.position.tolist() == pytest.approx(place[k].tolist(), abs=1e-4)
+    assert point.normal.norm().item() == pytest.approx(1, abs=1e-5)
+
+
+def test_even_light_arrives_evenly_and_not_from_below(subject, camera):
+    rays, _, ray = cast(subject, camera)
+    middle = ray[len(ray) // 2]
+    point = point_under(subject, tuple(rays.origins[middle].tolist()), tuple(rays.directions[middle].tolist()))
+    even = Lighting(Sky(torch.full((8, 16, 3), 0.7), True, 0.0), None, own=False)
+    radiance = light_at(subject, even, point)
+    normal = point.normal.numpy()
+    theta, phi = (np.arange(48) + 0.5) * np.pi / 48, (np.arange(96) + 0.5) * np.pi / 48
+    cosine = (
+        np.sin(theta)[:, None] * (np.sin(phi) * normal[0] + np.cos(phi) * normal[1]) + np.cos(theta)[:, None] * normal[2]
+    )
+    assert np.median(np.abs(radiance[cosine > 0.5] - 0.7)) < 1e-5  # nothing stands before it
+    assert radiance[cosine < -0.05].max() == 0
+    picture = light_picture(np.ones_like(radiance), normal)
+    assert (picture[cosine < -0.05] == 44).all()
+    assert picture[cosine > 0.05].min() > 88
+
+
+def test_own_light_is_what_the_model_says(subject, camera):
+    rays, _, ray = cast(subject, camera)
+    middle = ray[len(ray) // 2]
+    point = point_under(subject, tuple(rays.origins[middle].tolist()), tuple(rays.directions[middle].tolist()))
+    radiance = light_at(subject, own_light(subject.run), point)
+    down, across = np.argwhere(radiance.any(-1))[77]
+    theta, phi = np.pi * (down + 0.5) / 48, 2 * np.pi * (across + 0.5) / 96
+    wi = torch.tensor([np.sin(phi) * np.sin(theta), np.cos(phi) * np.sin(theta), np.cos(theta)], dtype=torch.float32)
+    with torch.no_grad():
+        true = subject.run.model.incident_light(point.position[None], wi[None, None])[0, 0]
+    assert radiance[down, across].tolist() == pytest.approx(true.tolist(), rel=1e-3)
