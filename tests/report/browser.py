@@ -27,6 +27,7 @@ FLAGS = (
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
+    "--force-prefers-reduced-motion",
     "--virtual-time-budget=30000",
     "--dump-dom",
 )
@@ -40,7 +41,13 @@ def after(page: Path, script: str, width: int = 1100) -> Any:
     html = page.read_text("utf-8")
     policy = re.search(r'<meta http-equiv="Content-Security-Policy"[^>]*>', html)
     assert policy
+    # Timers in place of frames: a machine that is busy may show no frame before the browser's time is up.
     said = f"""<pre id=said></pre><script>
+      requestAnimationFrame = (draw) => setTimeout(draw, 16);
+      const {{ getContext }} = HTMLCanvasElement.prototype;
+      HTMLCanvasElement.prototype.getContext = function (kind, options) {{
+        return getContext.call(this, kind, {{ ...options, preserveDrawingBuffer: true }});
+      }};
       const tell = (value) => {{ said.textContent = said.textContent || JSON.stringify(value); }};
       addEventListener("error", (event) => tell({{ error: event.message }}));
       addEventListener("load", () => setTimeout(() => (async () => {{ {script} }})().then(tell), 500));

@@ -64,11 +64,10 @@ def test_the_surface_is_drawn_layer_by_layer(page: Path):
         page,
         CLICK
         + """
-        document.getElementById("surface-pause").click();
         const found = {};
         for (const layer of document.querySelectorAll("input[name=surface-layer]")) {
           layer.click();
-          await new Promise(requestAnimationFrame);  // asked for after the page's own, so its drawing is still there
+          await new Promise(requestAnimationFrame);  // asked for after the page's own
           const pixel = new Uint8Array(4);
           gl.readPixels(canvas.width / 2, canvas.height / 2, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
           found[layer.value] = [...pixel];
