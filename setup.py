@@ -1,4 +1,6 @@
-"""What pyproject.toml cannot say: the README of an index page, where links into the repository lead nowhere."""
+"""What pyproject.toml cannot say: the README of an index page, where links into the repository lead
+nowhere.
+"""
 
 import re
 from pathlib import Path

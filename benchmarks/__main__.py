@@ -5,7 +5,8 @@
     python -m benchmarks --compare          exit status 1 where a figure is worse than baseline.json by more than its tolerance
     python -m benchmarks --save             these figures become the baseline
 
-A suite is a module with `measurements()`. Curves and tables of docs/performance.md have commands of their own.
+A suite is a module with `measurements()`. Curves and tables of docs/performance.md have commands of their
+own.
 """
 
 from __future__ import annotations
@@ -50,13 +51,18 @@ class Options:
 
 
 def compare(measured: Sequence[Measurement], baseline: Mapping[str, float]) -> list[str]:
-    """The names of the figures that are worse than the baseline allows. A figure without a baseline is not."""
+    """The names of the figures that are worse than the baseline allows. A figure without a baseline is
+    not.
+    """
     return [m.name for m in measured if m.name in baseline and m.worse_than(baseline[m.name])]
 
 
 def merged(measured: Sequence[Measurement], old: Mapping[str, object], machine: str) -> dict[str, object]:
     """A baseline file with the new figures in place of those of the same name."""
-    figures = {**old.get("figures", {}), **{m.name: {k: v for k, v in asdict(m).items() if k != "name"} for m in measured}}
+    figures = {
+        **old.get("figures", {}),
+        **{m.name: {k: v for k, v in asdict(m).items() if k != "name"} for m in measured},
+    }
     return {"hardware": machine, "figures": dict(sorted(figures.items()))}
 
 
@@ -71,7 +77,11 @@ def main(options: Options, console: Console) -> int:
     measured: list[Measurement] = []
     for name in options.names or SUITES:
         for measurement in importlib.import_module(SUITES[name]).measurements():
-            console.print(f"{measurement.name}: {measurement.value:.3g} {measurement.unit}", markup=False, highlight=False)
+            console.print(
+                f"{measurement.name}: {measurement.value:.3g} {measurement.unit}",
+                markup=False,
+                highlight=False,
+            )
             measured.append(measurement)
     if options.save:
         now = read_json(BASELINE) if BASELINE.exists() else {}  # others may have saved meanwhile
@@ -87,7 +97,9 @@ def _table(measured: Sequence[Measurement], known: Mapping[str, float], worse: S
     for m in measured:
         before = f"{known[m.name]:.3g}" if m.name in known else "–"
         allowed = "–" if m.tolerance is None else f"{100 * m.tolerance:.0f} %"
-        table.add_row(m.name, f"{m.value:.3g} {m.unit}", before, m.better, allowed, "WORSE" if m.name in worse else "")
+        table.add_row(
+            m.name, f"{m.value:.3g} {m.unit}", before, m.better, allowed, "WORSE" if m.name in worse else ""
+        )
     return table
 
 

@@ -1,9 +1,10 @@
-"""What attaching costs a host while no material stage runs: its own step with and without the add-on, side by side.
+"""What attaching costs a host while no material stage runs: its own step with and without the add-on, side by
+side.
 
     python -m benchmarks.attach_cost
 
-The host is VolSDF in a loop of its own, borrowed by the add-on. Steps alternate between the two loops, so that whatever else
-the machine does falls on both; medians of both and their ratio are printed.
+The host is VolSDF in a loop of its own, borrowed by the add-on. Steps alternate between the two loops, so
+that whatever else the machine does falls on both; medians of both and their ratio are printed.
 """
 
 from __future__ import annotations
@@ -72,7 +73,10 @@ def main() -> None:
     for name, median in medians.items():
         print(f"{name:24} {1e3 * median:8.2f} ms a step")
     alone, attached = medians.values()
-    print(f"{'ratio':24} {attached / alone:8.3f}   ({torch.get_num_threads()} threads, 256 rays, {STEPS} steps each)")
+    print(
+        f"{'ratio':24} {attached / alone:8.3f}   ({torch.get_num_threads()} threads, 256 rays, {STEPS} steps "
+        "each)"
+    )
 
 
 if __name__ == "__main__":

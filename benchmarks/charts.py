@@ -19,7 +19,15 @@ WIDTH, HEIGHT = 420, 300
 LEFT, TOP, BOTTOM, GAP = 62, 34, 42, 18
 HEAD, LEGEND = 58, 26
 GRID = (222, 222, 218)
-COLORS = ((28, 30, 34), (214, 102, 34), (36, 118, 178), (52, 148, 84), (150, 76, 160), (190, 158, 40), (120, 124, 132))
+COLORS = (
+    (28, 30, 34),
+    (214, 102, 34),
+    (36, 118, 178),
+    (52, 148, 84),
+    (150, 76, 160),
+    (190, 158, 40),
+    (120, 124, 132),
+)
 
 
 @dataclass(frozen=True)
@@ -38,11 +46,16 @@ class Chart:
     lines: Mapping[str, Line]
 
 
-def draw_charts(path: Path, title: str, x_name: str, y_name: str, charts: Sequence[Chart], columns: int) -> None:
+def draw_charts(
+    path: Path, title: str, x_name: str, y_name: str, charts: Sequence[Chart], columns: int
+) -> None:
     """Write panels of one kind as a PNG, with common axes and one legend, so many side by side."""
     names = list(dict.fromkeys(name for chart in charts for name in chart.lines))
     lines = [line for chart in charts for line in chart.lines.values()]
-    x_range, y_range = _range([x for line in lines for x in line.x]), _range([y for line in lines for y in line.y])
+    x_range, y_range = (
+        _range([x for line in lines for x in line.x]),
+        _range([y for line in lines for y in line.y]),
+    )
     rows = math.ceil(len(charts) / columns)
     width = columns * (LEFT + WIDTH + GAP) + GAP
     per_line = max(1, width // 250)
@@ -55,7 +68,10 @@ def draw_charts(path: Path, title: str, x_name: str, y_name: str, charts: Sequen
         draw.line([(x, y + 9), (x + 26, y + 9)], fill=_color(number), width=3)
         _write(draw, (x + 34, y), name, 15)
     for number, chart in enumerate(charts):
-        corner = (number % columns * (LEFT + WIDTH + GAP) + LEFT, head + number // columns * (TOP + HEIGHT + BOTTOM) + TOP)
+        corner = (
+            number % columns * (LEFT + WIDTH + GAP) + LEFT,
+            head + number // columns * (TOP + HEIGHT + BOTTOM) + TOP,
+        )
         _panel(draw, corner, chart, names, x_range, y_range, f"{y_name} over {x_name}")
     write_png(path, np.asarray(sheet))
 
@@ -103,7 +119,9 @@ def _panel(
 def _ticks(low: float, high: float) -> list[float]:
     """1, 2 and 5 times the powers of ten in a range of logarithms; where it is short, more of them."""
     steps = (1, 2, 5) if high - low > 0.7 else (1, 1.5, 2, 2.5, 3, 4, 5, 7)
-    candidates = [step * 10.0**power for power in range(math.floor(low), math.ceil(high) + 1) for step in steps]
+    candidates = [
+        step * 10.0**power for power in range(math.floor(low), math.ceil(high) + 1) for step in steps
+    ]
     return [tick for tick in candidates if low <= math.log10(tick) <= high]
 
 
@@ -112,6 +130,10 @@ def _color(number: int) -> tuple[int, int, int]:
 
 
 def _write(
-    draw: ImageDraw.ImageDraw, corner: tuple[float, float], text: str, size: int, color: tuple[int, int, int] = INK
+    draw: ImageDraw.ImageDraw,
+    corner: tuple[float, float],
+    text: str,
+    size: int,
+    color: tuple[int, int, int] = INK,
 ) -> None:
     draw.text(corner, text, font=ImageFont.load_default(size), fill=color)

@@ -1,10 +1,11 @@
-"""How far the point cloud and the cameras of a prepared capture are from the truth: the figures of docs/captures.md.
+"""How far the point cloud and the cameras of a prepared capture are from the truth: the figures of
+docs/captures.md.
 
     neilfpp prepare DATA/ring_capture/images --out CAPTURE --dense
     python -m benchmarks.clouds CAPTURE DATA/ring_capture/true_cameras.json DATA/tabletop_env/inputs/model/mesh.ply
 
-The capture's frame is its own, so the camera centres are brought to the true ones by a similarity first. The mesh of
-tabletop_env is the surface that ring_capture shows.
+The capture's frame is its own, so the camera centres are brought to the true ones by a similarity first. The
+mesh of tabletop_env is the surface that ring_capture shows.
 """
 
 from __future__ import annotations
@@ -69,7 +70,9 @@ def nearest(mesh: trimesh.Trimesh, points: Float64[np.ndarray, "N 3"]) -> Neares
     return Nearest(distance, face)
 
 
-def main(capture: tyro.conf.Positional[Path], cameras: tyro.conf.Positional[Path], mesh: tyro.conf.Positional[Path]) -> None:
+def main(
+    capture: tyro.conf.Positional[Path], cameras: tyro.conf.Positional[Path], mesh: tyro.conf.Positional[Path]
+) -> None:
     """Print the figures.
 
     Args:
@@ -95,8 +98,13 @@ def main(capture: tyro.conf.Positional[Path], cameras: tyro.conf.Positional[Path
     console.print(f"{len(loaded.views)} of {len(truth)} cameras; radius of the scene {radius:.3f}")
     console.print(f"centres  largest {100 * off.max():.3f} % of the radius, rotations {angles.max():.3f}°")
     console.print(f"points   {len(points.position)}")
-    for name, values, unit in (("distance", 100 * there.distance / radius, "% of the radius"), ("normals", bent, "°")):
-        console.print(f"{name:8} median {np.median(values):.3f}, 90th percentile {np.quantile(values, 0.9):.3f} {unit}")
+    for name, values, unit in (
+        ("distance", 100 * there.distance / radius, "% of the radius"),
+        ("normals", bent, "°"),
+    ):
+        console.print(
+            f"{name:8} median {np.median(values):.3f}, 90th percentile {np.quantile(values, 0.9):.3f} {unit}"
+        )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
-"""How the cost of a step grows: with rays, samples and incident directions in proportion, with views not at all.
+"""How the cost of a step grows: with rays, samples and incident directions in proportion, with views not at
+all.
 
     python -m benchmarks.growth --out docs
 
-Each panel has the CPU time of a joint step of `fast` with the free light over one number, the others held, on rays that all
-meet the table of `benchmarks.joint`; the last has that of drawing 4096 pixels from so many views. The written table puts a
-straight line through each, a fixed part and one in proportion, and says how far the figures lie from it.
+Each panel has the CPU time of a joint step of `fast` with the free light over one number, the others held, on
+rays that all meet the table of `benchmarks.joint`; the last has that of drawing 4096 pixels from so many
+views. The written table puts a straight line through each, a fixed part and one in proportion, and says how
+far the figures lie from it.
 """
 
 from __future__ import annotations
@@ -73,7 +75,9 @@ def straight_line(growth: Growth) -> StraightLine:
     """The line of least relative squares."""
     numbers, seconds = np.array(growth.numbers, dtype=float), np.array(growth.seconds)
     each, fixed = np.polyfit(numbers, seconds, 1, w=1 / seconds)
-    return StraightLine(float(fixed), float(each), float(np.abs((fixed + each * numbers) / seconds - 1).max()))
+    return StraightLine(
+        float(fixed), float(each), float(np.abs((fixed + each * numbers) / seconds - 1).max())
+    )
 
 
 def seconds_of(function: Callable[[], object]) -> float:
@@ -122,7 +126,9 @@ def table(growths: list[Growth]) -> str:
     lines = []
     for growth in growths:
         line = straight_line(growth)
-        lines += ["| " + " | ".join([growth.name, *map(str, growth.numbers), "straight line", "off it"]) + " |"]
+        lines += [
+            "| " + " | ".join([growth.name, *map(str, growth.numbers), "straight line", "off it"]) + " |"
+        ]
         lines += ["|---" * (len(growth.numbers) + 3) + "|"]
         cells = [f"{1e3 * seconds:.3g} ms" for seconds in growth.seconds]
         fitted = f"{1e3 * line.fixed:.3g} ms + {1e3 * line.each:.2g} ms each"
@@ -138,7 +144,14 @@ def main(options: Options) -> None:
     text = f"{hardware()}\n\n{table(growths)}"
     (options.out / "cost_growth.md").write_text(text)
     charts = [Chart(growth.name, {"CPU time": Line(growth.numbers, growth.seconds)}) for growth in growths]
-    draw_charts(options.out / "cost_growth.png", "How the cost of a step grows", "number", "seconds", charts, columns=2)
+    draw_charts(
+        options.out / "cost_growth.png",
+        "How the cost of a step grows",
+        "number",
+        "seconds",
+        charts,
+        columns=2,
+    )
     Console().print(text, markup=False, highlight=False, soft_wrap=True)
 
 

@@ -2,11 +2,12 @@
 
     python -m benchmarks joint
 
-256 rays, all of which meet the object, 128 incident directions each for the paper's networks. The scene is a table with two
-balls; each geometry is fitted to it first, so that rays converge, and traced rays hit, as in a scene that trains. Everything
-runs in one process and takes turns; a figure is the median of the CPU time that the process spends (of the clock on a GPU,
-where there is one), or of its ratio to the plain one of the same turn. The plain implementation runs twice: as any process
-starts, and with the settings that the commands make (`kernels.process`).
+256 rays, all of which meet the object, 128 incident directions each for the paper's networks. The scene is a
+table with two balls; each geometry is fitted to it first, so that rays converge, and traced rays hit, as in a
+scene that trains. Everything runs in one process and takes turns; a figure is the median of the CPU time that
+the process spends (of the clock on a GPU, where there is one), or of its ratio to the plain one of the same
+turn. The plain implementation runs twice: as any process starts, and with the settings that the commands make
+(`kernels.process`).
 """
 
 from __future__ import annotations
@@ -114,15 +115,19 @@ def step_on(model: NeilfModel, batch: PixelBatch) -> Callable[[], None]:
 
 
 def cheap_paper() -> NeilfConfig:
-    """The networks of `paper-mlp`, with empty space skipped, and half of the cuts a round for what is left of a ray
-    (`benchmarks.sampler` has the error of that)."""
+    """The networks of `paper-mlp`, with empty space skipped, and half of the cuts a round for what is left of
+    a ray (`benchmarks.sampler` has the error of that).
+    """
     config = preset("paper-mlp")
-    return dataclasses.replace(config, volume=dataclasses.replace(config.volume, skip_empty=True, initial_samples=64))
+    return dataclasses.replace(
+        config, volume=dataclasses.replace(config.volume, skip_empty=True, initial_samples=64)
+    )
 
 
 def seconds_of(steps: Mapping[str, Callable[[], None]], fast: Mapping[str, bool]) -> dict[str, list[float]]:
-    """The times of each step, which take turns. Each comes right after another like it that does not count: a training goes on
-    with the memory and the settings of the step before."""
+    """The times of each step, which take turns. Each comes right after another like it that does not count: a
+    training goes on with the memory and the settings of the step before.
+    """
     now = clock(device())
     taken: dict[str, list[float]] = {name: [] for name in steps}
     for number in range(REPETITIONS):

@@ -1,13 +1,15 @@
-"""What the signed distance, its normal and their backward pass cost behind a hash grid, by three routes side by side.
+"""What the signed distance, its normal and their backward pass cost behind a hash grid, by three routes side
+by side.
 
     python -m benchmarks.kernels [--points 32768] [--repeats 9] [--device cpu]
 
-- naive: straightforward torch; the normal is autograd's gradient of the distance, differentiated once more by the loss.
+- naive: straightforward torch; the normal is autograd's gradient of the distance, differentiated once more by
+  the loss.
 - reference: the analytic Jacobian and the hand-written adjoint of the package, in torch.
 - fastest: the same with the compiled loops (CPU) or Triton's kernels (CUDA).
 
-All three compute one loss of one field, and their gradients are compared before anything is timed. Routes take turns, so
-that whatever else the machine does falls on all; medians and their ratios are printed.
+All three compute one loss of one field, and their gradients are compared before anything is timed. Routes
+take turns, so that whatever else the machine does falls on all; medians and their ratios are printed.
 """
 
 from __future__ import annotations
@@ -35,7 +37,9 @@ PRIMES = (1, 2654435761, 805459861)
 SAMPLES = 32  # points of one ray: neighbours in memory are neighbours in space, as in training
 
 
-def naive_encode(x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpec) -> Float[Tensor, "N F"]:
+def naive_encode(
+    x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpec
+) -> Float[Tensor, "N F"]:
     """A hash grid as one writes it down: eight weighted rows a level."""
     features = []
     for level, resolution in enumerate(spec.resolutions):
@@ -83,7 +87,9 @@ def encode_alone(field: SdfField, x: Float[Tensor, "N 3"]) -> None:
     torch.autograd.backward((encoded.features, encoded.jacobian), (encoded.features, encoded.jacobian))
 
 
-def with_backend(step: Callable[[SdfField, Tensor], None], backend: str) -> Callable[[SdfField, Tensor], None]:
+def with_backend(
+    step: Callable[[SdfField, Tensor], None], backend: str
+) -> Callable[[SdfField, Tensor], None]:
     """A step of which the grid is computed by a backend."""
 
     def chosen(field: SdfField, x: Float[Tensor, "N 3"]) -> None:
@@ -93,7 +99,9 @@ def with_backend(step: Callable[[SdfField, Tensor], None], backend: str) -> Call
     return chosen
 
 
-def measure(config: SdfConfig, grid: HashGridConfig, points: int, repeats: int, device: torch.device) -> dict[str, float]:
+def measure(
+    config: SdfConfig, grid: HashGridConfig, points: int, repeats: int, device: torch.device
+) -> dict[str, float]:
     """Median milliseconds of each route."""
     torch.manual_seed(0)
     field = SdfField(config, grid, RADIUS).to(device)
@@ -114,7 +122,9 @@ def measure(config: SdfConfig, grid: HashGridConfig, points: int, repeats: int, 
         routes[name](field, x)
         gradients.append(field.encoding.table.grad.clone())
     for gradient in gradients[1:]:
-        torch.testing.assert_close(gradient, gradients[0], rtol=1e-2, atol=1e-4 * gradients[0].abs().max().item())
+        torch.testing.assert_close(
+            gradient, gradients[0], rtol=1e-2, atol=1e-4 * gradients[0].abs().max().item()
+        )
     calls = [partial(_fresh, route, field, x) for route in routes.values()]
     taken = median_seconds(*calls, repetitions=repeats, where=device)
     return {name: 1e3 * seconds for name, seconds in zip(routes, taken, strict=True)}
@@ -143,7 +153,9 @@ def main(options: Options) -> None:
     print(f"{hardware()}; {options.points} points, medians of {options.repeats}")
     for title, name in (("16 levels × 2, 2^19", "paper-ngp"), ("the grid of `fast`, 8 × 2, 2^18", "fast")):
         config = preset(name)
-        medians = measure(config.host.sdf, config.encoding, options.points, options.repeats, torch.device(options.device))
+        medians = measure(
+            config.host.sdf, config.encoding, options.points, options.repeats, torch.device(options.device)
+        )
         print(title)
         for name, median in medians.items():
             print(f"  {name:24} {median:9.1f} ms   {medians['naive'] / median:6.1f} times faster than naive")

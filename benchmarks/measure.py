@@ -13,7 +13,16 @@ from typing import Literal
 
 import torch
 
-__all__ = ["Measurement", "clock", "device", "hardware", "in_yardsticks", "median_seconds", "revision", "yardstick"]
+__all__ = [
+    "Measurement",
+    "clock",
+    "device",
+    "hardware",
+    "in_yardsticks",
+    "median_seconds",
+    "revision",
+    "yardstick",
+]
 
 
 @dataclass(frozen=True)
@@ -25,8 +34,8 @@ class Measurement:
         value: the figure.
         unit: of the value; "×" for a ratio within one run, which other machines share.
         better: which way is better.
-        tolerance: relative change for the worse that is not yet worse; none for a figure that no other machine shares, which
-            is shown and never fails.
+        tolerance: relative change for the worse that is not yet worse; none for a figure that no other
+            machine shares, which is shown and never fails.
     """
 
     name: str
@@ -50,7 +59,9 @@ def device() -> torch.device:
 
 
 def clock(where: torch.device) -> Callable[[], float]:
-    """Seconds: of this process's own on a CPU, which others may share; of the clock, with all work done, on a GPU."""
+    """Seconds: of this process's own on a CPU, which others may share; of the clock, with all work done, on a
+    GPU.
+    """
     if where.type != "cuda":
         return time.process_time
 
@@ -61,11 +72,14 @@ def clock(where: torch.device) -> Callable[[], float]:
     return now
 
 
-def median_seconds(*functions: Callable[[], object], repetitions: int = 7, where: torch.device | None = None) -> list[float]:
-    """The median duration of each function, after one call that does not count; `where` they run, if not on `device()`.
+def median_seconds(
+    *functions: Callable[[], object], repetitions: int = 7, where: torch.device | None = None
+) -> list[float]:
+    """The median duration of each function, after one call that does not count; `where` they run, if not on
+    `device()`.
 
-    They take turns, so that whatever else the machine does falls on all of them: their ratios are worth more than their
-    durations.
+    They take turns, so that whatever else the machine does falls on all of them: their ratios are worth more
+    than their durations.
     """
     now = clock(where or device())
     for function in functions:
@@ -86,9 +100,21 @@ def hardware() -> str:
 
 
 def revision() -> str:
-    """The commit that is measured, short; with a plus where files differ from it; "unknown" outside a repository."""
+    """The commit that is measured, short; with a plus where files differ from it; "unknown" outside a
+    repository.
+    """
     try:
-        command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--exclude", "*", "--abbrev=7", "--dirty=+"]
+        command = [
+            "git",
+            "-C",
+            str(Path(__file__).parent),
+            "describe",
+            "--always",
+            "--exclude",
+            "*",
+            "--abbrev=7",
+            "--dirty=+",
+        ]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
@@ -97,14 +123,20 @@ def revision() -> str:
 def _processor() -> str:
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():
-        names = [line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
+        names = [
+            line.split(":", 1)[1].strip()
+            for line in cpuinfo.read_text().splitlines()
+            if line.startswith("model name")
+        ]
         if names:
             return names[0]
     return platform.processor() or platform.machine()
 
 
 def yardstick() -> None:
-    """Work that a machine does about as fast as ours: products of matrices and sines, some hundredths of a second."""
+    """Work that a machine does about as fast as ours: products of matrices and sines, some hundredths of a
+    second.
+    """
     x = torch.ones(2048, 256, device=device())
     weight = torch.full((256, 256), 1e-3, device=device())
     for _ in range(16):
@@ -112,6 +144,8 @@ def yardstick() -> None:
 
 
 def in_yardsticks(function: Callable[[], object], repetitions: int) -> float:
-    """The duration of a function, in durations of `yardstick`: a figure that machines share better than seconds."""
+    """The duration of a function, in durations of `yardstick`: a figure that machines share better than
+    seconds.
+    """
     taken, unit = median_seconds(function, yardstick, repetitions=repetitions)
     return taken / unit

@@ -3,9 +3,10 @@
     python -m benchmarks.memory --sizes 4x2 16x2
     python -m benchmarks.memory --sizes 100x12 --scale 1 --data captures/teapot
 
-Each entry is a capture of so many views of so many megapixels, made by resampling the views of another one, and a process of
-its own that trains a few steps of the preset `fast` on it. Printed is the most that the process held (resident memory, pages of
-mapped files included), the size of the files that hold the pixels, and what 19 bytes a pixel of float32 planes would take.
+Each entry is a capture of so many views of so many megapixels, made by resampling the views of another one,
+and a process of its own that trains a few steps of the preset `fast` on it. Printed is the most that the
+process held (resident memory, pages of mapped files included), the size of the files that hold the pixels,
+and what 19 bytes a pixel of float32 planes would take.
 """
 
 from __future__ import annotations
@@ -52,7 +53,9 @@ class Options:
 
 
 def enlarged(source: Path, out: Path, views: int, megapixels: float) -> Path:
-    """A capture of `views` views of about `megapixels` million pixels: those of another one in turn, resampled."""
+    """A capture of `views` views of about `megapixels` million pixels: those of another one in turn,
+    resampled.
+    """
     capture = load_capture(source, test_every=0)
     listed = []
     for i in range(views):
@@ -66,7 +69,16 @@ def enlarged(source: Path, out: Path, views: int, megapixels: float) -> Path:
             write_exr(path, {"RGB": pixels.astype(np.float16)})
         else:
             write_png(path, np.rint(255 * pixels).astype(np.uint8))
-        listed.append(replace(view, name=f"{i:04d}", index=i, camera=scaled_camera(view.camera, *size), image=path, mask=None))
+        listed.append(
+            replace(
+                view,
+                name=f"{i:04d}",
+                index=i,
+                camera=scaled_camera(view.camera, *size),
+                image=path,
+                mask=None,
+            )
+        )
     made = replace(capture, root=out, inputs=out, views=tuple(listed), point_cloud=None)
     write_capture(out, made, response="linear" if capture.hdr else "srgb", test=frozenset())
     return out
@@ -93,19 +105,31 @@ def train_small(data: Path, out: Path, scale: float | None, steps: int) -> None:
 
 def main(options: Options) -> None:
     """Print a row of the table for each size."""
-    print(f"{hardware()}\n\n| views | megapixels | peak | files of pixels | float32 planes |\n|---|---|---|---|---|")
+    print(
+        f"{hardware()}\n\n| views | megapixels | peak | files of pixels | float32 planes "
+        "|\n|---|---|---|---|---|"
+    )
     for size in options.sizes:
         count, megapixels = int(size.split("x")[0]), float(size.split("x")[1])
         with tempfile.TemporaryDirectory() as folder:
             data = enlarged(options.data or demo_scene(), Path(folder) / "capture", count, megapixels)
             run = Path(folder) / "run"
-            arguments = [str(data), str(run), "none" if options.scale is None else str(options.scale), str(options.steps)]
+            arguments = [
+                str(data),
+                str(run),
+                "none" if options.scale is None else str(options.scale),
+                str(options.steps),
+            ]
             command = [sys.executable, "-m", "benchmarks.memory", "--child", *arguments]
             done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
             peak = int(done.stdout.splitlines()[-1])
             files = sum(path.stat().st_size for path in (run / "pixels").iterdir())
         planes = FLOAT_PLANES * count * megapixels * 1e6
-        print(f"| {count} | {megapixels:g} | {peak / 1e9:.2f} GB | {files / 1e9:.2f} GB | {planes / 1e9:.2f} GB |", flush=True)
+        print(
+            f"| {count} | {megapixels:g} | {peak / 1e9:.2f} GB | {files / 1e9:.2f} GB | {planes / 1e9:.2f} "
+            "GB |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -45,7 +45,9 @@ def load_mitsuba(variant: str):
 
         mi.set_variant(variant)
     except ImportError as error:
-        raise UserError(f"Mitsuba does not run here in the variant {variant} ({error})", "pip install mitsuba") from error
+        raise UserError(
+            f"Mitsuba does not run here in the variant {variant} ({error})", "pip install mitsuba"
+        ) from error
     _register(mi)
     return mi
 
@@ -161,14 +163,18 @@ def _register(mi) -> None:
             above = active & (i > 0) & (o > 0)
             h = dr.normalize(wo + si.wi)
             fresnel = self.facing + (1 - self.facing) * (1 - dr.dot(h, wo)) ** 5
-            specular = self.distribution(mi.Frame3f.cos_theta(h)) * fresnel * self.masking(i) * self.masking(o)
+            specular = (
+                self.distribution(mi.Frame3f.cos_theta(h)) * fresnel * self.masking(i) * self.masking(o)
+            )
             return dr.select(above, (self.diffuse + specular) * i, mi.Color3f(0.0))
 
         def pdf(self, ctx, si, wo, active=True):
             i, o = mi.Frame3f.cos_theta(wo), mi.Frame3f.cos_theta(si.wi)
             h = dr.normalize(wo + si.wi)
             by_lobe = self.distribution(dr.abs(mi.Frame3f.cos_theta(h))) / (1 - dr.exp(-2 / self.alpha**2))
-            pdf = 0.5 * dr.maximum(i, 0) / dr.pi + 0.5 * by_lobe / (4 * dr.maximum(dr.abs(dr.dot(h, wo)), 1e-6))
+            pdf = 0.5 * dr.maximum(i, 0) / dr.pi + 0.5 * by_lobe / (
+                4 * dr.maximum(dr.abs(dr.dot(h, wo)), 1e-6)
+            )
             return dr.select(active & (i > 0) & (o > 0), pdf, 0.0)
 
         def eval_pdf(self, ctx, si, wo, active=True):

@@ -3,7 +3,8 @@
     python -m benchmarks.planted_defects              the table, as docs/hosts.md has it
     python -m benchmarks.planted_defects --missed     those alone that nothing finds
 
-The host is a ball with a learned radius and learned colours above a disc, seen from all sides of the upper half.
+The host is a ball with a learned radius and learned colours above a disc, seen from all sides of the upper
+half.
 """
 
 from __future__ import annotations
@@ -61,11 +62,19 @@ class Scene(nn.Module):
         distance = torch.minimum(ball, floor)
         hit = distance.isfinite()
         position = o + torch.where(hit, distance, 0.0)[:, None] * d
-        normal = torch.where((ball < floor)[:, None], position / position.norm(dim=-1, keepdim=True), torch.eye(3)[2].to(o))
+        normal = torch.where(
+            (ball < floor)[:, None], position / position.norm(dim=-1, keepdim=True), torch.eye(3)[2].to(o)
+        )
         normal = torch.where((normal * d).sum(-1, keepdim=True) > 0, -normal, normal) * hit[:, None]
         color = self.paint(position) * hit[:, None]
         share = hit.to(o.dtype)
-        return {"color": color, "position": position, "normal": normal, "opacity": share, "concentration": share}
+        return {
+            "color": color,
+            "position": position,
+            "normal": normal,
+            "opacity": share,
+            "concentration": share,
+        }
 
     def render(self, rays: RayBatch) -> SurfaceHits | SimpleNamespace:
         """What the host contract asks for, but for the defect."""
@@ -77,7 +86,7 @@ class Scene(nn.Module):
             return SimpleNamespace(**outputs)
 
 
-# ------------------------------------------------------------------------------------------------------------ the defects
+# ------------------------------------------------------------------------------------------------ the defects
 
 Change = Callable[[RayBatch, Outputs], Mapping[str, object]]
 
@@ -105,7 +114,9 @@ def z_depth(rays: RayBatch, outputs: Outputs) -> Mapping[str, Tensor]:
 
 def noisy(normal: Tensor, position: Tensor, degrees: float) -> Tensor:
     """Turned by so many degrees, by directions that follow from the place."""
-    wave = torch.sin(91.7 * position @ torch.tensor([[1.0, 2.3, -1.7], [0.7, -1.9, 2.9], [2.1, 1.1, 1.3]]).to(position))
+    wave = torch.sin(
+        91.7 * position @ torch.tensor([[1.0, 2.3, -1.7], [0.7, -1.9, 2.9], [2.1, 1.1, 1.3]]).to(position)
+    )
     aside = normalize(torch.linalg.cross(normal, wave), dim=-1)
     return normalize(normal + torch.tan(torch.deg2rad(torch.tensor(degrees))) * aside, dim=-1)
 
@@ -196,13 +207,19 @@ DEFECTS: Mapping[str, Callable[[Scene, RayBatch], Outputs]] = {
     "depth too short by a tenth": after(partial(along, factor=0.9)),
     "depth too long by a fiftieth": after(partial(along, factor=1.02)),
     "z-depth for the distance": after(z_depth),
-    "inverse depth for depth": after(lambda r, o: along(r, o, 1 / (o["position"] - r.origins).norm(dim=-1, keepdim=True) ** 2)),
-    "positions beside their rays": after(lambda r, o: {"position": o["position"] + 0.1 * r.directions.roll(1, -1)}),
+    "inverse depth for depth": after(
+        lambda r, o: along(r, o, 1 / (o["position"] - r.origins).norm(dim=-1, keepdim=True) ** 2)
+    ),
+    "positions beside their rays": after(
+        lambda r, o: {"position": o["position"] + 0.1 * r.directions.roll(1, -1)}
+    ),
     "positions without the origin": after(lambda r, o: {"position": o["position"] - r.origins}),
     "positions behind the camera": after(lambda r, o: along(r, o, -1.0)),
     "axes y and z exchanged in positions": after(lambda r, o: {"position": o["position"][:, [0, 2, 1]]}),
     "positions with noise of 0.03": after(lambda r, o: along(r, o, 1 + 0.012 * torch.randn(len(r), 1))),
-    "positions with noise of their own": after(lambda r, o: along(r, o, 1 + 0.01 * torch.rand((), generator=OWN))),
+    "positions with noise of their own": after(
+        lambda r, o: along(r, o, 1 + 0.01 * torch.rand((), generator=OWN))
+    ),
     "scene five times too large": partial(scaled, factor=5.0, shift=0.0),
     "scene 4 beside the origin": partial(scaled, factor=1.0, shift=4.0),
     "the far side of surfaces": inside_out,
@@ -216,11 +233,15 @@ DEFECTS: Mapping[str, Callable[[Scene, RayBatch], Outputs]] = {
     "normals 20° noisy": after(lambda r, o: {"normal": noisy(o["normal"], o["position"], 20.0) * hit_of(o)}),
     "normals in the camera's frame": after(lambda r, o: {"normal": in_camera(r, o["normal"])}),
     "normals of a neighbour": after(lambda r, o: {"normal": o["normal"].roll(1, 0)}),
-    "a normal that is not finite": after(lambda r, o: {"normal": o["normal"] / o["normal"].norm(dim=-1, keepdim=True)}),
+    "a normal that is not finite": after(
+        lambda r, o: {"normal": o["normal"] / o["normal"].norm(dim=-1, keepdim=True)}
+    ),
     # colours
     "colours that stop at 1": after(lambda r, o: {"color": (o["color"] / 0.75).clamp_max(1.0)}),
     "colours below 0": after(lambda r, o: {"color": o["color"] - 0.8}),
-    "colours that are not finite": after(lambda r, o: {"color": torch.where(hit_of(o), o["color"], torch.nan)}),
+    "colours that are not finite": after(
+        lambda r, o: {"color": torch.where(hit_of(o), o["color"], torch.nan)}
+    ),
     "colours in display values": after(lambda r, o: {"color": o["color"].clamp_min(1e-6) ** (1 / 2.2)}),
     "red and blue exchanged": after(lambda r, o: {"color": o["color"].flip(-1)}),
     # hits and misses
@@ -229,10 +250,16 @@ DEFECTS: Mapping[str, Callable[[Scene, RayBatch], Outputs]] = {
     "opacity above 1": after(lambda r, o: {"opacity": 1.5 * o["opacity"]}),
     "opacity 1 for misses": after(lambda r, o: {"opacity": torch.ones_like(o["opacity"])}),
     "no opacity at all": after(lambda r, o: {"opacity": torch.zeros_like(o["opacity"])}),
-    "positions of misses not finite": after(lambda r, o: {"position": torch.where(hit_of(o), o["position"], torch.inf)}),
+    "positions of misses not finite": after(
+        lambda r, o: {"position": torch.where(hit_of(o), o["position"], torch.inf)}
+    ),
     # batches
-    "colours scaled by the batch": after(lambda r, o: {"color": o["color"] / o["color"].amax().clamp_min(0.1)}),
-    "depth scaled by the batch": after(lambda r, o: along(r, o, 1 + 0.01 * o["opacity"].mean() * (len(r) > 150))),
+    "colours scaled by the batch": after(
+        lambda r, o: {"color": o["color"] / o["color"].amax().clamp_min(0.1)}
+    ),
+    "depth scaled by the batch": after(
+        lambda r, o: along(r, o, 1 + 0.01 * o["opacity"].mean() * (len(r) > 150))
+    ),
     "answers in another order": after(lambda r, o: {"color": o["color"][o["position"][:, 0].argsort()]}),
     "a buffer that is used again": one_buffer,
     # conduct
@@ -245,9 +272,13 @@ DEFECTS: Mapping[str, Callable[[Scene, RayBatch], Outputs]] = {
     # gradients
     "colours cut off": after(lambda r, o: {"color": o["color"].detach()}),
     "hits cut off": after(lambda r, o: {name: o[name].detach() for name in ("position", "normal")}),
-    "a gradient that is not finite": after(lambda r, o: {"color": o["color"] + (o["color"] - o["color"].detach()).sqrt()}),
+    "a gradient that is not finite": after(
+        lambda r, o: {"color": o["color"] + (o["color"] - o["color"].detach()).sqrt()}
+    ),
     "a gradient under no_grad": after(recomputed),
-    "freezes its parameters": with_call(lambda host: [p.requires_grad_(False) for p in host.paint.parameters()]),
+    "freezes its parameters": with_call(
+        lambda host: [p.requires_grad_(False) for p in host.paint.parameters()]
+    ),
 }
 
 
@@ -258,7 +289,7 @@ def in_camera(rays: RayBatch, normal: Tensor) -> Tensor:
     return torch.stack([(normal * axis).sum(-1) for axis in (x, torch.linalg.cross(z, x), z)], -1)
 
 
-# ------------------------------------------------------------------------------------------------------------- the table
+# -------------------------------------------------------------------------------------------------- the table
 
 
 @dataclass(frozen=True)
@@ -295,7 +326,10 @@ def main() -> None:
     for outcome in shown:
         said = outcome.message.partition("\n")[0]
         print(f"| {outcome.defect} | {outcome.check or '**nothing**'} | {said} |")
-    print(f"\n{sum(o.check is not None for o in found)} of {len(found)} defects are found; the whole host passes.")
+    print(
+        f"\n{sum(o.check is not None for o in found)} of {len(found)} defects are found; the whole host "
+        "passes."
+    )
 
 
 if __name__ == "__main__":

@@ -100,7 +100,9 @@ def corner_parts() -> list[Part]:
 
 def sunny_map(height: int = 32) -> Float[Tensor, "H W 3"]:
     """A sky that darkens downwards, with a sun of three texels."""
-    sky = torch.linspace(1.0, 0.2, height)[:, None, None].expand(height, 2 * height, 3) * torch.tensor([0.7, 0.9, 1.2])
+    sky = torch.linspace(1.0, 0.2, height)[:, None, None].expand(height, 2 * height, 3) * torch.tensor(
+        [0.7, 0.9, 1.2]
+    )
     sky[height // 5, height : height + 3] = torch.tensor([120.0, 100.0, 70.0])
     return sky.contiguous()
 
@@ -142,7 +144,9 @@ def agreement(variant: str, width: int, spp: int, bounces: int) -> Agreement:
     seconds = time.perf_counter() - begun
     with tempfile.TemporaryDirectory() as folder:
         begun = time.perf_counter()
-        theirs = [render(mi, parts, radiance.numpy(), camera, Path(folder), spp, bounces, seed) for seed in (1, 2)]
+        theirs = [
+            render(mi, parts, radiance.numpy(), camera, Path(folder), spp, bounces, seed) for seed in (1, 2)
+        ]
         seconds_of_mitsuba = (time.perf_counter() - begun) / 2
     mean = theirs[0].mean()
     return Agreement(
@@ -202,7 +206,9 @@ def relit_truth(options: Options, console: Console) -> None:
     scene = Scene(true_surface(capture), true_materials(capture), SPHERICAL_GAUSSIAN, read.sky)
     relit, truths = [], []
     for view in capture.test_views:
-        relit.append(take_picture(scene, capture.normalisation.camera(view.camera), Budget(options.spp), BOUNCES))
+        relit.append(
+            take_picture(scene, capture.normalisation.camera(view.camera), Budget(options.spp), BOUNCES)
+        )
         truths.append(read_truth(capture, view, files[view.name]))
     found = compare([p.radiance.numpy() for p in relit], [p.alpha[..., 0].numpy() for p in relit], truths)
     for name, value in found.figures.items():
@@ -214,13 +220,17 @@ def main(options: Options, console: Console) -> None:
     """Measure, and print."""
     console.print(hardware(), markup=False)
     if (options.capture is None) != (options.under is None):
-        raise UserError("--capture and --under go together", "give both, or none for the comparison with Mitsuba")
+        raise UserError(
+            "--capture and --under go together", "give both, or none for the comparison with Mitsuba"
+        )
     if options.capture is not None:
         relit_truth(options, console)
         return
     for title, bounces in (("direct", 1), ("six bounces", BOUNCES)):
         found = agreement(options.variant, options.width, options.spp, bounces)
-        shares = ", ".join(f"{name} {100 * getattr(found, name):.2f} %" for name in ("error", "noise", "bias"))
+        shares = ", ".join(
+            f"{name} {100 * getattr(found, name):.2f} %" for name in ("error", "noise", "bias")
+        )
         times = f"{found.seconds:.1f} s, Mitsuba {found.seconds_of_mitsuba:.1f} s"
         console.print(f"{title}: {shares}; {times}", highlight=False)
 

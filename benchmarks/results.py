@@ -3,11 +3,12 @@
     python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results
     python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results-mesh --host mesh --compare ladder
 
-For each capture: the preset trained from scratch, beside it the paper's free light field with and without L_ref (the paper's
-Table 2), with `--compare ladder` every light with every inter-reflection that goes with it; each measured after the
-material stage (the paper's "Sep.") and after the joint stage (Table 3), beside baselines that need no method. The runs share
-the stage SDF init, which none of this enters; every step depends on seed and number alone, so sharing changes nothing. With
-the mesh host geometry is given, and there is one stage. `--save NAME` keeps the figures for docs/results.md.
+For each capture: the preset trained from scratch, beside it the paper's free light field with and without
+L_ref (the paper's Table 2), with `--compare ladder` every light with every inter-reflection that goes with
+it; each measured after the material stage (the paper's "Sep.") and after the joint stage (Table 3), beside
+baselines that need no method. The runs share the stage SDF init, which none of this enters; every step
+depends on seed and number alone, so sharing changes nothing. With the mesh host geometry is given, and there
+is one stage. `--save NAME` keeps the figures for docs/results.md.
 """
 
 from __future__ import annotations
@@ -57,14 +58,17 @@ class Options:
     out: Path = Path("runs/results")
     """Where the runs and results.json go."""
     save: str | None = None
-    """Keep the figures under this name in benchmarks/results, for the tables of docs/results.md; none: in --out alone."""
+    """Keep the figures under this name in benchmarks/results, for the tables of docs/results.md; none: in
+    --out alone.
+    """
     preset: str = "fast"
     """Which settings."""
     host: Literal["volsdf", "mesh"] = "volsdf"
     """Geometry to be found, or given as a mesh."""
     compare: Literal["preset", "paper", "ladder"] = "paper"
-    """preset: nothing else. paper: the free light field with and without L_ref. ladder: every light with every
-    inter-reflection that goes with it."""
+    """preset: nothing else. paper: the free light field with and without L_ref. ladder: every light with
+    every inter-reflection that goes with it.
+    """
     material_steps: int | None = None
     """Steps of the stage material init; none: the preset's."""
     device: str = "auto"
@@ -85,7 +89,9 @@ def variants(config: NeilfConfig, which: str) -> dict[str, NeilfConfig]:
         compared["free light, hard"] = changed(free, "inter_reflection", mode="hard")
         for kind, name in (("distant", "map"), ("distant_near", "map and lamps")):
             light = changed(config, "light", kind=kind)
-            compared |= {f"{name}, {mode}": changed(light, "inter_reflection", mode=mode) for mode in ("hard", "off")}
+            compared |= {
+                f"{name}, {mode}": changed(light, "inter_reflection", mode=mode) for mode in ("hard", "off")
+            }
     return compared
 
 
@@ -112,16 +118,23 @@ def train(capture: Path, out: Path, config: NeilfConfig, device: str, start_from
 
 
 def branch(trunk: Path, out: Path, config: NeilfConfig) -> None:
-    """A run that stands at the end of SDF init, with the host of the trunk and a material and a light that have not moved."""
+    """A run that stands at the end of SDF init, with the host of the trunk and a material and a light that
+    have not moved.
+    """
     described = read_description(trunk)
     saved = load_checkpoint(trunk / "checkpoints" / "sdf_init.pt")
     seed_step(config.train.seed, step=-1)
     model = build_model(described.source.load(), described.facts, config)
     own = model.state_dict()
-    shared = {key: value for key, value in saved["model"].items() if key.startswith("host.") and is_like(value, own[key])}
+    shared = {
+        key: value
+        for key, value in saved["model"].items()
+        if key.startswith("host.") and is_like(value, own[key])
+    }
     model.load_state_dict(own | shared)
     optimizer = make_optimizer(model, config.optimizer)
-    # So far only the host has moved: its moments are all that the optimiser knows, and its parameters come first.
+    # So far only the host has moved: its moments are all that the optimiser knows, and its parameters come
+    # first.
     optimizer.load_state_dict(optimizer.state_dict() | {"state": saved["optimizer"]["state"]})
     create_run(out, config, described.source, described.facts)
     save_checkpoint(out / "checkpoints" / "last.pt", model, model.light_solver(), optimizer, saved["step"])
@@ -152,13 +165,19 @@ def main(options: Options) -> None:
     config = preset(options.preset)
     config = fixed_geometry(config) if options.host == "mesh" else config
     if options.material_steps is not None:
-        config = dataclasses.replace(config, train=dataclasses.replace(config.train, material_steps=options.material_steps))
+        config = dataclasses.replace(
+            config, train=dataclasses.replace(config.train, material_steps=options.material_steps)
+        )
     rows: list[Row] = []
     for capture in options.captures:
         base = options.out / capture.name
         compared = variants(config, options.compare)
         for name, settings in compared.items():
-            run = base if settings is config else options.out / f"{capture.name}-{name.replace(', ', '-').replace(' ', '-')}"
+            run = (
+                base
+                if settings is config
+                else options.out / f"{capture.name}-{name.replace(', ', '-').replace(' ', '-')}"
+            )
             shares_trunk = run != base and config.train.sdf_steps > 0
             train(capture, run, settings, options.device, start_from=base if shares_trunk else None)
             figures = measure(run, config)
@@ -168,13 +187,23 @@ def main(options: Options) -> None:
                 rows.append(Row("naive baseline", baseline, capture.name))
             seconds = read_json(run / "timing.json")
             rows += [
-                Row(f"{STAGES[stage]}, {name}", {**values, "seconds": seconds_until(stage, seconds)}, capture.name)
+                Row(
+                    f"{STAGES[stage]}, {name}",
+                    {**values, "seconds": seconds_until(stage, seconds)},
+                    capture.name,
+                )
                 for stage, values in figures.items()
             ]
             write_report(run, run / REPORT)
         # After every capture, so that what is measured is kept where a later one fails.
         table = "light-ladder" if options.compare == "ladder" else TABLES[options.host]
-        result = Result(table, revision(), f"python -m benchmarks.results {shlex.join(sys.argv[1:])}", hardware(), tuple(rows))
+        result = Result(
+            table,
+            revision(),
+            f"python -m benchmarks.results {shlex.join(sys.argv[1:])}",
+            hardware(),
+            tuple(rows),
+        )
         write_result(options.out / "results.json", result)
         if options.save is not None:
             write_result(RESULTS / f"{options.save}.json", result)

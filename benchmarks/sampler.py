@@ -1,10 +1,11 @@
-"""What finding the surface costs: queries of G per ray, by the error-bounded sampler on whole rays and on what is not empty.
+"""What finding the surface costs: queries of G per ray, by the error-bounded sampler on whole rays and on
+what is not empty.
 
     python -m benchmarks sampler
 
-The table of `benchmarks.joint` behind the grid of `fast`, with the samples and rounds of the paper's presets. Queries of the
-cached path include the one per ray that tests the grid's promise, and the ray's share of the grid, which is sampled once in
-`MOST_LIFE` steps of 4096 rays.
+The table of `benchmarks.joint` behind the grid of `fast`, with the samples and rounds of the paper's presets.
+Queries of the cached path include the one per ray that tests the grid's promise, and the ray's share of the
+grid, which is sampled once in `MOST_LIFE` steps of 4096 rays.
 """
 
 from __future__ import annotations
@@ -43,7 +44,9 @@ def table_host(skip_empty: bool = True) -> VolSdfHost:
 
 
 def queries_per_ray(host: VolSdfHost, rays: RayBatch) -> float:
-    """How often G is asked for a distance alone, per ray of a rendering; the grid of empty space is there already."""
+    """How often G is asked for a distance alone, per ray of a rendering; the grid of empty space is there
+    already.
+    """
     asked = []
     plain = host.sdf
     host.sdf = lambda x: asked.append(len(x)) or plain(x)
@@ -56,7 +59,9 @@ def queries_per_ray(host: VolSdfHost, rays: RayBatch) -> float:
 
 
 def measurements() -> Iterator[Measurement]:
-    """By scale and way: queries, and how far hits lie from those of whole rays that are sampled without random numbers."""
+    """By scale and way: queries, and how far hits lie from those of whole rays that are sampled without
+    random numbers.
+    """
     rays = rays_at_the_table(RAYS).rays
     share_of_grid = RESOLUTION**3 / (MOST_LIFE * preset("paper-ngp").train.rays)
     hosts = {name: with_cuts(table_host(name != WHOLE), cuts) for name, cuts in WAYS.items()}
@@ -70,15 +75,27 @@ def measurements() -> Iterator[Measurement]:
                 host.may_meet(rays)  # samples the grid
                 queries = queries_per_ray(host, rays) + (0 if name == WHOLE else share_of_grid)
                 off = (host.render(rays).position - truth).norm(dim=-1).median().item() / scale
-                yield Measurement(f"sampler/β {scale:g}, {name}", queries, "queries a ray", "lower", tolerance=0.2)
-                yield Measurement(f"sampler/β {scale:g}, {name}: hit off", off, "β, median", "lower", tolerance=1.0)
+                yield Measurement(
+                    f"sampler/β {scale:g}, {name}", queries, "queries a ray", "lower", tolerance=0.2
+                )
+                yield Measurement(
+                    f"sampler/β {scale:g}, {name}: hit off", off, "β, median", "lower", tolerance=1.0
+                )
         seconds = median_seconds(*(lambda host=host: host.render(rays) for host in hosts.values()))
         for name, taken in list(zip(WAYS, seconds, strict=True))[1:]:
-            yield Measurement(f"sampler/β {SHARP:g}: time, whole over {name}", seconds[0] / taken, "×", "higher", tolerance=0.5)
+            yield Measurement(
+                f"sampler/β {SHARP:g}: time, whole over {name}",
+                seconds[0] / taken,
+                "×",
+                "higher",
+                tolerance=0.5,
+            )
 
 
 def with_cuts(host: VolSdfHost, cuts: int) -> VolSdfHost:
-    """The host with so many first and further cuts a ray; where it skips empty space it takes half of those that are set."""
+    """The host with so many first and further cuts a ray; where it skips empty space it takes half of those
+    that are set.
+    """
     cuts = cuts if host.empty_space is None else 2 * cuts
     volume = dataclasses.replace(host.config.volume, initial_samples=cuts)
     host.config = dataclasses.replace(host.config, volume=volume)

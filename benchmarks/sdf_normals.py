@@ -1,5 +1,7 @@
-"""The routes of `benchmarks.kernels` as figures of the suite: an SDF behind a hash grid, its normal and their backward pass;
-and softplus units, of which the paper's SDF has two thousand, by torch and by the compiled loops."""
+"""The routes of `benchmarks.kernels` as figures of the suite: an SDF behind a hash grid, its normal and their
+backward pass; and softplus units, of which the paper's SDF has two thousand, by torch and by the compiled
+loops.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +23,16 @@ REPEATS = 5
 
 
 def measurements() -> Iterator[Measurement]:
-    """How many times faster than straightforward torch the package is, by preset, and the grid's share alone."""
+    """How many times faster than straightforward torch the package is, by preset, and the grid's share
+    alone.
+    """
     for name in ("fast", "paper-ngp"):
         medians = measure(preset(name).sdf, POINTS, REPEATS, torch.device("cpu"))
-        for faster, slower in (("reference", "naive"), ("fastest", "naive"), ("fastest, grid alone", "reference, grid alone")):
+        for faster, slower in (
+            ("reference", "naive"),
+            ("fastest", "naive"),
+            ("fastest, grid alone", "reference, grid alone"),
+        ):
             ratio = medians[slower] / medians[faster]
             yield Measurement(f"kernels/{name}: {slower} over {faster}", ratio, "×", "higher", tolerance=0.4)
     yield from _units()
@@ -42,4 +50,6 @@ def _units() -> Iterator[Measurement]:
     with computing_fast():
         for name, (plain, ours) in routes.items():
             slower, faster = median_seconds(plain, ours)
-            yield Measurement(f"kernels/{name}: torch over compiled", slower / faster, "×", "higher", tolerance=0.5)
+            yield Measurement(
+                f"kernels/{name}: torch over compiled", slower / faster, "×", "higher", tolerance=0.5
+            )

@@ -2,13 +2,14 @@
 
     python -m benchmarks.shading_samples DATA/tabletop_env DATA/tabletop_mix --out docs
 
-At the points of the true light field, seen from some of its directions, the surface has its true colour and metallicity and
-one roughness after another. Every sampler estimates the same integral, of METHOD §1's BRDF and the true light interpolated
-between its 4096 directions; the reference is the same estimator with 9216 directions of all techniques together. The error is
-the root of the mean square over points, views, channels and repetitions, divided by that of the reference.
+At the points of the true light field, seen from some of its directions, the surface has its true colour and
+metallicity and one roughness after another. Every sampler estimates the same integral, of METHOD §1's BRDF
+and the true light interpolated between its 4096 directions; the reference is the same estimator with 9216
+directions of all techniques together. The error is the root of the mean square over points, views, channels
+and repetitions, divided by that of the reference.
 
-Beside the samplers that know nothing of the light, `mis` is measured with an environment map that is the mean of what arrives
-at all points: what training comes to know.
+Beside the samplers that know nothing of the light, `mis` is measured with an environment map that is the mean
+of what arrives at all points: what training comes to know.
 """
 
 from __future__ import annotations
@@ -70,7 +71,9 @@ class Scene:
         """The estimate of the outgoing radiance of a surface with this roughness."""
         even = torch.full_like(self.material.roughness, roughness)
         material = Material(self.material.base_color, even, self.material.metallic)
-        return shade(material, self.normal, self.wo, Incident.of(samples, self.light.radiance(samples.wi)), LOBE).color
+        return shade(
+            material, self.normal, self.wo, Incident.of(samples, self.light.radiance(samples.wi)), LOBE
+        ).color
 
     def lobe(self, roughness: float) -> Technique:
         even = torch.full_like(self.material.roughness, roughness)
@@ -78,7 +81,9 @@ class Scene:
 
     def to_light(self) -> Technique:
         """Sampling of the map."""
-        return Technique(lambda count, stochastic: self.map.sample(self.normal, count, stochastic).wi, self.map.pdf)
+        return Technique(
+            lambda count, stochastic: self.map.sample(self.normal, count, stochastic).wi, self.map.pdf
+        )
 
 
 Draw = Callable[[Scene, float, int], IncidentSamples]
@@ -108,15 +113,25 @@ def techniques() -> dict[str, Draw]:
 
     def plain(kind: str) -> Draw:
         return lambda scene, roughness, count: sample_directions(
-            kind, scene.normal, scene.wo, torch.full_like(scene.material.roughness, roughness), count, LOBE, stochastic=True
+            kind,
+            scene.normal,
+            scene.wo,
+            torch.full_like(scene.material.roughness, roughness),
+            count,
+            LOBE,
+            stochastic=True,
         )
 
     def with_light(scene: Scene, roughness: float, count: int) -> IncidentSamples:
         even = torch.full_like(scene.material.roughness, roughness)
         light = scene.to_light()
-        return sample_directions("mis", scene.normal, scene.wo, even, count, LOBE, stochastic=True, light=light)
+        return sample_directions(
+            "mis", scene.normal, scene.wo, even, count, LOBE, stochastic=True, light=light
+        )
 
-    return {kind: plain(kind) for kind in ("fibonacci", "cosine", "lobe", "mis")} | {"mis, light: map": with_light}
+    return {kind: plain(kind) for kind in ("fibonacci", "cosine", "lobe", "mis")} | {
+        "mis, light: map": with_light
+    }
 
 
 @torch.no_grad()
@@ -148,7 +163,9 @@ def measurements() -> Iterator[Measurement]:
     for roughness in (0.1, 0.35, 1.0):
         few = error_curves(scene, roughness, {"": best}, counts=(32,))[""].y[0]
         many = error_curves(scene, roughness, {"": paper}, counts=(128,))[""].y[0]
-        yield Measurement(f"shading/error of 32 over Fibonacci-128, roughness {roughness:g}", few / many, "×", "lower", 1.0)
+        yield Measurement(
+            f"shading/error of 32 over Fibonacci-128, roughness {roughness:g}", few / many, "×", "lower", 1.0
+        )
     for name, draw, count in (("Fibonacci-128", paper, 128), ("32 by mis with light", best, 32)):
 
         def integrate(draw: Draw = draw, count: int = count) -> None:
@@ -159,16 +176,27 @@ def measurements() -> Iterator[Measurement]:
 
 
 def table(curves: Mapping[float, Mapping[str, Line]]) -> str:
-    """Markdown: by roughness, the error of Fibonacci-128, that of each sampler with 32 directions, and the least number of
-    directions with which the last sampler reaches the first."""
+    """Markdown: by roughness, the error of Fibonacci-128, that of each sampler with 32 directions, and the
+    least number of directions with which the last sampler reaches the first.
+    """
     names = list(next(iter(curves.values())))
-    head = ["roughness", f"{names[0]}, 128", *(f"{name}, 32" for name in names[1:]), "least directions of the last"]
+    head = [
+        "roughness",
+        f"{names[0]}, 128",
+        *(f"{name}, 32" for name in names[1:]),
+        "least directions of the last",
+    ]
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for roughness, by_name in curves.items():
         goal = _at(by_name[names[0]], 128)
         last = by_name[names[-1]]
         least = next((str(count) for count, error in zip(last.x, last.y, strict=True) if error <= goal), "–")
-        cells = [f"{roughness:g}", f"{goal:.3f}", *(f"{_at(by_name[name], 32):.3f}" for name in names[1:]), least]
+        cells = [
+            f"{roughness:g}",
+            f"{goal:.3f}",
+            *(f"{_at(by_name[name], 32):.3f}" for name in names[1:]),
+            least,
+        ]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -191,7 +219,9 @@ def main(options: Options) -> None:
     text = "\n\n".join(sections)
     (options.out / "shading_samples.md").write_text(text + "\n")
     title = "The shading integral: what a direction is worth"
-    draw_charts(options.out / "shading_samples.png", title, "incident directions", "relative RMSE", charts, columns=3)
+    draw_charts(
+        options.out / "shading_samples.png", title, "incident directions", "relative RMSE", charts, columns=3
+    )
     Console().print(text, markup=False, highlight=False, soft_wrap=True)
 
 

@@ -1,7 +1,8 @@
 """Whole training steps of every stage and preset, rendering for evaluation, and the memory that a step takes.
 
-The scene is the one in the package; the surface is the sphere that every geometry starts as, made sharp, so that the material
-stages have hits to shade. Numbers of rays are small; networks and samples per ray and per point are the presets' own.
+The scene is the one in the package; the surface is the sphere that every geometry starts as, made sharp, so
+that the material stages have hits to shade. Numbers of rays are small; networks and samples per ray and per
+point are the presets' own.
 """
 
 from __future__ import annotations
@@ -112,8 +113,12 @@ def measurements() -> Iterator[Measurement]:
         model.eval()
         rays = _pixels().sample(EVALUATED).rays
         taken = in_yardsticks(lambda model=model, rays=rays: model.maps(rays), REPETITIONS)
-        yield Measurement(f"evaluation/{name}", EVALUATED / taken, "pixels a yardstick", "higher", tolerance=0.5)
-    spawn = multiprocessing.get_context("spawn")  # a process of its own: none of its memory has been used before
+        yield Measurement(
+            f"evaluation/{name}", EVALUATED / taken, "pixels a yardstick", "higher", tolerance=0.5
+        )
+    spawn = multiprocessing.get_context(
+        "spawn"
+    )  # a process of its own: none of its memory has been used before
     for name in PRESETS if (PROCESS / "clear_refs").exists() else ():
         with ProcessPoolExecutor(1, mp_context=spawn) as fresh:
             peak = fresh.submit(peak_mebibytes, name).result()

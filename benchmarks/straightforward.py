@@ -1,11 +1,12 @@
 """The method as one writes it down from the paper, in plain torch: the yardstick of whole steps.
 
-The networks, their weights, the losses and the order of a step are those of the package; what is computed is the same. How it
-is computed is not:
+The networks, their weights, the losses and the order of a step are those of the package; what is computed is
+the same. How it is computed is not:
 
 - softplus units by torch;
 - normals, Hessians and gradients of the material by autograd, which a loss on them differentiates once more;
-- every ray in every round of VolSDF's Algorithm 1 until all rays of the batch have converged, and no space skipped;
+- every ray in every round of VolSDF's Algorithm 1 until all rays of the batch have converged, and no space
+  skipped;
 - every traced ray of L_ref rendered, whether or not it meets anything;
 - every pair of a point and a direction through the whole network of the light.
 """
@@ -44,7 +45,9 @@ from neilfpp_method.volume.samplers import (
 __all__ = ["plain_units", "straightforward"]
 
 
-def gradient_of(output: Float[Tensor, " N"], x: Float[Tensor, "N 3"], differentiable: bool) -> Float[Tensor, "N 3"]:
+def gradient_of(
+    output: Float[Tensor, " N"], x: Float[Tensor, "N 3"], differentiable: bool
+) -> Float[Tensor, "N 3"]:
     """∂output/∂x, which autograd may differentiate again."""
     return torch.autograd.grad(output.sum(), x, create_graph=differentiable, retain_graph=True)[0]
 
@@ -72,7 +75,11 @@ class PlainSdf(nn.Module):
             x = x if x.requires_grad else x.detach().requires_grad_()
             outputs = self.mlp(self.encoding(x))
             sample = SdfSample(outputs[:, 0], gradient_of(outputs[:, 0], x, trains), outputs[:, 1:])
-        return sample if trains else SdfSample(sample.distance.detach(), sample.gradient, sample.feature.detach())
+        return (
+            sample
+            if trains
+            else SdfSample(sample.distance.detach(), sample.gradient, sample.feature.detach())
+        )
 
     def hessian(self, x: Float[Tensor, "N 3"], method: str | None = None) -> Float[Tensor, "N 3 3"]:
         x = x.detach().requires_grad_()
@@ -93,7 +100,9 @@ class PlainBrdf(nn.Module):
     def with_gradients(self, x: Float[Tensor, "N 3"]) -> BrdfSample:
         x = x if x.requires_grad else x.detach().requires_grad_()
         material = self.field(x)
-        roughness, metallic = (gradient_of(value[:, 0], x, True) for value in (material.roughness, material.metallic))
+        roughness, metallic = (
+            gradient_of(value[:, 0], x, True) for value in (material.roughness, material.metallic)
+        )
         return BrdfSample(material, roughness, metallic)
 
 
@@ -114,7 +123,9 @@ class PlainLight(nn.Module):
 
 
 class PlainHost(VolSdfHost):
-    """VolSDF with its sampler as published: a batch of rays takes a round more as long as one of them asks for it."""
+    """VolSDF with its sampler as published: a batch of rays takes a round more as long as one of them asks
+    for it.
+    """
 
     def __init__(self, config: NeilfConfig, radiance_scale: float, background: str) -> None:
         super().__init__(config, radiance_scale, background)
@@ -123,7 +134,9 @@ class PlainHost(VolSdfHost):
     @torch.no_grad()
     def _sample(self, rays: RayBatch, interval: Interval, volume: VolumeConfig) -> Float[Tensor, "N M"]:
         beta = self.density.beta().reshape(1, 1)
-        partition = first_cuts(self.sdf, rays, interval.near, interval.far, volume.initial_samples, self.training)
+        partition = first_cuts(
+            self.sdf, rays, interval.near, interval.far, volume.initial_samples, self.training
+        )
         worst = partition.width.square().sum(dim=-1, keepdim=True).div(4.0 * math.log1p(OPACITY_ERROR)).sqrt()
         wide = torch.maximum(worst, beta)
         for number in range(volume.rounds + 1):
@@ -137,7 +150,9 @@ class PlainHost(VolSdfHost):
 
 
 def straightforward(model: NeilfModel) -> NeilfModel:
-    """A model with the weights of another, whose host is VolSDF and whose light is the paper's, that computes plainly."""
+    """A model with the weights of another, whose host is VolSDF and whose light is the paper's, that computes
+    plainly.
+    """
     config = replace(
         model.config,
         volume=replace(model.config.volume, skip_empty=False),

@@ -81,7 +81,9 @@ COLUMNS: Mapping[str, Column] = {
 
 @dataclass(frozen=True)
 class Row:
-    """One run: `figures` by the names in `COLUMNS`; `capture` is empty where a table is not about captures."""
+    """One run: `figures` by the names in `COLUMNS`; `capture` is empty where a table is not about
+    captures.
+    """
 
     name: str
     figures: Mapping[str, float]
@@ -115,15 +117,21 @@ def read_results(folder: Path = RESULTS) -> list[Result]:
 def _read(path: Path) -> Result:
     try:
         content = json.loads(path.read_text("utf-8"))
-        rows = tuple(Row(row["name"], dict(row["figures"]), row.get("capture", "")) for row in content["rows"])
+        rows = tuple(
+            Row(row["name"], dict(row["figures"]), row.get("capture", "")) for row in content["rows"]
+        )
         result = Result(content["table"], content["commit"], content["command"], content["machine"], rows)
         format = content["format"]
     except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path}: not a result file ({error!r})", "see benchmarks/tables.py for what one holds") from error
+        raise UserError(
+            f"{path}: not a result file ({error!r})", "see benchmarks/tables.py for what one holds"
+        ) from error
     unknown = {name for row in rows for name in row.figures} - COLUMNS.keys()
     if format != FORMAT or unknown:
         wrong = f"figures without a column: {', '.join(sorted(unknown))}" if unknown else f"format {format}"
-        raise UserError(f"{path}: {wrong}", "add them to COLUMNS of benchmarks/tables.py, or correct the file")
+        raise UserError(
+            f"{path}: {wrong}", "add them to COLUMNS of benchmarks/tables.py, or correct the file"
+        )
     return result
 
 
@@ -197,10 +205,14 @@ def filled(document: str, results: Sequence[Result]) -> str:
         _, name, shown, _ = match.groups()
         own = [result for result in results if result.table == name]
         if not own:
-            raise UserError(f"the table '{name}' has no result file", "run its command, or take the table out")
+            raise UserError(
+                f"the table '{name}' has no result file", "run its command, or take the table out"
+            )
         unknown = set(shown.split()) - COLUMNS.keys()
         if unknown:
-            raise UserError(f"the table '{name}' has no figure '{min(unknown)}'", "see COLUMNS of benchmarks/tables.py")
+            raise UserError(
+                f"the table '{name}' has no figure '{min(unknown)}'", "see COLUMNS of benchmarks/tables.py"
+            )
         return f"{match[1]}{markdown(own, shown.split())}\n{match[4]}"
 
     return MARKED.sub(table, document)

@@ -3,10 +3,10 @@
     python -m benchmarks.time_to_quality DATA/tabletop_mix --out docs
     python -m benchmarks.time_to_quality DATA/tabletop_mix --presets paper-ngp --device cuda --cap 600 --out docs
 
-Each preset trains from scratch. At marks of time (seconds of the process's own CPU time, or on a GPU of the clock), each
-twice the last, training is held, some test views are rendered and measured, and the time that takes does not count. `fast`
-runs to its end; a preset that is stopped by the cap is shown as unfinished, with the step that it reached: its rates have not
-fallen, and its material may not have begun.
+Each preset trains from scratch. At marks of time (seconds of the process's own CPU time, or on a GPU of the
+clock), each twice the last, training is held, some test views are rendered and measured, and the time that
+takes does not count. `fast` runs to its end; a preset that is stopped by the cap is shown as unfinished, with
+the step that it reached: its rates have not fallen, and its material may not have begun.
 """
 
 from __future__ import annotations
@@ -93,7 +93,9 @@ class Curve:
         return Line(*zip(*known, strict=True)) if known else None
 
 
-def curve(root: Path, config: NeilfConfig, cap: float, first: float, views: int, device: torch.device) -> Curve:
+def curve(
+    root: Path, config: NeilfConfig, cap: float, first: float, views: int, device: torch.device
+) -> Curve:
     """Train a preset until its end or the cap, and measure it at the marks and at the end."""
     capture = load_capture(root)
     pixels = PixelDataset(capture, capture.train_views, device=device)
@@ -118,7 +120,9 @@ def curve(root: Path, config: NeilfConfig, cap: float, first: float, views: int,
 def _training(
     model: NeilfModel, pixels: PixelDataset, config: NeilfConfig, device: torch.device
 ) -> Iterator[tuple[int, float]]:
-    """The steps of all stages as `train.loop` takes them, with nothing kept: how many are done, and the last one's seconds."""
+    """The steps of all stages as `train.loop` takes them, with nothing kept: how many are done, and the last
+    one's seconds.
+    """
     now = clock(device)
     optimizer, solver = make_optimizer(model, config.optimizer), model.light_solver().to(device)
     for step in range(sum(stage_steps(config.train).values())):
@@ -130,7 +134,9 @@ def _training(
         set_rates(optimizer, config.optimizer, position)
         optimizer.zero_grad(set_to_none=True)
         computed = model.step(pixels.sample(config.train.rays), position.stage)
-        weigh(computed.terms, active_losses(position.stage, config, model.stages, position.share)).loss.backward()
+        weigh(
+            computed.terms, active_losses(position.stage, config, model.stages, position.share)
+        ).loss.backward()
         optimizer.step()
         solver.observe(computed)
         solver.solve(model.brdf, model.scene)
@@ -146,11 +152,18 @@ def _measure(run: Run) -> dict[str, float]:
 
 def table(curves: Mapping[str, Curve]) -> str:
     """Markdown: a row for each mark."""
-    lines = ["| preset | seconds | step | " + " | ".join(FIGURES.values()) + " |", "|---" * (3 + len(FIGURES)) + "|"]
+    lines = [
+        "| preset | seconds | step | " + " | ".join(FIGURES.values()) + " |",
+        "|---" * (3 + len(FIGURES)) + "|",
+    ]
     for name, measured in curves.items():
         for mark in measured.marks:
             cells = [f"{mark.figures[figure]:.2f}" if figure in mark.figures else "–" for figure in FIGURES]
-            lines.append("| " + " | ".join([name, f"{mark.seconds:.0f}", f"{mark.step} of {measured.steps}", *cells]) + " |")
+            lines.append(
+                "| "
+                + " | ".join([name, f"{mark.seconds:.0f}", f"{mark.step} of {measured.steps}", *cells])
+                + " |"
+            )
     return "\n".join(lines)
 
 
@@ -178,7 +191,9 @@ def main(options: Options) -> None:
             panels += charts(capture, curves)
     (options.out / "time_to_quality.md").write_text("\n\n".join(sections) + "\n")
     title = "What training time buys"
-    draw_charts(options.out / "time_to_quality.png", title, "seconds of training", "PSNR, dB", panels, columns=2)
+    draw_charts(
+        options.out / "time_to_quality.png", title, "seconds of training", "PSNR, dB", panels, columns=2
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""What a traced ray of L_ref costs: looked up in the cached grid and rendered where it may hit, against rendered anyway.
+"""What a traced ray of L_ref costs: looked up in the cached grid and rendered where it may hit, against
+rendered anyway.
 
     python -m benchmarks trace
 

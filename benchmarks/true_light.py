@@ -1,7 +1,7 @@
 """The true light of a capture as a function: what arrives at its surface points from any direction.
 
-The truth is known along 4096 directions a point. Between them it is interpolated on a grid with one vertex per direction,
-so that sums over few and over very many directions are estimates of one and the same integral.
+The truth is known along 4096 directions a point. Between them it is interpolated on a grid with one vertex
+per direction, so that sums over few and over very many directions are estimates of one and the same integral.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ class TrueLight:
     grid: Float[Tensor, "N R C 3"]
 
     def radiance(self, wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
-        """Linear RGB that arrives at the points from wi; below the horizon, that of the nearest known direction."""
+        """Linear RGB that arrives at the points from wi; below the horizon, that of the nearest known
+        direction.
+        """
         rows, columns = self.grid.shape[1:3]
         x, y, z = wi.unbind(-1)
         row = ((1 - z) * (rows / 2) - 0.5).clamp(0, rows - 1)
@@ -59,7 +61,9 @@ class TrueLight:
 
 
 def true_light(wi: Float[Tensor, "N S 3"], radiance: Float[Tensor, "N S 3"]) -> TrueLight:
-    """The function that radiance known along wi stands for: each vertex takes that of the nearest direction."""
+    """The function that radiance known along wi stands for: each vertex takes that of the nearest
+    direction.
+    """
     vertices = cell_directions(ROWS, COLUMNS, wi).reshape(-1, 3).numpy()
     nearest = np.stack([cKDTree(known).query(vertices)[1] for known in wi.numpy()])
     index = torch.from_numpy(nearest)[..., None].expand(-1, -1, 3)
@@ -79,7 +83,9 @@ def read_light(capture: Path) -> LightField:
 
 
 def cell_directions(rows: int, columns: int, like: Tensor) -> Float[Tensor, "R C 3"]:
-    """The middles of cells of equal solid angle: rows of equal height about +z, columns of equal azimuth from +x towards +y."""
+    """The middles of cells of equal solid angle: rows of equal height about +z, columns of equal azimuth from
+    +x towards +y.
+    """
     i = torch.arange(rows, device=like.device, dtype=like.dtype)
     j = torch.arange(columns, device=like.device, dtype=like.dtype)
     z = (1 - 2 * (i[:, None] + 0.5) / rows).expand(rows, columns)

@@ -2,9 +2,9 @@
 
     python -m benchmarks.true_material RUN [RUN …]
 
-A run with a given mesh on a capture whose test views have true materials: points of these views, their true base colour,
-roughness and metallic, and their pixels are what the light is fitted to, from nothing, as often as `--fits` says. The error of
-the light is that of `neilfpp eval`, beside what the run itself came to.
+A run with a given mesh on a capture whose test views have true materials: points of these views, their true
+base colour, roughness and metallic, and their pixels are what the light is fitted to, from nothing, as often
+as `--fits` says. The error of the light is that of `neilfpp eval`, beside what the run itself came to.
 """
 
 from __future__ import annotations
@@ -59,14 +59,18 @@ def known_points(run: Run) -> Known:
     Raises:
         UserError: the capture has no true materials.
     """
-    rendered = render_test_views(dataclasses.replace(run, step=0))  # without material: the host's maps are enough
+    rendered = render_test_views(
+        dataclasses.replace(run, step=0)
+    )  # without material: the host's maps are enough
     parts = []
     for known in known_test_views(run, rendered).views:
         if known.material is None:
             raise UserError(f"{run.capture.root}: no true materials", "take a capture with ground truth")
         rays = camera_rays(run.capture.normalisation.camera(known.view.camera))
         hits = run.model.host.render(rays)
-        rows = torch.nonzero(hits.is_hit(run.config.shading.hit_share) & torch.from_numpy(known.mask.reshape(-1)))[:, 0]
+        rows = torch.nonzero(
+            hits.is_hit(run.config.shading.hit_share) & torch.from_numpy(known.mask.reshape(-1))
+        )[:, 0]
         truth = [torch.from_numpy(known.material[name]).reshape(len(rays), -1)[rows] for name in MAPS]
         image = torch.from_numpy(known.image).reshape(-1, 3)[rows]
         parts.append([hits.position[rows], hits.normal[rows], -rays.directions[rows], image, *truth])
@@ -82,7 +86,10 @@ def solve_under_truth(run: Run, known: Known, fits: int) -> None:
     settings = dataclasses.replace(settings, fit=dataclasses.replace(settings.fit, evenness=0.0))
     model.light.log_radiance.fill_(math.log(model.facts.median_radiance / 0.3))
     model.lamps.lit = 0
-    light, objective = LightModel(model.light, model.lamps), Objective(model.facts.response, model.units.physical, settings.fit)
+    light, objective = (
+        LightModel(model.light, model.lamps),
+        Objective(model.facts.response, model.units.physical, settings.fit),
+    )
     for _ in range(fits):
         rows = torch.randperm(len(known.seen.position))[: settings.fit.points]
         seen, material = known.seen[rows], known.material[rows]
@@ -96,7 +103,9 @@ def line(run: Run, title: str) -> str:
     if field is None:
         raise UserError(f"{run.capture.root}: no true light", "take a capture with light/light_field_gt.npz")
     figures = light_metrics(run, field, truth.mesh())
-    text = f"{title:>22}: " + ", ".join(f"{name.removeprefix('incident_light_')} {x:.3f}" for name, x in figures.items())
+    text = f"{title:>22}: " + ", ".join(
+        f"{name.removeprefix('incident_light_')} {x:.3f}" for name, x in figures.items()
+    )
     lamps = run.model.lamps
     for k in range(lamps.lit):
         place = run.capture.normalisation.to_world(lamps.position[k]).tolist()
@@ -112,7 +121,10 @@ def main(options: Options) -> None:
     for path in options.runs:
         run = load_run(path)
         if not isinstance(run.model.light, EnvironmentLight):
-            raise UserError(f"{path}: its light is no environment map", "take a run with --config.light.kind auto or distant")
+            raise UserError(
+                f"{path}: its light is no environment map",
+                "take a run with --config.light.kind auto or distant",
+            )
         run.model.eval()
         console.print(str(path), highlight=False, soft_wrap=True)
         console.print(line(run, "as trained"), highlight=False, soft_wrap=True)

@@ -14,7 +14,9 @@ from neilfpp_method.settings.presets import free_light
 
 
 class Ball(nn.Module):
-    """Stands for your model: rays to colour, hit position and normal; zero normals where a ray meets nothing."""
+    """Stands for your model: rays to colour, hit position and normal; zero normals where a ray meets
+    nothing.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -26,7 +28,11 @@ class Ball(nn.Module):
         half_chord = self.radius**2 + middle**2 - origins.square().sum(-1, keepdim=True)
         hit = (half_chord > 1e-4) & (middle > 0.0)
         position = origins + (middle - half_chord.clamp_min(1e-4).sqrt()) * directions
-        return torch.where(hit, self.paint(position), 0.0), position, torch.where(hit, normalize(position, dim=-1), 0.0)
+        return (
+            torch.where(hit, self.paint(position), 0.0),
+            position,
+            torch.where(hit, normalize(position, dim=-1), 0.0),
+        )
 
 
 def photograph(count: int):
@@ -42,7 +48,9 @@ torch.manual_seed(0)
 host = Ball()
 optimizer = torch.optim.Adam(host.parameters(), lr=5e-3)
 settings = free_light(preset("fast"))
-settings = dataclasses.replace(settings, train=dataclasses.replace(settings.train, sdf_steps=60, joint_steps=20))
+settings = dataclasses.replace(
+    settings, train=dataclasses.replace(settings.train, sdf_steps=60, joint_steps=20)
+)
 
 neilf = attach_neilf(host, settings, median_radiance=0.2)  # 1
 optimizer.add_param_group({"params": neilf.parameters(), "lr": 2e-3})  # 2

@@ -1,4 +1,6 @@
-"""A distance field of your own as a host: `render` is all that it takes, and `check_host` says whether it is right."""
+"""A distance field of your own as a host: `render` is all that it takes, and `check_host` says whether it is
+right.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,9 @@ origins = 3.0 * normalize(torch.randn(256, 3), dim=-1)
 rays = RayBatch(origins, normalize(0.3 * torch.randn(256, 3) - origins, dim=-1))
 batch = pixel_batch(rays.origins, rays.directions, torch.tensor([[0.4, 0.3, 0.2]]).expand(256, 3))
 print(check_host(host := Blob(), rays))
-neilf = attach_neilf(host, free_light(preset("fast")))  # the light of the paper: nothing is fitted in so few steps
+neilf = attach_neilf(
+    host, free_light(preset("fast"))
+)  # the light of the paper: nothing is fitted in so few steps
 optimizer = torch.optim.Adam(neilf.parameters(), lr=2e-3)
 for stage in Stage:
     for _ in range(30):

@@ -31,7 +31,9 @@ box = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 neus = NeuSModelConfig().setup(scene_box=box, num_train_data=len(pixels.views)).to(DEVICE)
 
 # Your trainer, whatever it is. This one is six lines.
-optimizer = torch.optim.Adam([p for group in neus.get_param_groups().values() for p in group if p.requires_grad], 5e-4)
+optimizer = torch.optim.Adam(
+    [p for group in neus.get_param_groups().values() for p in group if p.requires_grad], 5e-4
+)
 own = NerfstudioHost(neus, response="linear")
 for _ in range(STEPS):
     rendered = own.render_regularised(batch := pixels.sample(RAYS), {"eikonal"})
@@ -43,7 +45,9 @@ print(f"NeuS: loss {loss.item():.4f}")
 
 # The add-on: three lines, and the same kind of step. The host is trained already, so its stage has no steps.
 config = free_light(preset("fast"))
-config = dataclasses.replace(config, train=dataclasses.replace(config.train, sdf_steps=0, material_steps=STEPS))
+config = dataclasses.replace(
+    config, train=dataclasses.replace(config.train, sdf_steps=0, material_steps=STEPS)
+)
 neilf = attach_neilf(neus, config, response="linear", median_radiance=pixels.median_radiance()).to(DEVICE)
 optimizer = torch.optim.Adam(neilf.parameters(), 1e-3)
 for step in range(STEPS):
@@ -55,4 +59,7 @@ print(f"NeuS with material and light: loss {loss.item():.4f}")
 
 maps = neilf.eval().model.maps(pixels.sample(RAYS).rays)
 seen = maps.roughness[:, 0] > 0
-print(f"{int(seen.sum())} of {RAYS} rays meet one surface; mean base colour {maps.base_color[seen].mean(0).tolist()}")
+print(
+    f"{int(seen.sum())} of {RAYS} rays meet one surface; mean base colour "
+    f"{maps.base_color[seen].mean(0).tolist()}"
+)

@@ -17,7 +17,9 @@ from neilfpp_method.settings.types import LightFitConfig
 
 
 class Surfels(nn.Module):
-    """Stands for your splats: soft discs on a ball, blended in front to back. `render_image` is all that it takes."""
+    """Stands for your splats: soft discs on a ball, blended in front to back. `render_image` is all that it
+    takes.
+    """
 
     def __init__(self, count: int = 300) -> None:
         super().__init__()
@@ -67,7 +69,9 @@ for group in neilf.param_groups():  # 2
     optimizer.add_param_group(group)
 for step in range(36):
     rays, hits = camera_rays(camera := cameras[step % 6]), host.render_image(camera)
-    photograph = (0.7 + 0.3 * hits.normal[:, 2:]) * red * hits.opacity[:, None].detach()  # a red ball under a soft sky
+    photograph = (
+        (0.7 + 0.3 * hits.normal[:, 2:]) * red * hits.opacity[:, None].detach()
+    )  # a red ball under a soft sky
     own, rows = (hits.color - photograph).abs().mean(), torch.randperm(len(rays))[:200]
     batch = pixel_batch(rays.origins, rays.directions, photograph.detach())[rows]
     total = neilf.losses(batch, step, hits[rows])  # what is drawn already is not drawn again

@@ -1,4 +1,5 @@
-"""`attach_neilf`: material and light on top of somebody else's geometry and radiance, in somebody else's loop.
+"""`attach_neilf`: material and light on top of somebody else's geometry and radiance, in somebody else's
+loop.
 
 Three lines, the last one in every step:
 
@@ -58,15 +59,15 @@ log = logging.getLogger(__name__)
 class AttachedNeilf(nn.Module):
     """Material and light of a scene whose geometry and radiance a host knows.
 
-    A host that offers `parameter_groups` is trained with the rest: `parameters()` holds its parameters, and all three
-    stages of the paper run. Any other is borrowed: nothing of it is in `parameters()`, `state_dict()`, `to()` or
-    `train()`, and nothing is computed in the first stage, which is its own trainer's. In the material stage it is asked
-    without gradients. In the joint stage gradients reach it.
+    A host that offers `parameter_groups` is trained with the rest: `parameters()` holds its parameters, and
+    all three stages of the paper run. Any other is borrowed: nothing of it is in `parameters()`,
+    `state_dict()`, `to()` or `train()`, and nothing is computed in the first stage, which is its own
+    trainer's. In the material stage it is asked without gradients. In the joint stage gradients reach it.
 
     Attributes:
         model: the method itself.
-        proxy: stands in for the surface where the host cannot trace it cheaply; `proxy.report()` says how well. None: the
-            host traces, or the settings ask for no rays between surfaces.
+        proxy: stands in for the surface where the host cannot trace it cheaply; `proxy.report()` says how
+            well. None: the host traces, or the settings ask for no rays between surfaces.
         light_solver: remembers what steps showed, and solves for the light now and then.
         missing: the optional methods that the host does not have, and what is lost without each.
     """
@@ -87,13 +88,15 @@ class AttachedNeilf(nn.Module):
         return self.losses(batch, step, hits)
 
     def losses(self, batch: PixelBatch, step: int | Stage | str, hits: Rendered | None = None) -> Total:
-        """The weighted sum of what counts in a step, to add to a loss of your own, and each term before its weight.
+        """The weighted sum of what counts in a step, to add to a loss of your own, and each term before its
+        weight.
 
         Args:
             batch: pixels with their rays in the scene frame; see `pixel_batch`.
-            step: the number of the step, from 0, which `config.train` places in its stage; or a stage by name, "joint" say.
-            hits: what the host has rendered of these rays already, in any form that `hosts.answers` reads: the rays are then
-                not rendered again. In the joint stage gradients go back through it.
+            step: the number of the step, from 0, which `config.train` places in its stage; or a stage by
+                name, "joint" say.
+            hits: what the host has rendered of these rays already, in any form that `hosts.answers` reads:
+                the rays are then not rendered again. In the joint stage gradients go back through it.
 
         Raises:
             UserError: the host returned what cannot be used, or the batch cannot be, or is on another device.
@@ -117,7 +120,8 @@ class AttachedNeilf(nn.Module):
         """Every map of a view, a row per ray: material, shading, normal, depth (`model.Maps`).
 
         Args:
-            rays: in the scene frame; bound the memory by their number. Or a camera, of a host that draws whole images.
+            rays: in the scene frame; bound the memory by their number. Or a camera, of a host that draws
+                whole images.
             hits: what the host has rendered of them already.
 
         Raises:
@@ -125,7 +129,9 @@ class AttachedNeilf(nn.Module):
         """
         if isinstance(rays, Camera):
             if not isinstance(self.model.host, ForeignHost):
-                raise UserError(f"{host_name(self.model.host)} takes rays", "give data.views.camera_rays(camera)")
+                raise UserError(
+                    f"{host_name(self.model.host)} takes rays", "give data.views.camera_rays(camera)"
+                )
             with torch.no_grad():
                 rays, hits = self.model.host.image_hits(rays, next(self.model.brdf.parameters()))
         self._check_place(rays)
@@ -146,7 +152,9 @@ class AttachedNeilf(nn.Module):
         """
         rates = self.model.config.optimizer
         groups = self.parameter_groups().items()
-        return [{"params": p, "lr": getattr(rates, name, rates.geometry), "name": name} for name, p in groups if p]
+        return [
+            {"params": p, "lr": getattr(rates, name, rates.geometry), "name": name} for name, p in groups if p
+        ]
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
         """The parameters by field, for a learning rate each (`config.optimizer`)."""
@@ -172,9 +180,11 @@ class AttachedNeilf(nn.Module):
         normal = self.model.shading_normals(position, hits.normal[rows])
         shading = self.model.shade(position, normal, wo[rows], self.materials(position), samples)
         nothing = torch.zeros_like(wo)
-        return Shading(*(nothing.index_put((rows,), part) for part in (shading.color, shading.diffuse, shading.specular)))
+        return Shading(
+            *(nothing.index_put((rows,), part) for part in (shading.color, shading.diffuse, shading.specular))
+        )
 
-    # -------------------------------------------------------------------------------------------------------- inside a step
+    # ------------------------------------------------------------------------------------------ inside a step
 
     def _position(self, step: int | Stage | str) -> StagePosition:
         if not isinstance(step, str):
@@ -183,7 +193,9 @@ class AttachedNeilf(nn.Module):
             return stage_at(int(step), self.model.config.train)
         names = [stage.value for stage in Stage]
         if step not in names:
-            raise UserError(f"'{step}' is no stage", f"give the number of the step, or one of {', '.join(names)}")
+            raise UserError(
+                f"'{step}' is no stage", f"give the number of the step, or one of {', '.join(names)}"
+            )
         return StagePosition(Stage(step), 0, 1)
 
     def _check_place(self, rays: RayBatch) -> None:
@@ -223,29 +235,37 @@ def attach_neilf(
     radiance_scale: float | None = None,
     open_scene: bool = False,
 ) -> AttachedNeilf:
-    """Put the material field, the light and their losses on top of a host. One line of the log says what the host lacks, and
-    when its material starts. The global random state stays as it is.
+    """Put the material field, the light and their losses on top of a host. One line of the log says what the
+    host lacks, and when its material starts. The global random state stays as it is.
 
     Args:
-        host: an object with `render(rays) -> SurfaceHits`, or `render_image(camera) -> SurfaceHits` where it draws whole
-            images; a function (origins, directions) → (color, position, normal); or a nerfstudio model. In a frame where the
-            object lies in the unit sphere. docs/hosts.md has a recipe for each.
-        config: the settings; none: the preset `fast`, and for a host that belongs to another trainer material from step 0.
+        host: an object with `render(rays) -> SurfaceHits`, or `render_image(camera) -> SurfaceHits` where it
+            draws whole images; a function (origins, directions) → (color, position, normal); or a nerfstudio
+            model. In a frame where the object lies in the unit sphere. docs/hosts.md has a recipe for each.
+        config: the settings; none: the preset `fast`, and for a host that belongs to another trainer material
+            from step 0.
         response: what the pixels are: "linear" (HDR) or "srgb" (LDR).
         median_radiance: median linear luminance of the object in the images; sets the light's first guess.
         radiance_scale: the range of the host's radiance; none: 3 for HDR, 1 for LDR.
-        open_scene: pixels of rays that meet nothing show the light from far away, not a backdrop; a map keeps to them.
+        open_scene: pixels of rays that meet nothing show the light from far away, not a backdrop; a map keeps
+            to them.
 
     Raises:
-        UserError: the host is none of these, a fact cannot be right, or the environment map that the settings name cannot be
-            used.
+        UserError: the host is none of these, a fact cannot be right, or the environment map that the settings
+            name cannot be used.
     """
     if response not in RADIANCE_SCALE:
-        raise UserError(f"response '{response}'", "choose linear (pixels are radiance) or srgb (8-bit images, divided by 255)")
+        raise UserError(
+            f"response '{response}'",
+            "choose linear (pixels are radiance) or srgb (8-bit images, divided by 255)",
+        )
     scale = RADIANCE_SCALE[response] if radiance_scale is None else radiance_scale
     for name, value in {"median_radiance": median_radiance, "radiance_scale": scale}.items():
         if not 0 < value < math.inf:
-            raise UserError(f"{name} is {value}", "give the median linear luminance of the object, or of the host's largest")
+            raise UserError(
+                f"{name} is {value}",
+                "give the median linear luminance of the object, or of the host's largest",
+            )
     borrowed = not isinstance(host, HasParameterGroups)
     if config is None:
         config = preset("fast")
@@ -290,7 +310,9 @@ def pixel_batch(origins: Tensor, directions: Tensor, color: Tensor, mask: Tensor
 
 
 def _proxy(host: object, config: NeilfConfig) -> SurfaceProxy | None:
-    """What traces rays between surfaces for a host that does not, or not cheaply, where the settings ask for them."""
+    """What traces rays between surfaces for a host that does not, or not cheaply, where the settings ask for
+    them.
+    """
     settings = config.inter_reflection
     asked = settings.mode != "off" and not answers_secondary_rays(host)
     if isinstance(host, LightsItself) or not (asked or settings.mode == "hard"):
@@ -305,10 +327,18 @@ def _what_comes(attached: AttachedNeilf, borrowed: bool) -> str:
     parts = []
     if borrowed:
         start = train.sdf_steps
-        parts += [f"nothing is computed before step {start} (train.sdf_steps)"] if start else ["material from step 0"]
-        parts += [f"the host moves with it from step {start + train.material_steps}"] if train.joint_steps else []
+        parts += (
+            [f"nothing is computed before step {start} (train.sdf_steps)"]
+            if start
+            else ["material from step 0"]
+        )
+        parts += (
+            [f"the host moves with it from step {start + train.material_steps}"] if train.joint_steps else []
+        )
     if attached.proxy is not None:
-        parts += ["a proxy of its surface, gathered from the training rays, traces the light between surfaces"]
+        parts += [
+            "a proxy of its surface, gathered from the training rays, traces the light between surfaces"
+        ]
     parts += [f"no {name}: {loss}" for name, loss in attached.missing.items()]
     return "; ".join(parts) or "it has all that a host can have"
 

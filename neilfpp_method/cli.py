@@ -63,7 +63,9 @@ def _run(name: str, arguments: Sequence[str]) -> None:
 
 
 def _parse(name: str, command: Command, arguments: Sequence[str]) -> Any:
-    description = f"{command.summary}\n\nExamples:\n" + "\n".join(f"  {example}" for example in command.examples)
+    description = f"{command.summary}\n\nExamples:\n" + "\n".join(
+        f"  {example}" for example in command.examples
+    )
     known: dict[str, Any] = {"prog": f"neilfpp {name}", "description": description}
     if command.usual is not None:
         known["description"] += f"\n\nEvery setting: neilfpp {name} --help-all"

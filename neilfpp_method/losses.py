@@ -26,26 +26,33 @@ __all__ = [
 ]
 
 
-def photometric(radiance: Float[Tensor, "N 3"], pixel: Float[Tensor, "N 3"], response: str, unit: float = 1.0) -> LossTerm:
+def photometric(
+    radiance: Float[Tensor, "N 3"], pixel: Float[Tensor, "N 3"], response: str, unit: float = 1.0
+) -> LossTerm:
     """L_vol and L_phys: L1 between a render and the pixel.
 
     Args:
         radiance: what the model sees, linear.
         pixel: what the file holds, in the capture's `response`.
         response: "linear" compares radiance; "srgb" clips the render and encodes it first (METHOD §6).
-        unit: what the difference is measured in: with the range of an output activation, the gradient keeps its size.
+        unit: what the difference is measured in: with the range of an output activation, the gradient keeps
+            its size.
     """
     return LossTerm((apply_response(radiance, response) - pixel).abs() / unit)
 
 
 def mask(
-    opacity: Float[Tensor, " N"], depth: Float[Tensor, " N"], object_mask: Float[Tensor, " N"], known: Float[Tensor, " N"]
+    opacity: Float[Tensor, " N"],
+    depth: Float[Tensor, " N"],
+    object_mask: Float[Tensor, " N"],
+    known: Float[Tensor, " N"],
 ) -> LossTerm:
-    """On the object what a ray lets through, 1 − opacity; off it ln(1 + τ), τ the optical depth; where the mask is known.
+    """On the object what a ray lets through, 1 − opacity; off it ln(1 + τ), τ the optical depth; where the
+    mask is known.
 
-    Opacity itself has no slope behind a solid, 1 − e^−τ: what stands where nothing may stand would stay there for good,
-    painted like the background. The cross-entropy of IDR is τ, and its slope grows without bound as surfaces become sharp,
-    which is what a mask that is wrong by a pixel brings about along every silhouette.
+    Opacity itself has no slope behind a solid, 1 − e^−τ: what stands where nothing may stand would stay there
+    for good, painted like the background. The cross-entropy of IDR is τ, and its slope grows without bound as
+    surfaces become sharp, which is what a mask that is wrong by a pixel brings about along every silhouette.
     """
     return LossTerm(known * (object_mask * (1 - opacity) + (1 - object_mask) * depth.log1p()))
 
@@ -61,20 +68,28 @@ def hessian(matrix: Float[Tensor, "P 3 3"]) -> LossTerm:
 
 
 def surface(distance: Float[Tensor, ...], epsilon: float) -> LossTerm:
-    """L_surf = δ_ε(G), δ_ε(z) = ε / (π (ε² + z²)): the area of the zero set, against surfaces that no image asks for."""
+    """L_surf = δ_ε(G), δ_ε(z) = ε / (π (ε² + z²)): the area of the zero set, against surfaces that no image
+    asks for.
+    """
     return LossTerm(epsilon / (math.pi * (epsilon**2 + distance**2)))
 
 
-def point_cloud(distance: Float[Tensor, " P"], gradient: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]) -> LossTerm:
+def point_cloud(
+    distance: Float[Tensor, " P"], gradient: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]
+) -> LossTerm:
     """L_pcd = |G(x_D)| + 1 − cos∠(n_D, ∇G(x_D)) at the points x_D of an oriented cloud."""
     cosine = (functional.normalize(gradient, dim=-1, eps=1e-6) * normal).sum(-1)
     return LossTerm(distance.abs() + (1.0 - cosine))
 
 
 def inter_reflection(
-    incident: Float[Tensor, "K 3"], outgoing: Float[Tensor, "K 3"], unit: float = 1.0, monochrome: bool = False
+    incident: Float[Tensor, "K 3"],
+    outgoing: Float[Tensor, "K 3"],
+    unit: float = 1.0,
+    monochrome: bool = False,
 ) -> LossTerm:
-    """L_ref = ‖L(x₁, ωi) − R(x₂, −ωi)‖₁ for rays that leave x₁ along ωi and meet the surface at x₂, in a unit of radiance.
+    """L_ref = ‖L(x₁, ωi) − R(x₂, −ωi)‖₁ for rays that leave x₁ along ωi and meet the surface at x₂, in a unit
+    of radiance.
 
     A light without colour is compared by luminance: no L can meet three channels that differ.
     """
@@ -89,7 +104,9 @@ def smoothness(
     image_gradient: Float[Tensor, " N"],
 ) -> LossTerm:
     """L_smth = (‖∇r‖ + ‖∇m‖) exp(−‖∇I‖): roughness and metallic change where the image does."""
-    return LossTerm((_safe_norm(roughness_gradient) + _safe_norm(metallic_gradient)) * torch.exp(-image_gradient))
+    return LossTerm(
+        (_safe_norm(roughness_gradient) + _safe_norm(metallic_gradient)) * torch.exp(-image_gradient)
+    )
 
 
 def lambertian(material: Material) -> LossTerm:

@@ -52,14 +52,16 @@ __all__ = ["Maps", "NeilfModel"]
 CLEAR_OPACITY = 0.01
 """Opacity below which a ray shows what lies beyond the scene."""
 SURFACE_OPACITY = 0.5
-"""Opacity above which a picture shows a surface. A picture has no holes: where a pixel shows two surfaces, too blurred to
-learn from, it shows what lies between them."""
+"""Opacity above which a picture shows a surface. A picture has no holes: where a pixel shows two surfaces,
+too blurred to learn from, it shows what lies between them.
+"""
 
 
 @dataclass(frozen=True)
 class Maps:
-    """Everything that a ray shows; one row a ray. Colours are linear. A ray that meets no surface has the host's colour
-    in `rgb`, and zeros for the material."""
+    """Everything that a ray shows; one row a ray. Colours are linear. A ray that meets no surface has the
+    host's colour in `rgb`, and zeros for the material.
+    """
 
     rgb: Float[Tensor, "N 3"]
     rgb_volume: Float[Tensor, "N 3"]
@@ -77,11 +79,12 @@ class NeilfModel(nn.Module):
     """The method on top of any host.
 
     Args:
-        host: renders rays (`hosts.base.Host`); its parameters train with ours where it offers `parameter_groups`.
+        host: renders rays (`hosts.base.Host`); its parameters train with ours where it offers
+            `parameter_groups`.
         config: the settings.
         facts: what the images decided.
-        borrowed: the host belongs to another trainer. Its parameters, its device and its mode are then none of this
-            module's, though gradients reach it in the joint stage.
+        borrowed: the host belongs to another trainer. Its parameters, its device and its mode are then none
+            of this module's, though gradients reach it in the joint stage.
 
     Attributes:
         host: geometry and outgoing radiance R.
@@ -92,7 +95,8 @@ class NeilfModel(nn.Module):
         units: what errors of radiance are measured in.
         replay: surface points of earlier steps, for stages in which no surface moves.
         check_outputs: refuses what a host must not return.
-        observers: called with the rays of every training step and what the host says of them, before anything is shaded.
+        observers: called with the rays of every training step and what the host says of them, before anything
+            is shaded.
 
     Raises:
         UserError: settings that do not go together (`settings.check`).
@@ -120,12 +124,14 @@ class NeilfModel(nn.Module):
         self.replay = Replay(config.train.fresh if stands_still else 1.0, config.train.rays)
 
     def use(self, config: NeilfConfig) -> None:
-        """Compute with these settings from now on. They switch effects; sizes of fields stay what they were built with."""
+        """Compute with these settings from now on. They switch effects; sizes of fields stay what they were
+        built with.
+        """
         self.config = config
         self.lobe = LOBES[config.shading.lobe] if config.shading.specular else None
         self.brdf.metals = config.brdf.metals
 
-    # -------------------------------------------------------------------------------------------------------- one step
+    # ----------------------------------------------------------------------------------------------- one step
 
     def forward(self, batch: PixelBatch, stage: Stage, hits: SurfaceHits | None = None) -> StepResult:
         """`step`, under the name that data-parallel wrappers call."""
@@ -136,8 +142,9 @@ class NeilfModel(nn.Module):
         return self.step(batch, stage, hits).terms
 
     def step(self, batch: PixelBatch, stage: Stage, hits: SurfaceHits | None = None) -> StepResult:
-        """The losses that count in a stage, for a batch of pixels, and what the step showed of surface and sky. `hits` are what
-        the host has rendered of the batch already; none: it is asked."""
+        """The losses that count in a stage, for a batch of pixels, and what the step showed of surface and
+        sky. `hits` are what the host has rendered of the batch already; none: it is asked.
+        """
         plan, names = self.stages[stage], active_losses(stage, self.config, self.stages)
         if not names:
             return StepResult.of({}, SurfacePixels.none_of(batch), batch[:0])
@@ -149,11 +156,14 @@ class NeilfModel(nn.Module):
         # 1. The host renders colour, hit position and normal.
         hits, terms = self._render_host(batch, plan, names, hits)
         if "volume" in names:
-            terms["volume"] = losses.photometric(hits.color, batch.color, self.facts.response, self.units.volume)
+            terms["volume"] = losses.photometric(
+                hits.color, batch.color, self.facts.response, self.units.volume
+            )
         if not plan.moves_material:
             return StepResult.of(terms, SurfacePixels.none_of(batch), batch[:0])
 
-        # 2. Rays that meet one surface, on the object, are shaded; a scaled gradient goes back to where they met it.
+        # 2. Rays that meet one surface, on the object, are shaded; a scaled gradient goes back to where they
+        #   met it.
         rows = torch.nonzero(hits.is_hit(self.config.shading.hit_share) & (batch.mask > 0.5))[:, 0]
         rendered = self._surface_pixels(hits[rows], batch[rows])
         surface = self.replay.beside_earlier(rendered) if replays else rendered
@@ -162,8 +172,12 @@ class NeilfModel(nn.Module):
         material = self._material_and_priors(surface, names, terms)
 
         # 4. Light and scene say what arrives, and 5. the rendering equation what leaves towards the camera.
-        shading = self.shade(surface.position, surface.normal, surface.wo, material, self.config.shading.train_samples)
-        terms["physical"] = losses.photometric(shading.color, surface.pixel, self.facts.response, self.units.physical)
+        shading = self.shade(
+            surface.position, surface.normal, surface.wo, material, self.config.shading.train_samples
+        )
+        terms["physical"] = losses.photometric(
+            shading.color, surface.pixel, self.facts.response, self.units.physical
+        )
 
         # 6. What arrives from another surface is what that surface sends.
         if "inter_reflection" in names:
@@ -194,14 +208,18 @@ class NeilfModel(nn.Module):
         settings = self.config.loss
         return SurfacePixels(
             position=losses.scale_gradient(hits.position, settings.position_gradient),
-            normal=losses.scale_gradient(self.shading_normals(hits.position, hits.normal), settings.normal_gradient),
+            normal=losses.scale_gradient(
+                self.shading_normals(hits.position, hits.normal), settings.normal_gradient
+            ),
             wo=-pixels.directions,
             pixel=pixels.color,
             image_gradient=pixels.image_gradient,
         )
 
     @doing("shading")
-    def _material_and_priors(self, surface: SurfacePixels, names: Mapping[str, float], terms: dict[str, LossTerm]) -> Material:
+    def _material_and_priors(
+        self, surface: SurfacePixels, names: Mapping[str, float], terms: dict[str, LossTerm]
+    ) -> Material:
         if "smoothness" in names:
             with doing("regularisers"):
                 sample = self.brdf.with_gradients(surface.position)
@@ -215,21 +233,27 @@ class NeilfModel(nn.Module):
 
     @doing("tracing")
     def _inter_reflection(self, position: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]) -> LossTerm:
-        traced = trace_light(self.host, position, normal, self.config.inter_reflection, self.config.shading.hit_share)
+        traced = trace_light(
+            self.host, position, normal, self.config.inter_reflection, self.config.shading.hit_share
+        )
         hit = torch.nonzero(traced.hit)[:, 0]
         incident = self.light.radiance(traced.position[hit], traced.wi[hit][:, None])[:, 0]
-        return losses.inter_reflection(incident, traced.radiance[hit], self.units.incident, self.config.light.monochrome)
+        return losses.inter_reflection(
+            incident, traced.radiance[hit], self.units.incident, self.config.light.monochrome
+        )
 
     def _beyond(self, batch: PixelBatch, hits: SurfaceHits) -> PixelBatch:
         """Pixels off the object, as far as masks tell, whose rays pass the scene by."""
         off_object = (batch.mask < 0.5) | (batch.mask_known == 0)
         return batch[torch.nonzero(off_object & (hits.opacity.detach() < CLEAR_OPACITY))[:, 0]]
 
-    # ------------------------------------------------------------------------------------------------------- the parts
+    # ---------------------------------------------------------------------------------------------- the parts
 
     @property
     def scene(self) -> SceneTracer | None:
-        """What the scene's own surfaces send, where inter-reflection is traced; none where it is off or a loss."""
+        """What the scene's own surfaces send, where inter-reflection is traced; none where it is off or a
+        loss.
+        """
         if self.config.inter_reflection.mode != "hard":
             return None
         return scene_tracer(self.host, self.config.inter_reflection, self.config.shading.hit_share)
@@ -248,8 +272,12 @@ class NeilfModel(nn.Module):
         """Base colour, roughness and metallic at points of the scene frame."""
         return self.brdf(x)
 
-    def shading_normals(self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """Unit normals at hits as surfaces are shaded with them; their gradient is that of the hits' normals."""
+    def shading_normals(
+        self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N 3"]:
+        """Unit normals at hits as surfaces are shaded with them; their gradient is that of the hits'
+        normals.
+        """
         if not isinstance(self.host, SmoothsNormals):
             return normal
         smooth = self.host.smooth_normals(position.detach(), normal.detach())
@@ -268,7 +296,9 @@ class NeilfModel(nn.Module):
         material: Material,
         samples: int,
     ) -> Shading:
-        """Outgoing radiance towards wo by the rendering equation, from `samples` incident directions per point."""
+        """Outgoing radiance towards wo by the rendering equation, from `samples` incident directions per
+        point.
+        """
         about, roughness, sampler = normal.detach(), material.roughness.detach(), self.config.shading.sampler
         drawn = draw_directions(sampler, self.light, about, wo, roughness, samples, self.lobe, self.training)
         return shade(material, normal, wo, arriving(self.sources, position, drawn), self.lobe)
@@ -293,14 +323,23 @@ class NeilfModel(nn.Module):
             shading = self.shade(position, normal, wo, material, self.config.shading.eval_samples)
             rgb[rows] = shading.color
             surfaces[rows] = torch.cat(
-                [shading.diffuse, shading.specular, material.base_color, material.roughness, material.metallic], dim=-1
+                [
+                    shading.diffuse,
+                    shading.specular,
+                    material.base_color,
+                    material.roughness,
+                    material.metallic,
+                ],
+                dim=-1,
             )
         diffuse, specular, base_color, roughness, metallic = surfaces.split([3, 3, 3, 1, 1], dim=-1)
         depth = ((hits.position - rays.origins) * rays.directions).sum(-1, keepdim=True)
         opacity = hits.opacity[:, None]
-        return Maps(rgb, hits.color, diffuse, specular, base_color, roughness, metallic, normals, depth, opacity)
+        return Maps(
+            rgb, hits.color, diffuse, specular, base_color, roughness, metallic, normals, depth, opacity
+        )
 
-    # ------------------------------------------------------------------------------------------------------- parameters
+    # --------------------------------------------------------------------------------------------- parameters
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters by field, the host's among them where it offers them and is not borrowed."""

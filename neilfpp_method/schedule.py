@@ -7,8 +7,9 @@
 
 L_en and L_spec, which the paper does not have, go with L_phys where they are switched on.
 
-Two more tables are for hosts whose geometry is not ours to train: where it is given, R is a surface light field and
-moves with the material; where the host belongs to another trainer, that one sees to the first stage.
+Two more tables are for hosts whose geometry is not ours to train: where it is given, R is a surface light
+field and moves with the material; where the host belongs to another trainer, that one sees to the first
+stage.
 """
 
 from __future__ import annotations
@@ -52,14 +53,16 @@ LIGHT_FIELD = frozenset({"radiance", "background"})
 GEOMETRY = LIGHT_FIELD | {"geometry", "beta"}
 MATERIAL = frozenset({"brdf", "light"})
 
-# Each loss of the material stages with the setting that weighs it; L_phys is what the others are weighed against, and has 1.
+# Each loss of the material stages with the setting that weighs it; L_phys is what the others are weighed
+# against, and has 1.
 MATERIAL_LOSSES = {name: name for name in ("inter_reflection", "smoothness", "lambertian")}
 
 
 @dataclass(frozen=True)
 class StagePlan:
-    """One row of the table: for each loss that counts the setting that weighs it, and the fields that move; for each loss whose
-    weight grows in the course of the stage the setting that says by how much."""
+    """One row of the table: for each loss that counts the setting that weighs it, and the fields that move;
+    for each loss whose weight grows in the course of the stage the setting that says by how much.
+    """
 
     weights: Mapping[str, str]
     moves: frozenset[str]
@@ -112,7 +115,8 @@ FIXED_GEOMETRY: StageTable = {
     Stage.JOINT: TOGETHER,
 }
 
-# Somebody else trains the host. Nothing is computed before there is a material, so that adding it on costs nothing.
+# Somebody else trains the host. Nothing is computed before there is a material, so that adding it on costs
+# nothing.
 BORROWED_HOST: StageTable = {
     Stage.SDF_INIT: StagePlan({}, frozenset()),
     Stage.MATERIAL_INIT: STAGES[Stage.MATERIAL_INIT],
@@ -130,7 +134,9 @@ def stage_steps(config: TrainConfig) -> Mapping[Stage, int]:
 
 
 def has_material(steps: int, config: TrainConfig) -> bool:
-    """Whether the first `steps` steps moved the material and the light; before that they are what they start as."""
+    """Whether the first `steps` steps moved the material and the light; before that they are what they start
+    as.
+    """
     return steps > config.sdf_steps
 
 
@@ -149,7 +155,9 @@ class StagePosition:
 
 
 def stage_at(step: int, config: TrainConfig) -> StagePosition:
-    """The stage of a global step (from 0); the last stage that has steps, one past its end, when training is over."""
+    """The stage of a global step (from 0); the last stage that has steps, one past its end, when training is
+    over.
+    """
     start = 0
     lengths = [(stage, n) for stage, n in stage_steps(config).items() if n > 0]
     for stage, length in lengths:
@@ -165,7 +173,8 @@ WARM_UP_START = 0.1
 
 
 def rate_factor(config: OptimizerConfig, position: StagePosition) -> float:
-    """What a learning rate is multiplied by at a step of a stage: the stage's own factor, its fall, and its warm-up.
+    """What a learning rate is multiplied by at a step of a stage: the stage's own factor, its fall, and its
+    warm-up.
 
     Example:
         >>> halfway = StagePosition(Stage.SDF_INIT, step=50, length=100)
@@ -181,14 +190,18 @@ def rate_factor(config: OptimizerConfig, position: StagePosition) -> float:
     return (config.joint if position.stage is Stage.JOINT else 1.0) * start * final**fallen
 
 
-def active_losses(stage: Stage, config: NeilfConfig, stages: StageTable = STAGES, share: float = 0.0) -> Mapping[str, float]:
+def active_losses(
+    stage: Stage, config: NeilfConfig, stages: StageTable = STAGES, share: float = 0.0
+) -> Mapping[str, float]:
     """The losses that count in a stage, with their weights when `share` of it is over.
 
     One of weight 0, or whose effect is switched off, is absent: nothing computes it.
     """
     plan = stages[stage]
     weights = {loss: getattr(config.loss, setting) for loss, setting in plan.weights.items()}
-    weights |= {loss: weights[loss] * getattr(config.loss, setting) ** share for loss, setting in plan.grows.items()}
+    weights |= {
+        loss: weights[loss] * getattr(config.loss, setting) ** share for loss, setting in plan.grows.items()
+    }
     if plan.moves_material:
         weights["physical"] = 1.0
     if config.inter_reflection.mode != "soft":

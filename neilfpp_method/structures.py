@@ -1,7 +1,8 @@
 """What travels between the rooms of the package.
 
-N rays or surface points, S incident directions per point. Positions are in the scene frame (the object lies in the
-unit sphere, see docs/conventions.md); directions are unit vectors in that frame; radiance is linear RGB.
+N rays or surface points, S incident directions per point. Positions are in the scene frame (the object lies
+in the unit sphere, see docs/conventions.md); directions are unit vectors in that frame; radiance is linear
+RGB.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ __all__ = [
 ]
 
 PDF_FLOOR = 1e-6
-"""Smallest density divided by, per steradian. Less than 2π · 1e-6 of a sampler's directions lie where it acts."""
+"""Smallest density divided by, per steradian. Less than 2π · 1e-6 of a sampler's directions lie where it
+acts.
+"""
 
 Structure = TypeVar("Structure", bound="Indexable")
 
@@ -74,12 +77,11 @@ class RayBatch(Indexable):
 class PixelBatch(Indexable):
     """Rays with what the images say about them.
 
-    `color` is linear radiance for an HDR capture, on the scale that its views share, and display values (sRGB) for an LDR
-    one.
-    `mask` is 1 on the object and 0 off it, as far as `mask_known` is 1: everywhere in a capture with masks, only where the
-    image shows exactly its background in one without (there the other pixels have mask 1). `image_gradient` is the length
-    of the gradient of the image's luminance at the pixel, by Scharr's filter: 32 times the change per pixel; 0 where no
-    loss needs it.
+    `color` is linear radiance for an HDR capture, on the scale that its views share, and display values
+    (sRGB) for an LDR one. `mask` is 1 on the object and 0 off it, as far as `mask_known` is 1: everywhere in
+    a capture with masks, only where the image shows exactly its background in one without (there the other
+    pixels have mask 1). `image_gradient` is the length of the gradient of the image's luminance at the pixel,
+    by Scharr's filter: 32 times the change per pixel; 0 where no loss needs it.
     """
 
     origins: Float[Tensor, "N 3"]
@@ -107,10 +109,11 @@ class OrientedPoints(Indexable):
 class SurfaceHits(Indexable):
     """Where rays meet the surface, and what they see there.
 
-    `color` is the linear radiance that the host renders for the whole ray, background included; `position` and `normal`
-    are blended along the ray and `normal` is unit, away from the surface; `opacity` is the share of the ray that the
-    surface stops; `concentration` is the share of the blending weight that lies close to `position` (1 for a host with
-    a sharp surface), which tells a hit from a miss and from an average over two surfaces. The normal of a miss is zero.
+    `color` is the linear radiance that the host renders for the whole ray, background included; `position`
+    and `normal` are blended along the ray and `normal` is unit, away from the surface; `opacity` is the share
+    of the ray that the surface stops; `concentration` is the share of the blending weight that lies close to
+    `position` (1 for a host with a sharp surface), which tells a hit from a miss and from an average over two
+    surfaces. The normal of a miss is zero.
     """
 
     color: Float[Tensor, "N 3"]
@@ -126,7 +129,9 @@ class SurfaceHits(Indexable):
 
 @dataclass(frozen=True)
 class Material(Indexable):
-    """The simplified Disney parameters at a point, each in [0, 1]. `roughness` r has microfacet width α = r²."""
+    """The simplified Disney parameters at a point, each in [0, 1]. `roughness` r has microfacet width α =
+    r².
+    """
 
     base_color: Float[Tensor, "N 3"]
     roughness: Float[Tensor, "N 1"]
@@ -137,9 +142,9 @@ class Material(Indexable):
 class IncidentSamples(Indexable):
     """Directions towards the light with the density that drew them.
 
-    `wi` points away from the surface. `pdf` is per steradian and is that of the whole set, so that the mean over S of
-    f(wi)/pdf(wi) estimates the integral of f over the hemisphere, whatever the sampler. A direction below the horizon is
-    allowed; the shading gives it no weight. Directions that all points share have N = 1.
+    `wi` points away from the surface. `pdf` is per steradian and is that of the whole set, so that the mean
+    over S of f(wi)/pdf(wi) estimates the integral of f over the hemisphere, whatever the sampler. A direction
+    below the horizon is allowed; the shading gives it no weight. Directions that all points share have N = 1.
     """
 
     wi: Float[Tensor, "N S 3"]
@@ -158,8 +163,9 @@ class Source(IntEnum):
 class Incident(Indexable):
     """Light that arrives at N points along S directions.
 
-    `radiance` is linear; `weight` is the solid angle that a direction stands for, steradians, so that the sum over S of
-    weight · radiance · f · cos is the estimate of the rendering equation; `source` is a `Source`, or more for a lamp.
+    `radiance` is linear; `weight` is the solid angle that a direction stands for, steradians, so that the sum
+    over S of weight · radiance · f · cos is the estimate of the rendering equation; `source` is a `Source`,
+    or more for a lamp.
     """
 
     wi: Float[Tensor, "N S 3"]
@@ -168,8 +174,12 @@ class Incident(Indexable):
     source: Int[Tensor, "N S"]
 
     @staticmethod
-    def of(drawn: IncidentSamples, radiance: Float[Tensor, "#N S 3"], source: Int[Tensor, "N S"] | None = None) -> Incident:
-        """What arrives along drawn directions: each stands for 1/(S · pdf). No `source`: all comes from the light."""
+    def of(
+        drawn: IncidentSamples, radiance: Float[Tensor, "#N S 3"], source: Int[Tensor, "N S"] | None = None
+    ) -> Incident:
+        """What arrives along drawn directions: each stands for 1/(S · pdf). No `source`: all comes from the
+        light.
+        """
         weight = 1 / (drawn.pdf.clamp_min(PDF_FLOOR) * drawn.pdf.shape[1])
         if source is None:
             source = torch.zeros((), dtype=torch.long, device=weight.device).expand(weight.shape)
@@ -177,12 +187,16 @@ class Incident(Indexable):
 
     def beside(self, other: Incident) -> Incident:
         """The directions of both."""
-        return Incident(*(torch.cat((getattr(self, f.name), getattr(other, f.name)), 1) for f in fields(self)))
+        return Incident(
+            *(torch.cat((getattr(self, f.name), getattr(other, f.name)), 1) for f in fields(self))
+        )
 
 
 @dataclass(frozen=True)
 class Shading(Indexable):
-    """Outgoing radiance of a point towards the viewer, and its two parts: `color` = `diffuse` + `specular`."""
+    """Outgoing radiance of a point towards the viewer, and its two parts: `color` = `diffuse` +
+    `specular`.
+    """
 
     color: Float[Tensor, "N 3"]
     diffuse: Float[Tensor, "N 3"]
@@ -191,8 +205,10 @@ class Shading(Indexable):
 
 @dataclass(frozen=True)
 class SceneLight(Indexable):
-    """What the scene itself sends to N points from S directions: where a direction meets the scene, how far away, and the
-    linear radiance that arrives from there. Where it meets nothing the distance is infinite and the radiance zero."""
+    """What the scene itself sends to N points from S directions: where a direction meets the scene, how far
+    away, and the linear radiance that arrives from there. Where it meets nothing the distance is infinite and
+    the radiance zero.
+    """
 
     hit: Bool[Tensor, "N S"]
     radiance: Float[Tensor, "N S 3"]
@@ -204,9 +220,11 @@ SceneTracer = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N S 3"]], SceneLigh
 
 
 class LossTerm(NamedTuple):
-    """One loss before reduction: `values` of any shape and, where not all count alike, `weights` that broadcast to it.
+    """One loss before reduction: `values` of any shape and, where not all count alike, `weights` that
+    broadcast to it.
 
-    A named tuple, because the wrappers of data-parallel training look for tensors in those and not in frozen dataclasses.
+    A named tuple, because the wrappers of data-parallel training look for tensors in those and not in frozen
+    dataclasses.
     """
 
     values: Float[Tensor, ...]
@@ -225,7 +243,9 @@ LossTerms = Mapping[str, LossTerm]
 
 @dataclass(frozen=True)
 class Observed(Indexable):
-    """Surface points and what an image holds of each: `pixel` in the capture's response, `wo` towards the camera."""
+    """Surface points and what an image holds of each: `pixel` in the capture's response, `wo` towards the
+    camera.
+    """
 
     position: Float[Tensor, "N 3"]
     normal: Float[Tensor, "N 3"]
@@ -249,12 +269,13 @@ class SurfacePixels(Observed):
 class StepResult(NamedTuple):
     """What a training step computed: its losses, and constants for those who solve for the light.
 
-    Wrappers of data-parallel training change no frozen dataclass, so points and pixels travel as the rows of tensors.
+    Wrappers of data-parallel training change no frozen dataclass, so points and pixels travel as the rows of
+    tensors.
 
     Attributes:
         terms: the losses that count in the stage, before their weights.
-        surface_rows: position, normal, wo and pixel of the surface points that the step rendered; none before the material
-            stages.
+        surface_rows: position, normal, wo and pixel of the surface points that the step rendered; none before
+            the material stages.
         beyond_rows: direction and pixel of the rays that pass the scene by; none before the material stages.
     """
 

@@ -2,7 +2,8 @@
 
     python scripts/check_package.py      needs git, and an index for pip; writes dist/ and build/package
 
-Build isolation would ask the index a second time, so the build's tools lie in an environment that is made here.
+Build isolation would ask the index a second time, so the build's tools lie in an environment that is made
+here.
 """
 
 from __future__ import annotations
@@ -76,7 +77,12 @@ def check_wheel(wheel: Path) -> None:
         metadata = message_from_bytes(
             archive.read(next(n for n in names if n.endswith(".dist-info/METADATA")))
         )
-    for ending in ("neilfpp_method/py.typed", "demo/scene/split.json", "report/static/viewer.js", "licenses/LICENSE"):
+    for ending in (
+        "neilfpp_method/py.typed",
+        "demo/scene/split.json",
+        "report/static/viewer.js",
+        "licenses/LICENSE",
+    ):
         assert any(name.endswith(ending) for name in names), f"{wheel.name} lacks {ending}"
     description = str(metadata.get_payload())
     relative = [

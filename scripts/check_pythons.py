@@ -2,8 +2,8 @@
 
     python scripts/check_pythons.py      needs an index for pip; writes build/pythons
 
-Resolving reads metadata alone (a build of torch can have gigabytes). To start the command takes its two imports; the
-whole package is compiled to byte code, which finds syntax that an older Python does not know.
+Resolving reads metadata alone (a build of torch can have gigabytes). To start the command takes its two
+imports; the whole package is compiled to byte code, which finds syntax that an older Python does not know.
 `make package PYTHON=python3.10` installs everything on one Python.
 """
 

@@ -44,7 +44,9 @@ def make(source: Path, target: Path) -> None:
         copy(view.image, target / "inputs" / "images" / view.image.name)
     for view in test:
         for folder in ("depth_maps", "normal_maps"):
-            copy(capture.inputs / folder / f"{view.name}.exr", target / "inputs" / folder / f"{view.name}.exr")
+            copy(
+                capture.inputs / folder / f"{view.name}.exr", target / "inputs" / folder / f"{view.name}.exr"
+            )
         for name in ("kd", "roughness", "metallic"):
             relative = Path("ground_truths") / "materials" / name / f"{view.name}.png"
             copy(source / relative, target / relative)

@@ -1,4 +1,5 @@
-"""The viewer's page in a headless Chromium, clicked through and pictured: python scripts/viewer_screenshot.py RUN PICTURE.
+"""The viewer's page in a headless Chromium, clicked through and pictured: python scripts/viewer_screenshot.py
+RUN PICTURE.
 
 Needs the extra `view`, selenium, and Debian's packages chromium and chromium-driver.
 """
@@ -98,7 +99,9 @@ def main(run: Path, picture: Path) -> None:
         with chromium() as driver:
             driver.get(f"http://127.0.0.1:{PORT}/")
             wait_for(lambda: "samples a pixel" in text_of(driver), 120)
-            for button in driver.find_elements("xpath", f"//*[contains(text(),'{NOTICE}')]/following::button[1]"):
+            for button in driver.find_elements(
+                "xpath", f"//*[contains(text(),'{NOTICE}')]/following::button[1]"
+            ):
                 button.click()
             click_at(driver, 0.38, 0.62)
             wait_for(lambda: "roughness 0" in text_of(driver))

@@ -13,7 +13,7 @@ __all__ = ["ChiSquare", "brdf", "chi2_test", "distribution", "hemisphere_integra
 Array = np.ndarray
 
 
-# ----------------------------------------------------------------------------------------------------------------- BRDF
+# ------------------------------------------------------------------------------------------------------- BRDF
 
 
 def distribution(lobe: str, cos_h: Array, r: Array) -> Array:
@@ -34,18 +34,22 @@ def masking(lobe: str, cos_i: Array, cos_o: Array, r: Array) -> Array:
 
 
 def brdf(lobe: str, b: Array, r: Array, m: Array, n: Array, wo: Array, wi: Array) -> tuple[Array, Array]:
-    """f_d and f_s of METHOD §1 for vectors (..., 3) and scalars (..., 1); both zero below the horizon of wi."""
+    """f_d and f_s of METHOD §1 for vectors (..., 3) and scalars (..., 1); both zero below the horizon of
+    wi.
+    """
     cos_i, cos_o = (wi * n).sum(-1, keepdims=True), (wo * n).sum(-1, keepdims=True)
     above = cos_i > 0
     cos_i = np.where(above, cos_i, 1.0)
     h = (wi + wo) / np.linalg.norm(wi + wo, axis=-1, keepdims=True)
     f0 = 0.04 * (1 - m) + b * m
     fresnel = f0 + (1 - f0) * (1 - (wo * h).sum(-1, keepdims=True)) ** 5
-    specular = distribution(lobe, (h * n).sum(-1, keepdims=True), r) * fresnel * masking(lobe, cos_i, cos_o, r)
+    specular = (
+        distribution(lobe, (h * n).sum(-1, keepdims=True), r) * fresnel * masking(lobe, cos_i, cos_o, r)
+    )
     return above * (1 - m) / np.pi * b, above * specular / (4 * cos_i * cos_o)
 
 
-# ----------------------------------------------------------------------------------------------------------- quadrature
+# ------------------------------------------------------------------------------------------------- quadrature
 
 
 def spherical(cosine: Array, azimuth: Array) -> Array:
@@ -65,7 +69,7 @@ def hemisphere_integral(f: Callable[[Array], float]) -> float:
     return value
 
 
-# ----------------------------------------------------------------------------------------------------------- statistics
+# ------------------------------------------------------------------------------------------------- statistics
 
 
 @dataclass(frozen=True)
@@ -85,9 +89,10 @@ def chi2_test(
 ) -> ChiSquare:
     """Pearson's χ² test of directions (K, 3) against a density per steradian on the whole sphere.
 
-    Cells are equal steps of the polar angle from +z and of azimuth; the density is integrated over each by 12×12
-    Gauss-Legendre nodes, and cells that expect fewer than 5 samples are pooled. With several `tests` the significance
-    of each is Šidák's 1 − (1 − significance)^(1/tests), so that all together fail by chance as rarely as one would.
+    Cells are equal steps of the polar angle from +z and of azimuth; the density is integrated over each by
+    12×12 Gauss-Legendre nodes, and cells that expect fewer than 5 samples are pooled. With several `tests`
+    the significance of each is Šidák's 1 − (1 − significance)^(1/tests), so that all together fail by chance
+    as rarely as one would.
     """
     cells = 32
     directions = sample_fn()

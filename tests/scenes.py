@@ -26,7 +26,9 @@ def tiny_config(**changes) -> NeilfConfig:
         brdf=dataclasses.replace(config.brdf, layers=1, width=16),
         light=dataclasses.replace(config.light, layers=4, width=16),
         background=dataclasses.replace(config.background, layers=2, width=16, samples=4),
-        volume=dataclasses.replace(config.volume, initial_samples=24, rounds=1, samples=20, beta_init=0.02, skip_empty=False),
+        volume=dataclasses.replace(
+            config.volume, initial_samples=24, rounds=1, samples=20, beta_init=0.02, skip_empty=False
+        ),
         shading=dataclasses.replace(config.shading, train_samples=8, eval_samples=8),
         inter_reflection=dataclasses.replace(config.inter_reflection, rays_per_point=0.5),
         loss=dataclasses.replace(config.loss, lambertian=5e-4),  # every loss of the table counts
@@ -35,7 +37,9 @@ def tiny_config(**changes) -> NeilfConfig:
     return dataclasses.replace(small, **changes)
 
 
-def sphere_model(config: NeilfConfig | None = None, response: str = "linear", background: str = "constant") -> NeilfModel:
+def sphere_model(
+    config: NeilfConfig | None = None, response: str = "linear", background: str = "constant"
+) -> NeilfModel:
     """An untrained model: its surface is the sphere of radius 0.6 that every field starts as, β = 0.02."""
     torch.manual_seed(0)
     config = config or tiny_config()

@@ -16,7 +16,8 @@ SOURCES = {
     for path in sorted(ROOT.rglob("*.py"))
 }
 
-# A room may import what stands to its left, and itself; rooms of one step know nothing of one another. Lower is right.
+# A room may import what stands to its left, and itself; rooms of one step know nothing of one another. Lower
+# is right.
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "structures", "timing"),
     ("settings",),
@@ -36,7 +37,8 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("commands",),
     ("cli",),
 )
-# Rooms that keep out of more than their layer says. Data is read and prepared without a network in sight, settings included.
+# Rooms that keep out of more than their layer says. Data is read and prepared without a network in sight,
+# settings included.
 ONLY = {
     "data": {"errors", "structures", "shading.color"},
     "prepare": {"errors", "structures", "shading.color", "data", "inspection"},
@@ -60,7 +62,9 @@ def layer(name: str) -> int:
 
 
 def imports(tree: ast.AST, module: str = "") -> Iterator[str]:
-    """Every module that a source imports, wherever in it; of the package only modules, not the names in them."""
+    """Every module that a source imports, wherever in it; of the package only modules, not the names in
+    them.
+    """
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -103,9 +107,13 @@ def test_every_module_has_its_place(source):
 def test_no_arrow_runs_backwards(source):
     module, tree = source
     if module == PACKAGE:
-        assert not [name for name in imports(tree) if name.startswith(PACKAGE)]  # its names load when asked for
+        assert not [
+            name for name in imports(tree) if name.startswith(PACKAGE)
+        ]  # its names load when asked for
         return
-    wrong = [name for name in imports(tree, module) if name.startswith(f"{PACKAGE}.") and backward(module, name)]
+    wrong = [
+        name for name in imports(tree, module) if name.startswith(f"{PACKAGE}.") and backward(module, name)
+    ]
     assert not wrong, f"{module} may not import {wrong}"
 
 
@@ -150,7 +158,7 @@ def test_modules_are_short(source):
     assert len(SOURCES[module].read_text().splitlines()) <= MOST_LINES
 
 
-# --------------------------------------------------------------------------------------------- the tests above can fail
+# ----------------------------------------------------------------------------------- the tests above can fail
 
 
 @pytest.mark.parametrize(

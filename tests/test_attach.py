@@ -47,7 +47,7 @@ def same(one: list[torch.Tensor], other: list[torch.Tensor]) -> bool:
     return all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
 
 
-# --------------------------------------------------------------------------------------------------- somebody else's loop
+# --------------------------------------------------------------------------------------- somebody else's loop
 
 
 def test_three_lines_in_a_foreign_loop():
@@ -107,7 +107,13 @@ def test_steps_fall_into_the_stages_of_the_settings():
     neilf = attach_neilf(Ball(), steps(sdf=2, material=3, joint=1))
     names = [set(neilf.losses(pixels(), step).terms) for step in (1, 2, 4, 5, 99)]
     material = {"physical", "inter_reflection"}
-    assert [n - {"lambertian"} for n in names] == [set(), material, material, material | {"volume"}, material | {"volume"}]
+    assert [n - {"lambertian"} for n in names] == [
+        set(),
+        material,
+        material,
+        material | {"volume"},
+        material | {"volume"},
+    ]
     assert set(neilf.losses(pixels(), Stage.JOINT).terms) == names[3]
 
 
@@ -146,7 +152,7 @@ def test_a_mesh_learns_its_light_field_with_the_material():
     assert any(p.grad.abs().max() > 0 for p in host.parameters())
 
 
-# --------------------------------------------------------------------------------------------------------------- the parts
+# -------------------------------------------------------------------------------------------------- the parts
 
 
 def test_a_map_that_the_settings_name_lights_the_scene_and_stays(tmp_path):
@@ -218,7 +224,7 @@ def test_pixels_of_a_loop_that_knows_little():
     assert masked.mask_known.all()
 
 
-# ---------------------------------------------------------------------------------------------------- what a host is not
+# ----------------------------------------------------------------------------------------- what a host is not
 
 
 def test_what_a_host_lacks_is_said_once_and_in_one_line(caplog):
@@ -300,8 +306,14 @@ def test_a_colour_may_be_cut_off_where_nothing_trains_it():
 def test_bad_normals_of_a_host_object_are_named():
     for spoil, message in (
         (lambda rays, o: {"normal": 0.0 * o["normal"]}, "BallHost: its normal is no unit vector"),
-        (lambda rays, o: {"normal": o["normal"] / 0.0}, "BallHost: its normal is not finite for 64 of 64 rays; divide by"),
-        (lambda rays, o: {"opacity": o["opacity"][:, None]}, r"BallHost: its opacity has the shape \(64, 1\)"),
+        (
+            lambda rays, o: {"normal": o["normal"] / 0.0},
+            "BallHost: its normal is not finite for 64 of 64 rays; divide by",
+        ),
+        (
+            lambda rays, o: {"opacity": o["opacity"][:, None]},
+            r"BallHost: its opacity has the shape \(64, 1\)",
+        ),
         (lambda rays, o: {"concentration": None}, "BallHost: its concentration is a NoneType"),
     ):
         with pytest.raises(UserError, match=message):
@@ -310,7 +322,9 @@ def test_bad_normals_of_a_host_object_are_named():
 
 def test_normals_are_looked_at_until_the_first_hit_and_shapes_always():
     spoil = {}
-    neilf = attach_neilf(BallHost(lambda rays, outputs: {n: f(outputs[n]) for n, f in spoil.items()}), tiny_config())
+    neilf = attach_neilf(
+        BallHost(lambda rays, outputs: {n: f(outputs[n]) for n, f in spoil.items()}), tiny_config()
+    )
     batch = pixels()
     away = dataclasses.replace(batch, directions=-batch.directions)
     neilf.losses(away, Stage.MATERIAL_INIT)

@@ -1,4 +1,6 @@
-"""Hits that are rendered already, hosts that draw images, and everything that an attachment says or must not touch."""
+"""Hits that are rendered already, hosts that draw images, and everything that an attachment says or must not
+touch.
+"""
 
 from __future__ import annotations
 
@@ -55,20 +57,27 @@ class Counted(Ball):
         return super().forward(origins, directions)
 
 
-# ---------------------------------------------------------------------------------------------------------- hits handed in
+# --------------------------------------------------------------------------------------------- hits handed in
 
 
 @pytest.mark.parametrize("form", ["hits", "dictionary", "tuple"])
 def test_hits_that_are_handed_in_are_not_rendered_again_and_change_nothing(form):
     host, rays = Counted(), ball_rays(64, 0.8)
     config = tiny_config()
-    config = dataclasses.replace(config, inter_reflection=dataclasses.replace(config.inter_reflection, mode="off"))
+    config = dataclasses.replace(
+        config, inter_reflection=dataclasses.replace(config.inter_reflection, mode="off")
+    )
     neilf = attach_neilf(host, config)
     color, position, normal = host(rays.origins, rays.directions)
     depth = ((position - rays.origins) * rays.directions).sum(-1, keepdim=True)
     given = {
         "hits": CallableHost(host).render(rays),
-        "dictionary": {"rgb": color, "depth": depth, "normal": normal, "accumulation": normal.detach().norm(dim=-1)},
+        "dictionary": {
+            "rgb": color,
+            "depth": depth,
+            "normal": normal,
+            "accumulation": normal.detach().norm(dim=-1),
+        },
         "tuple": (color, position, normal),
     }[form]
     host.asked = 0
@@ -98,17 +107,23 @@ def test_maps_of_hits_that_are_handed_in_are_those_of_rendered_rays():
 
 def test_gradients_do_not_go_back_through_hits_in_the_material_stage():
     host, rays = Ball(), ball_rays(64)
-    attach_neilf(host, tiny_config()).losses(pixels(rays), "material_init", CallableHost(host).render(rays)).loss.backward()
+    attach_neilf(host, tiny_config()).losses(
+        pixels(rays), "material_init", CallableHost(host).render(rays)
+    ).loss.backward()
     assert all(p.grad is None for p in host.parameters())
 
 
 def test_outputs_without_a_normal_are_named():
     rays = ball_rays(4)
-    with pytest.raises(UserError, match=r"Ball: its outputs have no tensor 'normal' or 'normals', but rgb, depth; add one"):
-        attach_neilf(Ball(), tiny_config()).losses(pixels(rays), "joint", {"rgb": rays.origins, "depth": rays.origins[:, 0]})
+    with pytest.raises(
+        UserError, match=r"Ball: its outputs have no tensor 'normal' or 'normals', but rgb, depth; add one"
+    ):
+        attach_neilf(Ball(), tiny_config()).losses(
+            pixels(rays), "joint", {"rgb": rays.origins, "depth": rays.origins[:, 0]}
+        )
 
 
-# --------------------------------------------------------------------------------------------------- hosts of whole images
+# -------------------------------------------------------------------------------------- hosts of whole images
 
 
 def camera(size: int = 40) -> Camera:
@@ -196,7 +211,7 @@ def test_a_host_that_answers_no_secondary_rays_is_asked_with_camera_rays_alone()
         assert neilf.maps(ball_rays(16)).rgb.isfinite().all()
 
 
-# -------------------------------------------------------------------------------------------------------- what is untouched
+# ------------------------------------------------------------------------------------------ what is untouched
 
 
 def test_a_host_is_never_called_without_rays():
@@ -232,7 +247,7 @@ def test_groups_of_parameters_have_the_rates_of_the_settings():
     assert [group["name"] for group in mapped] == ["brdf"]
 
 
-# --------------------------------------------------------------------------------------------------------------- what is said
+# ----------------------------------------------------------------------------------------------- what is said
 
 
 def test_a_borrowed_host_starts_with_its_material_or_says_when(caplog):
@@ -241,7 +256,9 @@ def test_a_borrowed_host_starts_with_its_material_or_says_when(caplog):
         attach_neilf(Ball(), tiny_config())
     first, second = (record.message for record in caplog.records)
     assert now.model.config.train.sdf_steps == 0
-    assert "Ball: material from step 0; the host moves with it from step 1500; a proxy of its surface" in first
+    assert (
+        "Ball: material from step 0; the host moves with it from step 1500; a proxy of its surface" in first
+    )
     assert "nothing is computed before step 4 (train.sdf_steps)" in second
     assert now.model.config.light.kind == "auto"  # the light of the preset, on any host
     assert now.proxy is not None
@@ -263,7 +280,9 @@ def test_facts_that_cannot_be_right_are_named(arguments, message):
 
 def test_a_stage_is_one_of_three():
     neilf = attach_neilf(Ball(), tiny_config())
-    with pytest.raises(UserError, match="'late' is no stage; give the number of the step, or one of sdf_init, material_init"):
+    with pytest.raises(
+        UserError, match="'late' is no stage; give the number of the step, or one of sdf_init, material_init"
+    ):
         neilf.losses(pixels(ball_rays(4)), "late")
     with pytest.raises(UserError, match="step -1; count steps from 0"):
         neilf.losses(pixels(ball_rays(4)), -1)
@@ -287,5 +306,7 @@ def test_a_host_of_another_precision_is_read_and_half_of_it_is_warned_of(dtype, 
 def test_rays_of_another_precision_are_named():
     rays = ball_rays(4)
     batch = pixels(RayBatch(rays.origins.double(), rays.directions.double()))
-    with pytest.raises(UserError, match=r"rays are torch.float64, material and light torch.float32; give rays.float\(\)"):
+    with pytest.raises(
+        UserError, match=r"rays are torch.float64, material and light torch.float32; give rays.float\(\)"
+    ):
         attach_neilf(Ball(), tiny_config()).losses(batch, "joint")

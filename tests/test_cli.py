@@ -64,14 +64,16 @@ def tree(folder: Path) -> dict[Path, bytes | None]:
     return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
 
 
-# --------------------------------------------------------------------------------------------------------- the good way
+# ----------------------------------------------------------------------------------------------- the good way
 
 
 def test_train_says_what_it_does_and_leaves_a_run(trained):
     for name in ("config.json", "capture.json", "scene.json", "environment.json", "timing.json"):
         assert json.loads((trained / name).read_text())
     stages = ("sdf_init", "material_init", "joint")
-    assert {path.name for path in (trained / "checkpoints").iterdir()} == {f"{s}.pt" for s in ("last", *stages)}
+    assert {path.name for path in (trained / "checkpoints").iterdir()} == {
+        f"{s}.pt" for s in ("last", *stages)
+    }
     assert {path.name for path in (trained / "previews").iterdir()} == {f"{s}.png" for s in stages}
     assert list(json.loads((trained / "timing.json").read_text())) == list(stages)
     assert list((trained / "tensorboard").iterdir())
@@ -84,7 +86,13 @@ def test_eval_writes_flat_finite_figures(trained, tmp_path, monkeypatch, capfd):
     said = capfd.readouterr()
     assert said.err == ""
     figures = json.loads((trained / "metrics.json").read_text())
-    material = {"base_color_psnr", "base_color_psnr_gamma", "base_color_psnr_scaled", "roughness_psnr", "metallic_psnr"}
+    material = {
+        "base_color_psnr",
+        "base_color_psnr_gamma",
+        "base_color_psnr_scaled",
+        "roughness_psnr",
+        "metallic_psnr",
+    }
     wanted = {"volume_psnr", "pbr_psnr", "normal_mae_deg"} | material | {f"{name}_frame" for name in material}
     assert wanted <= figures.keys()
     assert figures.pop("health") in ("sound", "doubtful", "failed")
@@ -93,7 +101,10 @@ def test_eval_writes_flat_finite_figures(trained, tmp_path, monkeypatch, capfd):
         assert math.isfinite(value), name
         assert f"{name} " in said.out
     out = tmp_path / "of_a_stage.json"
-    assert main(["eval", str(trained), "--device", "cpu", "--checkpoint", "material_init", "--out", str(out)]) == 0
+    assert (
+        main(["eval", str(trained), "--device", "cpu", "--checkpoint", "material_init", "--out", str(out)])
+        == 0
+    )
     assert wanted <= json.loads(out.read_text()).keys()
 
 
@@ -117,15 +128,39 @@ def test_render_writes_every_map(trained, tmp_path, capfd):
     assert capfd.readouterr().err == ""
     out = trained / "renders"
     assert (out / "000.exr").is_file()
-    for name in ("rgb", "rgb_volume", "base_color", "roughness", "metallic", "normal", "depth", "diffuse", "specular"):
+    for name in (
+        "rgb",
+        "rgb_volume",
+        "base_color",
+        "roughness",
+        "metallic",
+        "normal",
+        "depth",
+        "diffuse",
+        "specular",
+    ):
         assert read_image(out / name / "000.png").pixels.shape[:2] == (18, 24)
-    assert main(["render", str(trained), "--device", "cpu", "--views", "all", "--out", str(tmp_path / "all")]) == 0
+    assert (
+        main(["render", str(trained), "--device", "cpu", "--views", "all", "--out", str(tmp_path / "all")])
+        == 0
+    )
     assert len(list((tmp_path / "all").glob("*.exr"))) == 6
 
 
 def test_export_writes_the_surface_where_it_was_captured(trained, tmp_path, capfd):
     out = tmp_path / "sphere"
-    command = ["export", str(trained), "--device", "cpu", "--resolution", "32", "--probes", "2", "--out", str(out)]
+    command = [
+        "export",
+        str(trained),
+        "--device",
+        "cpu",
+        "--resolution",
+        "32",
+        "--probes",
+        "2",
+        "--out",
+        str(out),
+    ]
     assert main(command) == 0
     assert capfd.readouterr().err == ""
     assert {path.name for path in (out / "light").rglob("*.exr")} == {"0000.exr", "0001.exr"}
@@ -142,7 +177,7 @@ def test_a_run_without_a_name_is_named_after_its_capture(capture, tmp_path, monk
     assert (tmp_path / "runs" / "sphere-fast" / "config.json").is_file()
 
 
-# ----------------------------------------------------------------------------------------------------------------- help
+# ------------------------------------------------------------------------------------------------------- help
 
 
 @pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"]])
@@ -171,7 +206,9 @@ def test_the_examples_parse(monkeypatch):
     for name, command in COMMANDS.items():
         for example in command.examples:
             seen = []
-            monkeypatch.setitem(COMMANDS, name, command.__class__(command.options, seen.append, command.examples))
+            monkeypatch.setitem(
+                COMMANDS, name, command.__class__(command.options, seen.append, command.examples)
+            )
             assert main(example.split("  ")[0].split()[1:]) == 0
             assert isinstance(seen[0], command.options)
 
@@ -187,10 +224,15 @@ def test_help_of_train_fits_on_two_screens_and_all_of_it_is_one_option_away(caps
     assert "--config.train.rays" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["train", "--help"], ["train", "--data", "x", "--colour", "red"]])
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["train", "--help"], ["train", "--data", "x", "--colour", "red"]]
+)
 def test_help_and_mistyped_options_do_not_wait_for_torch(arguments):
     asks = f"import sys; from neilfpp_method.cli import main; main({arguments}); sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", asks], capture_output=True, timeout=60, check=False).returncode == 0
+    assert (
+        subprocess.run([sys.executable, "-c", asks], capture_output=True, timeout=60, check=False).returncode
+        == 0
+    )
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
@@ -204,7 +246,9 @@ def test_help_and_mistyped_options_do_not_wait_for_torch(arguments):
     ],
 )
 def test_bash_completes(completion, words, completed):
-    """As bash asks: its variables are set, the registered function is called, and `COMPREPLY` is the answer."""
+    """As bash asks: its variables are set, the registered function is called, and `COMPREPLY` is the
+    answer.
+    """
     before = ["neilfpp", *words.split()]
     ask = f"COMP_WORDS=({' '.join(before)}); COMP_CWORD={len(before) - 1}; COMP_LINE='neilfpp {words}'"
     call = "eval \"$(complete -p neilfpp | sed 's/.*-F \\([^ ]*\\).*/\\1/')\" neilfpp; echo ${COMPREPLY[@]}"
@@ -218,11 +262,13 @@ def test_version(capsys):
     assert capsys.readouterr().out.startswith("neilfpp 0.")
 
 
-# ------------------------------------------------------------------------------------------------------------ bad input
+# -------------------------------------------------------------------------------------------------- bad input
 
 
 def refused(capfd, arguments: list[object], *words: object, leaves: Path) -> None:
-    """The command ends with 2 and one line that has these words and a remedy, and changes nothing in a folder."""
+    """The command ends with 2 and one line that has these words and a remedy, and changes nothing in a
+    folder.
+    """
     before = tree(leaves)
     capfd.readouterr()
     assert main([str(argument) for argument in arguments]) == 2
@@ -242,8 +288,14 @@ def refused(capfd, arguments: list[object], *words: object, leaves: Path) -> Non
         (["paint"], ("unknown command 'paint'", "train", "eval")),
         (["tran", "--data", "x"], ("unknown command 'tran'", "did you mean neilfpp train?")),
         (["train", "--dta", "x"], ("--dta", "did you mean --data?", "neilfpp train --help")),
-        (["train", "--data", "x", "--config.shading.specular", "False"], ("did you mean --config.shading.no-specular?",)),
-        (["train", "--data", "x", "--config.shading.specular", "true"], ("did you mean --config.shading.specular?",)),
+        (
+            ["train", "--data", "x", "--config.shading.specular", "False"],
+            ("did you mean --config.shading.no-specular?",),
+        ),
+        (
+            ["train", "--data", "x", "--config.shading.specular", "true"],
+            ("did you mean --config.shading.specular?",),
+        ),
         (["train", "--preset", "slow"], ("unknown preset 'slow'", "fast", "paper-ngp")),
         (["train", "--preset=slow"], ("unknown preset 'slow'",)),
         (["train", "--preset"], ("--preset", "neilfpp train --help")),
@@ -322,11 +374,23 @@ def truncate(name: str) -> Callable[[Path], None]:
 BROKEN = {
     "missing folder": (shutil.rmtree, "no such folder"),
     "not a capture": (lambda root: (root / "inputs" / "sfm_scene.json").unlink(), "inputs/sfm_scene.json"),
-    "no images": (edit_scene(lambda cameras, files: (cameras.clear(), files.clear())), "sfm_scene.json: no images"),
-    "image without camera": (edit_scene(lambda cameras, _: cameras.pop("3")), "paths.3: an image without a camera"),
-    "camera without image": (edit_scene(lambda _, files: files.pop("3")), "images.3: a camera without an image"),
+    "no images": (
+        edit_scene(lambda cameras, files: (cameras.clear(), files.clear())),
+        "sfm_scene.json: no images",
+    ),
+    "image without camera": (
+        edit_scene(lambda cameras, _: cameras.pop("3")),
+        "paths.3: an image without a camera",
+    ),
+    "camera without image": (
+        edit_scene(lambda _, files: files.pop("3")),
+        "images.3: a camera without an image",
+    ),
     "image is not there": (lambda root: (root / "inputs" / "images" / "003.exr").unlink(), "003.exr"),
-    "another size": (edit_scene(lambda cameras, _: cameras["3"].update(size=[48, 36])), "003.exr: 24×18 pixels"),
+    "another size": (
+        edit_scene(lambda cameras, _: cameras["3"].update(size=[48, 36])),
+        "003.exr: 24×18 pixels",
+    ),
     "NaN": (paint(np.nan), "002.exr: 1 pixels are NaN"),
     "infinite": (paint(np.inf), "002.exr: 1 pixels are NaN, infinite"),
     "negative": (paint(-0.25), "002.exr: 1 pixels are NaN, infinite or negative"),
@@ -345,7 +409,17 @@ def test_a_capture_that_cannot_be_used(tmp_path, capfd, capture, case):
     root = tmp_path / "spoilt"
     shutil.copytree(capture, root)
     spoil(root)
-    command = ["train", "--data", root, "--out", tmp_path / "runs" / "new", "--preset", "tiny", "--device", "cpu"]
+    command = [
+        "train",
+        "--data",
+        root,
+        "--out",
+        tmp_path / "runs" / "new",
+        "--preset",
+        "tiny",
+        "--device",
+        "cpu",
+    ]
     refused(capfd, command, root, complaint, leaves=tmp_path)
 
 

@@ -34,7 +34,9 @@ CHEAP = {
 
 
 def quoted(text: str) -> Iterator[str]:
-    """The commands of a Markdown text: lines of fenced and indented blocks (`\\` continues one), and in backticks."""
+    """The commands of a Markdown text: lines of fenced and indented blocks (`\\` continues one), and in
+    backticks.
+    """
     inline = []
     fenced = False
     block: list[str] = []
@@ -68,7 +70,9 @@ def refusal(line: str) -> str:
         return _refused_by_the_cli(words[1:])
     if words[0] == "make":
         targets = [word for word in words[1:] if "=" not in word]
-        dry = subprocess.run(["make", "--dry-run", *targets], cwd=ROOT, capture_output=True, text=True, check=False)
+        dry = subprocess.run(
+            ["make", "--dry-run", *targets], cwd=ROOT, capture_output=True, text=True, check=False
+        )
         return dry.stderr
     return _refused_by_a_benchmark(words[2], words[3:])
 

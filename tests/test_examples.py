@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("0[124]_*.py"))  # the third needs nerfstudio
+EXAMPLES = sorted(
+    (Path(__file__).parent.parent / "examples").glob("0[124]_*.py")
+)  # the third needs nerfstudio
 
 
 @pytest.fixture(params=EXAMPLES, ids=lambda path: path.stem)

@@ -51,12 +51,16 @@ def test_smoothness_fades_where_the_image_changes():
 def test_lambertian_is_zero_for_a_rough_dielectric_only():
     one, zero = torch.ones(1, 1), torch.zeros(1, 1)
     assert losses.lambertian(Material(torch.ones(1, 3), one, zero)).values.item() == 0.0
-    assert losses.lambertian(Material(torch.ones(1, 3), 0.25 * one, 0.5 * one)).values.item() == pytest.approx(1.25)
+    assert losses.lambertian(
+        Material(torch.ones(1, 3), 0.25 * one, 0.5 * one)
+    ).values.item() == pytest.approx(1.25)
 
 
 def test_mask_counts_where_it_is_known():
     opacity, depth = torch.full((4,), 0.75), torch.full((4,), math.e - 1)
-    term = losses.mask(opacity, depth, torch.tensor([1.0, 0.0, 1.0, 0.5]), known=torch.tensor([1.0, 1.0, 0.0, 1.0]))
+    term = losses.mask(
+        opacity, depth, torch.tensor([1.0, 0.0, 1.0, 0.5]), known=torch.tensor([1.0, 1.0, 0.0, 1.0])
+    )
     assert term.values.tolist() == pytest.approx([0.25, 1.0, 0.0, 0.625])
 
 

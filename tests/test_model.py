@@ -123,7 +123,9 @@ def test_pbr_colour_of_a_white_furnace():
 
 
 class Room:
-    """A host: a closed room whose walls, 2 scene units from the origin, all send out their own normal as a colour."""
+    """A host: a closed room whose walls, 2 scene units from the origin, all send out their own normal as a
+    colour.
+    """
 
     def render(self, rays: RayBatch) -> SurfaceHits:
         along = (rays.origins * rays.directions).sum(-1)
@@ -170,7 +172,9 @@ def test_a_ray_starts_further_out_towards_grazing_and_for_a_thicker_surface():
 
 
 def test_no_ray_starts_further_out_than_the_published_bound():
-    """β = 0.03 asks for 0.14 of height: 0.73 at 79°. From 46° on the bound of 0.2 would start a ray within the layer."""
+    """β = 0.03 asks for 0.14 of height: 0.73 at 79°. From 46° on the bound of 0.2 would start a ray within
+    the layer.
+    """
     torch.manual_seed(0)
     host, settings = Recorder(0.03), dataclasses.replace(tiny_config().inter_reflection, rays_per_point=1.0)
     normal = torch.tensor([[0.0, 0.0, 1.0]]).expand(500, 3)
@@ -184,7 +188,9 @@ def test_no_ray_starts_further_out_than_the_published_bound():
 def test_a_light_without_colour_is_compared_by_luminance():
     """Red, green and blue of one luminance are all met by the grey light of that luminance."""
     config = tiny_config()
-    model = sphere_model(dataclasses.replace(config, light=dataclasses.replace(config.light, monochrome=True)))
+    model = sphere_model(
+        dataclasses.replace(config, light=dataclasses.replace(config.light, monochrome=True))
+    )
     grey, colors = torch.full((3, 3), 0.05), torch.diag(0.05 / torch.tensor([0.2126, 0.7152, 0.0722]))
     assert losses.inter_reflection(grey, colors, monochrome=True).mean() < 1e-6
     assert losses.inter_reflection(grey, colors).mean() > 0.05
@@ -226,7 +232,9 @@ def test_material_gradients_reach_the_geometry_by_their_scales():
         loss = dataclasses.replace(config.loss, position_gradient=position, normal_gradient=normal)
         model = sphere_model(dataclasses.replace(config, loss=loss))
         term = model.losses(batch, Stage.JOINT)["physical"]
-        gradients = torch.autograd.grad(term.mean(), list(model.host.sdf_field.parameters()), allow_unused=True)
+        gradients = torch.autograd.grad(
+            term.mean(), list(model.host.sdf_field.parameters()), allow_unused=True
+        )
         return any(g is not None and bool(g.abs().max() > 0.0) for g in gradients)
 
     assert not geometry_moves(0.0, 0.0)
@@ -285,7 +293,9 @@ def test_an_sdf_host_sees_itself_by_its_grid():
     assert isinstance(host, LightsItself)
     out = torch.tensor([[0.0, 0.0, 1.0]])
     on_sphere = host.render(RayBatch(3.0 * out, -out)).position.detach()
-    up = torch.nn.functional.normalize(torch.tensor([[[0.0, 0.0, 1.0], [0.5, 0.0, 1.0], [0.0, -1.0, 1.0]]]), dim=-1)
+    up = torch.nn.functional.normalize(
+        torch.tensor([[[0.0, 0.0, 1.0], [0.5, 0.0, 1.0], [0.0, -1.0, 1.0]]]), dim=-1
+    )
     assert not host.scene_light(on_sphere, up).hit.any()
     towards = host.scene_light(3.0 * out / 2, -up)
     assert towards.hit[0, 0]
@@ -328,7 +338,9 @@ def test_every_light_goes_with_every_kind_of_sampling(kind, sampler):
     metallic = torch.full((2, 1), config.brdf.initial_metallic)
     material = Material(torch.full((2, 3), config.brdf.initial_base_color), half, metallic)
     shading = model.shade(position, normal, normal, material, 512)
-    torch.testing.assert_close(shading.color, torch.full((2, 3), model.facts.median_radiance), rtol=0.1, atol=0.0)
+    torch.testing.assert_close(
+        shading.color, torch.full((2, 3), model.facts.median_radiance), rtol=0.1, atol=0.0
+    )
 
 
 def test_a_lamp_shines_where_nothing_stands_before_it():

@@ -15,7 +15,9 @@ ROOT = Path(__file__).parent.parent
 def test_dir_shows_the_public_names():
     """Before any of them is loaded, so in a process of its own; and each name is there."""
     asks = "import sys, neilfpp_method as n; print(*dir(n)); sys.exit('torch' in sys.modules)"
-    shown = subprocess.run([sys.executable, "-c", asks], capture_output=True, text=True, timeout=60, check=True)
+    shown = subprocess.run(
+        [sys.executable, "-c", asks], capture_output=True, text=True, timeout=60, check=True
+    )
     assert shown.stdout.split() == sorted(neilfpp_method.__all__)
     assert all(getattr(neilfpp_method, name) is not None for name in neilfpp_method.__all__)
 

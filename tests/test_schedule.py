@@ -52,8 +52,12 @@ def factors(config: OptimizerConfig, stage: Stage, steps: list[int], length: int
 def test_rates_fall_smoothly_or_in_drops():
     config = OptimizerConfig(joint=0.5, final=(0.01, 0.1, 0.01), drops=(0, 1, 2))
     assert factors(config, Stage.SDF_INIT, [0, 50, 100], 100) == pytest.approx([1.0, 0.1, 0.01])
-    assert factors(config, Stage.MATERIAL_INIT, [0, 49, 50, 99, 100], 100) == pytest.approx([1.0, 1.0, 0.1, 0.1, 0.1])
-    assert factors(config, Stage.JOINT, [0, 29, 30, 59, 60, 90], 90) == pytest.approx([0.5, 0.5, 0.05, 0.05, 0.005, 0.005])
+    assert factors(config, Stage.MATERIAL_INIT, [0, 49, 50, 99, 100], 100) == pytest.approx(
+        [1.0, 1.0, 0.1, 0.1, 0.1]
+    )
+    assert factors(config, Stage.JOINT, [0, 29, 30, 59, 60, 90], 90) == pytest.approx(
+        [0.5, 0.5, 0.05, 0.05, 0.005, 0.005]
+    )
 
 
 def test_rates_rise_from_a_tenth():
@@ -65,7 +69,9 @@ def test_rates_rise_from_a_tenth():
 
 def test_an_effect_that_is_off_has_no_loss():
     config = preset("fast")
-    off = dataclasses.replace(config, inter_reflection=dataclasses.replace(config.inter_reflection, mode="off"))
+    off = dataclasses.replace(
+        config, inter_reflection=dataclasses.replace(config.inter_reflection, mode="off")
+    )
     assert "inter_reflection" not in active_losses(Stage.JOINT, off)
     matte = dataclasses.replace(config, shading=dataclasses.replace(config.shading, specular=False))
     assert not {"smoothness", "lambertian"} & set(active_losses(Stage.JOINT, matte))
@@ -117,5 +123,7 @@ def test_settings_of_another_version_are_refused_by_name():
 
 
 def test_an_unknown_preset_is_named():
-    with pytest.raises(UserError, match=r"unknown preset 'turbo'; choose one of fast, paper-mlp, paper-ngp, paper-ngp-hdr"):
+    with pytest.raises(
+        UserError, match=r"unknown preset 'turbo'; choose one of fast, paper-mlp, paper-ngp, paper-ngp-hdr"
+    ):
         preset("turbo")

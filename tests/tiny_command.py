@@ -1,7 +1,8 @@
-"""The command line with one more preset, `tiny`, for runs in other processes: `python -m tests.tiny_command train …`.
+"""The command line with one more preset, `tiny`, for runs in other processes: `python -m tests.tiny_command
+train …`.
 
-With TINY_RECORD=FOLDER every process also writes what it computed: `gradients_RANK.pt` of the first step, as the
-optimiser sees them, and `parameters_RANK.pt` at the end.
+With TINY_RECORD=FOLDER every process also writes what it computed: `gradients_RANK.pt` of the first step, as
+the optimiser sees them, and `parameters_RANK.pt` at the end.
 """
 
 from __future__ import annotations

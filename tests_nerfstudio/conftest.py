@@ -7,9 +7,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-pytest.importorskip("nerfstudio", reason="nerfstudio is not installed here: `make test-nerfstudio` has its own environment")
+pytest.importorskip(
+    "nerfstudio", reason="nerfstudio is not installed here: `make test-nerfstudio` has its own environment"
+)
 
-# torchvision's wheels are CUDA builds: beside a CPU torch two of its operators have no schema, and its import fails.
+# torchvision's wheels are CUDA builds: beside a CPU torch two of its operators have no schema, and its import
+# fails.
 OPERATORS = torch.library.Library("torchvision", "DEF")
 OPERATORS.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 OPERATORS.define("qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")

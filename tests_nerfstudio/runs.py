@@ -46,7 +46,9 @@ def reduced_tabletop(root: Path) -> Path:
 
 
 def small_settings(**steps: int) -> NeilfConfig:
-    """The tiny settings with the light of the preset, solved for every third step; four steps a stage but for `steps`."""
+    """The tiny settings with the light of the preset, solved for every third step; four steps a stage but for
+    `steps`.
+    """
     config, usual = small_config(**steps), preset("fast")
     fit = LightFitConfig(points=48, every=3, steps=5)
     return dataclasses.replace(
@@ -86,7 +88,11 @@ def checkpoint(run: Path) -> dict:
 def weights(run: Path) -> dict[str, Any]:
     """The state of a run by its names in `NeilfModel`."""
     prefix = "_model.neilf."
-    return {key.removeprefix(prefix): t for key, t in checkpoint(run)["pipeline"].items() if key.startswith(prefix)}
+    return {
+        key.removeprefix(prefix): t
+        for key, t in checkpoint(run)["pipeline"].items()
+        if key.startswith(prefix)
+    }
 
 
 def with_steps(settings: NeilfConfig, **steps: int) -> NeilfConfig:

@@ -23,7 +23,10 @@ def test_the_methods_and_the_dataparser_are_found() -> None:
 
 
 def test_every_entry_point_of_the_package_leads_somewhere() -> None:
-    for group, known in (("nerfstudio.method_configs", all_methods), ("nerfstudio.dataparser_configs", all_dataparsers)):
+    for group, known in (
+        ("nerfstudio.method_configs", all_methods),
+        ("nerfstudio.dataparser_configs", all_dataparsers),
+    ):
         for entry in entry_points(group=group):
             if entry.value.startswith("neilfpp_method"):
                 assert entry.name in known
@@ -52,10 +55,13 @@ def test_a_broken_dependency_raises_nowhere(dependency: str) -> None:
     code = (
         f"import sys, tests_nerfstudio.conftest; sys.modules['{dependency}'] = None\n"
         "from importlib.metadata import entry_points\n"
-        "found = [e for g in ('method', 'dataparser') for e in entry_points(group=f'nerfstudio.{g}_configs')]\n"
+        "found = [e for g in ('method', 'dataparser') for e in "
+        "entry_points(group=f'nerfstudio.{g}_configs')]\n"
         "print([e.load() for e in found if e.value.startswith('neilfpp_method')][:1])"
     )
-    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip().endswith("[None]")
     assert dependency in done.stderr

@@ -1,4 +1,6 @@
-"""What nerfstudio is given of a capture: the same rays and the same pixels that the standalone loop learns from."""
+"""What nerfstudio is given of a capture: the same rays and the same pixels that the standalone loop learns
+from.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +69,9 @@ def test_the_transform_leads_from_the_world_to_the_scene(root: Path) -> None:
 
 
 def test_each_drawn_pixel_brings_its_color_and_its_facts(root: Path) -> None:
-    manager = CaptureDataManagerConfig(dataparser=CaptureParserConfig(data=root), train_num_rays_per_batch=400).setup()
+    manager = CaptureDataManagerConfig(
+        dataparser=CaptureParserConfig(data=root), train_num_rays_per_batch=400
+    ).setup()
     rays, batch = manager.next_train(0)
     drawn = pixel_batch(rays.origins, rays.directions, batch)
     whole = PixelDataset(load_capture(root), load_capture(root).train_views)
@@ -83,7 +87,9 @@ def test_each_drawn_pixel_brings_its_color_and_its_facts(root: Path) -> None:
 
 
 def test_a_step_learns_from_the_pixels_of_the_same_step_of_the_standalone_loop(root: Path) -> None:
-    manager = CaptureDataManagerConfig(dataparser=CaptureParserConfig(data=root), train_num_rays_per_batch=64).setup()
+    manager = CaptureDataManagerConfig(
+        dataparser=CaptureParserConfig(data=root), train_num_rays_per_batch=64
+    ).setup()
     whole = PixelDataset(load_capture(root), load_capture(root).train_views)
     for step in (0, 1):
         seed_step(7, step)
@@ -104,7 +110,9 @@ def test_pixels_that_are_marked_as_invalid_are_not_drawn(tmp_path: Path) -> None
     write_png(tmp_path / "valid.png", valid)
     views = tuple(dataclasses.replace(view, valid=tmp_path / "valid.png") for view in capture.views)
     write_capture(tmp_path, dataclasses.replace(capture, views=views), response="linear", test=capture.test)
-    manager = CaptureDataManagerConfig(dataparser=CaptureParserConfig(data=tmp_path), train_num_rays_per_batch=400).setup()
+    manager = CaptureDataManagerConfig(
+        dataparser=CaptureParserConfig(data=tmp_path), train_num_rays_per_batch=400
+    ).setup()
     whole = PixelDataset(load_capture(tmp_path), load_capture(tmp_path).train_views)
     for step in (0, 1):
         seed_step(7, step)
@@ -125,7 +133,9 @@ def test_object_mask_and_validity_are_not_taken_for_one_another(tmp_path: Path) 
     views = [dataclasses.replace(view, **paths) for view in capture.views]
     views[-1] = dataclasses.replace(views[-1], mask=None)
     write_capture(tmp_path, dataclasses.replace(capture, views=tuple(views)), response="linear", test=())
-    dataset = CaptureDataset(CaptureParserConfig(data=tmp_path, test_every=0).setup().get_dataparser_outputs("train"))
+    dataset = CaptureDataset(
+        CaptureParserConfig(data=tmp_path, test_every=0).setup().get_dataparser_outputs("train")
+    )
     for i in (0, len(views) - 1):
         item, has_mask = dataset[i], i == 0
         assert np.array_equal(item["object_mask"][..., 0].numpy() > 0.5, facts["mask"] | (not has_mask))
@@ -155,7 +165,9 @@ LENSES = {
 def test_lenses_bend_rays_alike(tmp_path: Path, model: str) -> None:
     plain = load_capture(make_capture(tmp_path))
     lens = Lens(model, LENSES[model])
-    views = tuple(dataclasses.replace(v, camera=dataclasses.replace(v.camera, lens=lens)) for v in plain.views)
+    views = tuple(
+        dataclasses.replace(v, camera=dataclasses.replace(v.camera, lens=lens)) for v in plain.views
+    )
     write_capture(tmp_path, dataclasses.replace(plain, views=views), response="linear")
     capture, outputs = load_capture(tmp_path), parsed(tmp_path)
     pixels = PixelDataset(capture, capture.train_views)
@@ -167,11 +179,15 @@ def test_lenses_bend_rays_alike(tmp_path: Path, model: str) -> None:
         torch.testing.assert_close(back.view(i).directions, ours.directions, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize(("model", "words"), [("FOV", "no lens FOV"), ("THIN_PRISM_FISHEYE", "no lens THIN_PRISM")])
+@pytest.mark.parametrize(
+    ("model", "words"), [("FOV", "no lens FOV"), ("THIN_PRISM_FISHEYE", "no lens THIN_PRISM")]
+)
 def test_lenses_that_nerfstudio_has_not_are_refused(tmp_path: Path, model: str, words: str) -> None:
     plain = load_capture(make_capture(tmp_path))
     lens = Lens(model, (0.5,) if model == "FOV" else (0.01,) * 8)
-    views = tuple(dataclasses.replace(v, camera=dataclasses.replace(v.camera, lens=lens)) for v in plain.views)
+    views = tuple(
+        dataclasses.replace(v, camera=dataclasses.replace(v.camera, lens=lens)) for v in plain.views
+    )
     write_capture(tmp_path, dataclasses.replace(plain, views=views), response="linear")
     with pytest.raises(UserError, match=words):
         parsed(tmp_path)
@@ -192,7 +208,9 @@ def test_other_layouts_are_read_and_a_format_can_be_forced(tmp_path: Path) -> No
     capture = load_capture(make_capture(tmp_path / "in", masks=True))
     root = write_transforms(capture, tmp_path / "out")
     outputs = CaptureParserConfig(data=root, format="transforms").setup().get_dataparser_outputs("train")
-    torch.testing.assert_close(outputs.cameras.camera_to_worlds, parsed(tmp_path / "in").cameras.camera_to_worlds)
+    torch.testing.assert_close(
+        outputs.cameras.camera_to_worlds, parsed(tmp_path / "in").cameras.camera_to_worlds
+    )
     with pytest.raises(UserError, match="not a capture of the format colmap"):
         CaptureParserConfig(data=root, format="colmap").setup().get_dataparser_outputs("train")
 
@@ -208,9 +226,13 @@ def test_what_nerfstudio_makes_of_a_colmap_model_is_read(tmp_path: Path, model: 
     turned = points @ torch.from_numpy(applied[:, :3]).T + torch.from_numpy(applied[:, 3])
     assert [view.name for view in theirs.views] == [view.name for view in first.views]
     for new, old in zip(theirs.views, first.views, strict=True):
-        torch.testing.assert_close(project(new.camera, turned).pixel, project(old.camera, points).pixel, atol=1e-4, rtol=0)
+        torch.testing.assert_close(
+            project(new.camera, turned).pixel, project(old.camera, points).pixel, atol=1e-4, rtol=0
+        )
     assert theirs.scene_from == "points"  # those of their sparse_pc.ply, in the turned frame
-    np.testing.assert_allclose(theirs.normalisation.centre, applied[:, :3] @ first.normalisation.centre, atol=0.1)
+    np.testing.assert_allclose(
+        theirs.normalisation.centre, applied[:, :3] @ first.normalisation.centre, atol=0.1
+    )
 
 
 def test_nerfstudio_reads_what_is_written_for_it(tmp_path: Path) -> None:
@@ -238,5 +260,9 @@ def test_views_are_not_rescaled_in_silence(root: Path) -> None:
 
 
 def test_without_test_views_nerfstudio_still_has_one_to_show(tmp_path: Path) -> None:
-    outputs = CaptureParserConfig(data=make_capture(tmp_path, test=None), test_every=0).setup().get_dataparser_outputs("val")
+    outputs = (
+        CaptureParserConfig(data=make_capture(tmp_path, test=None), test_every=0)
+        .setup()
+        .get_dataparser_outputs("val")
+    )
     assert [path.stem for path in outputs.image_filenames] == ["000"]

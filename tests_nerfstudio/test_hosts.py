@@ -82,7 +82,9 @@ def test_hits_are_in_the_scene_frame(kind: type[Model]) -> None:
     hit = slice(0, 3)
     torch.testing.assert_close(hits.position[hit].norm(dim=-1), torch.full((3,), RADIUS / 3.0))
     torch.testing.assert_close(hits.normal[hit], normalize(hits.position[hit], dim=-1), atol=1e-5, rtol=0)
-    along = (hits.position[hit] - rays().origins[hit]) / (hits.position[hit] - rays().origins[hit]).norm(dim=-1)[:, None]
+    along = (hits.position[hit] - rays().origins[hit]) / (hits.position[hit] - rays().origins[hit]).norm(
+        dim=-1
+    )[:, None]
     torch.testing.assert_close(along, rays().directions[hit], atol=1e-5, rtol=0)
     assert hits.opacity.tolist() == [1.0, 1.0, 1.0, 0.0]
     assert not hits.normal[3].any()
@@ -105,7 +107,12 @@ def test_a_gradient_reaches_the_model_but_not_what_it_never_trains() -> None:
 
 @pytest.mark.parametrize(
     ("outputs", "remedy"),
-    [("rgb", "renders a colour"), ("accumulation", "sum of its weights"), ("depth", "depth"), ("normal", "predict_normals")],
+    [
+        ("rgb", "renders a colour"),
+        ("accumulation", "sum of its weights"),
+        ("depth", "depth"),
+        ("normal", "predict_normals"),
+    ],
 )
 def test_a_missing_output_is_named_with_its_remedy(outputs: str, remedy: str) -> None:
     class Without(Ball):
@@ -116,7 +123,7 @@ def test_a_missing_output_is_named_with_its_remedy(outputs: str, remedy: str) ->
         NerfstudioHost(ball(Without)).render(rays())
 
 
-# ----------------------------------------------------------------------------------------------- hosts that people have
+# ------------------------------------------------------------------------------------- hosts that people have
 
 ARGUMENTS = {
     "scene_box": SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])),
@@ -131,8 +138,11 @@ ARGUMENTS = {
 def test_neus_starts_as_a_sphere_and_the_host_sees_it() -> None:
     torch.manual_seed(0)
     host = NerfstudioHost(build_foreign("neus", ARGUMENTS).model).eval()
-    hits = host.render(RayBatch(torch.tensor([[0.0, 0.0, 3.0], [0.0, 3.0, 0.0]]), torch.tensor([[0, 0, -1.0], [0, -1.0, 0]])))
-    # NeuS is a blurred sphere at first: the hit lies before its centre, and the normal looks back along the ray.
+    hits = host.render(
+        RayBatch(torch.tensor([[0.0, 0.0, 3.0], [0.0, 3.0, 0.0]]), torch.tensor([[0, 0, -1.0], [0, -1.0, 0]]))
+    )
+    # NeuS is a blurred sphere at first: the hit lies before its centre, and the normal looks back along the
+    # ray.
     assert (hits.position.norm(dim=-1) < 1.0).all()
     assert ((hits.normal * torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])).sum(-1) > 0.9).all()
     torch.testing.assert_close(hits.normal.norm(dim=-1), torch.ones(2))

@@ -70,7 +70,7 @@ def train_for(data: Path, out: Path, iterations: int, settings: NeilfConfig = SE
     return ns_train(config)
 
 
-# ------------------------------------------------------------------------------------------------------------- training
+# --------------------------------------------------------------------------------------------------- training
 
 
 @pytest.mark.parametrize("settings", [SETTINGS, FREE], ids=["solved light", "free light"])
@@ -79,7 +79,9 @@ def test_each_stage_moves_its_fields_and_no_others(data: Path, tmp_path: Path, s
     # The first is one step into SDF init; the others are the ends of the stages.
     for stage, before, after in zip(Stage, ends, ends[1:], strict=False):
         for field, prefix in FIELDS.items():
-            changed = any(bool(differences(before[key], after[key])) for key in before if key.startswith(prefix))
+            changed = any(
+                bool(differences(before[key], after[key])) for key in before if key.startswith(prefix)
+            )
             there = any(key.startswith(prefix) for key in before)
             assert changed == (there and field in STAGES[stage].moves), (stage, field)
 
@@ -103,7 +105,10 @@ def test_a_run_that_is_resumed_ends_as_one_that_was_not(data: Path, tmp_path: Pa
 
 
 def test_a_map_that_is_known_is_shown_once_and_then_part_of_the_run(data: Path, tmp_path: Path) -> None:
-    file, radiance = tmp_path / "map.exr", np.random.default_rng(0).uniform(0.5, 2.0, (6, 12, 3)).astype(np.float32)
+    file, radiance = (
+        tmp_path / "map.exr",
+        np.random.default_rng(0).uniform(0.5, 2.0, (6, 12, 3)).astype(np.float32),
+    )
     write_exr(file, {"RGB": radiance})
     settings = dataclasses.replace(SETTINGS, light=dataclasses.replace(SETTINGS.light, map=str(file)))
     first = train_for(data, tmp_path / "first", 6, settings)
@@ -126,7 +131,9 @@ def test_the_same_scene_seed_and_steps_give_the_same_weights_in_both_loops(
     assert differences(weights(inside), dict(standalone.model.state_dict())) == []
 
 
-def test_the_same_scene_seed_and_steps_give_the_same_quality_in_both_loops(data: Path, tmp_path: Path) -> None:
+def test_the_same_scene_seed_and_steps_give_the_same_quality_in_both_loops(
+    data: Path, tmp_path: Path
+) -> None:
     settings = with_steps(SETTINGS, sdf_steps=60, material_steps=20, joint_steps=5)
     ns = evaluated(ns_train(trainer_config(data, tmp_path / "inside", settings)), tmp_path)
     standalone = small_training(data, tmp_path / "standalone", settings)
@@ -146,7 +153,9 @@ def test_on_a_given_mesh_material_and_light_alone_are_trained(
     tiny = fixed_geometry(settings)
     settings = dataclasses.replace(tiny, radiance=dataclasses.replace(tiny.radiance, layers=1, width=16))
     settings = with_steps(settings, sdf_steps=0, material_steps=2, joint_steps=0)
-    run = ns_train(trainer_config(make_capture(tmp_path / "capture"), tmp_path / "run", settings, method="neilfpp-mesh"))
+    run = ns_train(
+        trainer_config(make_capture(tmp_path / "capture"), tmp_path / "run", settings, method="neilfpp-mesh")
+    )
     moved = {key.split(".")[0] for key in weights(run)}
     assert {"brdf", "light", "host"} <= moved
     assert set(checkpoint(run)["optimizers"]) == {"radiance", *descends}
@@ -158,14 +167,18 @@ def test_several_devices_are_refused(data: Path, tmp_path: Path) -> None:
     config.pipeline.datamanager.data = data
     model = config.pipeline.setup(device="cpu").model
     with pytest.raises(UserError, match="one device"):
-        model.get_training_callbacks(TrainingCallbackAttributes(None, None, None, SimpleNamespace(world_size=2)))
+        model.get_training_callbacks(
+            TrainingCallbackAttributes(None, None, None, SimpleNamespace(world_size=2))
+        )
 
 
-# ---------------------------------------------------------------------------------------------------- the commands after
+# ----------------------------------------------------------------------------------------- the commands after
 
 
 def evaluated(run: Path, out: Path) -> dict[str, float]:
-    ComputePSNR(load_config=run / "config.yml", output_path=out / "eval.json", render_output_path=out / "eval").main()
+    ComputePSNR(
+        load_config=run / "config.yml", output_path=out / "eval.json", render_output_path=out / "eval"
+    ).main()
     return json.loads((out / "eval.json").read_text())["results"]
 
 
@@ -214,7 +227,11 @@ def test_figures_count_the_pixels_of_the_object_that_are_valid(run: Path) -> Non
     objects[:8], valid[:, :8], opacity[4:] = True, True, True
 
     def psnr(known: bool, wrong: torch.Tensor) -> float:
-        facts = {"object_mask": objects.float(), "mask_known": torch.full((12, 12, 1), float(known)), "valid": valid}
+        facts = {
+            "object_mask": objects.float(),
+            "mask_known": torch.full((12, 12, 1), float(known)),
+            "valid": valid,
+        }
         shown = torch.where(wrong, 0.25, image)
         outputs = {name: shown for name in ("rgb", "rgb_volume", "normal", "base_color", "incident_light")}
         outputs |= {name: opacity.float() for name in ("accumulation", "depth", "roughness", "metallic")}
@@ -231,7 +248,9 @@ def test_figures_count_the_pixels_of_the_object_that_are_valid(run: Path) -> Non
 def test_light_on_a_wall_is_its_irradiance_over_pi(run: Path, monkeypatch) -> None:
     _, pipeline, _, _ = eval_setup(run / "config.yml")
     model = pipeline.model
-    monkeypatch.setattr(model.neilf, "incident_light", lambda x, wi: wi[..., 2:].clamp_min(0.0).expand(-1, -1, 3))
+    monkeypatch.setattr(
+        model.neilf, "incident_light", lambda x, wi: wi[..., 2:].clamp_min(0.0).expand(-1, -1, 3)
+    )
     up = torch.tensor([[0.0, 0.0, 1.0]])
     one, three = torch.ones(1, 1), torch.ones(1, 3)
     maps = Maps(three, three, three, three, three, one, one, up, one, one)

@@ -32,8 +32,17 @@ def free_port() -> int:
 def ns_viewer(config: Path, port: int) -> Iterator[None]:
     """The command in a process of its own: it never ends by itself."""
     code = "import tests_nerfstudio.conftest; from nerfstudio.scripts.viewer.run_viewer import entrypoint; entrypoint()"
-    options = ["--load-config", str(config), "--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", str(port)]
-    process = subprocess.Popen([sys.executable, "-W", "ignore", "-c", code, *options], stdout=subprocess.DEVNULL)
+    options = [
+        "--load-config",
+        str(config),
+        "--viewer.websocket-host",
+        "127.0.0.1",
+        "--viewer.websocket-port",
+        str(port),
+    ]
+    process = subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-c", code, *options], stdout=subprocess.DEVNULL
+    )
     try:
         yield
     finally:
@@ -42,7 +51,9 @@ def ns_viewer(config: Path, port: int) -> Iterator[None]:
 
 
 def test_a_frame_arrives(tmp_path: Path) -> None:
-    run = ns_train(trainer_config(make_capture(tmp_path / "capture", background=0.2), tmp_path / "run", small_settings()))
+    run = ns_train(
+        trainer_config(make_capture(tmp_path / "capture", background=0.2), tmp_path / "run", small_settings())
+    )
     port = free_port()
     with ns_viewer(run / "config.yml", port):
         frame = first_frame(port)
@@ -54,8 +65,8 @@ def test_a_frame_arrives(tmp_path: Path) -> None:
 def first_frame(port: int, patience: float = 120.0) -> bytes:
     """The first picture that the server sends to somebody who moves about.
 
-    Nerfstudio hears of a client by its first camera, and only then listens to its cameras: one that stood still might have
-    been seen too early.
+    Nerfstudio hears of a client by its first camera, and only then listens to its cameras: one that stood
+    still might have been seen too early.
     """
     end = time.monotonic() + patience
     while True:
@@ -76,7 +87,9 @@ def first_frame(port: int, patience: float = 120.0) -> bytes:
 
 def camera(z: float) -> bytes:
     """What a client says of its camera."""
-    message = ViewerCameraMessage((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, z), 0.8, 1.0, (0.0, 0.0, 0.0), (0.0, -1.0, 0.0))
+    message = ViewerCameraMessage(
+        (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, z), 0.8, 1.0, (0.0, 0.0, 0.0), (0.0, -1.0, 0.0)
+    )
     return msgspec.msgpack.encode(message.as_serializable_dict())
 
 

@@ -28,9 +28,10 @@ class Command:
         options: a dataclass; its docstring is the command's summary, those of its fields are the help.
         run: does it.
         examples: command lines for the help.
-        default: the options that a command line starts from, where some of its words decide what others default to;
-            none: the defaults of the dataclass.
-        usual: the dataclass that `--help` shows, where `options` has too many to read; `--help-all` then shows all.
+        default: the options that a command line starts from, where some of its words decide what others
+            default to; none: the defaults of the dataclass.
+        usual: the dataclass that `--help` shows, where `options` has too many to read; `--help-all` then
+            shows all.
     """
 
     options: type
@@ -51,7 +52,9 @@ def terminal() -> Console:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
-    """A bar that takes the share of the work that is done; at the first share it says how long all of it will take."""
+    """A bar that takes the share of the work that is done; at the first share it says how long all of it will
+    take.
+    """
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     share = TextColumn("{task.percentage:3.0f} %")

@@ -29,7 +29,9 @@ def run(options: Demo) -> None:
     from neilfpp_method.kernels.process import computing_fast
 
     with computing_fast():
-        run_demo(options.out, short=options.short, resume=options.resume, device=options.device, console=terminal())
+        run_demo(
+            options.out, short=options.short, resume=options.resume, device=options.device, console=terminal()
+        )
 
 
 COMMAND = Command(Demo, run, ["neilfpp demo", "neilfpp demo --short --out trial"])

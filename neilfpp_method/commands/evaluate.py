@@ -27,8 +27,9 @@ class Eval:
     out: Path | None = None
     """Where the figures go; none: RUN/metrics.json, or RUN/eval/NAME.json of a published protocol."""
     scale: float | None = None
-    """Size of the views over that of their files; 1: every pixel. None: 131 thousand pixels a view, about 420×310, and no
-    more than the run was trained at."""
+    """Size of the views over that of their files; 1: every pixel. None: 131 thousand pixels a view, about
+    420×310, and no more than the run was trained at.
+    """
     width: int | None = None
     """Width of the views in pixels, in place of --scale."""
     device: Device = "auto"
@@ -53,7 +54,9 @@ def _published(options: Eval) -> None:
 
     protocol = PROTOCOLS[options.protocol]
     scale = 1.0 if options.scale is None and options.width is None else options.scale
-    run = at_size(load_run(options.run, pick_device(options.device), options.checkpoint), scale, options.width)
+    run = at_size(
+        load_run(options.run, pick_device(options.device), options.checkpoint), scale, options.width
+    )
     out = options.out or options.run / "eval" / f"{protocol.name}.json"
     check_writable(out)
     protocol.check(run)
@@ -63,7 +66,9 @@ def _published(options: Eval) -> None:
     with computing_fast(), progress_bar("evaluating") as advance:
         figures = protocol.measure(run, render_test_views(run, advance))
     write_figures(out, protocol, run, figures)
-    console.print(f"protocol {protocol.name}, as {protocol.source}; left out: {protocol.left_out}", soft_wrap=True)
+    console.print(
+        f"protocol {protocol.name}, as {protocol.source}; left out: {protocol.left_out}", soft_wrap=True
+    )
     for name, value in figures.items():
         console.print(f"{name:36} {value:8.3f}")
     console.print(f"written to {out}", soft_wrap=True)
@@ -76,7 +81,9 @@ def _own(options: Eval) -> None:
     from neilfpp_method.train.device import pick_device
     from neilfpp_method.train.run import check_writable, load_run
 
-    run = at_size(load_run(options.run, pick_device(options.device), options.checkpoint), options.scale, options.width)
+    run = at_size(
+        load_run(options.run, pick_device(options.device), options.checkpoint), options.scale, options.width
+    )
     out = options.out or options.run / "metrics.json"
     check_writable(out)
     console = terminal()

@@ -28,7 +28,9 @@ def mistake(complaint: str, arguments: Sequence[str]) -> tuple[str, str | None]:
         complaint: the box as tyro prints it; its paragraphs are separated by rules.
         arguments: the words of the command line.
     """
-    lines = [line.strip("│ ") for line in complaint.splitlines() if line.startswith("│")] or complaint.splitlines()
+    lines = [
+        line.strip("│ ") for line in complaint.splitlines() if line.startswith("│")
+    ] or complaint.splitlines()
     paragraphs: list[list[str]] = [[]]
     for line in lines:
         if line.strip("─ "):
@@ -50,7 +52,9 @@ def _suggested(what: str, paragraphs: Sequence[Sequence[str]]) -> str | None:
 
 
 def _flag_with_a_value(what: str, arguments: Sequence[str]) -> str | None:
-    """How to write `--a.flag False`, of which tyro says that it does not know the word False: `--a.no-flag`."""
+    """How to write `--a.flag False`, of which tyro says that it does not know the word False:
+    `--a.no-flag`.
+    """
     if not what.startswith(TYRO_UNKNOWN):
         return None
     unknown = what.removeprefix(TYRO_UNKNOWN).replace(",", " ").split()

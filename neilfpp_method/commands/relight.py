@@ -35,7 +35,9 @@ class Relight:
     """Views of the capture, or a circle about the scene, which also becomes turntable.mp4."""
     frames: int = 96
     """Pictures of a turntable."""
-    edits: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="NAME=VALUE")] = ()
+    edits: Annotated[
+        tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="NAME=VALUE")
+    ] = ()
     """Change the material: roughness=0.2, metallic=1 or base_color=0.8,0.1,0.1 (linear); can be given several
     times."""
     box: tuple[float, float, float, float, float, float] | None = None

@@ -33,15 +33,23 @@ class Train:
     out: Path | None = None
     """The run's folder; none: runs/CAPTURE-PRESET."""
     preset: str | None = None
-    """fast (minutes on a laptop's CPU), paper-mlp, paper-ngp or paper-ngp-hdr (the published settings); none: fast."""
+    """fast (minutes on a laptop's CPU), paper-mlp, paper-ngp or paper-ngp-hdr (the published settings); none:
+    fast.
+    """
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
-    """Settings from a .yaml or .json file, all or some; a run folder's config.json is one. Options here win over it."""
+    """Settings from a .yaml or .json file, all or some; a run folder's config.json is one. Options here win
+    over it.
+    """
     host: Literal["volsdf", "mesh"] = "volsdf"
-    """Where geometry comes from: volsdf recovers it; mesh takes it as given and recovers material and light."""
+    """Where geometry comes from: volsdf recovers it; mesh takes it as given and recovers material and
+    light.
+    """
     mesh: Path | None = None
     """The mesh of --host mesh, in the capture's world frame; none: the capture's inputs/model/mesh.ply."""
     light: Path | None = None
-    """An environment map that is known (linear EXR, see docs/light.md), in the radiance of the images; none: recovered."""
+    """An environment map that is known (linear EXR, see docs/light.md), in the radiance of the images; none:
+    recovered.
+    """
     resume: bool = False
     """Continue the run in --out from its last checkpoint, exactly as if it had never stopped."""
     format: str | None = None
@@ -51,7 +59,9 @@ class Train:
     response: Literal["auto", "linear", "srgb"] = "auto"
     """What the pixels are: linear radiance (HDR) or sRGB (LDR); auto: told from the files."""
     scale: float | None = None
-    """Size of the images over that of their files, 1: as they are; none: as large as the training's rays can use."""
+    """Size of the images over that of their files, 1: as they are; none: as large as the training's rays can
+    use.
+    """
     effects: str | None = None
     """auto, all, none, as-set, or as auto,-lamps."""
     strict: bool = False
@@ -81,8 +91,10 @@ def run(options: TrainWithSettings) -> None:
     named = options.preset is not None or options.config_file is not None
     as_before = options.resume and not named and config == preset(DEFAULT_PRESET)
     published = config.preset.startswith("paper-")
-    asked = None if options.resume and options.effects is None else read_asked(
-        options.effects or ("as-set" if published else "auto")
+    asked = (
+        None
+        if options.resume and options.effects is None
+        else read_asked(options.effects or ("as-set" if published else "auto"))
     )
     with computing_fast():
         run_training(
@@ -108,7 +120,9 @@ def _with_files(options: TrainWithSettings) -> NeilfConfig:
     config = options.config
     if options.mesh is not None:
         if not isinstance(config.host, MeshConfig):
-            raise UserError(f"--mesh {options.mesh}: the host {config.host.kind} takes no mesh", "add --host mesh")
+            raise UserError(
+                f"--mesh {options.mesh}: the host {config.host.kind} takes no mesh", "add --host mesh"
+            )
         config = changed(config, {"host.path": str(options.mesh.resolve())})
     if options.light is not None:
         if not isinstance(config.light, MapLightConfig):
@@ -121,8 +135,9 @@ def _with_files(options: TrainWithSettings) -> NeilfConfig:
 
 
 def _starting_point(arguments: Sequence[str]) -> TrainWithSettings:
-    """What decides which other settings there are, and what they default to, is read first: the file, the preset, the host,
-    and the kinds of light and of encoding."""
+    """What decides which other settings there are, and what they default to, is read first: the file, the
+    preset, the host, and the kinds of light and of encoding.
+    """
     file = _option(arguments, "--config")
     stored = dict(read_settings(Path(file))) if file is not None else {}
     where = file or "config"
@@ -130,7 +145,9 @@ def _starting_point(arguments: Sequence[str]) -> TrainWithSettings:
     config = _base(_option(arguments, "--preset"), host, stored, where)
     config = changed(config, stored, where)
     if host is not None and host != config.host.kind:
-        raise UserError(f"{where}: its host is {config.host.kind}, and --host {host} is given", "leave one of them out")
+        raise UserError(
+            f"{where}: its host is {config.host.kind}, and --host {host} is given", "leave one of them out"
+        )
     kinds = {room: _option(arguments, f"--config.{room}.kind") for room in ROOMS_WITH_KINDS}
     chosen = {f"{room}.kind": kind for room, kind in kinds.items() if kind is not None}
     if kinds["light"] == "free" and config.light.kind != "free":
@@ -142,9 +159,15 @@ def _base(name: str | None, host: str | None, stored: Mapping[str, Any], where: 
     """The preset that a file changes: the one that is named, else the file's own, else the usual one."""
     label = stored.get("preset", DEFAULT_PRESET) if name is None else name
     kind = stored.get("host", {})
-    mesh = host == "mesh" or (isinstance(kind, Mapping) and kind.get("kind") == "mesh") or stored.get("host.kind") == "mesh"
+    mesh = (
+        host == "mesh"
+        or (isinstance(kind, Mapping) and kind.get("kind") == "mesh")
+        or stored.get("host.kind") == "mesh"
+    )
     if not isinstance(label, str):
-        raise UserError(f"{where}.preset: {label!r} where a name belongs", f"choose one of {', '.join(PRESETS)}")
+        raise UserError(
+            f"{where}.preset: {label!r} where a name belongs", f"choose one of {', '.join(PRESETS)}"
+        )
     label = label.removesuffix("-mesh") if name is None else label
     # What no preset made has the label of the settings' own defaults.
     config = NeilfConfig() if name is None and label == NeilfConfig().preset else preset(label)

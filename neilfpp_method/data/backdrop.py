@@ -1,8 +1,8 @@
 """Whether a colour that most of the borders share is all that lies behind the scene.
 
-The ground under a sky, or a table that runs out of the picture, leaves half of the border to one colour as well. What tells
-them apart is the other views: a thing in the scene has a place that all views see covered, a sky has none (the visual hull of
-all that is not of the colour; Laurentini 1994).
+The ground under a sky, or a table that runs out of the picture, leaves half of the border to one colour as
+well. What tells them apart is the other views: a thing in the scene has a place that all views see covered, a
+sky has none (the visual hull of all that is not of the colour; Laurentini 1994).
 """
 
 from __future__ import annotations

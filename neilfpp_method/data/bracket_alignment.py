@@ -1,9 +1,11 @@
-"""Brackets taken by hand: the photographs of a pose are brought onto its middle exposure before they are merged.
+"""Brackets taken by hand: the photographs of a pose are brought onto its middle exposure before they are
+merged.
 
-Neighbours in exposure are compared, as these share most levels of light that neither clips, and the motions are chained.
-No response is needed: the levels of one image are first mapped to those of the other by their histograms (Grossberg and Nayar,
-2003), which a motion of the camera hardly changes. OpenCV's median threshold bitmaps find the shift, least squares from coarse
-to fine (Baker and Matthews, 2004) the rest: a homography, which is what a turn of the camera does to a picture.
+Neighbours in exposure are compared, as these share most levels of light that neither clips, and the motions
+are chained. No response is needed: the levels of one image are first mapped to those of the other by their
+histograms (Grossberg and Nayar, 2003), which a motion of the camera hardly changes. OpenCV's median threshold
+bitmaps find the shift, least squares from coarse to fine (Baker and Matthews, 2004) the rest: a homography,
+which is what a turn of the camera does to a picture.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ SHIFT_BITS = 5
 
 @dataclass(frozen=True)
 class Aligned:
-    """A bracket whose images lie on one another, and the largest motion that was undone, in pixels; 0: a tripod's.
+    """A bracket whose images lie on one another, and the largest motion that was undone, in pixels; 0: a
+    tripod's.
 
     What an image does not show after its motion, and what it had clipped, is 1 there: no evidence.
     """
@@ -58,15 +61,24 @@ def align(bracket: Bracket) -> Aligned:
             motions[outer] = _motion(bracket.pixels[inner], bracket.pixels[outer]) @ motions[inner]
     size = bracket.pixels[0].shape[:2]
     moved = {i: _corner_shift(motion, size) for i, motion in motions.items()}
-    pixels = tuple(_moved(image, motions[i]) if moved[i] > STILL else image for i, image in enumerate(bracket.pixels))
-    return Aligned(Bracket(pixels, bracket.exposures), max((shift for shift in moved.values() if shift > STILL), default=0.0))
+    pixels = tuple(
+        _moved(image, motions[i]) if moved[i] > STILL else image for i, image in enumerate(bracket.pixels)
+    )
+    return Aligned(
+        Bracket(pixels, bracket.exposures),
+        max((shift for shift in moved.values() if shift > STILL), default=0.0),
+    )
 
 
-# -------------------------------------------------------------------------------------------------------------- motion
+# ----------------------------------------------------------------------------------------------------- motion
 
 
-def _motion(fixed: Float32[np.ndarray, "H W 3"], moving: Float32[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "3 3"]:
-    """The homography from pixels of `fixed` to those of `moving`; the identity where none explains the images better."""
+def _motion(
+    fixed: Float32[np.ndarray, "H W 3"], moving: Float32[np.ndarray, "H W 3"]
+) -> Float64[np.ndarray, "3 3"]:
+    """The homography from pixels of `fixed` to those of `moving`; the identity where none explains the images
+    better.
+    """
     size = fixed.shape[:2]
     still = np.eye(3)
     pair = _pair(fixed, moving, SIDES[1])
@@ -85,8 +97,9 @@ def _motion(fixed: Float32[np.ndarray, "H W 3"], moving: Float32[np.ndarray, "H 
 
 @dataclass(frozen=True)
 class _Pair:
-    """Two exposures in grey, reduced, the levels of the second mapped to those of the first; where they are neither dark
-    nor clipped; and the map from reduced to full pixels. Motions are said in full pixels."""
+    """Two exposures in grey, reduced, the levels of the second mapped to those of the first; where they are
+    neither dark nor clipped; and the map from reduced to full pixels. Motions are said in full pixels.
+    """
 
     fixed: Float32[np.ndarray, "h w"]
     moving: Float32[np.ndarray, "h w"]
@@ -94,7 +107,9 @@ class _Pair:
     moving_seen: Bool[np.ndarray, "h w"]
     scale: Float64[np.ndarray, "3 3"]
 
-    def warped(self, motion: Float64[np.ndarray, "3 3"]) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    def warped(
+        self, motion: Float64[np.ndarray, "3 3"]
+    ) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
         """The second image after a motion, and where both are seen."""
         reduced = np.linalg.inv(self.scale) @ motion @ self.scale
         size, flags = self.fixed.shape[::-1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -129,7 +144,8 @@ def _first_shift(pair: _Pair) -> Float64[np.ndarray, "3 3"]:
 def _refined(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
     """The motion, from one that is nearly right, under which the images differ least but for gain and offset.
 
-    Inverse compositional Gauss–Newton: the small motion is one of the fixed image, whose derivatives are taken once.
+    Inverse compositional Gauss–Newton: the small motion is one of the fixed image, whose derivatives are
+    taken once.
     """
     height, width = pair.fixed.shape
     unit = max(height, width) / 2
@@ -137,7 +153,9 @@ def _refined(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> Float64[np.ndar
     x, y = (columns - (width - 1) / 2) / unit, (rows - (height - 1) / 2) / unit
     dx, dy = (cv2.Sobel(pair.fixed, cv2.CV_32F, *axis, ksize=3, scale=unit / 8) for axis in ((1, 0), (0, 1)))
     along = dx * x + dy * y
-    slopes = np.stack([dx * x, dx * y, dx, dy * x, dy * y, dy, -along * x, -along * y, pair.fixed, np.ones_like(x)])
+    slopes = np.stack(
+        [dx * x, dx * y, dx, dy * x, dy * y, dy, -along * x, -along * y, pair.fixed, np.ones_like(x)]
+    )
     centred = pair.scale @ np.array([[unit, 0, (width - 1) / 2], [0, unit, (height - 1) / 2], [0, 0, 1]])
     for _ in range(ROUNDS):
         warped, seen = pair.warped(motion)
@@ -145,7 +163,9 @@ def _refined(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> Float64[np.ndar
             break
         off, known = (warped - pair.fixed)[seen], slopes[:, seen]
         typical = 1.5 * np.median(np.abs(off - np.median(off))) + 1e-4
-        weighted = known / np.maximum(np.abs(off - np.median(off)) / typical, 1.0)  # Huber: what moves on its own counts little
+        weighted = known / np.maximum(
+            np.abs(off - np.median(off)) / typical, 1.0
+        )  # Huber: what moves on its own counts little
         step = np.linalg.lstsq(weighted @ known.T, weighted @ off, rcond=1e-9)[0]
         small = np.eye(3) + np.append(step[:8], 0).reshape(3, 3)
         change = centred @ np.linalg.inv(small) @ np.linalg.inv(centred)
@@ -172,10 +192,18 @@ def _corner_shift(motion: Float64[np.ndarray, "3 3"], size: tuple[int, int]) -> 
     return float(np.linalg.norm(cv2.perspectiveTransform(corners[None], motion)[0] - corners, axis=1).max())
 
 
-def _moved(image: Float32[np.ndarray, "H W 3"], motion: Float64[np.ndarray, "3 3"]) -> Float32[np.ndarray, "H W 3"]:
-    """The image seen from where the middle exposure was; 1 where a clipped pixel, or none, has a part in it."""
+def _moved(
+    image: Float32[np.ndarray, "H W 3"], motion: Float64[np.ndarray, "3 3"]
+) -> Float32[np.ndarray, "H W 3"]:
+    """The image seen from where the middle exposure was; 1 where a clipped pixel, or none, has a part in
+    it.
+    """
     size, flags = image.shape[1::-1], cv2.WARP_INVERSE_MAP
-    moved = cv2.warpPerspective(image, motion, size, flags=cv2.INTER_CUBIC | flags, borderMode=cv2.BORDER_REPLICATE)
+    moved = cv2.warpPerspective(
+        image, motion, size, flags=cv2.INTER_CUBIC | flags, borderMode=cv2.BORDER_REPLICATE
+    )
     clipped = cv2.dilate((image >= BRIGHTEST).astype(np.float32), np.ones((3, 3), np.uint8))
-    unseen = cv2.warpPerspective(clipped, motion, size, flags=cv2.INTER_LINEAR | flags, borderValue=(1.0, 1.0, 1.0))
+    unseen = cv2.warpPerspective(
+        clipped, motion, size, flags=cv2.INTER_LINEAR | flags, borderValue=(1.0, 1.0, 1.0)
+    )
     return np.where(unseen > 1e-3, np.float32(1.0), moved.clip(0, 1))

@@ -37,15 +37,15 @@ CALIBRATION_SIDE = 1024
 def find_brackets(folder: Path, exposures: Path | None = None, unreadable: Collection[Path] = ()) -> Brackets:
     """The brackets of a folder.
 
-    Images belong together when `brackets.json` says so ({"pose": ["a.jpg", "b.jpg"]}); when they lie in one sub-folder;
-    when their names are NAME_0, NAME_1, …; or when, in the order of their names, the same exposures return again and
-    again.
+    Images belong together when `brackets.json` says so ({"pose": ["a.jpg", "b.jpg"]}); when they lie in one
+    sub-folder; when their names are NAME_0, NAME_1, …; or when, in the order of their names, the same
+    exposures return again and again.
 
     Args:
         folder: where the images are.
         exposures: a file of exposures, as `exposures_of` reads it; none: beside the images, or from EXIF.
-        unreadable: images that are known to be damaged. They keep their places in the brackets, with the exposure NaN, so
-            that the brackets they spoil can be told from the others.
+        unreadable: images that are known to be damaged. They keep their places in the brackets, with the
+            exposure NaN, so that the brackets they spoil can be told from the others.
 
     Raises:
         UserError: no brackets, an image without an exposure, or two images of a bracket with the same one.
@@ -62,7 +62,8 @@ def find_brackets(folder: Path, exposures: Path | None = None, unreadable: Colle
     for name, group in groups.items():
         if not _is_bracket(group, known):
             raise UserError(
-                f"{folder}: the {len(group)} images of '{name}' are no bracket: their exposures do not all differ",
+                f"{folder}: the {len(group)} images of '{name}' are no bracket: their exposures do not all "
+                "differ",
                 f"put each pose in a folder of its own, or list the poses in {GROUPS}",
             )
     return {name: {image: known.get(image, math.nan) for image in group} for name, group in groups.items()}
@@ -73,12 +74,19 @@ def _listed_groups(folder: Path, unreadable: Collection[Path]) -> Mapping[str, S
     path = folder / GROUPS
     if path.is_file():
         try:
-            named = {str(name): [folder / file for file in files] for name, files in json.loads(path.read_text()).items()}
+            named = {
+                str(name): [folder / file for file in files]
+                for name, files in json.loads(path.read_text()).items()
+            }
         except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
-            raise UserError(f"{path}: no list of brackets ({error})", 'write {"pose": ["a.jpg", "b.jpg"]}') from error
+            raise UserError(
+                f"{path}: no list of brackets ({error})", 'write {"pose": ["a.jpg", "b.jpg"]}'
+            ) from error
         for name in named:
             if Path(name).name != name or name.startswith("."):
-                raise UserError(f"{path}: a pose cannot be called {name!r}", "give it the name of a file without suffix")
+                raise UserError(
+                    f"{path}: a pose cannot be called {name!r}", "give it the name of a file without suffix"
+                )
         for image in (image for group in named.values() for image in group):
             if not inside(folder, image).is_file():
                 raise UserError(f"{path}: there is no {image}", "correct the list")
@@ -97,7 +105,9 @@ def _images(folder: Path) -> list[Path]:
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in shown and not p.name.startswith("."))
 
 
-def _returning_groups(images: Sequence[Path], exposures: Mapping[Path, float]) -> Mapping[str, Sequence[Path]]:
+def _returning_groups(
+    images: Sequence[Path], exposures: Mapping[Path, float]
+) -> Mapping[str, Sequence[Path]]:
     """Runs of the shortest period of the exposures; the whole sequence where there is none."""
     period = next(
         n
@@ -123,21 +133,25 @@ def merge_brackets(
     response: Literal["auto", "linear", "srgb"] = "auto",
     on_merged: Callable[[str, float | None], None] = lambda name, moved: None,
 ) -> None:
-    """Write linear float `images/NAME.exr`, and `valid/NAME.png`, white where the radiance is known, for every pose.
+    """Write linear float `images/NAME.exr`, and `valid/NAME.png`, white where the radiance is known, for
+    every pose.
 
-    All are on one radiance scale, in which 1 is about the white of the middle exposure; photographs taken by hand are brought
-    onto the middle one. A pose whose two files are there is passed over, so that a call that was interrupted goes on.
+    All are on one radiance scale, in which 1 is about the white of the middle exposure; photographs taken by
+    hand are brought onto the middle one. A pose whose two files are there is passed over, so that a call that
+    was interrupted goes on.
 
     Args:
         brackets: the photographs, as `find_brackets` tells them.
         images: where the merged images go.
         valid: where the validity masks go.
-        response: what the pixels are; auto: linear for camera RAW, else calibrated from the brackets themselves.
-        on_merged: called once a pose's files are there, with its name and by how many pixels, at most, its photographs had
-            to be moved; none where the pose was passed over.
+        response: what the pixels are; auto: linear for camera RAW, else calibrated from the brackets
+            themselves.
+        on_merged: called once a pose's files are there, with its name and by how many pixels, at most, its
+            photographs had to be moved; none where the pose was passed over.
 
     Raises:
-        UserError: an image cannot be read; the images of a pose differ in size; or the response cannot be calibrated.
+        UserError: an image cannot be read; the images of a pose differ in size; or the response cannot be
+            calibrated.
     """
     middle = float(np.median([exposure for bracket in brackets.values() for exposure in bracket.values()]))
     decode = _response(brackets, response)
@@ -156,7 +170,9 @@ def merge_brackets(
 def _response(brackets: Brackets, response: str) -> Response:
     raw = {image.suffix.lower() in RAW_SUFFIXES for bracket in brackets.values() for image in bracket}
     if response != "auto" or raw == {True}:
-        return {"linear": linear_response, "srgb": srgb_response}["linear" if response == "auto" else response]
+        return {"linear": linear_response, "srgb": srgb_response}[
+            "linear" if response == "auto" else response
+        ]
     if len(raw) > 1:
         raise UserError("camera RAW and other images in one folder", "keep one of the two")
     alike = Counter(tuple(bracket.values()) for bracket in brackets.values()).most_common(1)[0][0]
@@ -166,7 +182,9 @@ def _response(brackets: Brackets, response: str) -> Response:
 
 
 def _thin(bracket: Bracket) -> Bracket:
-    """Some of the pixels, enough to calibrate from; all photographs of a camera at once would fill the memory."""
+    """Some of the pixels, enough to calibrate from; all photographs of a camera at once would fill the
+    memory.
+    """
     step = -(-max(bracket.pixels[0].shape[:2]) // CALIBRATION_SIDE)
     return Bracket(tuple(pixels[::step, ::step].copy() for pixels in bracket.pixels), bracket.exposures)
 
@@ -177,7 +195,9 @@ def _read(bracket: Mapping[Path, float], unit: float) -> Aligned:
     first = next(iter(frames))
     for path, frame in frames.items():
         if frame.shape != frames[first].shape:
-            raise UserError(f"{path}: another size than {first.name}", "do not crop or turn single images of a bracket")
+            raise UserError(
+                f"{path}: another size than {first.name}", "do not crop or turn single images of a bracket"
+            )
     return align(Bracket(tuple(frames.values()), tuple(exposure / unit for exposure in bracket.values())))
 
 

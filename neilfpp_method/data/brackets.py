@@ -1,7 +1,8 @@
 """Exposure brackets, photographs of one pose at several exposures, merged into linear radiance.
 
-The camera's response is known (linear, sRGB) or calibrated by OpenCV's implementation of Debevec and Malik (SIGGRAPH
-1997). The merge is our own: OpenCV's takes 8 bits a pixel alone, and does not say what is clipped at every exposure.
+The camera's response is known (linear, sRGB) or calibrated by OpenCV's implementation of Debevec and Malik
+(SIGGRAPH 1997). The merge is our own: OpenCV's takes 8 bits a pixel alone, and does not say what is clipped
+at every exposure.
 """
 
 from __future__ import annotations
@@ -40,13 +41,15 @@ class Bracket:
 
 @dataclass(frozen=True)
 class Merged:
-    """Linear radiance, and where it is known: a pixel that is clipped at every exposure holds only a lower bound."""
+    """Linear radiance, and where it is known: a pixel that is clipped at every exposure holds only a lower
+    bound.
+    """
 
     radiance: Float32[np.ndarray, "H W 3"]
     valid: Bool[np.ndarray, "H W"]
 
 
-# ------------------------------------------------------------------------------------------------------------- response
+# --------------------------------------------------------------------------------------------------- response
 
 
 def linear_response(pixels: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
@@ -62,14 +65,16 @@ def srgb_response(pixels: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "
 def calibrate(brackets: Sequence[Bracket]) -> Response:
     """The response of the camera that took brackets, all at the same exposures, with 8 bits a pixel.
 
-    Debevec and Malik's linear system for 256 pixels, whose sums over the exposures are evenly spaced: so all levels of
-    light count alike, whatever fills most of the picture. Pixels that a longer exposure shows darker are left out, unless
-    most are: there something moved, or an image that was aligned shows nothing.
+    Debevec and Malik's linear system for 256 pixels, whose sums over the exposures are evenly spaced: so all
+    levels of light count alike, whatever fills most of the picture. Pixels that a longer exposure shows
+    darker are left out, unless most are: there something moved, or an image that was aligned shows nothing.
 
     Raises:
         UserError: the images do not determine a response that increases.
     """
-    stacks = [np.stack([np.rint(255 * image).reshape(-1, 3) for image in bracket.pixels]) for bracket in brackets]
+    stacks = [
+        np.stack([np.rint(255 * image).reshape(-1, 3) for image in bracket.pixels]) for bracket in brackets
+    ]
     levels = np.concatenate(stacks, axis=1).astype(np.uint8)
     more = np.diff(levels[np.argsort(brackets[0].exposures)].astype(np.int16), axis=0)
     lighter = (more >= -NOISE).all(axis=(0, 2))
@@ -97,16 +102,16 @@ def calibrate(brackets: Sequence[Bracket]) -> Response:
     return response
 
 
-# ---------------------------------------------------------------------------------------------------------------- merge
+# ------------------------------------------------------------------------------------------------------ merge
 
 
 def merge(bracket: Bracket, response: Response) -> Merged:
     """Radiance E = Σ w f(z)/t / Σ w over the exposures t, per channel, in the unit of f per unit of t.
 
-    w = t · max(min(z − z₀, z₁ − z), 0): photon noise makes the variance of f(z)/t proportional to 1/t, and values fade
-    out towards both ends of the range. A channel that is dark at every exposure takes its value from the longest, whose
-    error is small as an amount of light; one that is clipped at every exposure takes the shortest's, and the pixel is
-    invalid. 1, a clipped value, also stands for what an image does not show.
+    w = t · max(min(z − z₀, z₁ − z), 0): photon noise makes the variance of f(z)/t proportional to 1/t, and
+    values fade out towards both ends of the range. A channel that is dark at every exposure takes its value
+    from the longest, whose error is small as an amount of light; one that is clipped at every exposure takes
+    the shortest's, and the pixel is invalid. 1, a clipped value, also stands for what an image does not show.
     """
     first, *_ = order = np.argsort(bracket.exposures)
     total = np.zeros_like(bracket.pixels[0])

@@ -1,6 +1,7 @@
 """A capture: posed images of a scene, found by one of several readers, checked, normalised and split.
 
-Everything that the headers can tell is checked here, before a run starts; pixels are checked where they are loaded.
+Everything that the headers can tell is checked here, before a run starts; pixels are checked where they are
+loaded.
 """
 
 from __future__ import annotations
@@ -17,7 +18,16 @@ from neilfpp_method.data import capture_folder
 from neilfpp_method.data.formats import blender, colmap, dtu, nero, sfm_scene, transforms
 from neilfpp_method.data.images import IMAGE_SUFFIXES, image_header
 from neilfpp_method.data.raw import RAW_SUFFIXES
-from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, SceneSource, View, check_camera, inside, plain_name
+from neilfpp_method.data.views import (
+    Camera,
+    CaptureFiles,
+    Normalisation,
+    SceneSource,
+    View,
+    check_camera,
+    inside,
+    plain_name,
+)
 from neilfpp_method.errors import UserError
 
 __all__ = ["FOUND", "READERS", "Camera", "Capture", "Normalisation", "Reader", "View", "load_capture"]
@@ -61,9 +71,9 @@ READERS: Mapping[str, Reader] = {
 class Capture:
     """A checked capture. Cameras are in the world frame; `normalisation` leads to the scene frame.
 
-    `hdr`: pixels are linear radiance; otherwise they are display values (sRGB). `test` names the views that are held
-    out. `inputs` is the folder of masks, depth maps and other companions of the images. `scene_from` is what told the
-    normalisation.
+    `hdr`: pixels are linear radiance; otherwise they are display values (sRGB). `test` names the views that
+    are held out. `inputs` is the folder of masks, depth maps and other companions of the images. `scene_from`
+    is what told the normalisation.
     """
 
     root: Path
@@ -99,8 +109,8 @@ class Capture:
                 f"{len(self.train_views)} to train on and {len(self.test_views)} to test on",
                 f"pixels: {'linear HDR' if self.hdr else 'display values (sRGB)'}; masks: {masks or 'none'}; "
                 f"point cloud: {self.point_cloud.name if self.point_cloud else 'none'}",
-                f"scene: centre ({x:.3g}, {y:.3g}, {z:.3g}), 1 scene unit = {self.normalisation.scale:.4g} world units"
-                + FOUND[self.scene_from],
+                f"scene: centre ({x:.3g}, {y:.3g}, {z:.3g}), 1 scene unit = {self.normalisation.scale:.4g} "
+                "world units" + FOUND[self.scene_from],
             ]
         )
 
@@ -118,10 +128,10 @@ def load_capture(
         root: the capture's folder.
         format: a name in `READERS`; none: the first reader that recognises the folder.
         test_every: hold out every k-th view, from the k-th on; 0 holds out none. Overrides `split.json`.
-        test: hold out these views, by name or by number; overrides both. Without any of the three the capture's own
-            split counts, and without one every 8th view is held out.
-        response: whether pixels are linear radiance or display values; auto: as the capture says, and where it does
-            not, floating-point files are linear.
+        test: hold out these views, by name or by number; overrides both. Without any of the three the
+            capture's own split counts, and without one every 8th view is held out.
+        response: whether pixels are linear radiance or display values; auto: as the capture says, and where
+            it does not, floating-point files are linear.
 
     Raises:
         UserError: the capture cannot be used; names the file and the remedy.
@@ -165,7 +175,11 @@ def _recognise(root: Path) -> str:
 def _photographs(root: Path) -> int:
     """How many photographs lie in a folder and in its own folders, as `neilfpp prepare` takes them."""
     files = [*root.glob("*"), *root.glob("*/*")]
-    return sum(file.suffix.lower() in (*IMAGE_SUFFIXES, *RAW_SUFFIXES) for file in files if not file.name.startswith("."))
+    return sum(
+        file.suffix.lower() in (*IMAGE_SUFFIXES, *RAW_SUFFIXES)
+        for file in files
+        if not file.name.startswith(".")
+    )
 
 
 def _check_views(views: tuple[View, ...]) -> bool:
@@ -177,17 +191,25 @@ def _check_views(views: tuple[View, ...]) -> bool:
         if not plain_name(view.name):
             raise UserError(f"{view.image}: '{view.name}' cannot name a file", "rename the view")
         if view.name in names:
-            raise UserError(f"{view.image} and {names[view.name].image} have the same name", "rename one of them")
+            raise UserError(
+                f"{view.image} and {names[view.name].image} have the same name", "rename one of them"
+            )
         names[view.name] = view
         if not all(np.isfinite(f) and f > 0 for f in (view.exposure, *view.white_balance)):
-            raise UserError(f"{view.image}: exposure and white balance are not all positive", "correct the factors")
+            raise UserError(
+                f"{view.image}: exposure and white balance are not all positive", "correct the factors"
+            )
         size = (view.camera.width, view.camera.height)
         headers = {path: image_header(path) for path in (view.image, view.mask, view.valid) if path}
         hdr.setdefault(headers[view.image].hdr, view)
         for path, header in headers.items():
             if (header.width, header.height) != size:
                 turned = (header.height, header.width) == size
-                remedy = "turn the pixels as the image's EXIF says" if turned else "resize the image, or scale its camera"
+                remedy = (
+                    "turn the pixels as the image's EXIF says"
+                    if turned
+                    else "resize the image, or scale its camera"
+                )
                 raise UserError(
                     f"{path}: {header.width}×{header.height} pixels where the camera has {size[0]}×{size[1]}",
                     remedy,
@@ -197,10 +219,12 @@ def _check_views(views: tuple[View, ...]) -> bool:
     return next(iter(hdr))
 
 
-# ---------------------------------------------------------------------------------------------------------------- split
+# ------------------------------------------------------------------------------------------------------ split
 
 
-def _test_views(root: Path, files: CaptureFiles, test_every: int | None, test: Collection[str | int] | None) -> frozenset[str]:
+def _test_views(
+    root: Path, files: CaptureFiles, test_every: int | None, test: Collection[str | int] | None
+) -> frozenset[str]:
     split, views = root / "split.json", files.views
     if test is not None:
         held_out = _named(views, test, "test")
@@ -231,7 +255,9 @@ def _read_split(path: Path) -> list[str | int]:
     try:
         test = json.loads(path.read_text("utf-8"))["test"]
     except (ValueError, OSError, RecursionError, KeyError, TypeError) as error:
-        raise UserError(f"{path}: not a JSON object with the key 'test' ({error})", 'write {"test": [0, 8]}') from error
+        raise UserError(
+            f"{path}: not a JSON object with the key 'test' ({error})", 'write {"test": [0, 8]}'
+        ) from error
     if not isinstance(test, list) or not all(isinstance(key, str | int) for key in test):
         raise UserError(f"{path}: 'test' is not a list of view names or numbers", 'write {"test": [0, 8]}')
     return test

@@ -34,12 +34,15 @@ def read(root: Path) -> CaptureFiles:
     """The capture's files.
 
     Raises:
-        UserError: `capture.json` is malformed, of a later version, or names a file that is missing or outside the folder.
+        UserError: `capture.json` is malformed, of a later version, or names a file that is missing or outside
+            the folder.
     """
     entry = Entry.load(inside(root, root / FILE))
     entry["format"].word(FORMAT)
     if entry["version"].size() > VERSION:
-        raise UserError(f"{entry.where}: version {entry['version'].size()} of the format", f"version {VERSION} is read")
+        raise UserError(
+            f"{entry.where}: version {entry['version'].size()} of the format", f"version {VERSION} is read"
+        )
     views = tuple(_view(root, i, view) for i, view in enumerate(entry["views"].items()))
     if not views:
         raise UserError(f"{entry.where}: no views", "add some")
@@ -64,7 +67,9 @@ def read_scene(entry: Entry) -> Normalisation:
     x, y, z = map(float, entry["centre"].numbers((3,)))
     radius = entry["radius"].number()
     if radius <= 0:
-        raise UserError(f"{entry.name('radius')}: not positive", "give half the largest extent of the scene's box")
+        raise UserError(
+            f"{entry.name('radius')}: not positive", "give half the largest extent of the scene's box"
+        )
     return Normalisation(radius, (x, y, z))
 
 
@@ -117,7 +122,7 @@ def _file(root: Path, entry: Entry, key: str) -> Path | None:
     return path
 
 
-# -------------------------------------------------------------------------------------------------------------- writing
+# ---------------------------------------------------------------------------------------------------- writing
 
 
 @runtime_checkable
@@ -137,7 +142,9 @@ class Writable(Protocol):
     def scene_from(self) -> SceneSource: ...
 
 
-def write_capture(root: Path, files: Writable, *, response: Literal["linear", "srgb"], test: Collection[str] = ()) -> Path:
+def write_capture(
+    root: Path, files: Writable, *, response: Literal["linear", "srgb"], test: Collection[str] = ()
+) -> Path:
     """Write `capture.json` into a folder whose images, masks and points are there already; returns its path.
 
     Args:

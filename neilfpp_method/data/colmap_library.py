@@ -1,12 +1,12 @@
 """pycolmap, for every module that needs it: `from neilfpp_method.data.colmap_library import pycolmap`.
 
-Loaded before OpenCV, it brings its own zlib into the process first, and OpenCV's PNG writer then aborts with "free():
-invalid pointer". OpenCV is therefore loaded before it, here and nowhere else.
+Loaded before OpenCV, it brings its own zlib into the process first, and OpenCV's PNG writer then aborts with
+"free(): invalid pointer". OpenCV is therefore loaded before it, here and nowhere else.
 
 It also has SIGTERM print a stack trace, as if the program had failed. What SIGTERM did before comes back.
 
-Its interface changes with its versions, so others than those that this project is made for are refused when they are
-loaded, and not somewhere in the middle of the work.
+Its interface changes with its versions, so others than those that this project is made for are refused when
+they are loaded, and not somewhere in the middle of the work.
 """
 
 from __future__ import annotations
@@ -24,8 +24,13 @@ __all__ = ["pycolmap"]
 OLDEST, END = (4, 2), (5, 0)
 
 with suppress(ValueError):  # signals are the main thread's
-    if (before := signal.getsignal(signal.SIGTERM)) is not None:  # Python knows of no other handlers than its own
+    if (
+        before := signal.getsignal(signal.SIGTERM)
+    ) is not None:  # Python knows of no other handlers than its own
         signal.signal(signal.SIGTERM, before)
 
 if not OLDEST <= tuple(int(part) for part in pycolmap.__version__.split(".")[:2]) < END:
-    raise UserError(f"pycolmap {pycolmap.__version__} is installed, of another interface", "pip install 'pycolmap>=4.2,<5'")
+    raise UserError(
+        f"pycolmap {pycolmap.__version__} is installed, of another interface",
+        "pip install 'pycolmap>=4.2,<5'",
+    )

@@ -1,12 +1,13 @@
-"""Which pixels a step learns from: most of them on the object or near its outline, where masks tell the object.
+"""Which pixels a step learns from: most of them on the object or near its outline, where masks tell the
+object.
 
-What a pixel far off the object shows is known after a few steps, so a step that draws uniformly from pictures of
-one object under a sky spends most of its rays on nothing. Where the object is known, `NEAR_SHARE` of a step's pixels are
-drawn from those on it or near its outline, and the rest from all others; within each of the two every pixel is as likely
-as any other. Where nothing is known of the object, all valid pixels are alike.
+What a pixel far off the object shows is known after a few steps, so a step that draws uniformly from pictures
+of one object under a sky spends most of its rays on nothing. Where the object is known, `NEAR_SHARE` of a
+step's pixels are drawn from those on it or near its outline, and the rest from all others; within each of the
+two every pixel is as likely as any other. Where nothing is known of the object, all valid pixels are alike.
 
-The loss stays a plain mean over the pixels that are drawn: it is weighted towards the object on purpose, and no importance
-weights take that back.
+The loss stays a plain mean over the pixels that are drawn: it is weighted towards the object on purpose, and
+no importance weights take that back.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from torch import Tensor
 __all__ = ["BLOCK", "KNOWN", "MASK", "NEAR", "VALID", "PixelDraws", "PixelSet", "near_object"]
 
 VALID, MASK, KNOWN, NEAR = 1, 2, 4, 8
-"""Bits of a pixel: it counts; it is on the object; whether it is, is known; it is on the object or near its outline."""
+"""Bits of a pixel: it counts; it is on the object; whether it is, is known; it is on the object or near its
+outline.
+"""
 NEAR_SHARE = 0.85
 """Share of a step's pixels that are on the object or near its outline, where masks tell it."""
 NEAR_DISTANCE = 0.08
@@ -28,7 +31,9 @@ NEAR_DISTANCE = 0.08
 SMALL_SIDE = 256
 """Longest side, pixels, at which nearness is decided."""
 BLOCK = 1024
-"""Pixels of a block, whose chosen pixels are counted; planes of pixels are padded to a whole number of blocks."""
+"""Pixels of a block, whose chosen pixels are counted; planes of pixels are padded to a whole number of
+blocks.
+"""
 COUNTED = 2**14
 """Blocks that are counted at once."""
 
@@ -36,8 +41,8 @@ COUNTED = 2**14
 class PixelSet:
     """The numbers of the pixels with certain bits among P, drawn uniformly and independently.
 
-    The k-th such pixel is looked up: its block by the running count, then its place in the block. That takes a byte a pixel,
-    wherever that byte is, and 8 bytes a block in memory.
+    The k-th such pixel is looked up: its block by the running count, then its place in the block. That takes
+    a byte a pixel, wherever that byte is, and 8 bytes a block in memory.
 
     Args:
         bits: of all pixels; a whole number of blocks, 0 in what is padded.
@@ -85,7 +90,9 @@ class PixelDraws:
             self._parts = (near, PixelSet(bits, VALID | NEAR, VALID))
 
     def draw(self, count: int) -> Int[Tensor, " count"]:
-        """`count` numbers of valid pixels, with repetition, by torch's global generator on the CPU; in random order."""
+        """`count` numbers of valid pixels, with repetition, by torch's global generator on the CPU; in random
+        order.
+        """
         if self._parts is None:
             return torch.randint(self.valid.count, (count,)) if self._all else self.valid.draw(count)
         near, rest = self._parts

@@ -38,12 +38,15 @@ def read_environment(path: Path) -> Float[Tensor, "3 H W"]:
     """Linear radiance of a lat-long map, rows from +z down; one channel counts for all three.
 
     Raises:
-        UserError: as `check_environment`, or the pixels cannot be read, are NaN, infinite or negative, or all black.
+        UserError: as `check_environment`, or the pixels cannot be read, are NaN, infinite or negative, or all
+            black.
     """
     check_environment(path)
     radiance = torch.from_numpy(read_image(path).pixels).permute(2, 0, 1)
     if not radiance.isfinite().all() or radiance.amin() < 0:
         raise UserError(f"{path}: a texel is NaN, infinite or negative", "store radiance as it is, from 0 on")
     if not radiance.any():
-        raise UserError(f"{path}: the environment map is black", "give the light that was there, or leave --light out")
+        raise UserError(
+            f"{path}: the environment map is black", "give the light that was there, or leave --light out"
+        )
     return radiance.expand(3, -1, -1)

@@ -1,7 +1,8 @@
 """OpenEXR: which part and which channels of a file are the picture, and where its pixels lie in the frame.
 
-Renderers store many things in one file. The picture is R, G, B wherever it is in the file; else that of the one layer that
-has these, or of Blender's "Combined" among several; else X, Y, Z; else a single channel. The alpha of its layer goes with it.
+Renderers store many things in one file. The picture is R, G, B wherever it is in the file; else that of the
+one layer that has these, or of Blender's "Combined" among several; else X, Y, Z; else a single channel. The
+alpha of its layer goes with it.
 """
 
 from __future__ import annotations
@@ -70,13 +71,17 @@ def exr_samples(path: Path) -> Float32[np.ndarray, "H W C"]:
         UserError: nothing in the file is a picture.
         ValueError: it is damaged.
     """
-    with redirect_stdout(io.StringIO()):  # where a file is damaged, OpenEXR says so there, and goes on without the part
+    with redirect_stdout(
+        io.StringIO()
+    ):  # where a file is damaged, OpenEXR says so there, and goes on without the part
         parts = OpenEXR.File(str(path), separate_channels=True).parts
     if not parts:
         raise ValueError("damaged, or cut off")
     channels = [part.channels for part in parts]
     picture = _picture(path, channels)
-    stored = np.stack([channels[picture.part][name].pixels.astype(np.float32) for name in picture.channels], axis=-1)
+    stored = np.stack(
+        [channels[picture.part][name].pixels.astype(np.float32) for name in picture.channels], axis=-1
+    )
     header = parts[picture.part].header
     data, frame = Window.of(header["dataWindow"]), Window.of(header["displayWindow"])
     if data == frame:
@@ -102,7 +107,11 @@ def _picture(path: Path, parts: Sequence[Sequence[str] | Mapping[str, object]]) 
     combined = [layer for layer in layers if layer.split(".")[-2] == COMBINED]
     (layer,) = combined if len(combined) == 1 else layers if len(layers) == 1 else ("",)
     alone = [(name,) for names in parts if len(rest := set(names) - {ALPHA}) == 1 for name in rest]
-    for prefix, wanted in (("", COLORS), (layer, COLORS), *(("", names) for names in (VECTOR, *SINGLE, *alone))):
+    for prefix, wanted in (
+        ("", COLORS),
+        (layer, COLORS),
+        *(("", names) for names in (VECTOR, *SINGLE, *alone)),
+    ):
         channels = tuple(prefix + name for name in wanted)
         for part, names in enumerate(parts):
             if set(channels) <= set(names) and CHROMA not in names:

@@ -1,7 +1,7 @@
 """The place that most cameras look at: where their optical axes come nearest to one another.
 
-People who photograph a thing aim at it, and walk about it. So the axes tell where it is even where points do not: structure
-from motion finds points on walls and trees as well.
+People who photograph a thing aim at it, and walk about it. So the axes tell where it is even where points do
+not: structure from motion finds points on walls and trees as well.
 """
 
 from __future__ import annotations
@@ -19,19 +19,24 @@ __all__ = ["Axes", "Focus", "axes_of", "find_focus", "meeting_point"]
 ITERATIONS = 50
 """Rounds of reweighting; the place moves no more after some twenty."""
 FLOOR = 1e-3
-"""Share of the median distance below which an axis counts as passing through the place: it has no weight without bound."""
+"""Share of the median distance below which an axis counts as passing through the place: it has no weight
+without bound.
+"""
 MIDDLE = 0.5
 """A camera looks at what lies in this part of its picture, along both sides, about the middle."""
 MOST = 2 / 3
 """Share of the cameras that must look at the place."""
 LEAST_SPREAD_DEG = 10.0
-"""Least angle, root mean square, of the axes from their common plane or line. Aim is true to a few degrees: the depth at which
-axes meet that are nearer to parallel is that of chance."""
+"""Least angle, root mean square, of the axes from their common plane or line. Aim is true to a few degrees:
+the depth at which axes meet that are nearer to parallel is that of chance.
+"""
 
 
 @dataclass(frozen=True)
 class Axes:
-    """Optical axes: where the cameras stand and the unit vectors along which they look, in the world frame."""
+    """Optical axes: where the cameras stand and the unit vectors along which they look, in the world
+    frame.
+    """
 
     eyes: Float64[np.ndarray, "V 3"]
     ahead: Float64[np.ndarray, "V 3"]
@@ -60,9 +65,9 @@ def axes_of(views: Sequence[View]) -> Axes:
 def find_focus(views: Sequence[View]) -> Focus | None:
     """The place that most cameras look at, or none.
 
-    The sum of the distances to all axes is least there, and not that of their squares: a few cameras that look elsewhere do
-    not move it. None where fewer than two thirds of the cameras have it in the middle of their picture, or where their axes
-    are so nearly parallel that it could be at any depth.
+    The sum of the distances to all axes is least there, and not that of their squares: a few cameras that
+    look elsewhere do not move it. None where fewer than two thirds of the cameras have it in the middle of
+    their picture, or where their axes are so nearly parallel that it could be at any depth.
 
     Example:
         >>> focus = find_focus(capture.views)

@@ -1,8 +1,8 @@
 """Image files in and out: EXR, TIFF, PNG, JPEG, Radiance HDR → float arrays; EXR and PNG ← arrays.
 
-Files come from strangers: a header is read and its size checked before any pixel is allocated, and a file that no
-decoder understands becomes a `UserError` that names it. Pixels stay in the orientation they are stored in; an EXIF
-rotation would part them from their camera.
+Files come from strangers: a header is read and its size checked before any pixel is allocated, and a file
+that no decoder understands becomes a `UserError` that names it. Pixels stay in the orientation they are
+stored in; an EXIF rotation would part them from their camera.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ class ImageHeader:
 class ImageFile:
     """A decoded image, rows from top to bottom, contiguous.
 
-    `pixels` is RGB or one channel: as stored where `hdr`, else scaled to [0, 1] and still display values, as no curve
-    is applied. `alpha` in [0, 1] is none where the file has no alpha channel, or one that is opaque everywhere: programs write
-    that without meaning that the object fills the picture.
+    `pixels` is RGB or one channel: as stored where `hdr`, else scaled to [0, 1] and still display values, as
+    no curve is applied. `alpha` in [0, 1] is none where the file has no alpha channel, or one that is opaque
+    everywhere: programs write that without meaning that the object fills the picture.
     """
 
     pixels: Float[np.ndarray, "H W C"]
@@ -63,7 +63,7 @@ class ImageFile:
     hdr: bool
 
 
-# ----------------------------------------------------------------------------------------------------- kinds of files
+# --------------------------------------------------------------------------------------------- kinds of files
 
 
 def _exr_header(path: Path) -> ImageHeader:
@@ -102,8 +102,12 @@ def _radiance_header(path: Path) -> ImageHeader:
 
 
 def _radiance_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
-    """Radiance: what is stored has been multiplied by every exposure that the header names, and OpenCV leaves it so."""
-    exposures = [float(line.split(b"=")[1]) for line in _radiance_lines(path) if line.startswith(b"EXPOSURE=")]
+    """Radiance: what is stored has been multiplied by every exposure that the header names, and OpenCV leaves
+    it so.
+    """
+    exposures = [
+        float(line.split(b"=")[1]) for line in _radiance_lines(path) if line.startswith(b"EXPOSURE=")
+    ]
     factor = float(np.prod(exposures))
     if not (np.isfinite(factor) and factor > 0):
         raise ValueError(f"an exposure of {factor:g}")
@@ -123,7 +127,9 @@ def _tiff_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
     with tifffile.TiffFile(path) as file:
         page = file.pages[0]
         if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and page.samplesperpixel > 1:
-            return np.moveaxis(page.asarray(), 0, -1)  # OpenCV would take the planes for pixels, and says nothing
+            return np.moveaxis(
+                page.asarray(), 0, -1
+            )  # OpenCV would take the planes for pixels, and says nothing
         if page.dtype == np.float16:
             return np.atleast_3d(page.asarray())  # which OpenCV does not know
     return _opencv_samples(path)
@@ -135,7 +141,7 @@ def _jpeg_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
         return np.atleast_3d(np.asarray(image if image.mode == "L" else image.convert("RGB")))
 
 
-# -------------------------------------------------------------------------------------------------------------- reading
+# ---------------------------------------------------------------------------------------------------- reading
 
 
 @dataclass(frozen=True)
@@ -177,7 +183,8 @@ def read_image(path: Path) -> ImageFile:
     """Decode an image.
 
     Raises:
-        UserError: as `image_header`, or the pixels are damaged, or of a type that is not 8 or 16 bit, half or float.
+        UserError: as `image_header`, or the pixels are damaged, or of a type that is not 8 or 16 bit, half or
+            float.
     """
     header = image_header(path)
     with _naming(path):
@@ -187,7 +194,9 @@ def read_image(path: Path) -> ImageFile:
             raise ValueError(f"{width}×{height} pixels where the header says {header.width}×{header.height}")
         if samples.dtype.name not in FULL_SCALE:
             raise ValueError(f"samples of type {samples.dtype.name}")
-    values = np.divide(samples, np.float32(FULL_SCALE[samples.dtype.name]), dtype=np.float32, casting="same_kind")
+    values = np.divide(
+        samples, np.float32(FULL_SCALE[samples.dtype.name]), dtype=np.float32, casting="same_kind"
+    )
     colors = channels if channels in (1, 3) else channels - 1
     alpha = np.ascontiguousarray(values[..., colors]) if channels > colors else None
     opaque = alpha is None or bool((alpha == 1).all())
@@ -205,7 +214,9 @@ def _naming(path: Path) -> Iterator[None]:
         raise UserError(f"{path}: no such image", "check the path") from None
     except Exception as error:  # four decoders, each with exceptions of its own
         reason = str(error).strip().splitlines() or [type(error).__name__]
-        raise UserError(f"{path}: cannot be read ({reason[0]})", "export the image again, as EXR or PNG") from error
+        raise UserError(
+            f"{path}: cannot be read ({reason[0]})", "export the image again, as EXR or PNG"
+        ) from error
 
 
 @contextmanager
@@ -237,12 +248,13 @@ def _check_size(path: Path, width: int, height: int) -> None:
         )
 
 
-# -------------------------------------------------------------------------------------------------------------- writing
+# ---------------------------------------------------------------------------------------------------- writing
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place in one step when the block ends, and vanishes when it fails.
+    """A temporary path beside `path` that takes its place in one step when the block ends, and vanishes when
+    it fails.
 
     A reader, or a run that is killed, never meets half a file. Folders that are missing are made.
 
@@ -267,7 +279,9 @@ def write_exr(path: Path, channels: Mapping[str, Shaped[np.ndarray, "H W ..."]])
 
     float16 is stored as half, everything else as float.
     """
-    kinds = {name: np.float16 if array.dtype == np.float16 else np.float32 for name, array in channels.items()}
+    kinds = {
+        name: np.float16 if array.dtype == np.float16 else np.float32 for name, array in channels.items()
+    }
     arrays = {name: np.ascontiguousarray(array, kinds[name]) for name, array in channels.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with replacing(path) as temporary:

@@ -1,4 +1,6 @@
-"""JSON in and out: values that know where they stand, so that every complaint can say so, and files written in one step."""
+"""JSON in and out: values that know where they stand, so that every complaint can say so, and files written
+in one step.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ class Entry:
     def load(path: Path) -> Entry:
         """The root of a file."""
         try:
-            return Entry(json.loads(path.read_text("utf-8-sig")), str(path))  # Windows puts a byte order mark first
+            return Entry(
+                json.loads(path.read_text("utf-8-sig")), str(path)
+            )  # Windows puts a byte order mark first
         except (ValueError, OSError, RecursionError) as error:
             raise UserError(f"{path}: not valid JSON ({error})", "export the cameras again") from error
 
@@ -78,7 +82,9 @@ class Entry:
         fits = numbers.shape in shapes if shapes else numbers.ndim == 1
         if not fits or not np.isfinite(numbers).all():
             wanted = " or ".join(dict.fromkeys("×".join(map(str, shape)) for shape in shapes if shape))
-            problem = "not a finite number" if shapes == ((),) else f"not {wanted or 'a list of'} finite numbers"
+            problem = (
+                "not a finite number" if shapes == ((),) else f"not {wanted or 'a list of'} finite numbers"
+            )
             raise UserError(f"{self.where}: {problem}", "export the cameras again")
         return numbers
 
@@ -95,6 +101,8 @@ class Entry:
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """Write an object, in one step; numbers that are not finite have no place in JSON and are a `ValueError`."""
+    """Write an object, in one step; numbers that are not finite have no place in JSON and are a
+    `ValueError`.
+    """
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n", "utf-8")

@@ -1,7 +1,8 @@
 """Lenses that bend straight lines: COLMAP's camera models between the pinhole's image plane and the real one.
 
-Both planes are at unit distance: the pinhole's point (x/z, y/z), and the point where the lens shows it, which becomes a
-pixel by focal length and principal point. pycolmap computes both directions, so a model means here what it means there.
+Both planes are at unit distance: the pinhole's point (x/z, y/z), and the point where the lens shows it, which
+becomes a pixel by focal length and principal point. pycolmap computes both directions, so a model means here
+what it means there.
 """
 
 from __future__ import annotations
@@ -21,15 +22,17 @@ PINHOLES = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
 PANORAMAS = frozenset({"INVALID", "EQUIRECTANGULAR"})
 LENSES = tuple(name for name in pycolmap.CameraModelId.__members__ if name not in PINHOLES | PANORAMAS)
 # Models that bend nothing when all coefficients are 0; a fisheye does even then.
-STRAIGHT_AT_ZERO = frozenset({"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION"})
+STRAIGHT_AT_ZERO = frozenset(
+    {"SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION"}
+)
 
 
 @dataclass(frozen=True)
 class Lens:
     """A COLMAP camera model without its focal length and principal point.
 
-    `model` is COLMAP's name ("OPENCV", "OPENCV_FISHEYE", …), `coefficients` are the model's parameters after these, in
-    COLMAP's order.
+    `model` is COLMAP's name ("OPENCV", "OPENCV_FISHEYE", …), `coefficients` are the model's parameters after
+    these, in COLMAP's order.
     """
 
     model: str
@@ -56,7 +59,9 @@ class Lens:
             raise UserError(f"{where}: unknown lens model '{self.model}'", f"use one of {', '.join(LENSES)}")
         count = len(pycolmap.Camera.create_from_model_name(0, self.model, 1.0, 1, 1).extra_params_idxs())
         if len(self.coefficients) != count or not np.isfinite(self.coefficients).all():
-            raise UserError(f"{where}: the lens {self.model} has {count} finite coefficients", "correct the camera")
+            raise UserError(
+                f"{where}: the lens {self.model} has {count} finite coefficients", "correct the camera"
+            )
 
     def camera(
         self,

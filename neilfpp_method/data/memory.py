@@ -1,4 +1,6 @@
-"""How much memory is free, and a word before more than that is taken: a process that takes too much is killed without one."""
+"""How much memory is free, and a word before more than that is taken: a process that takes too much is killed
+without one.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,9 @@ UNLIMITED = 2**60
 
 
 def available_memory(proc: Path = Path("/proc"), groups: Path = Path("/sys/fs/cgroup")) -> int | None:
-    """Bytes that this process may still take: the least of what the system has left, what its control group leaves it (both
-    versions, with the groups above), and what its limit of address space does; none where nothing of that is known.
+    """Bytes that this process may still take: the least of what the system has left, what its control group
+    leaves it (both versions, with the groups above), and what its limit of address space does; none where
+    nothing of that is known.
 
     Pages of files that the system would give up for it count as free.
     """
@@ -36,7 +39,10 @@ def check_memory(needed: int, what: str, remedy: str, free: int | None = None) -
     """
     free = available_memory() if free is None else free
     if free is not None and needed > free:
-        raise UserError(f"{what} need about {needed / 1e9:.1f} GB of memory, and {max(free, 0) / 1e9:.1f} GB are free", remedy)
+        raise UserError(
+            f"{what} need about {needed / 1e9:.1f} GB of memory, and {max(free, 0) / 1e9:.1f} GB are free",
+            remedy,
+        )
 
 
 def _system(proc: Path) -> int | None:
@@ -45,7 +51,9 @@ def _system(proc: Path) -> int | None:
 
 def _group(proc: Path, groups: Path) -> int | None:
     """Of control groups, version 2; each group is bound by those above it."""
-    path = next((line[3:].strip("/") for line in _lines(proc / "self" / "cgroup") if line.startswith("0::")), "")
+    path = next(
+        (line[3:].strip("/") for line in _lines(proc / "self" / "cgroup") if line.startswith("0::")), ""
+    )
     folder, free = groups / path, []
     while folder.is_relative_to(groups):
         limit, used = _number(folder / "memory.max"), _number(folder / "memory.current")

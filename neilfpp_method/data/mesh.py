@@ -32,7 +32,9 @@ def read_mesh(path: Path, normalisation: Normalisation) -> Mesh:
         UserError: no such file, or it holds no triangles that can be used.
     """
     if not path.is_file():
-        raise UserError(f"{path}: there is no such mesh", "give the path of a triangle mesh, such as a PLY file")
+        raise UserError(
+            f"{path}: there is no such mesh", "give the path of a triangle mesh, such as a PLY file"
+        )
     try:
         mesh = trimesh.load_mesh(path, process=False)
         vertices = torch.as_tensor(np.array(mesh.vertices), dtype=torch.float32)
@@ -40,5 +42,7 @@ def read_mesh(path: Path, normalisation: Normalisation) -> Mesh:
     except Exception as error:  # whatever trimesh meets in a damaged file
         raise UserError(f"{path}: not a mesh that can be read ({error})", "export it again as PLY") from error
     if not len(faces) or not vertices.isfinite().all() or faces.min() < 0 or faces.max() >= len(vertices):
-        raise UserError(f"{path}: no triangles, or triangles of vertices that are not there", "export it again")
+        raise UserError(
+            f"{path}: no triangles, or triangles of vertices that are not there", "export it again"
+        )
     return Mesh(normalisation.to_scene(vertices), faces)

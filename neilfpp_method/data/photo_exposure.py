@@ -30,10 +30,15 @@ def exposures_of(folder: Path, images: Sequence[Path], table: Path | None = None
     Raises:
         UserError: the file is malformed, or an image has no exposure.
     """
-    tables = [path for path in (folder / name for name in LISTS) if path.is_file()] if table is None else [table]
+    tables = (
+        [path for path in (folder / name for name in LISTS) if path.is_file()] if table is None else [table]
+    )
     if tables:
         listed = read_exposures(tables[0])
-        found = {image: listed.get(image.relative_to(folder).as_posix(), listed.get(image.name)) for image in images}
+        found = {
+            image: listed.get(image.relative_to(folder).as_posix(), listed.get(image.name))
+            for image in images
+        }
         remedy = f"add it to {tables[0]}"
     else:
         found, remedy = {image: photo_exposure(image) for image in images}, WRITE_A_LIST
@@ -44,15 +49,21 @@ def exposures_of(folder: Path, images: Sequence[Path], table: Path | None = None
 
 
 def photo_exposure(path: Path) -> float | None:
-    """Exposure time, seconds, times ISO/100, over the f-number squared, from EXIF; none where no time is said.
+    """Exposure time, seconds, times ISO/100, over the f-number squared, from EXIF; none where no time is
+    said.
 
-    An entry that is missing counts as 1: it is the same in all pictures of a lens or a camera that does not say it. An
-    ISO of 0 or an f-number of 0, which adapted lenses write, is such an entry.
+    An entry that is missing counts as 1: it is the same in all pictures of a lens or a camera that does not
+    say it. An ISO of 0 or an f-number of 0, which adapted lenses write, is such an entry.
     """
     try:
         with Image.open(path) as image:
             exif = image.getexif().get_ifd(EXIF_FOLDER)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # what Pillow does not open says nothing
+    except (
+        OSError,
+        ValueError,
+        SyntaxError,
+        Image.DecompressionBombError,
+    ):  # what Pillow does not open says nothing
         return None
     time, aperture, sensitivity = (_positive(exif.get(tag)) for tag in (TIME, APERTURE, SENSITIVITY))
     if time is None:
@@ -69,7 +80,8 @@ def _positive(entry: object) -> float | None:
 
 
 def read_exposures(path: Path) -> Mapping[str, float]:
-    """Seconds by image name: a JSON object, or lines `NAME SECONDS`, seconds also as `1/60`; `#` starts a comment.
+    """Seconds by image name: a JSON object, or lines `NAME SECONDS`, seconds also as `1/60`; `#` starts a
+    comment.
 
     Raises:
         UserError: the file is malformed, or an exposure is not a positive number.
@@ -83,7 +95,9 @@ def read_exposures(path: Path) -> Mapping[str, float]:
             pairs = [line.rsplit(maxsplit=1) for line in lines if line]
         listed = {name: float(Fraction(str(seconds))) for name, seconds in pairs}
     except (OSError, ValueError, AttributeError, ZeroDivisionError, OverflowError, RecursionError) as error:
-        raise UserError(f"{path}: no list of exposures ({error})", "write lines 'NAME SECONDS', as 'a.jpg 1/60'") from error
+        raise UserError(
+            f"{path}: no list of exposures ({error})", "write lines 'NAME SECONDS', as 'a.jpg 1/60'"
+        ) from error
     for name, seconds in listed.items():
         if not (math.isfinite(seconds) and seconds > 0):
             raise UserError(f"{path}: the exposure of {name} is {seconds}", "give seconds above 0")

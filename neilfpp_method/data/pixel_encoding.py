@@ -1,8 +1,9 @@
 """How colours are kept: in as few bits as hold what the files say.
 
-8-bit images keep their bytes, so they come back to the bit. 16-bit images, and display values that were averaged, take
-16 bits. Radiance is kept in half precision (11 bits of mantissa), with a power of two for each view that brings its brightest
-pixel near the top of the range; where a view's range is wider than that of half, all views are kept in single precision.
+8-bit images keep their bytes, so they come back to the bit. 16-bit images, and display values that were
+averaged, take 16 bits. Radiance is kept in half precision (11 bits of mantissa), with a power of two for each
+view that brings its brightest pixel near the top of the range; where a view's range is wider than that of
+half, all views are kept in single precision.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ __all__ = ["BYTES", "ENCODINGS", "Encoded", "Encoding", "encodings_for"]
 TOP = 32_768.0
 """What the brightest value of a view comes to in half precision, at most; half ends at 65 504."""
 LEAST_MEDIAN = 2.0**-4
-"""Median of a view's values that half precision is good for: a thousandth of it then still has all 11 bits, which end at
-2⁻¹⁴."""
+"""Median of a view's values that half precision is good for: a thousandth of it then still has all 11 bits,
+which end at 2⁻¹⁴.
+"""
 LOOKED_AT = 2**20
 """Values of which the median is taken."""
 

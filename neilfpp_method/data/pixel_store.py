@@ -1,11 +1,13 @@
-"""The pixels of many views, one after another and row by row: in memory, or in a folder of memory-mapped files.
+"""The pixels of many views, one after another and row by row: in memory, or in a folder of memory-mapped
+files.
 
     color.npy    (P, 3) codes of `pixel_encoding`: 3 bytes a pixel for 8-bit images, 6 for 16 bits and for radiance
     bits.npy     (P,) one byte: valid, mask, mask known, near the object (`drawing`); padded to whole blocks
     store.json   what they were made from, written last: a folder without it holds no store
 
-Views are read one at a time, so building takes the memory of one view, whatever their number. A store is used again when it
-was made from the very same files (name, size, time of the last change), cameras and factors; else it is made anew.
+Views are read one at a time, so building takes the memory of one view, whatever their number. A store is used
+again when it was made from the very same files (name, size, time of the last change), cameras and factors;
+else it is made anew.
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ FORMAT, VERSION = "neilfpp-pixels", 1
 BORDER_SHARE = 0.5
 REPAIR = "repair the images, or mark the pixels in a validity mask"
 MOST_MAPPED = 2**29
-"""Bytes of the files that draws may leave mapped; a page that holds one drawn pixel brings 16 of them along."""
+"""Bytes of the files that draws may leave mapped; a page that holds one drawn pixel brings 16 of them
+along.
+"""
 BYTES_OF_A_DRAW = 2 * 16 * 4096
 SPARE = 2**28
 """Bytes that a disk should keep free."""
@@ -74,7 +78,9 @@ class PixelStore:
         """The numbers of the pixels of view `i`."""
         return slice(int(self.starts[i]), int(self.starts[i + 1]))
 
-    def colors(self, numbers: Int[np.ndarray, "*N"], view: Int[np.ndarray, "*N"]) -> Float32[np.ndarray, "*N 3"]:
+    def colors(
+        self, numbers: Int[np.ndarray, "*N"], view: Int[np.ndarray, "*N"]
+    ) -> Float32[np.ndarray, "*N 3"]:
         """Colours of single pixels of views; kept in a folder, only the pages that hold them are read."""
         self._drawn += numbers.size
         if self._drawn * BYTES_OF_A_DRAW > MOST_MAPPED:
@@ -149,7 +155,7 @@ def load_pixels(
     return opened
 
 
-# --------------------------------------------------------------------------------------------------------------- making
+# ----------------------------------------------------------------------------------------------------- making
 
 
 def _in_any_encoding(
@@ -160,7 +166,9 @@ def _in_any_encoding(
     paths: dict[str, Path] | None,
     on_view: Callable[[str], None] | None,
 ) -> PixelStore:
-    """In the smallest encoding that holds every view; when one turns out to need more, all are read once more."""
+    """In the smallest encoding that holds every view; when one turns out to need more, all are read once
+    more.
+    """
     if ladder[0] is BYTES and any(view.file_size is not None for view in views):
         ladder = ladder[1:]  # means of bytes are no bytes
     told: set[str] = set()
@@ -227,9 +235,11 @@ def _near(mask: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, " N"]:
 
 
 def _mask_from_background(store: PixelStore) -> None:
-    """Without masks, pixels of exactly the colour of most of the border are off the object; of the others nothing is known.
+    """Without masks, pixels of exactly the colour of most of the border are off the object; of the others
+    nothing is known.
 
-    Rendered captures, and clipped backdrops, have such pixels; in front of a noisy backdrop hardly any pixel is exact.
+    Rendered captures, and clipped backdrops, have such pixels; in front of a noisy backdrop hardly any pixel
+    is exact.
     """
     numbers, view = border(store)
     colors = store.colors(numbers, view)
@@ -267,11 +277,13 @@ def border(store: PixelStore) -> tuple[Int[np.ndarray, " B"], Int[np.ndarray, " 
     return np.concatenate(numbers), np.concatenate(views)
 
 
-# ------------------------------------------------------------------------------------------------------------ the files
+# -------------------------------------------------------------------------------------------------- the files
 
 
 def _plane(path: Path | None, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """An array of zeros, in memory or in a file whose room is taken at once: a full disk would kill who writes to a map."""
+    """An array of zeros, in memory or in a file whose room is taken at once: a full disk would kill who
+    writes to a map.
+    """
     if path is None:
         return np.zeros(shape, dtype)
     array = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
@@ -286,7 +298,8 @@ def _check_room(folder: Path, needed: int) -> None:
     free = shutil.disk_usage(above).free
     if needed + SPARE > free:
         raise UserError(
-            f"{folder}: the pixels of the training views take {needed / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free there",
+            f"{folder}: the pixels of the training views take {needed / 1e9:.1f} GB, and {free / 1e9:.1f} GB "
+            "are free there",
             "make room, choose another --out, or take smaller images with --scale",
         )
 
@@ -316,7 +329,9 @@ def _open(folder: Path, views: Sequence[View], made_from: str) -> PixelStore | N
         description = json.loads((folder / "store.json").read_text("utf-8"))
         kind = [description[name] for name in ("format", "version", "made_from")]
         encoding, scales = ENCODINGS[description["encoding"]], np.array(description["scales"], np.float64)
-        arrays = [np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ("color", "bits")]
+        arrays = [
+            np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ("color", "bits")
+        ]
     except (OSError, ValueError, EOFError, KeyError, TypeError, RecursionError):
         return None
     store = PixelStore(tuple(views), encoding, scales, *arrays)
@@ -329,7 +344,9 @@ def _open(folder: Path, views: Sequence[View], made_from: str) -> PixelStore | N
 
 
 def expect_draws(store: PixelStore) -> None:
-    """Tell the system that single pixels will be asked for: it then reads pages, and not what follows them."""
+    """Tell the system that single pixels will be asked for: it then reads pages, and not what follows
+    them.
+    """
     for array in (store.codes, store.bits):
         _advise(array, "MADV_RANDOM")
 

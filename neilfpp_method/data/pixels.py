@@ -34,12 +34,13 @@ MOST_COUNTED = 2**20
 
 
 class PixelDataset:
-    """P pixels of the chosen views, view after view, row by row. `len` is P; `PixelBatch.view` counts in `views`.
+    """P pixels of the chosen views, view after view, row by row. `len` is P; `PixelBatch.view` counts in
+    `views`.
 
-    Colours, masks and validity are kept in a `PixelStore`, 4 to 13 bytes a pixel, in a folder or in memory; rays and image
-    gradients are computed when asked for. Colours of a linear capture are radiance on the scale that its views share: the
-    exposure and the white balance of each view are divided out. A pixel is valid unless its view's validity mask is black
-    there, or its view's lens shows nothing there.
+    Colours, masks and validity are kept in a `PixelStore`, 4 to 13 bytes a pixel, in a folder or in memory;
+    rays and image gradients are computed when asked for. Colours of a linear capture are radiance on the
+    scale that its views share: the exposure and the white balance of each view are divided out. A pixel is
+    valid unless its view's validity mask is black there, or its view's lens shows nothing there.
 
     Args:
         capture: where the views come from.
@@ -47,12 +48,13 @@ class PixelDataset:
         device: where batches go. Pixels are drawn, and read, on the CPU.
         on_view: called with the name of each view once it is read.
         folder: where the pixels are kept, and found again by the next who asks; none: in memory.
-        exact: keep colours in single precision, as the files have them, to compare with; needs `folder` to be none.
+        exact: keep colours in single precision, as the files have them, to compare with; needs `folder` to be
+            none.
 
     Raises:
-        UserError: an image cannot be read, has changed its size, or holds NaN, infinite or negative pixels that are not
-            marked as invalid; a mask shows no object; no pixel is valid; a view of display values has an exposure; or the
-            folder cannot be written.
+        UserError: an image cannot be read, has changed its size, or holds NaN, infinite or negative pixels
+            that are not marked as invalid; a mask shows no object; no pixel is valid; a view of display
+            values has an exposure; or the folder cannot be written.
     """
 
     def __init__(
@@ -84,7 +86,8 @@ class PixelDataset:
         return len(self.store)
 
     def sample(self, count: int, gradients: bool = True) -> PixelBatch:
-        """`count` valid pixels drawn by torch's global generator as `data.drawing` says: most on the object or near it.
+        """`count` valid pixels drawn by torch's global generator as `data.drawing` says: most on the object
+        or near it.
 
         Image gradients take nine reads a pixel; without `gradients` they are 0.
         """
@@ -98,7 +101,9 @@ class PixelDataset:
         return self._draws.draw(count)
 
     def view(self, i: int, gradients: bool = True) -> PixelBatch:
-        """All pixels of `views[i]`, row by row; those that are not `valid` as well. Image gradients as in `sample`."""
+        """All pixels of `views[i]`, row by row; those that are not `valid` as well. Image gradients as in
+        `sample`.
+        """
         rows, camera = self.store.rows(i), self.views[i].camera
         numbers, colors = np.arange(rows.start, rows.stop), self.store.view_colors(i)
         shape = camera.height, camera.width
@@ -116,7 +121,9 @@ class PixelDataset:
         return self._bit(self.store.bits[self.store.rows(i)], VALID)
 
     def near(self, i: int) -> Bool[Tensor, " N"]:
-        """Which pixels of `views[i]` are on the object or near its outline; none where nothing is known of the object."""
+        """Which pixels of `views[i]` are on the object or near its outline; none where nothing is known of
+        the object.
+        """
         return self._bit(self.store.bits[self.store.rows(i)], NEAR)
 
     def _views_of(self, numbers: Int[np.ndarray, " N"]) -> Int[np.ndarray, " N"]:
@@ -141,11 +148,13 @@ class PixelDataset:
             color=torch.from_numpy(colors).to(self.device),
             mask=self._bit(bits, MASK).float(),
             mask_known=self._bit(bits, KNOWN).float(),
-            image_gradient=torch.zeros(len(numbers), device=self.device) if gradient is None else gradient.to(self.device),
+            image_gradient=torch.zeros(len(numbers), device=self.device)
+            if gradient is None
+            else gradient.to(self.device),
             view=view,
         )
 
-    # -------------------------------------------------------------------------------------------------- image gradients
+    # ---------------------------------------------------------------------------------------- image gradients
 
     @cached_property
     def _exposure(self) -> float:
@@ -158,7 +167,9 @@ class PixelDataset:
         color = torch.from_numpy(colors)
         return luminance(tone_map(self._exposure * color) if self.capture.hdr else color)
 
-    def _gradients_at(self, numbers: Int[np.ndarray, " N"], views: Int[np.ndarray, " N"]) -> Float32[Tensor, " N"]:
+    def _gradients_at(
+        self, numbers: Int[np.ndarray, " N"], views: Int[np.ndarray, " N"]
+    ) -> Float32[Tensor, " N"]:
         """How much the images change per pixel as they look, at single pixels; see `_gradient`."""
         size = np.array([(view.camera.width, view.camera.height) for view in self.views])[views]
         at = numbers - self.store.starts[views]
@@ -169,7 +180,7 @@ class PixelDataset:
         seen = self._seen(self.store.colors(around, np.broadcast_to(views, around.shape)))
         return _scharr(seen.unbind(0))
 
-    # ------------------------------------------------------------------------------------------------------- statistics
+    # --------------------------------------------------------------------------------------------- statistics
 
     def median_radiance(self) -> float:
         """The median luminance, linear, of the object: of valid pixels within the mask that are not black.
@@ -181,11 +192,15 @@ class PixelDataset:
         """
         lit = self._lit()
         if not len(lit):
-            raise UserError(f"{self.capture.root}: all pixels of the object are black", "check images and masks")
+            raise UserError(
+                f"{self.capture.root}: all pixels of the object are black", "check images and masks"
+            )
         return float(lit.median())
 
     def radiance_quantile(self, share: float) -> float:
-        """The linear value that `share` of the values of the valid object pixels and channels do not exceed."""
+        """The linear value that `share` of the values of the valid object pixels and channels do not
+        exceed.
+        """
         values = self._of_the_object().flatten()
         return float(values.kthvalue(max(1, round(share * len(values)))).values)
 
@@ -209,9 +224,9 @@ class PixelDataset:
     def border_color(self) -> Float[Tensor, " 3"] | None:
         """The linear RGB that most pixels on the borders of the images share, or none.
 
-        The border's median colour counts when half of the border shares it: differs from it by at most 2 % of the
-        brighter of that colour and the object's median radiance. The rest must find room within the scene (`backdrop`):
-        the colour of the ground is not that of the sky above.
+        The border's median colour counts when half of the border shares it: differs from it by at most 2 % of
+        the brighter of that colour and the object's median radiance. The rest must find room within the scene
+        (`backdrop`): the colour of the ground is not that of the sky above.
         """
         numbers, views = border(self.store)
         color = self.border_median()
@@ -242,7 +257,9 @@ class PixelDataset:
         views: Int[np.ndarray, " N"],
         other: Callable[[Float32[np.ndarray, "V 3"]], Bool[Tensor, " V"]],
     ) -> bool:
-        """Whether what some pixels show can lie within the scene, as the views have it by which of their pixels are `other`."""
+        """Whether what some pixels show can lie within the scene, as the views have it by which of their
+        pixels are `other`.
+        """
         if not len(numbers):
             return True
         step = -(-len(numbers) // MOST_RAYS)
@@ -264,7 +281,9 @@ def _gradient(values: Float32[Tensor, "H W"]) -> Float32[Tensor, "H W"]:
     """`_scharr` of a whole image; the borders are continued."""
     padded = torch.nn.functional.pad(values[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
     height, width = values.shape
-    return _scharr([padded[1 + row : 1 + row + height, 1 + column : 1 + column + width] for row, column in NEIGHBOURS])
+    return _scharr(
+        [padded[1 + row : 1 + row + height, 1 + column : 1 + column + width] for row, column in NEIGHBOURS]
+    )
 
 
 def _scharr(about: Sequence[Float32[Tensor, "*shape"]]) -> Float32[Tensor, "*shape"]:

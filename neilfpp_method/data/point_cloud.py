@@ -15,7 +15,14 @@ from neilfpp_method.data.views import Normalisation
 from neilfpp_method.errors import UserError
 from neilfpp_method.structures import OrientedPoints
 
-__all__ = ["WorldPoints", "has_normals", "load_point_cloud", "read_oriented_ply", "read_positions", "write_oriented_ply"]
+__all__ = [
+    "WorldPoints",
+    "has_normals",
+    "load_point_cloud",
+    "read_oriented_ply",
+    "read_positions",
+    "write_oriented_ply",
+]
 
 OLD_NAMES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
 NEW_NAMES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
@@ -51,8 +58,8 @@ def read_oriented_ply(path: Path) -> WorldPoints:
     """The vertices of a PLY file.
 
     Raises:
-        UserError: the file is missing, malformed or cut off, has no points or no normals, or holds a number that is not
-            finite or a normal of no length.
+        UserError: the file is missing, malformed or cut off, has no points or no normals, or holds a number
+            that is not finite or a normal of no length.
     """
     vertices = _read(path)
     position, normal = _columns(path, vertices, POSITION), _columns(path, vertices, NORMAL)
@@ -100,7 +107,9 @@ def _read(path: Path) -> np.ndarray:
     try:
         return _vertices(path.read_bytes())
     except (OSError, ValueError, KeyError, IndexError) as error:
-        raise UserError(f"{path}: not a PLY file that can be read ({error})", "export the point cloud again") from error
+        raise UserError(
+            f"{path}: not a PLY file that can be read ({error})", "export the point cloud again"
+        ) from error
 
 
 def _columns(path: Path, vertices: np.ndarray, names: tuple[str, str, str]) -> Float64[np.ndarray, "N 3"]:
@@ -111,7 +120,9 @@ def _columns(path: Path, vertices: np.ndarray, names: tuple[str, str, str]) -> F
 
 
 def _vertices(data: bytes) -> np.ndarray:
-    """The vertex table as a structured array; the vertices have to come first, as they do in every common writer."""
+    """The vertex table as a structured array; the vertices have to come first, as they do in every common
+    writer.
+    """
     head, separator, _ = data[:HEADER_LIMIT].partition(b"end_header")
     if not separator or not head.startswith(b"ply"):
         raise ValueError("it has no PLY header")
@@ -128,8 +139,14 @@ def _vertices(data: bytes) -> np.ndarray:
     body = data.index(b"\n", len(head)) + 1
     if order is None:
         text = io.StringIO(data[body:].decode("ascii"))
-        rows = np.loadtxt(text, dtype=np.float64, max_rows=count, ndmin=2) if count else np.empty((0, len(properties)))
+        rows = (
+            np.loadtxt(text, dtype=np.float64, max_rows=count, ndmin=2)
+            if count
+            else np.empty((0, len(properties)))
+        )
         if rows.shape != (count, len(properties)):
-            raise ValueError(f"{count} points with {len(properties)} numbers each are announced, and not there")
+            raise ValueError(
+                f"{count} points with {len(properties)} numbers each are announced, and not there"
+            )
         return np.rec.fromarrays(rows.T, names=[name for name, _ in properties])
     return np.frombuffer(data, np.dtype([(name, order + kind) for name, kind in properties]), count, body)

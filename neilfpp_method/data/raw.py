@@ -1,7 +1,7 @@
 """Camera RAW developed into linear radiance by LibRaw; needs the extra `raw`.
 
-Nothing is decided by the single picture: no automatic brightness, no maximum told from the data, one white balance for all
-pictures of a camera. Two pictures of a scene then differ by their exposures alone.
+Nothing is decided by the single picture: no automatic brightness, no maximum told from the data, one white
+balance for all pictures of a camera. Two pictures of a scene then differ by their exposures alone.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ INTERPOLATION_REACH = 5
 class Developed:
     """A developed RAW file, in the orientation of the sensor.
 
-    `pixels` are linear, with the primaries of sRGB; 1 is the level at which the sensor saturates. `valid` is false where it
-    has. `white_balance` is what the camera would have multiplied red, green and blue of the sensor by, relative to green;
-    what was used instead is the daylight balance of the camera model.
+    `pixels` are linear, with the primaries of sRGB; 1 is the level at which the sensor saturates. `valid` is
+    false where it has. `white_balance` is what the camera would have multiplied red, green and blue of the
+    sensor by, relative to green; what was used instead is the daylight balance of the camera model.
     """
 
     pixels: Float32[np.ndarray, "H W 3"]
@@ -61,7 +61,9 @@ def develop(path: Path) -> Developed:
     except UserError:
         raise
     except Exception as error:  # LibRaw's own exceptions do not share a base with rawpy's
-        raise UserError(f"{path}: cannot be developed ({error})", "convert it to DNG, or to linear EXR") from error
+        raise UserError(
+            f"{path}: cannot be developed ({error})", "convert it to DNG, or to linear EXR"
+        ) from error
     pixels = samples.astype(np.float32) / np.float32(65_535)
     balance = (red / green, 1.0, blue / green) if min(red, green, blue) > 0 else (1.0, 1.0, 1.0)
     return Developed(pixels, ~saturated, balance)
@@ -79,6 +81,9 @@ def _saturated(raw, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
     """Pixels whose colour comes, wholly or in part, from a sensor pixel at its white level."""
     mosaic = raw.raw_image_visible
     if mosaic.shape[:2] != size:
-        raise UserError(f"a sensor of {mosaic.shape[:2]} pixels in a picture of {size}", "develop it to linear EXR yourself")
+        raise UserError(
+            f"a sensor of {mosaic.shape[:2]} pixels in a picture of {size}",
+            "develop it to linear EXR yourself",
+        )
     full = (mosaic >= raw.white_level).reshape(*size, -1).any(axis=-1).astype(np.uint8)
     return cv2.dilate(full, np.ones((INTERPOLATION_REACH, INTERPOLATION_REACH), np.uint8)) > 0

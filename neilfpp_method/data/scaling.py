@@ -1,9 +1,9 @@
 """Views at another size than that of their files: cameras to match, and pixels averaged over their area.
 
-A pixel of a smaller image is the mean, over its area, of the linear radiance of the pixels that it covers (display values are
-made linear, averaged, and encoded again). An image point (u, v) of the file is then at (u · w/W, v · h/H), as pixel centres
-are at +0.5: focal lengths and principal points are multiplied by the same factors, and a lens keeps its coefficients, which
-apply to the plane at unit distance.
+A pixel of a smaller image is the mean, over its area, of the linear radiance of the pixels that it covers
+(display values are made linear, averaged, and encoded again). An image point (u, v) of the file is then at (u
+· w/W, v · h/H), as pixel centres are at +0.5: focal lengths and principal points are multiplied by the same
+factors, and a lens keeps its coefficients, which apply to the plane at unit distance.
 """
 
 from __future__ import annotations
@@ -35,10 +35,13 @@ __all__ = [
 ]
 
 PIXELS_OF_A_VIEW = 2**17
-"""Pixels of a view that are enough to look at it and to measure it, where nobody asks for more: about 420 × 310."""
+"""Pixels of a view that are enough to look at it and to measure it, where nobody asks for more: about 420 ×
+310.
+"""
 PIXELS_OF_A_RAY = 4
-"""Pixels of the training views to a ray of the whole training. With more, most pixels are never drawn, and a smaller image
-holds what they had to say, with less noise."""
+"""Pixels of the training views to a ray of the whole training. With more, most pixels are never drawn, and a
+smaller image holds what they had to say, with less noise.
+"""
 SAME = 0.98
 """A scale this close to 1 is 1: what is left out is not worth resampling for."""
 
@@ -81,7 +84,9 @@ def scaled_view(view: View, scale: float) -> View:
     if size == (view.camera.width, view.camera.height):
         return view
     return replace(
-        view, camera=scaled_camera(view.camera, *size), file_size=None if size == (width, height) else (width, height)
+        view,
+        camera=scaled_camera(view.camera, *size),
+        file_size=None if size == (width, height) else (width, height),
     )
 
 
@@ -90,14 +95,14 @@ def at_scale(capture: Capture, scale: float) -> Capture:
     return replace(capture, views=tuple(scaled_view(view, scale) for view in capture.views))
 
 
-# -------------------------------------------------------------------------------------------------------- which scale
+# ------------------------------------------------------------------------------------------------ which scale
 
 
 def scale_for_rays(views: Sequence[View], rays: int) -> float:
     """The largest scale at which a training of so many rays can use the pixels of the views.
 
-    That is `PIXELS_OF_A_RAY` pixels to a ray, and `PIXELS_OF_A_VIEW` pixels of a view at least, so that many views
-    do not make for tiny ones.
+    That is `PIXELS_OF_A_RAY` pixels to a ray, and `PIXELS_OF_A_VIEW` pixels of a view at least, so that many
+    views do not make for tiny ones.
     """
     return scale_for_pixels(views, max(PIXELS_OF_A_RAY * rays, PIXELS_OF_A_VIEW * len(views)))
 
@@ -120,11 +125,15 @@ def scale_for_width(views: Sequence[View], width: int) -> float:
     return min(1.0, width / max(file_size(view)[0] for view in views))
 
 
-# ---------------------------------------------------------------------------------------------------------- resampling
+# ------------------------------------------------------------------------------------------------- resampling
 
 
-def area_average(values: Float32[np.ndarray, "H W *C"], width: int, height: int) -> Float32[np.ndarray, "h w *C"]:
-    """Means over the areas of fewer pixels; parts of pixels count in part. The image itself where the size is the same."""
+def area_average(
+    values: Float32[np.ndarray, "H W *C"], width: int, height: int
+) -> Float32[np.ndarray, "h w *C"]:
+    """Means over the areas of fewer pixels; parts of pixels count in part. The image itself where the size is
+    the same.
+    """
     if values.shape[:2] == (height, width):
         return values
     averaged = cv2.resize(np.ascontiguousarray(values), (width, height), interpolation=cv2.INTER_AREA)

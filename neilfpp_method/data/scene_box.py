@@ -1,10 +1,12 @@
-"""Where the scene is, for captures that do not say it: told by points, by silhouettes, or else by the cameras alone.
+"""Where the scene is, for captures that do not say it: told by points, by silhouettes, or else by the cameras
+alone.
 
-The scene frame has the object in the unit sphere; a box gives its centre and half of its largest extent (METHOD's
-normalisation). What is known best decides: points on the surface, then the masks, whose visual hull holds the object;
-the cameras know only what they look at. Points without masks may reach far beyond that, to walls and trees. A box that holds
-those holds the cameras as well, or nearly so, and every view could be explained by fog before its own lens: there the box
-is about what the cameras look at, and ends well before them.
+The scene frame has the object in the unit sphere; a box gives its centre and half of its largest extent
+(METHOD's normalisation). What is known best decides: points on the surface, then the masks, whose visual hull
+holds the object; the cameras know only what they look at. Points without masks may reach far beyond that, to
+walls and trees. A box that holds those holds the cameras as well, or nearly so, and every view could be
+explained by fog before its own lens: there the box is about what the cameras look at, and ends well before
+them.
 """
 
 from __future__ import annotations
@@ -28,8 +30,9 @@ FEWEST_POINTS = 20
 CELLS = 32
 REFINEMENTS = 3
 REACH = 0.55
-"""Radius of the box about what the cameras look at, in their median distance from it: half of them are 1.8 scene units away or
-more, and none that stands at three quarters of the median comes nearer than 1.36."""
+"""Radius of the box about what the cameras look at, in their median distance from it: half of them are 1.8
+scene units away or more, and none that stands at three quarters of the median comes nearer than 1.36.
+"""
 
 
 @dataclass(frozen=True)
@@ -45,8 +48,8 @@ def find_box(views: Sequence[View], points: Float64[np.ndarray, "P 3"] | None = 
 
     Args:
         views: the capture's views, with their masks or alpha channels where they have any.
-        points: points on the scene's surface, in the world frame; outliers are put up with. Where there are masks, only
-            points within them count.
+        points: points on the scene's surface, in the world frame; outliers are put up with. Where there are
+            masks, only points within them count.
 
     Raises:
         UserError: a mask cannot be read, or nothing tells where the scene is.
@@ -58,7 +61,9 @@ def find_box(views: Sequence[View], points: Float64[np.ndarray, "P 3"] | None = 
         box = box_of_points(points)
         # Points within masks are the object's own.
         focus = None if outlines else box_of_focus(views)
-        return SceneBox(box, "points") if focus is None or box.scale <= focus.scale else SceneBox(focus, "focus")
+        return (
+            SceneBox(box, "points") if focus is None or box.scale <= focus.scale else SceneBox(focus, "focus")
+        )
     if outlines:
         return SceneBox(_carve(outlines, box_of_cameras(views, fill=2.0)), "masks")
     return SceneBox(box_of_cameras(views), "cameras")
@@ -75,8 +80,9 @@ def box_of_points(points: Float64[np.ndarray, "P 3"]) -> Normalisation:
 
 
 def box_of_focus(views: Sequence[View]) -> Normalisation | None:
-    """A ball about the place that most cameras look at, which ends at `REACH` of their median distance; none: there is no
-    such place (`focus`)."""
+    """A ball about the place that most cameras look at, which ends at `REACH` of their median distance; none:
+    there is no such place (`focus`).
+    """
     focus = find_focus(views)
     if focus is None:
         return None
@@ -87,7 +93,8 @@ def box_of_focus(views: Sequence[View]) -> Normalisation | None:
 def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalisation:
     """A guess: what the cameras look at, as large as the circle that fits into their images, times `fill`.
 
-    The centre is the place that most cameras look at, or else the point nearest to all optical axes, by least squares.
+    The centre is the place that most cameras look at, or else the point nearest to all optical axes, by least
+    squares.
 
     Raises:
         UserError: the axes do not come near one point in front of the cameras.
@@ -97,12 +104,14 @@ def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalisation:
     centre = meeting_point(axes, np.ones(len(views))) if focus is None else focus.centre
     if centre is None:
         raise UserError(
-            f"{where}: the cameras look in one direction: they do not tell where the scene is", "add points or a scene box"
+            f"{where}: the cameras look in one direction: they do not tell where the scene is",
+            "add points or a scene box",
         )
     depth = np.einsum("ni,ni->n", centre - axes.eyes, axes.ahead)
     if np.median(depth) <= 0:
         raise UserError(
-            f"{where}: the cameras look away from one another: they do not tell where the scene is", "add points or a scene box"
+            f"{where}: the cameras look away from one another: they do not tell where the scene is",
+            "add points or a scene box",
         )
     half = [min(c.width / c.fx, c.height / c.fy) / 2 for c in (view.camera for view in views)]
     radius = float(np.median(depth * half)) * fill
@@ -117,7 +126,7 @@ def _box(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> Nor
     return Normalisation(scale, (x, y, z))
 
 
-# ---------------------------------------------------------------------------------------------------------- silhouettes
+# ------------------------------------------------------------------------------------------------ silhouettes
 
 
 def _carve(outlines: Sequence[Outline], start: Normalisation) -> Normalisation:
@@ -130,6 +139,8 @@ def _carve(outlines: Sequence[Outline], start: Normalisation) -> Normalisation:
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         held = grid[agreement(outlines, grid) >= AGREEMENT]
         if not len(held):
-            raise UserError("the masks have no place in common", "check masks and cameras, or add a scene box")
+            raise UserError(
+                "the masks have no place in common", "check masks and cameras, or add a scene box"
+            )
         low, high = held.min(axis=0) - cell, held.max(axis=0) + cell
     return _box(low, high)

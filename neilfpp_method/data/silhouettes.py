@@ -20,12 +20,16 @@ AGREEMENT = 0.9
 MOST_VIEWS = 32
 """Views that are asked, evenly chosen."""
 LONGEST = 512
-"""Pixels along the longer side of a silhouette: places are told to a cell of some hundredths of the scene, no closer."""
+"""Pixels along the longer side of a silhouette: places are told to a cell of some hundredths of the scene, no
+closer.
+"""
 
 
 @dataclass(frozen=True)
 class Outline:
-    """A view with its silhouette; where that does not touch the border, what lies out of the image is beside it, too."""
+    """A view with its silhouette; where that does not touch the border, what lies out of the image is beside
+    it, too.
+    """
 
     view: View
     inside: Bool[np.ndarray, "H W"]
@@ -37,11 +41,12 @@ class Outline:
 
 
 def read_outlines(views: Sequence[View], most: int = MOST_VIEWS, longest: int = LONGEST) -> list[Outline]:
-    """The silhouettes, by mask or alpha channel, of at most `most` views, evenly chosen, and their cameras to match.
+    """The silhouettes, by mask or alpha channel, of at most `most` views, evenly chosen, and their cameras to
+    match.
 
-    None where fewer than half of these have one. An alpha channel that is opaque all over is none. The masks are read one
-    after the other, and those with more than `longest` pixels along a side are made smaller: a pixel is then inside where
-    most of it was.
+    None where fewer than half of these have one. An alpha channel that is opaque all over is none. The masks
+    are read one after the other, and those with more than `longest` pixels along a side are made smaller: a
+    pixel is then inside where most of it was.
 
     Raises:
         UserError: a mask cannot be read.
@@ -85,7 +90,10 @@ def sightings(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -
     for outline in outlines:
         camera = outline.view.camera
         image = project(camera, torch.from_numpy(points))
-        pixel, depth = np.nan_to_num(image.pixel.numpy(), nan=-1.0, posinf=-1.0, neginf=-1.0), image.depth.numpy()
+        pixel, depth = (
+            np.nan_to_num(image.pixel.numpy(), nan=-1.0, posinf=-1.0, neginf=-1.0),
+            image.depth.numpy(),
+        )
         size = np.array([camera.width, camera.height])
         shown = (depth > 0) & (pixel >= 0).all(axis=1) & (pixel < size).all(axis=1)
         column, row = np.where(shown[:, None], pixel, 0).astype(np.int64).T
@@ -95,7 +103,8 @@ def sightings(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -
 
 
 def agreement(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, " P"]:
-    """The share of the views that can tell of a point, in whose silhouette it lies; 0 where fewer than half of them can.
+    """The share of the views that can tell of a point, in whose silhouette it lies; 0 where fewer than half
+    of them can.
 
     Points are in the frame of the views' cameras.
     """

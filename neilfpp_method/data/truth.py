@@ -1,8 +1,9 @@
 """The ground truth of a capture, where it is at hand: depth, normals, masks, materials, mesh and light field.
 
-Everything is optional and read when asked for. What belongs to a view is flat, row by row, as in `PixelDataset.view`. Where a
-view has fewer pixels than its files, a pixel shows a surface if all of its area does; its depth is that at its centre, all else
-the mean over its area. All positions, lengths and directions are in the scene frame.
+Everything is optional and read when asked for. What belongs to a view is flat, row by row, as in
+`PixelDataset.view`. Where a view has fewer pixels than its files, a pixel shows a surface if all of its area
+does; its depth is that at its centre, all else the mean over its area. All positions, lengths and directions
+are in the scene frame.
 
     <inputs>/depth_maps/<stem>.exr                     depth along the camera's axis, world units, 0: background
     <inputs>/normal_maps/<stem>.exr                    unit normals, world axes, 0: background
@@ -60,7 +61,9 @@ class Truth:
 
     def depth(self, view: View) -> Float[Tensor, " P"] | None:
         """Depth along the camera's axis in scene units, 0 on the background."""
-        pixels = self._pixels(self.capture.inputs / "depth_maps" / f"{view.name}.exr", view, channels=1, mean=False)
+        pixels = self._pixels(
+            self.capture.inputs / "depth_maps" / f"{view.name}.exr", view, channels=1, mean=False
+        )
         return None if pixels is None else pixels[:, 0] / self.capture.normalisation.scale
 
     def mask(self, view: View) -> Bool[Tensor, " P"] | None:
@@ -98,13 +101,21 @@ class Truth:
             with np.load(path, allow_pickle=False) as arrays:
                 get = {name: torch.from_numpy(arrays[name].astype(np.float32)) for name in arrays.files}
             (n, s, _), (_, k, _) = get["wi"].shape, get["wo"].shape
-            shapes = {"points": (n, 3), "normals": (n, 3), "base_color": (n, 3), "roughness": (n,), "metallic": (n,)}
+            shapes = {
+                "points": (n, 3),
+                "normals": (n, 3),
+                "base_color": (n, 3),
+                "roughness": (n,),
+                "metallic": (n,),
+            }
             shapes |= {"wi": (n, s, 3), "incident": (n, s, 3), "wo": (n, k, 3), "outgoing": (n, k, 3)}
             for name, shape in shapes.items():
                 if get[name].shape != shape:
                     raise ValueError(f"{name} has the shape {tuple(get[name].shape)}, not {shape}")
         except Exception as error:  # a damaged archive raises what zipfile, zlib and numpy please
-            raise UserError(f"{path}: not a light field ({error})", "remove the file, or write it again") from error
+            raise UserError(
+                f"{path}: not a light field ({error})", "remove the file, or write it again"
+            ) from error
         return LightField(
             position=self.capture.normalisation.to_scene(get["points"]),
             normal=get["normals"],
@@ -118,7 +129,9 @@ class Truth:
     def _file(self, path: Path) -> Path | None:
         return path if inside(self.capture.root, path).is_file() else None
 
-    def _pixels(self, path: Path, view: View, channels: int, mean: bool = True) -> Float[Tensor, "P C"] | None:
+    def _pixels(
+        self, path: Path, view: View, channels: int, mean: bool = True
+    ) -> Float[Tensor, "P C"] | None:
         """The pixels of a file, flat."""
         if self._file(path) is None:
             return None
@@ -127,11 +140,17 @@ class Truth:
             pixels = pixels[..., :1]  # many programs write grey as three channels that are alike
         wanted = (*file_size(view)[::-1], channels)
         if pixels.shape != wanted:
-            raise UserError(f"{path}: the shape {pixels.shape}, where the view needs {wanted}", "render it again")
+            raise UserError(
+                f"{path}: the shape {pixels.shape}, where the view needs {wanted}", "render it again"
+            )
         if not np.isfinite(pixels).all():
             raise UserError(f"{path}: a pixel is not finite", "render it again")
         size = (view.camera.width, view.camera.height)
         if size != file_size(view):
-            covered = area_share((pixels != 0).any(-1), *size) > 1 - 1e-6 if not mean else np.ones(size[::-1], bool)
-            pixels = np.where(covered[..., None], (area_average if mean else nearest)(pixels, *size), np.float32(0.0))
+            covered = (
+                area_share((pixels != 0).any(-1), *size) > 1 - 1e-6 if not mean else np.ones(size[::-1], bool)
+            )
+            pixels = np.where(
+                covered[..., None], (area_average if mean else nearest)(pixels, *size), np.float32(0.0)
+            )
         return torch.from_numpy(pixels).reshape(-1, channels)

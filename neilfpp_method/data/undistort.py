@@ -15,7 +15,8 @@ __all__ = ["resample", "straight_camera"]
 
 
 def straight_camera(camera: Camera) -> Camera:
-    """The pinhole, of the same pose, that shows as much as possible of what a camera with a lens shows, and no more.
+    """The pinhole, of the same pose, that shows as much as possible of what a camera with a lens shows, and
+    no more.
 
     A pinhole is returned as it is.
     """
@@ -27,7 +28,9 @@ def straight_camera(camera: Camera) -> Camera:
     return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, width=pinhole.width, height=pinhole.height, lens=None)
 
 
-def resample(values: Float32[np.ndarray, "H W C"], camera: Camera, straight: Camera) -> Float32[np.ndarray, "h w C"]:
+def resample(
+    values: Float32[np.ndarray, "H W C"], camera: Camera, straight: Camera
+) -> Float32[np.ndarray, "h w C"]:
     """An image of a camera with a lens as its pinhole sees it, bilinear; the border is continued."""
     rows, columns = np.mgrid[: straight.height, : straight.width].reshape(2, -1) + 0.5
     plane = (np.stack([columns, rows], axis=1) - straight.intrinsics[2:]) / straight.intrinsics[:2]

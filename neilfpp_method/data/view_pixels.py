@@ -29,9 +29,11 @@ class ViewPixels:
     """What a view's files say of its pixels.
 
     Attributes:
-        color: linear radiance on the scale that the views share, or display values; finite where nothing is `broken`.
+        color: linear radiance on the scale that the views share, or display values; finite where nothing is
+            `broken`.
         mask: where the object is, by the mask file or the alpha channel; none where the view has neither.
-        valid: all but those that the validity mask leaves out; a pixel that covers several is valid where all of them are.
+        valid: all but those that the validity mask leaves out; a pixel that covers several is valid where all
+            of them are.
         broken: number of pixels of the file that are NaN, infinite or negative, and not marked as invalid.
     """
 
@@ -45,8 +47,8 @@ def read_view(view: View, hdr: bool) -> ViewPixels:
     """Read the files of a view.
 
     Raises:
-        UserError: a file cannot be read, or has another size than when the capture was loaded; the mask shows no object; or
-            display values have an exposure.
+        UserError: a file cannot be read, or has another size than when the capture was loaded; the mask shows
+            no object; or display values have an exposure.
     """
     image = _read(view)
     color = pixel_colors(view, image, hdr).numpy()
@@ -72,7 +74,8 @@ def read_colors(view: View, hdr: bool) -> Float32[np.ndarray, "H W 3"]:
 
 
 def pixel_colors(view: View, image: ImageFile, hdr: bool) -> Float32[Tensor, "H W 3"]:
-    """The pixels of a view's image, at its own size; linear ones without the view's exposure and white balance.
+    """The pixels of a view's image, at its own size; linear ones without the view's exposure and white
+    balance.
 
     Raises:
         UserError: display values with an exposure or a white balance.
@@ -82,7 +85,8 @@ def pixel_colors(view: View, image: ImageFile, hdr: bool) -> Float32[Tensor, "H 
     if (factors == 1.0).all():
         return color
     if not hdr:
-        # What is clipped at display values stays so at any exposure: no render could be compared with the quotient.
+        # What is clipped at display values stays so at any exposure: no render could be compared with the
+        # quotient.
         raise UserError(
             f"{view.image}: an exposure or white balance for display values (sRGB)",
             "develop the images linearly, or expose them all alike and leave out the factors",
@@ -104,24 +108,30 @@ def _read(view: View) -> ImageFile:
     wanted = file_size(view)
     if (width, height) != wanted:
         raise UserError(
-            f"{view.image}: {width}×{height} pixels where the camera has {wanted[0]}×{wanted[1]}", "load the capture again"
+            f"{view.image}: {width}×{height} pixels where the camera has {wanted[0]}×{wanted[1]}",
+            "load the capture again",
         )
     return image
 
 
 def _object_mask(view: View, image: ImageFile) -> Bool[np.ndarray, "H W"] | None:
-    """The object: where the mask file, or without one the image's alpha, is above one half; none without either."""
+    """The object: where the mask file, or without one the image's alpha, is above one half; none without
+    either.
+    """
     if view.mask is None and image.alpha is None:
         return None
     mask = read_mask(view.mask, view) if view.mask else image.alpha > 0.5
     if not mask.any():
         raise UserError(
-            f"{view.mask or view.image}: the mask shows no object", "remove the view, or make the object's pixels white"
+            f"{view.mask or view.image}: the mask shows no object",
+            "remove the view, or make the object's pixels white",
         )
     return mask
 
 
-def _scaled(color: Float32[np.ndarray, "H W 3"], hdr: bool, width: int, height: int) -> Float32[np.ndarray, "h w 3"]:
+def _scaled(
+    color: Float32[np.ndarray, "H W 3"], hdr: bool, width: int, height: int
+) -> Float32[np.ndarray, "h w 3"]:
     """Averaged in linear radiance."""
     if hdr:
         return area_average(color, width, height)

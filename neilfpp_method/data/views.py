@@ -1,7 +1,7 @@
 """What a capture is made of: cameras, views, and the map from the world to the scene frame.
 
-Cameras have OpenCV axes (x right, y down, z forward) and pixel centres at +0.5: pixel (column, row) is seen through the
-image point (column + ½, row + ½). They are pinholes, or have a `Lens` that bends straight lines.
+Cameras have OpenCV axes (x right, y down, z forward) and pixel centres at +0.5: pixel (column, row) is seen
+through the image point (column + ½, row + ½). They are pinholes, or have a `Lens` that bends straight lines.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ __all__ = [
 ]
 
 MOST_BLIND = 0.6
-"""A fisheye's circle fills 44 % of a picture of 16:9. A lens that shows less was calibrated for other images."""
+"""A fisheye's circle fills 44 % of a picture of 16:9. A lens that shows less was calibrated for other
+images.
+"""
 MOST_LOOKED_UP = 2**26
 """Pixels of different lenses whose rays are kept: half a gigabyte."""
 PLANE_PART = 2**20
@@ -48,8 +50,8 @@ PLANE_PART = 2**20
 class Camera:
     """Focal lengths and principal point in pixels, size in pixels, and the pose, world (or scene) to camera.
 
-    Without `lens` a pinhole; with it, focal lengths and principal point apply to the plane on which the lens shows the
-    scene. Cameras are compared by identity: an array has no single truth value.
+    Without `lens` a pinhole; with it, focal lengths and principal point apply to the plane on which the lens
+    shows the scene. Cameras are compared by identity: an array has no single truth value.
     """
 
     fx: float
@@ -88,7 +90,9 @@ def check_camera(camera: Camera, where: str) -> None:
         raise UserError(f"{where}: the image size is not positive", "give width and height in pixels")
     rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0
     if not rigid or not np.allclose(camera.w2c[3], [0, 0, 0, 1]):
-        raise UserError(f"{where}: the extrinsic is no rotation and translation", "give world-to-camera, 4×4, row-major")
+        raise UserError(
+            f"{where}: the extrinsic is no rotation and translation", "give world-to-camera, 4×4, row-major"
+        )
     if camera.lens is not None:
         camera.lens.check(where)
 
@@ -97,15 +101,15 @@ def check_camera(camera: Camera, where: str) -> None:
 class View:
     """One image with its camera in the world frame.
 
-    `name` is unique in the capture and a plain file name, most often the image's stem; `index` its number in the
-    capture's own list, which counts views that are left out as well.
+    `name` is unique in the capture and a plain file name, most often the image's stem; `index` its number in
+    the capture's own list, which counts views that are left out as well.
 
-    `mask` is white on the object. `valid` is white where a pixel can be used and black where it is saturated or
-    otherwise without meaning. Linear radiance = pixel / (`exposure` · `white_balance`), so that all images of a
-    capture share one scale.
+    `mask` is white on the object. `valid` is white where a pixel can be used and black where it is saturated
+    or otherwise without meaning. Linear radiance = pixel / (`exposure` · `white_balance`), so that all images
+    of a capture share one scale.
 
-    `file_size` is the width and height of the view's files where its camera is of another size (`scaling`); pixels are
-    brought to the size of the camera where they are read.
+    `file_size` is the width and height of the view's files where its camera is of another size (`scaling`);
+    pixels are brought to the size of the camera where they are read.
     """
 
     name: str
@@ -121,7 +125,9 @@ class View:
 
 @dataclass(frozen=True)
 class Normalisation:
-    """scene = (world − centre) / scale: no rotation, so that directions and normals are the same in both frames."""
+    """scene = (world − centre) / scale: no rotation, so that directions and normals are the same in both
+    frames.
+    """
 
     scale: float
     centre: tuple[float, float, float]
@@ -142,17 +148,19 @@ class Normalisation:
 
 
 SceneSource = Literal["box", "points", "focus", "masks", "cameras"]
-"""What told where the scene is: the capture itself; points; what the cameras look at, as the points reach beyond it; the visual
-hull of the masks; the cameras alone."""
+"""What told where the scene is: the capture itself; points; what the cameras look at, as the points reach
+beyond it; the visual hull of the masks; the cameras alone.
+"""
 
 
 @dataclass(frozen=True)
 class CaptureFiles:
     """What a reader finds in a folder: the views in order, the scene frame, and where the rest lies.
 
-    `inputs` is the folder that listed paths start from: masks, depth maps and the like lie in it. `test` names the views
-    that the capture itself holds out, and `hdr` says whether it declares its pixels linear; none: it does not say.
-    `scene_from` is what told the normalisation: a box that the capture has, or else what `scene_box` found.
+    `inputs` is the folder that listed paths start from: masks, depth maps and the like lie in it. `test`
+    names the views that the capture itself holds out, and `hdr` says whether it declares its pixels linear;
+    none: it does not say. `scene_from` is what told the normalisation: a box that the capture has, or else
+    what `scene_box` found.
     """
 
     inputs: Path
@@ -168,7 +176,8 @@ def inside(root: Path, path: Path) -> Path:
     """The path itself, when it leads to a place under `root` once links are followed.
 
     Raises:
-        UserError: it leaves `root`, or is no path at all; a capture from a stranger could otherwise read any file.
+        UserError: it leaves `root`, or is no path at all; a capture from a stranger could otherwise read any
+            file.
     """
     try:
         path.exists()  # raises where the name itself is not possible
@@ -184,19 +193,22 @@ def plain_name(name: str) -> bool:
     return bool(name) and name.isprintable() and not name.startswith(".") and not set(name) & set("/\\:")
 
 
-# ----------------------------------------------------------------------------------------------------------- projection
+# ------------------------------------------------------------------------------------------------- projection
 
 
 @dataclass(frozen=True)
 class Projection:
-    """Image points (column + ½ at a pixel's centre) and depth along the camera's axis, in the units of the pose."""
+    """Image points (column + ½ at a pixel's centre) and depth along the camera's axis, in the units of the
+    pose.
+    """
 
     pixel: Float[Tensor, "N 2"]
     depth: Float[Tensor, " N"]
 
 
 def project(camera: Camera, points: Float[Tensor, "N 3"]) -> Projection:
-    """Where the camera sees points: u = fx·x/z + cx, v = fy·y/z + cy, with x/z and y/z bent by a lens where there is one.
+    """Where the camera sees points: u = fx·x/z + cx, v = fy·y/z + cy, with x/z and y/z bent by a lens where
+    there is one.
 
     A depth ≤ 0 means the point is behind the camera. Differentiable without a lens.
     """
@@ -219,18 +231,21 @@ def camera_rays(camera: Camera, dtype: torch.dtype = torch.float32) -> RayBatch:
 class CameraRays:
     """Rays through the centres of pixels of many cameras, in the frame of their poses.
 
-    The rays of a pinhole are computed when asked for; those of a lens are looked up, as its equations have no closed
-    inverse: 8 bytes a pixel, shared by cameras that differ in their pose alone. Where lenses have more than `MOST_LOOKED_UP`
-    pixels together, as when every photograph has been calibrated by itself, they are computed when asked for, too, which
-    takes longer. A pixel at which a lens shows nothing, as in the corners of a fisheye, has a ray that leads backwards, away
-    from what the camera sees.
+    The rays of a pinhole are computed when asked for; those of a lens are looked up, as its equations have no
+    closed inverse: 8 bytes a pixel, shared by cameras that differ in their pose alone. Where lenses have more
+    than `MOST_LOOKED_UP` pixels together, as when every photograph has been calibrated by itself, they are
+    computed when asked for, too, which takes longer. A pixel at which a lens shows nothing, as in the corners
+    of a fisheye, has a ray that leads backwards, away from what the camera sees.
 
     Raises:
         UserError: a lens shows nothing at most of its pixels.
     """
 
     def __init__(
-        self, cameras: Sequence[Camera], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
+        self,
+        cameras: Sequence[Camera],
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
     ) -> None:
         self._intrinsics = torch.tensor(np.stack([c.intrinsics for c in cameras]), dtype=dtype, device=device)
         self._c2w = torch.tensor(np.stack([c.c2w for c in cameras]), dtype=dtype, device=device)
@@ -242,12 +257,16 @@ class CameraRays:
         self._lens_plane: Float[Tensor, "P 2"] | None = None
         if kinds and sum(sizes) <= MOST_LOOKED_UP:
             starts = dict(zip(kinds, itertools.accumulate(sizes, initial=0), strict=False))
-            self._lens_start = torch.tensor([starts.get(_shape(camera), 0) for camera in cameras], device=device)
+            self._lens_start = torch.tensor(
+                [starts.get(_shape(camera), 0) for camera in cameras], device=device
+            )
             planes = np.concatenate([_whole_plane(camera, dtype) for camera in kinds.values()])
             self._lens_plane = torch.from_numpy(planes).to(device)
 
     def shown(self, i: int) -> Bool[Tensor, " P"]:
-        """Which pixels of camera `i`, row by row, have a ray of their own; all but those where its lens shows nothing."""
+        """Which pixels of camera `i`, row by row, have a ray of their own; all but those where its lens shows
+        nothing.
+        """
         camera = self._cameras[i]
         size = camera.width * camera.height
         if camera.lens is None:
@@ -271,7 +290,9 @@ class CameraRays:
             plane = self._computed(plane, camera, pixel)
         local = torch.nn.functional.pad(plane, (0, 1), value=1.0)
         if self._bent.any():
-            local = torch.where(local.isnan().any(dim=-1, keepdim=True), local.new_tensor([0.0, 0.0, -1.0]), local)
+            local = torch.where(
+                local.isnan().any(dim=-1, keepdim=True), local.new_tensor([0.0, 0.0, -1.0]), local
+            )
         directions = torch.einsum("nij,nj->ni", c2w[:, :, :3], torch.nn.functional.normalize(local, dim=-1))
         return RayBatch(c2w[:, :, 3], directions)
 
@@ -294,10 +315,14 @@ def _shape(camera: Camera) -> tuple[Lens | None, float, float, float, float, int
 
 
 def _whole_plane(camera: Camera, dtype: torch.dtype) -> Float[np.ndarray, "P 2"]:
-    """`_straight_plane` of all pixels of a camera, in the precision of rays; in parts, which take several times as much."""
+    """`_straight_plane` of all pixels of a camera, in the precision of rays; in parts, which take several
+    times as much.
+    """
     count = camera.width * camera.height
     parts = np.split(np.arange(count), range(PLANE_PART, count, PLANE_PART))
-    plane = np.concatenate([torch.from_numpy(_straight_plane(camera, part)).to(dtype).numpy() for part in parts])
+    plane = np.concatenate(
+        [torch.from_numpy(_straight_plane(camera, part)).to(dtype).numpy() for part in parts]
+    )
     blind = int(np.isnan(plane).any(axis=1).sum())
     if blind > MOST_BLIND * count:
         raise UserError(

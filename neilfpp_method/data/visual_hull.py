@@ -1,8 +1,9 @@
-"""The visual hull of silhouettes: all places that no silhouette rules out, and the signed distance of its surface.
+"""The visual hull of silhouettes: all places that no silhouette rules out, and the signed distance of its
+surface.
 
-Every view with a mask says of each place that it sees whether the object can be there. What is left is the smallest body
-that the masks alone can tell (Laurentini 1994): it holds the object, and has its outline from every camera, but no hollow
-that is not seen from the side.
+Every view with a mask says of each place that it sees whether the object can be there. What is left is the
+smallest body that the masks alone can tell (Laurentini 1994): it holds the object, and has its outline from
+every camera, but no hollow that is not seen from the side.
 """
 
 from __future__ import annotations
@@ -21,23 +22,31 @@ from neilfpp_method.data.silhouettes import Outline, sightings
 __all__ = ["HULL_RADIUS", "RESOLUTION", "DistanceCube", "find_hull", "signed_distance", "visual_hull"]
 
 HULL_RADIUS = 1.3
-"""Half an edge of the cube that is carved, scene units: the unit sphere, which holds the object, and some room about it."""
+"""Half an edge of the cube that is carved, scene units: the unit sphere, which holds the object, and some
+room about it.
+"""
 RESOLUTION = 96
 """Cells along an edge; a cell is 0.027 scene units wide. Training knows better soon."""
 CONTRADICTED = 0.05
-"""Share of the views that see a place that may leave it out of their mask, rounded down: a few masks are wrong."""
+"""Share of the views that see a place that may leave it out of their mask, rounded down: a few masks are
+wrong.
+"""
 SEEN = 0.25
-"""Least share of all views that must see a place for it to be in the hull, and never fewer than two of them."""
+"""Least share of all views that must see a place for it to be in the hull, and never fewer than two of
+them.
+"""
 LEAST_CELLS = 64
 """Fewer cells are no body that a field could start as."""
 SMOOTHING = 1.5
-"""Standard deviation, in cells, of the blur that takes the steps of the cells from the distance. A ball of 0.6 scene units then
-has normals that are 2° off, in place of 8°, and is 0.004 units smaller."""
+"""Standard deviation, in cells, of the blur that takes the steps of the cells from the distance. A ball of
+0.6 scene units then has normals that are 2° off, in place of 8°, and is 0.004 units smaller.
+"""
 
 
 @dataclass(frozen=True)
 class DistanceCube:
-    """Signed distance, scene units and negative inside, at the centres of cells of the cube [−radius, radius]³.
+    """Signed distance, scene units and negative inside, at the centres of cells of the cube [−radius,
+    radius]³.
 
     `distance[i, j, k]` belongs to x = −radius + (i + ½) · 2 radius / R, and y and z by j and k alike.
     """
@@ -48,8 +57,8 @@ class DistanceCube:
     def at(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
         """The distance at points of the scene frame, trilinear between centres.
 
-        Beyond the outermost centres it is that of the nearest place within, and the way there: what a field takes from
-        it far away is a slope of 1 that leads back.
+        Beyond the outermost centres it is that of the nearest place within, and the way there: what a field
+        takes from it far away is a slope of 1 that leads back.
         """
         grid = self.distance.to(x)
         edge = self.radius * (1.0 - 1.0 / len(grid))
@@ -60,7 +69,9 @@ class DistanceCube:
         return found.view(-1) + (x - within).square().sum(-1).sqrt()
 
 
-def find_hull(outlines: Sequence[Outline], radius: float = HULL_RADIUS, resolution: int = RESOLUTION) -> DistanceCube | str:
+def find_hull(
+    outlines: Sequence[Outline], radius: float = HULL_RADIUS, resolution: int = RESOLUTION
+) -> DistanceCube | str:
     """The signed distance of the visual hull, or in a few words why these silhouettes do not make one.
 
     Args:
@@ -75,7 +86,8 @@ def find_hull(outlines: Sequence[Outline], radius: float = HULL_RADIUS, resoluti
     hull = visual_hull(outlines, radius, resolution)
     if hull.sum() < LEAST_CELLS:
         return "the masks have next to no place in common"
-    # A body that leaves the cube has no surface there: the masks show a ground, or the box is that of something smaller.
+    # A body that leaves the cube has no surface there: the masks show a ground, or the box is that of
+    # something smaller.
     faces = np.ones_like(hull)
     faces[1:-1, 1:-1, 1:-1] = False
     if hull[faces].any():
@@ -84,11 +96,12 @@ def find_hull(outlines: Sequence[Outline], radius: float = HULL_RADIUS, resoluti
 
 
 def visual_hull(outlines: Sequence[Outline], radius: float, resolution: int) -> Bool[np.ndarray, "R R R"]:
-    """Which cells of the cube [−radius, radius]³ hold their centre within the silhouettes of nearly all views that see it.
+    """Which cells of the cube [−radius, radius]³ hold their centre within the silhouettes of nearly all views
+    that see it.
 
-    A view sees what is in its image, and what is beside its image where its silhouette does not touch the border
-    (`Outline.complete`): a close-up says nothing of what lies outside it. A place that too few views see is not in the
-    hull.
+    A view sees what is in its image, and what is beside its image where its silhouette does not touch the
+    border (`Outline.complete`): a close-up says nothing of what lies outside it. A place that too few views
+    see is not in the hull.
 
     Args:
         outlines: silhouettes with their cameras, in the frame of the cube.
@@ -111,10 +124,11 @@ def visual_hull(outlines: Sequence[Outline], radius: float, resolution: int) -> 
 
 
 def signed_distance(inside: Bool[np.ndarray, "R R R"], cell: float) -> Float32[np.ndarray, "R R R"]:
-    """The Euclidean distance of every cell's centre from the surface between cells in and out, smoothed, negative inside.
+    """The Euclidean distance of every cell's centre from the surface between cells in and out, smoothed,
+    negative inside.
 
-    The surface lies half a cell from the centres next to it. `cell` is the width of a cell; without a cell inside, or
-    outside, there is no surface and no distance.
+    The surface lies half a cell from the centres next to it. `cell` is the width of a cell; without a cell
+    inside, or outside, there is no surface and no distance.
     """
     within, without = ndimage.distance_transform_edt(inside), ndimage.distance_transform_edt(~inside)
     exact = np.where(inside, 0.5 - within, without - 0.5) * cell

@@ -13,7 +13,9 @@ from neilfpp_method.settings.types import NeilfConfig
 __all__ = ["BASES", "Asked", "check_asked", "read_asked"]
 
 BASES = ("auto", "all", "none", "as-set")
-"""Who decides an effect that is not named: evidence; nobody, all are on; nobody, all are off; the settings."""
+"""Who decides an effect that is not named: evidence; nobody, all are on; nobody, all are off; the
+settings.
+"""
 ELSEWHERE = {
     "response": "what pixels are of radiance is told from the files; say it with --response linear or srgb",
 }
@@ -73,10 +75,17 @@ def check_asked(asked: Asked, config: NeilfConfig) -> None:
     for name, on in asked.named.items():
         obstacle = EFFECTS[name].obstacle(config)
         if obstacle:
-            raise UserError(f"--effects {'+' if on else '-'}{name}: {obstacle}", f"leave {name} out, or change the settings")
+            raise UserError(
+                f"--effects {'+' if on else '-'}{name}: {obstacle}",
+                f"leave {name} out, or change the settings",
+            )
 
 
 def _unknown(word: str, what: str) -> UserError:
     near = get_close_matches(word, EFFECTS, n=1)
-    remedy = f"did you mean '{near[0]}'?" if near else f"give {', '.join(BASES)}, or a list of {', '.join(EFFECTS)} with + or -"
+    remedy = (
+        f"did you mean '{near[0]}'?"
+        if near
+        else f"give {', '.join(BASES)}, or a list of {', '.join(EFFECTS)} with + or -"
+    )
     return UserError(f"--effects: {what}", remedy)

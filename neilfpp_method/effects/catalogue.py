@@ -87,7 +87,9 @@ EFFECTS: Mapping[str, Effect] = {
             on=lambda config: {"light.kind": "distant_near"},
             off={"light.kind": "distant"},
             obstacle=_free_light("a light that is free at every point holds that of lamps"),
-            cost=lambda config: f"a second fit of the light every {_every(config)} steps, and a shadow ray per point and lamp",
+            cost=lambda config: (
+                f"a second fit of the light every {_every(config)} steps, and a shadow ray per point and lamp"
+            ),
             risk="the glow of a lamp becomes base colour",
             solved=True,
         ),
@@ -97,10 +99,14 @@ EFFECTS: Mapping[str, Effect] = {
             is_on=lambda config: config.brdf.metals,
             on=lambda config: {"brdf.metals": True},
             off={"brdf.metals": False},
-            obstacle=lambda config: "" if config.shading.specular else "a surface without reflection shows no metal",
+            obstacle=lambda config: (
+                "" if config.shading.specular else "a surface without reflection shows no metal"
+            ),
             cost=lambda config: "one more unknown at every point",
             risk="metal becomes dark gloss",
-            unjudged=_free_light("not judged: a light that is free at every point explains paint and metal alike"),
+            unjudged=_free_light(
+                "not judged: a light that is free at every point explains paint and metal alike"
+            ),
         ),
         Effect(
             name="background",

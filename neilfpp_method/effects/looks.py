@@ -1,4 +1,6 @@
-"""When evidence is looked at: before a stage that learns a material, at its end, and after each fit of the light."""
+"""When evidence is looked at: before a stage that learns a material, at its end, and after each fit of the
+light.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ from neilfpp_method.structures import PixelBatch
 __all__ = ["LOOKED_AT", "after_fit", "look_at_surface", "note_facts", "wants_surface"]
 
 LOOKED_AT = 1024
-"""Training pixels whose surface points are looked at: the standard error of a share of 1 % is then 0.3 % at most."""
+"""Training pixels whose surface points are looked at: the standard error of a share of 1 % is then 0.3 % at
+most.
+"""
 AT_ONCE = 512
 """Rays that are rendered together; bounds the memory."""
 
@@ -38,7 +42,11 @@ def note_facts(plan: Plan, facts: SceneFacts) -> None:
     """What the files of the capture decide before training."""
     if plan.newest("background") is None:
         on = facts.background == "inverted_sphere"
-        seen = "the borders of the images show more than one colour" if on else "one colour is all that the borders show"
+        seen = (
+            "the borders of the images show more than one colour"
+            if on
+            else "one colour is all that the borders show"
+        )
         plan.decisions.append(Decision(0, "background", on, "files", seen))
 
 
@@ -65,13 +73,16 @@ def look_at_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: i
         measured = self_visibility(model, plan.settings.inter_reflection, surface.position, surface.normal)
         decisions.append(plan.decide("inter-reflection", measured, step))
     if plan.is_open("metals") and plan.newest("metals") is None:
-        decisions.append(plan.decide("metals", metal_evidence(model, pixels, surface.position, surface.normal), step))
+        decisions.append(
+            plan.decide("metals", metal_evidence(model, pixels, surface.position, surface.normal), step)
+        )
     model.train(mode)
     return decisions
 
 
 def after_fit(plan: Plan, found: Evidence | None, lit: int, step: int) -> list[Decision]:
-    """What a fit of the light with and without lamps made of lamps: the solver has chosen, the plan notes what it chose.
+    """What a fit of the light with and without lamps made of lamps: the solver has chosen, the plan notes
+    what it chose.
 
     Nothing is noted where the choice is what it was.
     """
@@ -80,7 +91,9 @@ def after_fit(plan: Plan, found: Evidence | None, lit: int, step: int) -> list[D
     before, on = plan.newest("lamps"), lit > 0
     if before is not None and before.on == on:
         return []
-    measured = Measurement("error that lamps save at points kept back", found.gain, found.deviation, MIN_GAIN, found.points)
+    measured = Measurement(
+        "error that lamps save at points kept back", found.gain, found.deviation, MIN_GAIN, found.points
+    )
     reason = measured.in_words() if before is None else f"revised: {measured.in_words()}"
     plan.decisions.append(Decision(step, "lamps", on, "evidence", reason, measured))
     return plan.decisions[-1:]

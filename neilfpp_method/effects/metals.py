@@ -1,9 +1,10 @@
-"""Evidence for metals: places that are fitted as metal, with views kept back, against the same places as paint.
+"""Evidence for metals: places that are fitted as metal, with views kept back, against the same places as
+paint.
 
-A dark gloss under a bright light explains a single view of a metal, and a metal explains a single view of a paint. How a
-place changes from view to view tells them apart. So light and materials are fitted to most views with and without metals, and
-compared at pixels of the other views. Only places count that the fit with metals takes for metal: at the others the two fits
-hardly differ. Lamps are no part of these fits.
+A dark gloss under a bright light explains a single view of a metal, and a metal explains a single view of a
+paint. How a place changes from view to view tells them apart. So light and materials are fitted to most views
+with and without metals, and compared at pixels of the other views. Only places count that the fit with metals
+takes for metal: at the others the two fits hardly differ. Lamps are no part of these fits.
 """
 
 from __future__ import annotations
@@ -36,10 +37,12 @@ METAL = 0.5
 def metal_evidence(
     model: NeilfModel, pixels: PixelDataset, position: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]
 ) -> Measurement:
-    """How much lower the relative error of kept-back pixels is with metals, at places that are taken for metal.
+    """How much lower the relative error of kept-back pixels is with metals, at places that are taken for
+    metal.
 
     Args:
-        model: its surface, and what it sends (R), are taken as they are; its material and its light play no part.
+        model: its surface, and what it sends (R), are taken as they are; its material and its light play no
+            part.
         pixels: of the training views.
         position, normal: points on the surface, scene frame; the first `PLACES` are taken.
     """
@@ -61,7 +64,9 @@ def metal_evidence(
         paint, metal = (fit_places(known, transport[fitted], typical, metals) for metals in (False, True))
         carried = transport[kept_back]
         gain = place_errors(paint, unknown, carried, typical) - place_errors(metal, unknown, carried, typical)
-        counts = (torch.bincount(unknown.place, minlength=places.count) > 0) & (metal.metallic >= _first_metal())
+        counts = (torch.bincount(unknown.place, minlength=places.count) > 0) & (
+            metal.metallic >= _first_metal()
+        )
         gains.append(unknown.mean(gain)[counts])
     return mean_of(torch.cat(gains), what, WORTH)
 

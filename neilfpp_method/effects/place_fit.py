@@ -1,8 +1,9 @@
-"""Light and materials that explain some places together: an environment map, and at each place one base colour, one
-roughness of a grid, and one metallic of a grid.
+"""Light and materials that explain some places together: an environment map, and at each place one base
+colour, one roughness of a grid, and one metallic of a grid.
 
-With few places everything is small: transport is a matrix for each roughness, the best material under a light is found by
-trying all pairs of roughness and metallic, the best light under the materials by descent, and the two take turns.
+With few places everything is small: transport is a matrix for each roughness, the best material under a light
+is found by trying all pairs of roughness and metallic, the best light under the materials by descent, and the
+two take turns.
 """
 
 from __future__ import annotations
@@ -125,7 +126,9 @@ def _relative_error(outgoing: Tensor, places: Places, typical: float) -> Tensor:
     return (outgoing - pixel) / (pixel + FLOOR * typical)
 
 
-def _better_light(fit: PlaceFit, places: Places, transport: Transport, typical: float, steps: int) -> PlaceFit:
+def _better_light(
+    fit: PlaceFit, places: Places, transport: Transport, typical: float, steps: int
+) -> PlaceFit:
     """The light by descent, and the base colours with it, at the roughness and metallic that places have."""
     shown, metallic = _at_roughness(transport, fit.roughness[places.place]), _metallic(fit)[places.place]
     flat = shown.sources.flatten(0, 1)
@@ -137,7 +140,9 @@ def _better_light(fit: PlaceFit, places: Places, transport: Transport, typical: 
         for _ in range(steps):
             base_color = fit.base_color * gain.exp()
             sent = (flat @ log_radiance.exp().flatten(1).t()).view_as(shown.scene) + shown.scene
-            error = _relative_error(_outgoing(sent, base_color.clamp(0, 1)[places.place], metallic), places, typical)
+            error = _relative_error(
+                _outgoing(sent, base_color.clamp(0, 1)[places.place], metallic), places, typical
+            )
             loss = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER)
             loss = loss + SMOOTHNESS * total_variation(log_radiance)
             loss = loss + BOUND_WEIGHT * (base_color - BOUND).clamp_min(0).square().mean()
@@ -152,7 +157,8 @@ def _better_light(fit: PlaceFit, places: Places, transport: Transport, typical: 
 def _best_material(
     fit: PlaceFit, places: Places, transport: Transport, typical: float, metallics: tuple[float, ...]
 ) -> PlaceFit:
-    """Of all pairs of roughness and metallic at a place the one whose best base colour leaves the smallest error.
+    """Of all pairs of roughness and metallic at a place the one whose best base colour leaves the smallest
+    error.
 
     Radiance is linear in the base colour, b · slope + rest, so the best is a weighted mean.
     """
@@ -167,11 +173,15 @@ def _best_material(
             wanted = (places.observed.pixel - 0.04 * (1 - m) * facing - grazing) / unit
             weight = torch.ones_like(slope)
             for _ in range(REWEIGHTED):
-                per_place = places.mean(weight * slope * wanted) / places.mean(weight * slope.square()).clamp_min(1e-12)
+                per_place = places.mean(weight * slope * wanted) / places.mean(
+                    weight * slope.square()
+                ).clamp_min(1e-12)
                 tried = per_place.clamp(DARKEST, 1)
                 error = tried[places.place] * slope - wanted
                 weight = 1 / error.abs().clamp_min(OUTLIER)
-            size = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER, reduction="none").mean(-1)
+            size = functional.smooth_l1_loss(
+                error, torch.zeros_like(error), beta=OUTLIER, reduction="none"
+            ).mean(-1)
             left = places.mean(size)
             better = left < best
             best = torch.where(better, left, best)

@@ -1,5 +1,6 @@
-"""Places on the surface, each with the pixels of all training views that show it: what tells materials apart is how a place
-changes from view to view."""
+"""Places on the surface, each with the pixels of all training views that show it: what tells materials apart
+is how a place changes from view to view.
+"""
 
 from __future__ import annotations
 
@@ -56,9 +57,14 @@ class Places:
 
 @torch.no_grad()
 def gather_places(
-    model: NeilfModel, pixels: PixelDataset, position: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"], views: int
+    model: NeilfModel,
+    pixels: PixelDataset,
+    position: Float[Tensor, "P 3"],
+    normal: Float[Tensor, "P 3"],
+    views: int,
 ) -> Places:
-    """The pixels that show given points of the surface, each in at most `views` views that are drawn at random.
+    """The pixels that show given points of the surface, each in at most `views` views that are drawn at
+    random.
 
     Args:
         model: whose host says what a pixel shows.
@@ -73,7 +79,9 @@ def gather_places(
     for number, camera in enumerate(cameras):
         shown = project(camera, position)
         column, row = shown.pixel.floor().long().unbind(-1)
-        within = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height) & (shown.depth > 0)
+        within = (
+            (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height) & (shown.depth > 0)
+        )
         place = torch.nonzero(within & chosen[:, number])[:, 0]
         if not len(place):
             continue
@@ -101,6 +109,9 @@ def gather_places(
         return Places(len(position), none, none, Observed(*[position[:0]] * 4))
     place, view = (torch.cat([getattr(part, name) for part in found]) for name in ("place", "view"))
     observed = Observed(
-        *(torch.cat([getattr(part.observed, name) for part in found]) for name in ("position", "normal", "wo", "pixel"))
+        *(
+            torch.cat([getattr(part.observed, name) for part in found])
+            for name in ("position", "normal", "wo", "pixel")
+        )
     )
     return Places(len(position), place, view, observed)

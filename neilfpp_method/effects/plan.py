@@ -24,8 +24,8 @@ class Decision:
         step: of the training; 0: from the start.
         effect: by name, as in `EFFECTS`.
         on: whether it is simulated.
-        by: who decided: a person by --effects, the settings, the files of the capture before training, or evidence of the
-            model that trains.
+        by: who decided: a person by --effects, the settings, the files of the capture before training, or
+            evidence of the model that trains.
         reason: for people, a clause.
         evidence: what was measured; none where nothing was.
     """
@@ -46,7 +46,8 @@ class Decision:
 def decided_settings(settings: NeilfConfig, decisions: Sequence[Decision]) -> NeilfConfig:
     """The settings with the newest decision on each effect.
 
-    What a person asked for is set as asked. Evidence only takes away: an effect that it keeps is as the settings have it.
+    What a person asked for is set as asked. Evidence only takes away: an effect that it keeps is as the
+    settings have it.
     """
     newest = {decision.effect: decision for decision in decisions}
     for name, decision in newest.items():
@@ -84,9 +85,13 @@ class Plan:
             elif obstacle:
                 plan.decisions.append(Decision(0, name, effect.is_on(settings), "settings", obstacle))
             elif asked.base in ("all", "none"):
-                plan.decisions.append(Decision(0, name, asked.base == "all", "asked", f"--effects {asked.base}"))
+                plan.decisions.append(
+                    Decision(0, name, asked.base == "all", "asked", f"--effects {asked.base}")
+                )
             elif asked.base == "as-set":
-                plan.decisions.append(Decision(0, name, effect.is_on(settings), "settings", "as the settings say"))
+                plan.decisions.append(
+                    Decision(0, name, effect.is_on(settings), "settings", "as the settings say")
+                )
             elif not effect.is_on(settings):
                 plan.decisions.append(Decision(0, name, False, "settings", "off in the settings"))
             elif effect.unjudged(settings):
@@ -100,8 +105,9 @@ class Plan:
 
     @property
     def config_of_model(self) -> NeilfConfig:
-        """The settings that the model of the run is built from: evidence of a model changes what is computed with it, and none
-        of its tensors."""
+        """The settings that the model of the run is built from: evidence of a model changes what is computed
+        with it, and none of its tensors.
+        """
         return decided_settings(self.settings, [d for d in self.decisions if d.before_training])
 
     def newest(self, name: str) -> Decision | None:
@@ -119,7 +125,9 @@ class Plan:
         return newest is None or newest.by == "evidence"
 
     def decide(self, name: str, measured: Measurement, step: int) -> Decision:
-        """What evidence makes of an effect that is open; without enough samples it stays as it is. It counts from now on."""
+        """What evidence makes of an effect that is open; without enough samples it stays as it is. It counts
+        from now on.
+        """
         before = self.is_on(name)
         favoured = measured.favours(before)
         on = before if favoured is None else favoured

@@ -17,15 +17,17 @@ OPEN = "open"
 def rows(plan: Plan) -> list[dict[str, Any]]:
     """Every effect with what was decided last, in the order of the catalogue.
 
-    `decision` is "on", "off" or "open"; `cost` is what the effect takes, and takes nothing when off; `value`, `deviation`,
-    `threshold`, `samples` are those of the evidence, or null.
+    `decision` is "on", "off" or "open"; `cost` is what the effect takes, and takes nothing when off; `value`,
+    `deviation`, `threshold`, `samples` are those of the evidence, or null.
     """
     config = plan.config
     found = []
     for name, effect in EFFECTS.items():
         newest = plan.newest(name)
         evidence = newest.evidence if newest else None
-        simulated = config if effect.obstacle(config) or effect.is_on(config) else switched(config, effect, on=True)
+        simulated = (
+            config if effect.obstacle(config) or effect.is_on(config) else switched(config, effect, on=True)
+        )
         found.append(
             {
                 "effect": name,

@@ -1,8 +1,9 @@
 """Evidence for shadows and light between surfaces: how much of what a surface looks at is the scene itself.
 
-A surface point that sees a share q of its hemisphere blocked, by the cosine, gets a share q of its light from the scene and
-not from the light, if that is even; where light comes from one side, a share q of all such points is in shadow in the mean
-over the sides. So a mean q is the size of the relative error of leaving both out. A convex body has none.
+A surface point that sees a share q of its hemisphere blocked, by the cosine, gets a share q of its light from
+the scene and not from the light, if that is even; where light comes from one side, a share q of all such
+points is in shadow in the mean over the sides. So a mean q is the size of the relative error of leaving both
+out. A convex body has none.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from neilfpp_method.structures import RayBatch
 __all__ = ["WORTH", "blocked_share", "self_visibility"]
 
 WORTH = 0.01
-"""Share of the hemisphere below which nothing is traced: the relative error that lamps must save as well (`lighting.fit`)."""
+"""Share of the hemisphere below which nothing is traced: the relative error that lamps must save as well
+(`lighting.fit`).
+"""
 DIRECTIONS = 16
 """Per point, by the cosine. The standard error is mostly that of the choice of points."""
 RAYS_AT_ONCE = 2048
@@ -30,7 +33,10 @@ RAYS_AT_ONCE = 2048
 
 @torch.no_grad()
 def self_visibility(
-    model: NeilfModel, settings: InterReflectionConfig, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
+    model: NeilfModel,
+    settings: InterReflectionConfig,
+    position: Float[Tensor, "N 3"],
+    normal: Float[Tensor, "N 3"],
 ) -> Measurement:
     """The share of the hemisphere of surface points, by the cosine, that the scene itself fills.
 
@@ -44,7 +50,10 @@ def self_visibility(
 
 
 def blocked_share(
-    model: NeilfModel, settings: InterReflectionConfig, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
+    model: NeilfModel,
+    settings: InterReflectionConfig,
+    position: Float[Tensor, "N 3"],
+    normal: Float[Tensor, "N 3"],
 ) -> Float[Tensor, " N"]:
     """Of each point."""
     drawn = cosine(normal).draw(DIRECTIONS, True)
@@ -56,5 +65,7 @@ def blocked_share(
         up, directions = normal.repeat_interleave(DIRECTIONS, 0), drawn.reshape(-1, 3)
         rays = RayBatch(off_surface(host, start, up, directions, settings.offset), directions)
         parts = [rays[i : i + RAYS_AT_ONCE] for i in range(0, len(rays), RAYS_AT_ONCE)]
-        hit = torch.cat([host.render(part).is_hit(hit_share) for part in parts]).view(len(position), DIRECTIONS)
+        hit = torch.cat([host.render(part).is_hit(hit_share) for part in parts]).view(
+            len(position), DIRECTIONS
+        )
     return hit.float().mean(1)

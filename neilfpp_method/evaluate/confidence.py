@@ -1,10 +1,12 @@
-"""How far off a run's material may be at points of its surface, from how well what the training views saw determines it.
+"""How far off a run's material may be at points of its surface, from how well what the training views saw
+determines it.
 
-Two things stand between the images and the material. Noise, and what no model explains, is different in every view; its size
-is that of the run's own residuals. Errors of the light are the same for all views of a point: the radiance that arrives is
-uncertain patch of directions by patch, and as a whole. More views do not help against those; a light that varies does, as
-does a lobe that moves across it. An error that all points have in common is a scale of the base colour and no error, so each
-patch counts for what a point receives from it more, or less, than a typical one (`Evidence.typical`).
+Two things stand between the images and the material. Noise, and what no model explains, is different in every
+view; its size is that of the run's own residuals. Errors of the light are the same for all views of a point:
+the radiance that arrives is uncertain patch of directions by patch, and as a whole. More views do not help
+against those; a light that varies does, as does a lobe that moves across it. An error that all points have in
+common is a scale of the base colour and no error, so each patch counts for what a point receives from it
+more, or less, than a typical one (`Evidence.typical`).
 """
 
 from __future__ import annotations
@@ -32,23 +34,35 @@ from neilfpp_method.shading.color import apply_response, response_slope, srgb_to
 from neilfpp_method.structures import OrientedPoints
 from neilfpp_method.train.run import Run
 
-__all__ = ["Evidence", "deviations_at", "gather_evidence", "material_deviation", "shown_surface", "with_deviation"]
+__all__ = [
+    "Evidence",
+    "deviations_at",
+    "gather_evidence",
+    "material_deviation",
+    "shown_surface",
+    "with_deviation",
+]
 
 VIEWS = 16
 """Views of a point that count. Those that lie between them add little that is new."""
 DIRECT, REFLECTED, OVERALL = 0.3, 0.2, 1.0
-"""Relative standard deviations of the light of a patch, or a lamp: from outside the scene, from its own surfaces, whose
-radiance the cameras see, and of all light from outside together, whose scale nothing but the latter ties down."""
+"""Relative standard deviations of the light of a patch, or a lamp: from outside the scene, from its own
+surfaces, whose radiance the cameras see, and of all light from outside together, whose scale nothing but the
+latter ties down.
+"""
 KNOWN = 0.05
 """The same of a light that was given."""
 PIXELS = 1024
-"""Training pixels whose points say how well the run explains its images, and what light a typical point receives."""
+"""Training pixels whose points say how well the run explains its images, and what light a typical point
+receives.
+"""
 TYPICAL_LOOKS = 1
 """Looks at a point that is explained as well as a typical one, which count beside those that there are."""
 POINTS_AT_ONCE, SIGHTED_AT_ONCE = 512, 2**16
 NEIGHBOURS, NEAR, TURN = 9, 0.1, 0.1
-"""Most points that tell how sure one is, itself among them; how near they are, in scene units; and how far a radian between
-normals puts two of them apart."""
+"""Most points that tell how sure one is, itself among them; how near they are, in scene units; and how far a
+radian between normals puts two of them apart.
+"""
 MIN_NOISE = 1e-3
 """No image is better than this."""
 STEP = 1e-3
@@ -62,8 +76,8 @@ class Evidence:
 
     Attributes:
         views: the training views.
-        noise: half of the relative errors of radiance are below it; they are relative to what was seen and a share of what
-            is typical (`lighting.objective.FLOOR`).
+        noise: half of the relative errors of radiance are below it; they are relative to what was seen and a
+            share of what is typical (`lighting.objective.FLOOR`).
         misfit: half of the points have a root mean square of their relative errors below it.
         typical: the mean over points of the shares of diffuse light that come from each patch.
     """
@@ -98,7 +112,9 @@ def gather_evidence(run: Run) -> Evidence:
         position, normal, seen = hits.position[rows], normal[rows], seen[rows]
         material = model.materials(position)
         incident = light_by_patch(model, position, normal, seen.wo, material)
-        error = _relative_error(model, sent_by_patch(model, incident, material, normal, seen.wo).sum(-1), seen)
+        error = _relative_error(
+            model, sent_by_patch(model, incident, material, normal, seen.wo).sum(-1), seen
+        )
         errors.append(error[seen.seen].abs().flatten())
         misfits.append(_mean_over_looks(error.square(), seen).sqrt())
         parts = by_patch(incident.light, incident.patch, patch_count(model))
@@ -127,9 +143,9 @@ def material_deviation(
         on_progress: told the share that is done.
 
     Returns:
-        Root mean square errors, of each point the median of its neighbours' among these: base colour up to a factor per
-        channel that is one for all points. Points that no view sees have those of a guess. Roughness and metallic mean
-        nothing where the run's shading is Lambertian.
+        Root mean square errors, of each point the median of its neighbours' among these: base colour up to a
+        factor per channel that is one for all points. Points that no view sees have those of a guess.
+        Roughness and metallic mean nothing where the run's shading is Lambertian.
     """
     parts = [Deviation(*position.new_zeros(3, 0, 1))]
     for block in range(0, len(position), SIGHTED_AT_ONCE):
@@ -151,10 +167,11 @@ def deviations_at(run: Run, points: OrientedPoints) -> Float[Tensor, "N 3"]:
 
 
 def with_deviation(run: Run, evidence: Evidence, view: RenderedView, step: int = 1) -> RenderedView:
-    """A rendered view with the maps base_color_std, roughness_std and metallic_std, 0 where it shows no surface.
+    """A rendered view with the maps base_color_std, roughness_std and metallic_std, 0 where it shows no
+    surface.
 
-    With a `step` of k only every k-th pixel of every k-th row is asked, and the k × k about it take after it. A Lambertian
-    run has the first map alone.
+    With a `step` of k only every k-th pixel of every k-th row is asked, and the k × k about it take after it.
+    A Lambertian run has the first map alone.
     """
     height, width = view.maps["opacity"].shape[:2]
     asked = np.zeros((height, width), bool)
@@ -174,23 +191,34 @@ def shown_surface(run: Run, view: RenderedView, pixels: Int[np.ndarray, " P"]) -
     camera = next(v.camera for v in run.capture.views if v.name == view.name)
     rays = camera_rays(run.capture.normalisation.camera(camera))[torch.from_numpy(pixels)]
     depth, normal = (
-        torch.from_numpy(view.maps[name].reshape(-1, size)[pixels]) for name, size in (("depth", 1), ("normal", 3))
+        torch.from_numpy(view.maps[name].reshape(-1, size)[pixels])
+        for name, size in (("depth", 1), ("normal", 3))
     )
-    return OrientedPoints(rays.origins + depth * rays.directions, normal).to(next(run.model.parameters()).device)
+    return OrientedPoints(rays.origins + depth * rays.directions, normal).to(
+        next(run.model.parameters()).device
+    )
 
 
 def _evened(deviation: Deviation, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> Deviation:
-    """Medians over neighbours. Directions are drawn for each point by itself, and what the views of one point do not tell those
-    of its neighbours may: the material is a field."""
+    """Medians over neighbours. Directions are drawn for each point by itself, and what the views of one point
+    do not tell those of its neighbours may: the material is a field.
+    """
     place = torch.cat((position, TURN * normal), -1).cpu().numpy()
     nearest = cKDTree(place).query(place, k=range(1, 1 + NEIGHBOURS), distance_upper_bound=NEAR)[1]
     # Where there are fewer, the tree says a row past the last.
-    values = (functional.pad(getattr(deviation, f.name), (0, 0, 0, 1), value=math.nan)[nearest] for f in fields(Deviation))
+    values = (
+        functional.pad(getattr(deviation, f.name), (0, 0, 0, 1), value=math.nan)[nearest]
+        for f in fields(Deviation)
+    )
     return Deviation(*(value.nanmedian(1).values for value in values))
 
 
 def _deviation(
-    model: NeilfModel, evidence: Evidence, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"], seen: Sightings
+    model: NeilfModel,
+    evidence: Evidence,
+    position: Float[Tensor, "N 3"],
+    normal: Float[Tensor, "N 3"],
+    seen: Sightings,
 ) -> Deviation:
     """Of points that are treated together."""
     material = model.materials(position)
@@ -200,13 +228,17 @@ def _deviation(
     peculiar = sent - sent.sum(-1, keepdim=True) * evidence.typical
     outside = torch.cat((peculiar[..., :PATCHES], peculiar[..., 2 * PATCHES :]), -1).sum(-1, keepdim=True)
     shared = torch.cat((peculiar * deviations[:-1], outside * deviations[-1]), -1)
-    sights = Sights(seen.seen, _to_radiance(model, seen.pixel), evidence.noise * _unit_error(model, seen.pixel), shared)
+    sights = Sights(
+        seen.seen, _to_radiance(model, seen.pixel), evidence.noise * _unit_error(model, seen.pixel), shared
+    )
     looks = possible_looks(model, incident, normal, seen.wo)
     deviation = expected_error(looks, sights, material, model.config.shading.specular)
     return _widened(deviation, guessed_error(material), _birge_ratio(model, evidence, sent.sum(-1), seen))
 
 
-def _birge_ratio(model: NeilfModel, evidence: Evidence, sent: Float[Tensor, "N V 3"], seen: Sightings) -> Float[Tensor, "N 1"]:
+def _birge_ratio(
+    model: NeilfModel, evidence: Evidence, sent: Float[Tensor, "N V 3"], seen: Sightings
+) -> Float[Tensor, "N 1"]:
     """How far off a point's own pixels are, against those of a typical point; 1 where nothing was seen."""
     off = (_relative_error(model, sent, seen) / evidence.misfit).square()
     looks = seen.seen.sum(1)
@@ -219,7 +251,9 @@ def _widened(deviation: Deviation, guess: Deviation, ratio: Float[Tensor, "N 1"]
     return Deviation(*((own * ratio).minimum(own.maximum(worst)) for own, worst in pairs))
 
 
-def _relative_error(model: NeilfModel, sent: Float[Tensor, "N V 3"], seen: Sightings) -> Float[Tensor, "N V 3"]:
+def _relative_error(
+    model: NeilfModel, sent: Float[Tensor, "N V 3"], seen: Sightings
+) -> Float[Tensor, "N V 3"]:
     """Of the radiance that a model sends towards views, against what they saw."""
     return (sent - _to_radiance(model, seen.pixel)) / _unit_error(model, seen.pixel)
 
@@ -238,7 +272,9 @@ def _light_deviations(model: NeilfModel) -> Float[Tensor, " E"]:
 
 
 def _unit_error(model: NeilfModel, pixel: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
-    """The radiance that a relative error of 1 stands for at a pixel, as fits of the light have it (`Objective`)."""
+    """The radiance that a relative error of 1 stands for at a pixel, as fits of the light have it
+    (`Objective`).
+    """
     response = model.facts.response
     typical = apply_response(torch.tensor(model.facts.median_radiance), response)
     unit = error_unit(pixel, response, response_slope(typical, response).item())

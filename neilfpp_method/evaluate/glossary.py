@@ -11,7 +11,9 @@ __all__ = ["Entry", "explain"]
 
 @dataclass(frozen=True)
 class Entry:
-    """A figure for people: its title, how its values are written (`%`-style), which way is better, what it says."""
+    """A figure for people: its title, how its values are written (`%`-style), which way is better, what it
+    says.
+    """
 
     title: str
     pattern: str
@@ -41,28 +43,54 @@ def _ratio(title: str) -> Entry:
 
 
 ENTRIES: Mapping[str, Entry] = {
-    "volume_psnr": _decibels("Image, volume rendering", "New views as the outgoing radiance field shows them, tone-mapped."),
-    "volume_ssim": Entry("Structure, volume rendering", "%.4f", "higher", "Likeness of local structure; 1 is the same."),
-    "volume_psnr_linear": _decibels("Image, volume rendering, linear", "On linear radiance, where highlights weigh most."),
-    "pbr_psnr": _decibels("Image, rendering equation", "New views rendered from material and incident light, tone-mapped."),
-    "pbr_ssim": Entry("Structure, rendering equation", "%.4f", "higher", "Likeness of local structure; 1 is the same."),
-    "pbr_psnr_linear": _decibels("Image, rendering equation, linear", "On linear radiance, where highlights weigh most."),
-    "base_color_psnr": _decibels("Base colour", "As estimated, with the free factor between light and base colour."),
-    "base_color_psnr_gamma": _decibels("Base colour, one gamma", "After one global exponent that matches the medians."),
-    "base_color_psnr_scaled": _decibels("Base colour, scaled", "After the best factor per channel: the free factor is out."),
+    "volume_psnr": _decibels(
+        "Image, volume rendering", "New views as the outgoing radiance field shows them, tone-mapped."
+    ),
+    "volume_ssim": Entry(
+        "Structure, volume rendering", "%.4f", "higher", "Likeness of local structure; 1 is the same."
+    ),
+    "volume_psnr_linear": _decibels(
+        "Image, volume rendering, linear", "On linear radiance, where highlights weigh most."
+    ),
+    "pbr_psnr": _decibels(
+        "Image, rendering equation", "New views rendered from material and incident light, tone-mapped."
+    ),
+    "pbr_ssim": Entry(
+        "Structure, rendering equation", "%.4f", "higher", "Likeness of local structure; 1 is the same."
+    ),
+    "pbr_psnr_linear": _decibels(
+        "Image, rendering equation, linear", "On linear radiance, where highlights weigh most."
+    ),
+    "base_color_psnr": _decibels(
+        "Base colour", "As estimated, with the free factor between light and base colour."
+    ),
+    "base_color_psnr_gamma": _decibels(
+        "Base colour, one gamma", "After one global exponent that matches the medians."
+    ),
+    "base_color_psnr_scaled": _decibels(
+        "Base colour, scaled", "After the best factor per channel: the free factor is out."
+    ),
     "roughness_psnr": _decibels("Roughness", "As estimated; 0 is a mirror, 1 is matt."),
     "metallic_psnr": _decibels("Metallic", "As estimated; 0 is no metal, 1 is metal."),
     "normal_mae_deg": Entry("Normals", "%.2f°", "lower", "Mean angle between estimated and true normals."),
-    "chamfer": _length("Surface", "Mean distance between the surfaces, scene units (the object has radius 1)."),
-    "chamfer_accuracy": _length("Surface, accuracy", "From the estimate to the truth: what is there and should not be."),
+    "chamfer": _length(
+        "Surface", "Mean distance between the surfaces, scene units (the object has radius 1)."
+    ),
+    "chamfer_accuracy": _length(
+        "Surface, accuracy", "From the estimate to the truth: what is there and should not be."
+    ),
     "chamfer_completeness": _length(
         "Surface, completeness", "From the truth to the estimate: what should be there and is not."
     ),
     "incident_light_log_mae": _log(
         "Incident light", "Mean |ln(estimate/truth)| over points and directions; 0.69 is a factor of 2."
     ),
-    "incident_light_log_mae_scaled": _log("Incident light, scaled", "As above, with one factor per channel taken out."),
-    "incident_light_log_mae_occluded": _log("Light from surfaces", "As above, over the directions that meet the scene again."),
+    "incident_light_log_mae_scaled": _log(
+        "Incident light, scaled", "As above, with one factor per channel taken out."
+    ),
+    "incident_light_log_mae_occluded": _log(
+        "Light from surfaces", "As above, over the directions that meet the scene again."
+    ),
     "incident_light_log_mae_occluded_scaled": _log(
         "Light from surfaces, scaled", "As above, with one factor per channel taken out."
     ),
@@ -73,10 +101,14 @@ ENTRIES: Mapping[str, Entry] = {
 
 
 def explain(name: str) -> Entry:
-    """The entry of a figure; a baseline has that of what it stands beside, and an unknown figure its own name."""
+    """The entry of a figure; a baseline has that of what it stands beside, and an unknown figure its own
+    name.
+    """
     if name in ENTRIES:
         return ENTRIES[name]
     base = ENTRIES.get(name.removeprefix("baseline_"))
     if base is not None:
-        return replace(base, title=f"{base.title}, without a method", meaning="A constant, or the mean image.")
+        return replace(
+            base, title=f"{base.title}, without a method", meaning="A constant, or the mean image."
+        )
     return Entry(name.replace("_", " ").capitalize(), "%.4g", "higher", "")

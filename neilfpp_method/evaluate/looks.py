@@ -1,4 +1,6 @@
-"""What surface points send to those who look at them, by a model's material and light: in all, and with other materials."""
+"""What surface points send to those who look at them, by a model's material and light: in all, and with other
+materials.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,11 @@ __all__ = ["possible_looks", "sent_by_patch"]
 
 @torch.no_grad()
 def sent_by_patch(
-    model: NeilfModel, incident: PatchLight, material: Material, normal: Float[Tensor, "N 3"], wo: Float[Tensor, "N V 3"]
+    model: NeilfModel,
+    incident: PatchLight,
+    material: Material,
+    normal: Float[Tensor, "N 3"],
+    wo: Float[Tensor, "N V 3"],
 ) -> Float[Tensor, "N V 3 K"]:
     """The radiance that leaves each point towards each viewer, by the patch that it came from."""
     specular, patches = model.config.shading.specular, patch_count(model)
@@ -30,13 +36,17 @@ def sent_by_patch(
         if specular:
             cos = cosines(normal, direction, incident.wi)
             steep = _steepness(cos)[..., None]
-            reflected = reflected + _lobe(model, cos, material.roughness)[..., None] * (f0 * (1 - steep) + steep)
+            reflected = reflected + _lobe(model, cos, material.roughness)[..., None] * (
+                f0 * (1 - steep) + steep
+            )
         sent.append(by_patch(incident.light * reflected, incident.patch, patches))
     return torch.stack(sent, 1)
 
 
 @torch.no_grad()
-def possible_looks(model: NeilfModel, incident: PatchLight, normal: Float[Tensor, "N 3"], wo: Float[Tensor, "N V 3"]) -> Looks:
+def possible_looks(
+    model: NeilfModel, incident: PatchLight, normal: Float[Tensor, "N 3"], wo: Float[Tensor, "N V 3"]
+) -> Looks:
     """What points would send whatever they are made of; no specular part where the model has none."""
     diffuse = incident.light.sum(1) / math.pi
     nodes = diffuse.new_tensor(ROUGHNESS_NODES)[:, None, None].expand(-1, len(diffuse), 1)
@@ -54,7 +64,9 @@ def possible_looks(model: NeilfModel, incident: PatchLight, normal: Float[Tensor
 def _lobe(model: NeilfModel, cos: Cosines, roughness: Float[Tensor, "N 1"]) -> Float[Tensor, "N S"]:
     """D V of a microfacet lobe."""
     lobe = model.lobe
-    return lobe.distribution(cos.h, roughness) * lobe.visibility(cos.i.clamp_min(0), cos.o.clamp_min(0), roughness)
+    return lobe.distribution(cos.h, roughness) * lobe.visibility(
+        cos.i.clamp_min(0), cos.o.clamp_min(0), roughness
+    )
 
 
 def _steepness(cos: Cosines) -> Float[Tensor, "N S"]:

@@ -1,7 +1,7 @@
 """Numbers that compare an estimate with the truth: pure functions on arrays.
 
-Image metrics take one view each, so that views may differ in size; a protocol averages them over its views, as
-published tables do.
+Image metrics take one view each, so that views may differ in size; a protocol averages them over its views,
+as published tables do.
 """
 
 from __future__ import annotations
@@ -32,19 +32,27 @@ __all__ = [
 ]
 
 PERFECT = 1e-10
-"""Least mean squared error, relative to the peak's square: a perfect estimate scores 100 dB, which JSON can hold."""
+"""Least mean squared error, relative to the peak's square: a perfect estimate scores 100 dB, which JSON can
+hold.
+"""
 
 SSIM_WINDOW = 11
-"""Side of the SSIM window, pixels (Wang et al. 2004): a Gaussian of σ = 1.5 cut off at 3.5 σ. Least image side."""
+"""Side of the SSIM window, pixels (Wang et al. 2004): a Gaussian of σ = 1.5 cut off at 3.5 σ. Least image
+side.
+"""
 
 LOG_FLOOR = 1e-3
-"""Radiance added before a logarithm: true radiance can be 0, and differences far below it are of no visible effect."""
+"""Radiance added before a logarithm: true radiance can be 0, and differences far below it are of no visible
+effect.
+"""
 
 QUERIES = 20_000
-"""Points of a surface that look for their neighbour on the other. Two surfaces far apart make one query slow."""
+"""Points of a surface that look for their neighbour on the other. Two surfaces far apart make one query
+slow.
+"""
 
 
-# --------------------------------------------------------------------------------------------------------------- images
+# ----------------------------------------------------------------------------------------------------- images
 
 
 def psnr(
@@ -73,11 +81,13 @@ def psnr_frame(
     return _decibels((_squared_error(estimate, truth) * mask[..., None]).mean(), peak)
 
 
-def ssim(estimate: Float[np.ndarray, "H W C"], truth: Float[np.ndarray, "H W C"], mask: Bool[np.ndarray, "H W"]) -> float:
+def ssim(
+    estimate: Float[np.ndarray, "H W C"], truth: Float[np.ndarray, "H W C"], mask: Bool[np.ndarray, "H W"]
+) -> float:
     """Structural similarity of one view, values in [0, 1]: the mean of its map over the masked pixels.
 
-    Windows as in Wang et al. 2004. They reach across the mask's border; what they see there is the truth for both, so
-    that the background, which nobody asked for, cannot lower the score.
+    Windows as in Wang et al. 2004. They reach across the mask's border; what they see there is the truth for
+    both, so that the background, which nobody asked for, cannot lower the score.
     """
     pasted = np.where(mask[..., None], estimate, truth)
     _, similarity = structural_similarity(
@@ -96,7 +106,8 @@ def ssim(estimate: Float[np.ndarray, "H W C"], truth: Float[np.ndarray, "H W C"]
 def angular_error(
     estimate: Float[np.ndarray, "H W 3"], truth: Float[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]
 ) -> float:
-    """Mean angle between normals, degrees, over the masked pixels where both are non-zero; NaN where there is none.
+    """Mean angle between normals, degrees, over the masked pixels where both are non-zero; NaN where there is
+    none.
 
     Normals need not be unit. atan2(‖a × b‖, a · b) keeps its digits at small angles, where acos loses them.
     """
@@ -114,21 +125,24 @@ def _decibels(squared_error: float, peak: float) -> float:
     return float(-10.0 * np.log10(max(squared_error / peak**2, PERFECT)))
 
 
-# ------------------------------------------------------------------------------------------------------------ alignment
+# -------------------------------------------------------------------------------------------------- alignment
 
 
 def align_gamma(estimate: Float[np.ndarray, "P C"], truth: Float[np.ndarray, "P C"]) -> float:
     """The exponent γ for which estimate^γ has the truth's median: ln(median truth) / ln(median estimate).
 
-    One number for all channels and pixels, as in the paper's published code. Medians are held off 0 and 1, where the
-    quotient has no value.
+    One number for all channels and pixels, as in the paper's published code. Medians are held off 0 and 1,
+    where the quotient has no value.
     """
     medians = np.clip([np.median(truth), np.median(estimate)], 1e-3, 1.0 - 1e-3)
     return float(np.log(medians[0]) / np.log(medians[1]))
 
 
-def align_scale(estimate: Float[np.ndarray, "P C"], truth: Float[np.ndarray, "P C"]) -> Float[np.ndarray, " C"]:
-    """The factor per channel that brings the estimate closest to the truth, in least squares (Stanford-ORB): Σet / Σe².
+def align_scale(
+    estimate: Float[np.ndarray, "P C"], truth: Float[np.ndarray, "P C"]
+) -> Float[np.ndarray, " C"]:
+    """The factor per channel that brings the estimate closest to the truth, in least squares (Stanford-ORB):
+    Σet / Σe².
 
     1 for a channel whose estimate is zero throughout.
     """
@@ -137,14 +151,15 @@ def align_scale(estimate: Float[np.ndarray, "P C"], truth: Float[np.ndarray, "P 
     return np.divide((e * t).sum(0), energy, out=np.ones_like(energy), where=energy > 0)
 
 
-# ------------------------------------------------------------------------------------------------------------- geometry
+# --------------------------------------------------------------------------------------------------- geometry
 
 
 @dataclass(frozen=True)
 class Chamfer:
     """Mean distances between two surfaces, in the unit of their points.
 
-    `accuracy` is from the estimate to the truth, `completeness` from the truth to the estimate, `mean` half their sum.
+    `accuracy` is from the estimate to the truth, `completeness` from the truth to the estimate, `mean` half
+    their sum.
     """
 
     accuracy: float
@@ -158,8 +173,9 @@ class Chamfer:
 def chamfer(estimate: Float[np.ndarray, "P 3"], truth: Float[np.ndarray, "Q 3"]) -> Chamfer:
     """Distances from the points of each surface to the nearest point of the other.
 
-    All points are there to be found, but of a large set only every k-th looks for its neighbour, fewer than twice
-    `QUERIES` of them: dense sets keep the distance between samples small, and the mean needs no more terms.
+    All points are there to be found, but of a large set only every k-th looks for its neighbour, fewer than
+    twice `QUERIES` of them: dense sets keep the distance between samples small, and the mean needs no more
+    terms.
     """
     return Chamfer(_mean_distance(estimate, truth), _mean_distance(truth, estimate))
 
@@ -175,11 +191,15 @@ def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int = 0) -> Float[np
     return np.asarray(points, dtype=np.float64)
 
 
-# ---------------------------------------------------------------------------------------------------------------- light
+# ------------------------------------------------------------------------------------------------------ light
 
 
-def log_ratio(estimate: Float[np.ndarray, "P C"], truth: Float[np.ndarray, "P C"]) -> Float[np.ndarray, "P C"]:
-    """ln(estimate + LOG_FLOOR) − ln(truth + LOG_FLOOR): radiance spans orders of magnitude, and its ratios show."""
+def log_ratio(
+    estimate: Float[np.ndarray, "P C"], truth: Float[np.ndarray, "P C"]
+) -> Float[np.ndarray, "P C"]:
+    """ln(estimate + LOG_FLOOR) − ln(truth + LOG_FLOOR): radiance spans orders of magnitude, and its ratios
+    show.
+    """
     return np.log(estimate.astype(np.float64) + LOG_FLOOR) - np.log(truth.astype(np.float64) + LOG_FLOOR)
 
 
@@ -188,11 +208,13 @@ def log_error(ratio: Float[np.ndarray, "P C"]) -> float:
     return float(np.abs(ratio).mean())
 
 
-# ----------------------------------------------------------------------------------------------------------- confidence
+# ------------------------------------------------------------------------------------------------- confidence
 
 
 def confidence_ratio(error: Float[np.ndarray, " P"], expected: Float[np.ndarray, " P"]) -> float | None:
-    """The mean error of the half with the smallest expected error over that of the other; none where that is 0."""
+    """The mean error of the half with the smallest expected error over that of the other; none where that is
+    0.
+    """
     order = np.argsort(expected, kind="stable")
     sure, unsure = np.split(error[order], [len(order) // 2])
     return float(sure.mean() / unsure.mean()) if len(sure) and unsure.mean() > 0 else None

@@ -1,4 +1,6 @@
-"""What the report shows: the views of a run beside the truth, and the light that arrives at points of its surface."""
+"""What the report shows: the views of a run beside the truth, and the light that arrives at points of its
+surface.
+"""
 
 from __future__ import annotations
 
@@ -40,12 +42,14 @@ SHADE = (232, 232, 229)
 """The directions below a surface."""
 
 
-# ---------------------------------------------------------------------------------------------------------------- views
+# ------------------------------------------------------------------------------------------------------ views
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """One map of one view, ready to be shown; where the estimate and the truth have a surface, if not all of it counts."""
+    """One map of one view, ready to be shown; where the estimate and the truth have a surface, if not all of
+    it counts.
+    """
 
     estimate: UInt8[np.ndarray, "H W 3"]
     truth: UInt8[np.ndarray, "H W 3"] | None = None
@@ -56,8 +60,9 @@ class Comparison:
 
 @dataclass(frozen=True)
 class ComparedMap:
-    """One map over all shown views, by its name in `model.Maps`. `largest` is the error at the bright end of its scale, `unit`
-    that of the error."""
+    """One map over all shown views, by its name in `model.Maps`. `largest` is the error at the bright end of
+    its scale, `unit` that of the error.
+    """
 
     name: str
     title: str
@@ -81,19 +86,31 @@ class ComparedMap:
 
 
 def view_sections(
-    run: Run, rendered: Sequence[RenderedView], known: Sequence[KnownView], scale: Float[np.ndarray, " 3"] | None
+    run: Run,
+    rendered: Sequence[RenderedView],
+    known: Sequence[KnownView],
+    scale: Float[np.ndarray, " 3"] | None,
 ) -> list[Section]:
     """Maps with a truth in three columns a view; those without in one."""
-    maps = [m for m in compared_maps(run, rendered, known, scale) if m.name != "rgb_volume" or not run.has_material]
+    maps = [
+        m
+        for m in compared_maps(run, rendered, known, scale)
+        if m.name != "rgb_volume" or not run.has_material
+    ]
     compared = tuple(m.row for m in maps if m.has_truth)
     alone = tuple(m.estimates for m in maps if not m.has_truth)
     titles = [f"View {view.name}" for view in rendered]
     sections = [Section(tuple(Group(title, ("truth", "estimate", "error")) for title in titles), compared)]
-    return sections + ([Section(tuple(Group(title, ("estimate",)) for title in titles), alone)] if alone else [])
+    return sections + (
+        [Section(tuple(Group(title, ("estimate",)) for title in titles), alone)] if alone else []
+    )
 
 
 def compared_maps(
-    run: Run, rendered: Sequence[RenderedView], known: Sequence[KnownView], scale: Float[np.ndarray, " 3"] | None
+    run: Run,
+    rendered: Sequence[RenderedView],
+    known: Sequence[KnownView],
+    scale: Float[np.ndarray, " 3"] | None,
 ) -> list[ComparedMap]:
     """Every map that the views have: images, the material with its expected errors, normals."""
     images = ("rgb", "rgb_volume") if run.has_material else ("rgb_volume",)
@@ -105,8 +122,12 @@ def compared_maps(
     ]
 
 
-def _image_map(run: Run, name: str, rendered: Sequence[RenderedView], known: Sequence[KnownView]) -> ComparedMap:
-    images = [k.image if run.capture.hdr else srgb_to_linear(torch.from_numpy(k.image)).numpy() for k in known]
+def _image_map(
+    run: Run, name: str, rendered: Sequence[RenderedView], known: Sequence[KnownView]
+) -> ComparedMap:
+    images = [
+        k.image if run.capture.hdr else srgb_to_linear(torch.from_numpy(k.image)).numpy() for k in known
+    ]
     seen = np.concatenate([image[k.mask] for image, k in zip(images, known, strict=True)])
     exposure = auto_exposure(seen) if run.capture.hdr else 1.0
     comparisons = []
@@ -119,14 +140,19 @@ def _image_map(run: Run, name: str, rendered: Sequence[RenderedView], known: Seq
 
 
 def _material_maps(
-    run: Run, rendered: Sequence[RenderedView], known: Sequence[KnownView], scale: Float[np.ndarray, " 3"] | None
+    run: Run,
+    rendered: Sequence[RenderedView],
+    known: Sequence[KnownView],
+    scale: Float[np.ndarray, " 3"] | None,
 ) -> Iterator[ComparedMap]:
     if not run.has_material:
         return
     yield _material_map("Base colour", "as estimated", "base_color", rendered, known)
     if scale is not None:
         factors = ", ".join(f"{factor:.2f}" for factor in scale)
-        yield _material_map("Base colour", f"scaled per channel\nby {factors}", "base_color", rendered, known, scale)
+        yield _material_map(
+            "Base colour", f"scaled per channel\nby {factors}", "base_color", rendered, known, scale
+        )
     if run.config.shading.specular:
         yield _material_map("Roughness", "0 black, 1 white", "roughness", rendered, known)
         yield _material_map("Metallic", "0 black, 1 white", "metallic", rendered, known)
@@ -155,7 +181,11 @@ def _material_map(
 
 def _deviation_maps(rendered: Sequence[RenderedView]) -> Iterator[ComparedMap]:
     """How far off the material may be, on the scale of its errors, of views that have been asked."""
-    for title, name in (("Base colour", "base_color_std"), ("Roughness", "roughness_std"), ("Metallic", "metallic_std")):
+    for title, name in (
+        ("Base colour", "base_color_std"),
+        ("Roughness", "roughness_std"),
+        ("Metallic", "metallic_std"),
+    ):
         if all(name in view.maps for view in rendered):
             shown = tuple(
                 Comparison(cut_out(display_error(view.maps[name][..., 0], 0.5), _hit(view)), hit=_hit(view))
@@ -186,7 +216,9 @@ def _difference(a: UInt8[np.ndarray, "H W C"], b: UInt8[np.ndarray, "H W C"]) ->
     return np.abs(a.astype(np.float32) - b).mean(-1) / 255.0
 
 
-def albedo_scale(rendered: Sequence[RenderedView], known: Sequence[KnownView]) -> Float[np.ndarray, " 3"] | None:
+def albedo_scale(
+    rendered: Sequence[RenderedView], known: Sequence[KnownView]
+) -> Float[np.ndarray, " 3"] | None:
     """The factor per channel that fits the base colour of all shown views to the truth; none without it."""
     pairs = [(view, k) for view, k in zip(rendered, known, strict=True) if k.material is not None]
     if not pairs:
@@ -195,24 +227,30 @@ def albedo_scale(rendered: Sequence[RenderedView], known: Sequence[KnownView]) -
     return align_scale(estimate, np.concatenate([k.material["base_color"][k.mask] for _, k in pairs]))
 
 
-# ---------------------------------------------------------------------------------------------------------------- light
+# ------------------------------------------------------------------------------------------------------ light
 
 
 @dataclass(frozen=True)
 class LightPoint:
-    """A surface point, and the light that is known to arrive there along the pixels of an unrolled picture."""
+    """A surface point, and the light that is known to arrive there along the pixels of an unrolled
+    picture.
+    """
 
     position: Float[np.ndarray, " 3"]
     normal: Float[np.ndarray, " 3"]
     truth: Float[np.ndarray, "H W 3"] | None
 
 
-def light_sections(run: Run, rendered: Sequence[RenderedView], scale: Float[np.ndarray, " 3"] | None) -> list[Section]:
-    """Incident light: the truth, the estimate, and the estimate divided by what the base colour is scaled with.
+def light_sections(
+    run: Run, rendered: Sequence[RenderedView], scale: Float[np.ndarray, " 3"] | None
+) -> list[Section]:
+    """Incident light: the truth, the estimate, and the estimate divided by what the base colour is scaled
+    with.
 
-    What is scaled out of the one is scaled into the other: their product is what the images see. The points are from
-    the capture's light field where it has one, else from the first view; no section where that shows no surface. Rings
-    in the estimate are about the middles of the lamps that the run has found, those behind something else too.
+    What is scaled out of the one is scaled into the other: their product is what the images see. The points
+    are from the capture's light field where it has one, else from the first view; no section where that shows
+    no surface. Rings in the estimate are about the middles of the lamps that the run has found, those behind
+    something else too.
     """
     directions = lat_long_directions(LIGHT_HEIGHT)
     points = _known_points(run, directions) or _seen_points(run, rendered[0])
@@ -257,12 +295,18 @@ def _known_points(run: Run, directions: Float[np.ndarray, "H W 3"]) -> list[Ligh
     if field is None:
         return []
     rows = spread(OrientedPoints(field.position, field.normal), POINTS).tolist()
-    position, normal, wi, incident = (t.numpy() for t in (field.position, field.normal, field.wi, field.incident))
-    return [LightPoint(position[i], normal[i], nearest_radiance(wi[i], incident[i], directions)) for i in rows]
+    position, normal, wi, incident = (
+        t.numpy() for t in (field.position, field.normal, field.wi, field.incident)
+    )
+    return [
+        LightPoint(position[i], normal[i], nearest_radiance(wi[i], incident[i], directions)) for i in rows
+    ]
 
 
 def _seen_points(run: Run, rendered: RenderedView) -> list[LightPoint]:
-    """Surface points of a rendered view, spread from the top of the picture to its foot; none where it shows none."""
+    """Surface points of a rendered view, spread from the top of the picture to its foot; none where it shows
+    none.
+    """
     view = next(view for view in run.capture.views if view.name == rendered.name)
     rays = camera_rays(run.capture.normalisation.camera(view.camera))
     hits = np.flatnonzero(_hit(rendered))

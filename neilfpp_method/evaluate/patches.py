@@ -1,4 +1,6 @@
-"""The light that arrives at surface points, by the part of the sphere, the scene or the lamp that it comes from."""
+"""The light that arrives at surface points, by the part of the sphere, the scene or the lamp that it comes
+from.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +24,11 @@ PATCHES = 32
 
 @dataclass(frozen=True)
 class PatchLight(Indexable):
-    """Light that arrives at N points along S directions, times cosine and solid angle, and the patch that it comes from.
+    """Light that arrives at N points along S directions, times cosine and solid angle, and the patch that it
+    comes from.
 
-    Patches are the `PATCHES` parts of the sphere, for light from outside the scene; the same again, for light from its own
-    surfaces; and one for each lamp.
+    Patches are the `PATCHES` parts of the sphere, for light from outside the scene; the same again, for light
+    from its own surfaces; and one for each lamp.
     """
 
     wi: Float[Tensor, "N S 3"]
@@ -41,7 +44,9 @@ def light_by_patch(
     wo: Float[Tensor, "N V 3"],
     material: Material,
 ) -> PatchLight:
-    """Light along directions that serve all viewers of a point: each is traced once, the same at every call."""
+    """Light along directions that serve all viewers of a point: each is traced once, the same at every
+    call.
+    """
     drawn = directions_for_viewers(model.light, normal, wo, material.roughness, model.lobe)
     incident = arriving(model.sources, position, drawn)
     weight = incident.weight * dot(incident.wi, normal).clamp_min(0)
@@ -61,7 +66,9 @@ def patch_count(model: NeilfModel) -> int:
     return 2 * PATCHES + model.lamps.lit
 
 
-def by_patch(light: Float[Tensor, "N S 3"], patch: Int[Tensor, "N S"], patches: int) -> Float[Tensor, "N 3 K"]:
+def by_patch(
+    light: Float[Tensor, "N S 3"], patch: Int[Tensor, "N S"], patches: int
+) -> Float[Tensor, "N 3 K"]:
     """What each patch brings."""
     total = light.new_zeros(len(light), 3, patches)
     return total.scatter_add_(2, patch[:, None].expand(-1, 3, -1), light.mT)

@@ -1,4 +1,5 @@
-"""Pictures for people: maps as 8-bit displays, incident light unrolled, and a sheet that lays pictures side by side.
+"""Pictures for people: maps as 8-bit displays, incident light unrolled, and a sheet that lays pictures side
+by side.
 
 Pure functions on arrays. Nothing here is measured: what a metric reads is never what a picture shows.
 """
@@ -38,11 +39,12 @@ INK = (28, 30, 34)
 PALE_INK = (112, 116, 124)
 
 
-# ----------------------------------------------------------------------------------------------------------------- maps
+# ------------------------------------------------------------------------------------------------------- maps
 
 
 def display(name: str, values: Float[np.ndarray, "H W C"]) -> UInt8[np.ndarray, "H W C"]:
-    """A map by its name in `Maps`: normals as colours, depth normalised, one channel as linear grey, else tone-mapped.
+    """A map by its name in `Maps`: normals as colours, depth normalised, one channel as linear grey, else
+    tone-mapped.
 
     Depths that are not finite belong to no surface: they are black and do not count in the range.
     """
@@ -82,7 +84,7 @@ def _to_bytes(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"
     return np.rint(np.clip(np.nan_to_num(values), 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-# ------------------------------------------------------------------------------------------------------- incident light
+# --------------------------------------------------------------------------------------------- incident light
 
 
 def lat_long_directions(height: int) -> Float[np.ndarray, "height W 3"]:
@@ -104,9 +106,13 @@ def nearest_radiance(
 
 
 def ring(
-    picture: UInt8[np.ndarray, "H W 3"], directions: Float[np.ndarray, "K 3"], color: tuple[int, int, int] = (255, 64, 64)
+    picture: UInt8[np.ndarray, "H W 3"],
+    directions: Float[np.ndarray, "K 3"],
+    color: tuple[int, int, int] = (255, 64, 64),
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A latitude-longitude picture with a ring about each of some unit directions; the inverse of `lat_long_directions`."""
+    """A latitude-longitude picture with a ring about each of some unit directions; the inverse of
+    `lat_long_directions`.
+    """
     height, width, _ = picture.shape
     marked = np.ascontiguousarray(picture).copy()
     for x, y, z in directions:
@@ -117,14 +123,16 @@ def ring(
 
 
 def auto_exposure(radiance: Float[np.ndarray, "P 3"]) -> float:
-    """The factor that brings the 90th percentile of luminance to 0.7: lamps clip, all else shows. 1 for no radiance."""
+    """The factor that brings the 90th percentile of luminance to 0.7: lamps clip, all else shows. 1 for no
+    radiance.
+    """
     if not len(radiance):
         return 1.0
     level = np.percentile(luminance(torch.from_numpy(np.asarray(radiance, dtype=np.float32))).numpy(), 90)
     return 0.7 / max(float(level), 1e-6)
 
 
-# -------------------------------------------------------------------------------------------------------- contact sheet
+# ---------------------------------------------------------------------------------------------- contact sheet
 
 
 @dataclass(frozen=True)
@@ -139,7 +147,8 @@ class Group:
 class Row:
     """Pictures, one a column, with a title and a note to their left; none leaves a cell empty.
 
-    `scale` is the error at the bright end of the error pictures, with its unit; the row then shows the colours' legend.
+    `scale` is the error at the bright end of the error pictures, with its unit; the row then shows the
+    colours' legend.
     """
 
     title: str
@@ -166,15 +175,20 @@ MIN_ROW_HEIGHT = 100
 TITLE, HEADING, TEXT, NOTE = 34, 24, 20, 16
 
 
-def contact_sheet(title: str, subtitle: str, sections: Sequence[Section], cell_width: int = 240) -> UInt8[np.ndarray, "H W 3"]:
-    """Lay sections out below one another; every picture is scaled to the width of a cell and keeps its proportions.
+def contact_sheet(
+    title: str, subtitle: str, sections: Sequence[Section], cell_width: int = 240
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Lay sections out below one another; every picture is scaled to the width of a cell and keeps its
+    proportions.
 
     A sheet without a title has no head.
     """
     fitted = [
         Section(
             s.groups,
-            tuple(Row(r.title, tuple(_fit(p, cell_width) for p in r.pictures), r.note, r.scale) for r in s.rows),
+            tuple(
+                Row(r.title, tuple(_fit(p, cell_width) for p in r.pictures), r.note, r.scale) for r in s.rows
+            ),
         )
         for s in sections
     ]
@@ -192,7 +206,9 @@ def contact_sheet(title: str, subtitle: str, sections: Sequence[Section], cell_w
     return np.asarray(sheet)
 
 
-def _draw_section(sheet: Image.Image, draw: ImageDraw.ImageDraw, section: Section, top: int, cell_width: int) -> None:
+def _draw_section(
+    sheet: Image.Image, draw: ImageDraw.ImageDraw, section: Section, top: int, cell_width: int
+) -> None:
     lefts = list(_column_lefts(section.groups, cell_width))
     column = 0
     for group in section.groups:
@@ -252,5 +268,11 @@ def _fit(picture: Shaped[np.ndarray, "H W C"] | None, width: int) -> UInt8[np.nd
     return np.ascontiguousarray(np.broadcast_to(scaled.reshape(height, width, -1), (height, width, 3)))
 
 
-def _write(draw: ImageDraw.ImageDraw, corner: tuple[int, int], text: str, size: int, color: tuple[int, int, int] = INK) -> None:
+def _write(
+    draw: ImageDraw.ImageDraw,
+    corner: tuple[int, int],
+    text: str,
+    size: int,
+    color: tuple[int, int, int] = INK,
+) -> None:
     draw.multiline_text(corner, text, font=ImageFont.load_default(size), fill=color, spacing=4)

@@ -1,12 +1,13 @@
-"""How far a material may be off, given what views saw of it: the posterior of base colour, roughness and metallic.
+"""How far a material may be off, given what views saw of it: the posterior of base colour, roughness and
+metallic.
 
 What a point sends to a viewer is linear in its base colour once roughness and metallic are given:
 
     L = b [(1 − m) D + m F(r)] + 0.04 (1 − m) F(r) + G(r)
 
-with D, F, G the diffuse, the facing and the grazing part. So roughness and metallic run over a grid, and for each of its
-cells the base colour is solved for: a normal distribution per channel, cut off at 0 and 1. Nothing is linearised, and a
-surface that could as well be a metal as not is found to be just that.
+with D, F, G the diffuse, the facing and the grazing part. So roughness and metallic run over a grid, and for
+each of its cells the base colour is solved for: a normal distribution per channel, cut off at 0 and 1.
+Nothing is linearised, and a surface that could as well be a metal as not is found to be just that.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ PRIOR_PRECISION = 1e-2
 
 @dataclass(frozen=True)
 class Deviation(Indexable):
-    """The expected root mean square error of an estimate, in its own units; of base colour the mean over the channels."""
+    """The expected root mean square error of an estimate, in its own units; of base colour the mean over the
+    channels.
+    """
 
     base_color: Float[Tensor, "N 1"]
     roughness: Float[Tensor, "N 1"]
@@ -40,7 +43,9 @@ class Deviation(Indexable):
 
 @dataclass(frozen=True)
 class Looks(Indexable):
-    """What N points send to V viewers: `diffuse` is D, the others are F and G at each of the `ROUGHNESS_NODES`."""
+    """What N points send to V viewers: `diffuse` is D, the others are F and G at each of the
+    `ROUGHNESS_NODES`.
+    """
 
     diffuse: Float[Tensor, "N 3"]
     facing: Float[Tensor, "N V R 3"]
@@ -55,8 +60,8 @@ class Sights(Indexable):
         seen: which of the views saw the point.
         radiance: linear.
         noise: standard deviation of an error that each view has of its own, above 0.
-        shared: standard deviations of K errors that all views of the point, of one channel, have in common: what each adds
-            to each view.
+        shared: standard deviations of K errors that all views of the point, of one channel, have in common:
+            what each adds to each view.
     """
 
     seen: Bool[Tensor, "N V"]
@@ -69,10 +74,10 @@ class Sights(Indexable):
 def expected_error(looks: Looks, sights: Sights, estimate: Material, specular: bool = True) -> Deviation:
     """The deviation of an estimate under the posterior, what it is off from the posterior's mean included.
 
-    The prior of base colour and roughness is even on [0, 1]; that of metallic leans to the ends, as the arcsine distribution
-    does: most surfaces are a metal or none.
-    A point that no view saw has the deviation from the prior. Without a specular part L is b D, and the deviations of
-    roughness and metallic mean nothing.
+    The prior of base colour and roughness is even on [0, 1]; that of metallic leans to the ends, as the
+    arcsine distribution does: most surfaces are a metal or none. A point that no view saw has the deviation
+    from the prior. Without a specular part L is b D, and the deviations of roughness and metallic mean
+    nothing.
     """
     wide = {"dtype": torch.float64, "device": looks.diffuse.device}
     metallic = torch.linspace(0, 1, METALLIC_CELLS, **wide) if specular else torch.zeros(1, **wide)
@@ -81,7 +86,12 @@ def expected_error(looks: Looks, sights: Sights, estimate: Material, specular: b
     base_color = _solve(products, metallic)
 
     log_prior = torch.linspace(0, 1, len(metallic) + 1).to(metallic).sqrt().asin().diff().log()
-    weight = (base_color.log_evidence.sum(1) + log_prior).flatten(1).softmax(-1).unflatten(1, (ROUGHNESS_CELLS, -1))
+    weight = (
+        (base_color.log_evidence.sum(1) + log_prior)
+        .flatten(1)
+        .softmax(-1)
+        .unflatten(1, (ROUGHNESS_CELLS, -1))
+    )
     off = base_color.variance + (base_color.mean - estimate.base_color[:, :, None, None]).square()
     squares = (
         (weight[:, None] * off).sum((2, 3)).mean(1, keepdim=True),
@@ -95,7 +105,9 @@ def guessed_error(estimate: Material) -> Deviation:
     """The deviation of an estimate under the prior alone: that of a guess."""
     even, to_the_ends = 1 / 12, 1 / 8  # variances about one half
     off = [(value - 0.5).square() for value in (estimate.base_color, estimate.roughness, estimate.metallic)]
-    return Deviation((even + off[0].mean(1, keepdim=True)).sqrt(), (even + off[1]).sqrt(), (to_the_ends + off[2]).sqrt())
+    return Deviation(
+        (even + off[0].mean(1, keepdim=True)).sqrt(), (even + off[1]).sqrt(), (to_the_ends + off[2]).sqrt()
+    )
 
 
 def _between_nodes(roughness: Float[Tensor, " Q"]) -> Float[Tensor, "R Q"]:
@@ -111,8 +123,9 @@ def _between_nodes(roughness: Float[Tensor, " Q"]) -> Float[Tensor, "R Q"]:
 
 @dataclass(frozen=True)
 class _Products:
-    """Inner products over the views, in units of the errors: of D and F, and of both and R = radiance − G with R; the
-    last axis is that of metallic."""
+    """Inner products over the views, in units of the errors: of D and F, and of both and R = radiance − G
+    with R; the last axis is that of metallic.
+    """
 
     dd: Float[Tensor, "N 3 1 1"]
     df: Float[Tensor, "N 3 Q 1"]
@@ -124,8 +137,8 @@ class _Products:
     @classmethod
     def of(cls, looks: Looks, sights: Sights, between: Float[Tensor, "R Q"]) -> _Products:
         """Errors that views have in common are taken out by the Cholesky factor of their covariance."""
-        # In double precision: shared errors are far larger than those of single views, and what tells one cell of the grid
-        # from another is a small difference of large numbers.
+        # In double precision: shared errors are far larger than those of single views, and what tells one
+        # cell of the grid from another is a small difference of large numbers.
         scale = (sights.seen[..., None] / sights.noise).double()
         shared = (sights.shared * scale[..., None]).transpose(1, 2)
         covariance = shared @ shared.mT + torch.eye(shared.shape[2], device=shared.device, dtype=shared.dtype)
@@ -141,7 +154,9 @@ class _Products:
 
 @dataclass(frozen=True)
 class _BaseColor:
-    """Base colour where roughness and metallic are given, and the log of how well both then explain the views."""
+    """Base colour where roughness and metallic are given, and the log of how well both then explain the
+    views.
+    """
 
     mean: Float[Tensor, "N 3 Q M"]
     variance: Float[Tensor, "N 3 Q M"]
@@ -149,7 +164,9 @@ class _BaseColor:
 
 
 def _solve(products: _Products, m: Float[Tensor, " M"]) -> _BaseColor:
-    """Least squares for b in R − k F = b A, with A = (1 − m) D + m F and k = 0.04 (1 − m), cut off at 0 and 1."""
+    """Least squares for b in R − k F = b A, with A = (1 − m) D + m F and k = 0.04 (1 − m), cut off at 0 and
+    1.
+    """
     p, k = products, 0.04 * (1 - m)
     aa = (1 - m).square() * p.dd + 2 * m * (1 - m) * p.df + m.square() * p.ff
     ar = (1 - m) * p.dr + m * p.fr - k * ((1 - m) * p.df + m * p.ff)
@@ -164,9 +181,12 @@ def _solve(products: _Products, m: Float[Tensor, " M"]) -> _BaseColor:
     below = torch.special.log_ndtr(torch.where(mirrored, -high, low))
     above = torch.special.log_ndtr(torch.where(mirrored, -low, high))
     log_mass = above + (-torch.expm1(below - above)).clamp_min(1e-7).log()
-    # No density at an end exceeds what bounds it here; far out, where exponents have lost their digits, the bound holds.
+    # No density at an end exceeds what bounds it here; far out, where exponents have lost their digits, the
+    # bound holds.
     at_low, at_high = (
-        torch.exp(-end.square() / 2 - math.log(2 * math.pi) / 2 - log_mass).minimum(end.abs() + 1 + 1 / (high - low))
+        torch.exp(-end.square() / 2 - math.log(2 * math.pi) / 2 - log_mass).minimum(
+            end.abs() + 1 + 1 / (high - low)
+        )
         for end in (low, high)
     )
     shift = at_low - at_high

@@ -1,7 +1,8 @@
 """What is measured of a run, and how (METHOD §8): the metrics put together into the figures that tables hold.
 
-An image metric is taken per view and averaged over the test views. A figure is there when its truth is at hand and
-the run has an estimate of it. Alignments are never silent: each has a key of its own beside the figure without it.
+An image metric is taken per view and averaged over the test views. A figure is there when its truth is at
+hand and the run has an estimate of it. Alignments are never silent: each has a key of its own beside the
+figure without it.
 
     volume_psnr, pbr_psnr, *_ssim     R and the rendering equation against the image, both clipped and sRGB-encoded
     *_psnr_linear                     the same on linear radiance, peak 1, HDR captures
@@ -54,13 +55,16 @@ __all__ = ["evaluate", "protocol", "write_metrics"]
 RENDERING = 0.9
 """Share of the work that rendering the test views is, for the progress bar."""
 SURFACE_POINTS = 500_000
-"""Points on each surface for Chamfer distances. Sampling alone gives a mean distance of about ½ √(area / points)."""
+"""Points on each surface for Chamfer distances. Sampling alone gives a mean distance of about ½ √(area /
+points).
+"""
 MESH_RESOLUTION = 256
 CONFIDENCE_PIXELS = 8192
 """Test pixels, evenly spread, whose error is compared with the one that is expected there."""
 MARGIN = 0.05
-"""The estimate counts up to this share of the diagonal of the truth's bounding box around that box: beyond it, where no
-image looks, a distance field closes its surface as it likes."""
+"""The estimate counts up to this share of the diagonal of the truth's bounding box around that box: beyond
+it, where no image looks, a distance field closes its surface as it likes.
+"""
 OFFSET = 1e-3
 """How far off the surface a ray starts that asks whether a direction meets the scene, scene units."""
 
@@ -118,7 +122,7 @@ def write_metrics(path: Path, run: Run, figures: Mapping[str, float]) -> None:
     write_json(path.with_name(f"{path.stem}-protocol.json"), protocol(run))
 
 
-# -------------------------------------------------------------------------------------------- images, material, normals
+# ---------------------------------------------------------------------------------- images, material, normals
 
 
 class Scores(defaultdict[str, list[float]]):
@@ -190,7 +194,9 @@ def confidence_metrics(run: Run, pairs: Pairs) -> dict[str, float]:
     figures = {}
     for name in ("base_color", "roughness", "metallic") if run.config.shading.specular else ("base_color",):
         estimate, true = (
-            np.concatenate([maps[name].reshape(-1, maps[name].shape[-1])[r] for maps, r in zip(side, rows, strict=True)])
+            np.concatenate(
+                [maps[name].reshape(-1, maps[name].shape[-1])[r] for maps, r in zip(side, rows, strict=True)]
+            )
             for side in ([view.maps for view, _ in pairs], [known.material for _, known in pairs])
         )
         scale = metrics.align_scale(estimate, true) if name == "base_color" else 1.0
@@ -206,7 +212,9 @@ def normal_metrics(pairs: Pairs) -> dict[str, float]:
     scores = Scores()
     for view, known in pairs:
         if known.normal is not None:
-            scores["normal_mae_deg"].append(metrics.angular_error(view.maps["normal"], known.normal, known.mask))
+            scores["normal_mae_deg"].append(
+                metrics.angular_error(view.maps["normal"], known.normal, known.mask)
+            )
     return scores.means()
 
 
@@ -219,14 +227,14 @@ def _pooled(pairs: Pairs, name: str) -> Float[np.ndarray, "P C"]:
     return np.concatenate([known.material[name][known.mask] for _, known in pairs])
 
 
-# ------------------------------------------------------------------------------------------------------------- geometry
+# --------------------------------------------------------------------------------------------------- geometry
 
 
 def chamfer_metrics(run: Run, truth: Mesh) -> dict[str, float]:
     """Chamfer distance between the run's surface and the true mesh, scene units.
 
-    Both are sampled by area; of the estimate only what lies within `MARGIN` of the truth's box counts. Absent where
-    none does.
+    Both are sampled by area; of the estimate only what lies within `MARGIN` of the truth's box counts. Absent
+    where none does.
     """
     true = trimesh.Trimesh(truth.vertices.numpy(), truth.faces.numpy(), process=False)
     margin = MARGIN * np.linalg.norm(true.extents)
@@ -234,7 +242,8 @@ def chamfer_metrics(run: Run, truth: Mesh) -> dict[str, float]:
     volume = run.config.volume
     corner = np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))
     device = next(run.model.parameters()).device
-    # The sphere that may close the scene is no surface of the object, and what lies far from the truth is cut anyway.
+    # The sphere that may close the scene is no surface of the object, and what lies far from the truth is cut
+    # anyway.
     radius = min(float(corner), volume.radius - HIT_RADIUS)
     surface = extract_mesh(run.model.host.sdf, radius, MESH_RESOLUTION, device=device)
     points = metrics.sample_surface(surface, SURFACE_POINTS)
@@ -249,16 +258,18 @@ def chamfer_metrics(run: Run, truth: Mesh) -> dict[str, float]:
     }
 
 
-# ---------------------------------------------------------------------------------------------------------------- light
+# ------------------------------------------------------------------------------------------------------ light
 
 
 def light_metrics(run: Run, field: LightField, mesh: Mesh | None) -> dict[str, float]:
     """Log errors of the incident light at the points of a true light field.
 
-    Images determine light only up to a factor that the base colour takes up; `_scaled` removes the median log ratio of
-    each channel, one for all points and directions.
+    Images determine light only up to a factor that the base colour takes up; `_scaled` removes the median log
+    ratio of each channel, one for all points and directions.
     """
-    ratio = metrics.log_ratio(_incident_light(run, field).reshape(-1, 3), field.incident.reshape(-1, 3).numpy())
+    ratio = metrics.log_ratio(
+        _incident_light(run, field).reshape(-1, 3), field.incident.reshape(-1, 3).numpy()
+    )
     scaled = ratio - np.median(ratio, axis=0)
     name = "incident_light_log_mae"
     figures = {name: metrics.log_error(ratio), f"{name}_scaled": metrics.log_error(scaled)}
@@ -275,7 +286,9 @@ def _incident_light(run: Run, field: LightField) -> Float[np.ndarray, "N S 3"]:
     in_flight = run.config.train.eval_chunk * run.config.shading.eval_samples
     points = max(1, in_flight // field.wi.shape[1])
     chunks = zip(field.position.split(points), field.wi.split(points), strict=True)
-    return torch.cat([run.model.incident_light(x.to(device), wi.to(device)).cpu() for x, wi in chunks]).numpy()
+    return torch.cat(
+        [run.model.incident_light(x.to(device), wi.to(device)).cpu() for x, wi in chunks]
+    ).numpy()
 
 
 def _occluded(field: LightField, mesh: Mesh) -> Bool[np.ndarray, " P"]:
@@ -285,14 +298,14 @@ def _occluded(field: LightField, mesh: Mesh) -> Bool[np.ndarray, " P"]:
     return surface.ray.intersects_any(origins.reshape(-1, 3).numpy(), field.wi.reshape(-1, 3).numpy())
 
 
-# ------------------------------------------------------------------------------------------------------------ baselines
+# -------------------------------------------------------------------------------------------------- baselines
 
 
 def baseline_metrics(capture: Capture, pairs: Pairs) -> dict[str, float]:
     """Guesses that take no method, for a method to beat.
 
-    Base colour is the mean colour that the training views saw of the point, with the best factor per channel; roughness
-    and metallic are constants, the true means. All three are generous: the truth has a say in them.
+    Base colour is the mean colour that the training views saw of the point, with the best factor per channel;
+    roughness and metallic are constants, the true means. All three are generous: the truth has a say in them.
     """
     pairs = [(view, known) for view, known in pairs if known.material is not None]
     if not pairs:
@@ -302,9 +315,13 @@ def baseline_metrics(capture: Capture, pairs: Pairs) -> dict[str, float]:
         constant = _pooled(pairs, name).mean()
         for _, known in pairs:
             true = known.material[name]
-            scores[f"baseline_{name}_psnr"].append(metrics.psnr(np.full_like(true, constant), true, known.mask))
+            scores[f"baseline_{name}_psnr"].append(
+                metrics.psnr(np.full_like(true, constant), true, known.mask)
+            )
     if all(known.depth is not None for _, known in pairs):
-        observed = mean_observed_color(capture, torch.cat([surface_points(capture, known) for _, known in pairs]))
+        observed = mean_observed_color(
+            capture, torch.cat([surface_points(capture, known) for _, known in pairs])
+        )
         if observed is not None:
             aligned = observed * metrics.align_scale(observed, _pooled(pairs, "base_color"))
             ends = np.cumsum([known.mask.sum() for _, known in pairs])[:-1]

@@ -31,18 +31,20 @@ def render_run(
     confidence: bool = False,
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> list[Path]:
-    """Render views of a run: `<out>/<map>/<view>.png` to look at, `<out>/<view>.exr` with all maps as they are.
+    """Render views of a run: `<out>/<map>/<view>.png` to look at, `<out>/<view>.exr` with all maps as they
+    are.
 
-    A view is written with its EXR last, and one whose EXR is there is skipped: a render that was stopped goes on where
-    it was. In the EXR a map is a layer (`base_color.R`, `normal.X`), or one channel by its own name; colours are
-    linear, normals and depths in the scene frame.
+    A view is written with its EXR last, and one whose EXR is there is skipped: a render that was stopped goes
+    on where it was. In the EXR a map is a layer (`base_color.R`, `normal.X`), or one channel by its own name;
+    colours are linear, normals and depths in the scene frame.
 
     Args:
         run: the trained run.
         out: the folder to write.
         views: "test", "train", "all", or names of views.
         overwrite: render again what is there.
-        confidence: also write how far off base colour, roughness and metallic may be (`confidence.with_deviation`).
+        confidence: also write how far off base colour, roughness and metallic may be
+            (`confidence.with_deviation`).
         on_progress: told the share that is done, as it goes.
 
     Returns:
@@ -60,10 +62,14 @@ def render_run(
         if view.name not in names:
             continue
         written.append(out / f"{view.name}.exr")
-        complete = written[-1].exists() and (not confidence or _picture(out, "base_color_std", view.name).exists())
+        complete = written[-1].exists() and (
+            not confidence or _picture(out, "base_color_std", view.name).exists()
+        )
         if overwrite or not complete:
             done = len(written) - 1
-            rendered = render_view(run, i, lambda share, done=done: on_progress((done + PART * share) / len(names)))
+            rendered = render_view(
+                run, i, lambda share, done=done: on_progress((done + PART * share) / len(names))
+            )
             _write(rendered if evidence is None else with_deviation(run, evidence, rendered), out)
         on_progress(len(written) / len(names))
     return written
@@ -81,7 +87,9 @@ def view_names(capture: Capture, views: str | Collection[str]) -> frozenset[str]
         return groups[views]
     wanted = frozenset([views] if isinstance(views, str) else views)
     if missing := sorted(wanted - everything):
-        raise UserError(f"{capture.root}: there is no view '{missing[0]}'", "give test, train, all, or names of views")
+        raise UserError(
+            f"{capture.root}: there is no view '{missing[0]}'", "give test, train, all, or names of views"
+        )
     return wanted
 
 
@@ -98,7 +106,9 @@ def _picture(out: Path, map_name: str, view_name: str) -> Path:
     return out / map_name / f"{view_name}.png"
 
 
-def _channels(name: str, values: Float[np.ndarray, "H W C"]) -> Iterator[tuple[str, Float[np.ndarray, "H W"]]]:
+def _channels(
+    name: str, values: Float[np.ndarray, "H W C"]
+) -> Iterator[tuple[str, Float[np.ndarray, "H W"]]]:
     if values.shape[-1] == 1:
         yield name, values[..., 0]
         return

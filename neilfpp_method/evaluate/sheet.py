@@ -1,4 +1,6 @@
-"""Pictures of a run for documents: a contact sheet of views and light beside the truth, and the light alone."""
+"""Pictures of a run for documents: a contact sheet of views and light beside the truth, and the light
+alone.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,10 @@ def write_contact_sheet(run: Run, path: Path, rendered: Sequence[RenderedView] =
     """
     shown = _with_shown_views(run)
     at_hand = {view.name: view for view in rendered}
-    rendered = [at_hand.get(view.name) or render_view(run, run.capture.views.index(view)) for view in shown.capture.test_views]
+    rendered = [
+        at_hand.get(view.name) or render_view(run, run.capture.views.index(view))
+        for view in shown.capture.test_views
+    ]
     known = known_test_views(shown, rendered).views
     scale = albedo_scale(rendered, known) if run.has_material else None
     if run.has_material and run.capture.train_views:
@@ -60,7 +65,9 @@ def write_light_picture(run: Run, path: Path) -> bool:
 
 
 def _with_shown_views(run: Run) -> Run:
-    """The run with up to three views held out, spread over those that are, or over the training views where none is."""
+    """The run with up to three views held out, spread over those that are, or over the training views where
+    none is.
+    """
     views = run.capture.test_views or run.capture.train_views
     rows = np.linspace(0, len(views) - 1, SHOWN_VIEWS).round().astype(int)
     return replace(run, capture=replace(run.capture, test=frozenset(views[row].name for row in rows)))

@@ -25,7 +25,9 @@ MIN_COSINE = 0.05
 
 @dataclass(frozen=True)
 class Sightings(Indexable):
-    """N points as up to V views see them; `wo` of a place that no view fills is the normal, its pixel black."""
+    """N points as up to V views see them; `wo` of a place that no view fills is the normal, its pixel
+    black.
+    """
 
     seen: Bool[Tensor, "N V"]
     wo: Float[Tensor, "N V 3"]
@@ -44,9 +46,9 @@ class TrainingViews:
         self.hdr = capture.hdr
         self.pixels = PixelDataset(capture, capture.train_views, device)
         self.cameras = [capture.normalisation.camera(view.camera) for view in capture.train_views]
-        self.centres = torch.stack([torch.as_tensor(camera.c2w[:, 3], dtype=torch.float32) for camera in self.cameras]).to(
-            device
-        )
+        self.centres = torch.stack(
+            [torch.as_tensor(camera.c2w[:, 3], dtype=torch.float32) for camera in self.cameras]
+        ).to(device)
         self.order = _far_from_one_another(self.centres)
 
     def evenly(self, count: int) -> PixelBatch:
@@ -57,14 +59,17 @@ class TrainingViews:
             view = self.pixels.view(i, gradients=False)
             rows = torch.nonzero((view.mask > 0.5) & self.pixels.valid(i))[:, 0]
             batches.append(view[rows[:: max(1, math.ceil(len(rows) / each))]])
-        return PixelBatch(**{f.name: torch.cat([getattr(batch, f.name) for batch in batches]) for f in fields(PixelBatch)})
+        return PixelBatch(
+            **{f.name: torch.cat([getattr(batch, f.name) for batch in batches]) for f in fields(PixelBatch)}
+        )
 
     @torch.no_grad()
     def sightings(
         self, model: NeilfModel, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"], most: int
     ) -> Sightings:
-        """The first views, `most` at most, in which nothing hides a point and whose pixel there can be used: it is valid, on
-        the object, and not clipped."""
+        """The first views, `most` at most, in which nothing hides a point and whose pixel there can be used:
+        it is valid, on the object, and not clipped.
+        """
         seen = torch.zeros(len(position), most, dtype=torch.bool, device=position.device)
         wo = normal[:, None].repeat(1, most, 1)
         pixel = torch.zeros_like(wo)
@@ -72,7 +77,10 @@ class TrainingViews:
             rows = torch.nonzero(~seen.all(1))[:, 0]
             if not len(rows):
                 break
-            view, index = self.pixels.view(i, gradients=False), _pixel_numbers(self.cameras[i], position[rows])
+            view, index = (
+                self.pixels.view(i, gradients=False),
+                _pixel_numbers(self.cameras[i], position[rows]),
+            )
             usable = (view.mask > 0.5) & self.pixels.valid(i) & (self.hdr | (view.color < 1).all(-1))
             towards = self.centres[i] - position[rows]
             distance = towards.norm(dim=-1)
@@ -81,7 +89,11 @@ class TrainingViews:
             rows, direction, distance, index = rows[kept], direction[kept], distance[kept], index[kept]
             free = _nothing_between(model, self.centres[i], position[rows], direction, distance)
             rows, slot = rows[free], seen[rows[free]].sum(1)
-            seen[rows, slot], wo[rows, slot], pixel[rows, slot] = True, direction[free], view.color[index[free]]
+            seen[rows, slot], wo[rows, slot], pixel[rows, slot] = (
+                True,
+                direction[free],
+                view.color[index[free]],
+            )
         return Sightings(seen, wo, pixel)
 
 
@@ -92,7 +104,9 @@ def _nothing_between(
     direction: Float[Tensor, "N 3"],
     distance: Float[Tensor, " N"],
 ) -> Bool[Tensor, " N"]:
-    """Whether a camera sees surface points that lie in its picture: traced as light is, or else rendered from there."""
+    """Whether a camera sees surface points that lie in its picture: traced as light is, or else rendered from
+    there.
+    """
     scene, share = model.scene, model.config.shading.hit_share
     if scene is not None:
         return scene(position, direction[:, None]).distance[:, 0] >= distance - TOLERANCE

@@ -1,4 +1,6 @@
-"""At which size views are rendered: by default as large as it takes to look at them and to measure them, not larger."""
+"""At which size views are rendered: by default as large as it takes to look at them and to measure them, not
+larger.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,8 @@ def at_size(run: Run, scale: float | None = None, width: int | None = None) -> R
     Args:
         run: the run; its own views have the size that it was trained at.
         scale: size over that of the files; 1 renders every pixel of a photograph.
-        width: of the widest view, pixels. Without either, `PIXELS_OF_A_VIEW` pixels a view, and no more than the run was
-            trained at.
+        width: of the widest view, pixels. Without either, `PIXELS_OF_A_VIEW` pixels a view, and no more than
+            the run was trained at.
 
     Raises:
         UserError: both are given, or one cannot be.
@@ -44,7 +46,9 @@ def at_size(run: Run, scale: float | None = None, width: int | None = None) -> R
 
 
 def size_in_words(run: Run) -> str | None:
-    """How large the views of a run are, and how to get larger ones; none where they are as large as their files."""
+    """How large the views of a run are, and how to get larger ones; none where they are as large as their
+    files.
+    """
     view = max(run.capture.views, key=lambda view: view.camera.width)
     width, height = view.camera.width, view.camera.height
     if (width, height) == file_size(view):

@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 
-# ------------------------------------------------------------------------------------------------------------ estimates
+# -------------------------------------------------------------------------------------------------- estimates
 
 
 @dataclass(frozen=True)
@@ -43,12 +43,14 @@ class RenderedView:
     maps: Mapping[str, Float[np.ndarray, "H W C"]]
 
 
-def render_view(run: Run, view_index: int, on_progress: Callable[[float], None] = lambda share: None) -> RenderedView:
+def render_view(
+    run: Run, view_index: int, on_progress: Callable[[float], None] = lambda share: None
+) -> RenderedView:
     """Render view `view_index` of `run.capture.views` at the size of its camera; the same picture every time.
 
-    `config.train.eval_chunk` rays are in flight at once, from all over the view, so that each such part takes about as long
-    as any other; the share that is done is reported after each. A run without a material has the host's colour for `rgb`,
-    and zeros for what a material would show.
+    `config.train.eval_chunk` rays are in flight at once, from all over the view, so that each such part takes
+    about as long as any other; the share that is done is reported after each. A run without a material has
+    the host's colour for `rgb`, and zeros for what a material would show.
     """
     view = run.capture.views[view_index]
     device = next(run.model.parameters()).device
@@ -65,7 +67,9 @@ def render_view(run: Run, view_index: int, on_progress: Callable[[float], None] 
     return RenderedView(view.name, {name: _image(values, view) for name, values in whole.items()})
 
 
-def render_test_views(run: Run, on_progress: Callable[[float], None] = lambda share: None) -> tuple[RenderedView, ...]:
+def render_test_views(
+    run: Run, on_progress: Callable[[float], None] = lambda share: None
+) -> tuple[RenderedView, ...]:
     """Render every view that is held out, in order; reports the share that is done as it goes.
 
     Raises:
@@ -76,16 +80,19 @@ def render_test_views(run: Run, on_progress: Callable[[float], None] = lambda sh
         raise UserError(f"{run.capture.root}: no view is held out for testing", "train with --test-every 8")
     rendered = []
     for i in held_out:
-        rendered.append(render_view(run, i, lambda share: on_progress((len(rendered) + share) / len(held_out))))
+        rendered.append(
+            render_view(run, i, lambda share: on_progress((len(rendered) + share) / len(held_out)))
+        )
     return tuple(rendered)
 
 
-# ---------------------------------------------------------------------------------------------------------------- truth
+# ------------------------------------------------------------------------------------------------------ truth
 
 
 @dataclass(frozen=True)
 class KnownView:
-    """What is known of a view: `image` as the capture holds it, the pixels that count, and the truth that is at hand.
+    """What is known of a view: `image` as the capture holds it, the pixels that count, and the truth that is
+    at hand.
 
     `depth` is along the camera's axis, scene units; `material` maps base_color, roughness and metallic.
     """
@@ -109,8 +116,9 @@ class HeldOut:
 def mask_source(capture: Capture) -> str:
     """What decides which pixels of the test views count; one source for all of them.
 
-    "true depth" where every view has it; else "capture masks" where there are any, or where pixels that show exactly the
-    background stand for them; else "rendered opacity" above one half, which lets the estimate choose its pixels.
+    "true depth" where every view has it; else "capture masks" where there are any, or where pixels that show
+    exactly the background stand for them; else "rendered opacity" above one half, which lets the estimate
+    choose its pixels.
     """
     return _mask_source(_known_depths(capture), _file_values(capture, capture.test_views))
 
@@ -138,7 +146,8 @@ def known_test_views(run: Run, rendered: Sequence[RenderedView]) -> HeldOut:
                 mask=_image(masks(i).reshape(-1) & stored.valid(i), view)[..., 0],
                 depth=None if depths[i] is None else _image(depths[i], view)[..., 0],
                 normal=None if normal is None else _image(normal, view),
-                material=material and {f.name: _image(getattr(material, f.name), view) for f in fields(material)},
+                material=material
+                and {f.name: _image(getattr(material, f.name), view) for f in fields(material)},
             )
         )
     return HeldOut(tuple(views), source)
@@ -165,7 +174,7 @@ def _image(values: Shaped[Tensor, "P ..."], view: View) -> Shaped[np.ndarray, "H
     return values.reshape(view.camera.height, view.camera.width, -1).numpy()
 
 
-# ------------------------------------------------------------------------------------------------- what other views saw
+# --------------------------------------------------------------------------------------- what other views saw
 
 VISIBLE = 0.02
 """Largest difference from a view's depth map, scene units, at which the view sees a point."""
@@ -180,10 +189,11 @@ def surface_points(capture: Capture, known: KnownView) -> Float[Tensor, "P 3"]:
 
 
 def mean_observed_color(capture: Capture, points: Float[Tensor, "P 3"]) -> Float[np.ndarray, "P 3"] | None:
-    """The mean linear colour of surface points over the training views that see them; none without true depths.
+    """The mean linear colour of surface points over the training views that see them; none without true
+    depths.
 
-    A view sees a point when its depth map, at the point's pixel, agrees within `VISIBLE`. A point that no view sees
-    takes the mean over the others.
+    A view sees a point when its depth map, at the point's pixel, agrees within `VISIBLE`. A point that no
+    view sees takes the mean over the others.
     """
     truth = Truth(capture)
     views = [view for view in capture.train_views if truth.depth(view) is not None]

@@ -57,7 +57,9 @@ def run_export(
         console.print(f"{size}, written to {out / 'mesh.ply'}", soft_wrap=True)
     if "light" in what:
         light = export_light(trained, out / "light", probes)
-        parts = (["an environment map", f"{light.lamps} lamps"] if light.environment else []) + [f"{light.probes} probes"]
+        parts = (["an environment map", f"{light.lamps} lamps"] if light.environment else []) + [
+            f"{light.probes} probes"
+        ]
         console.print(f"{', '.join(parts)}, written to {out / 'light'}", soft_wrap=True)
     if "asset" in what:
         export_asset(trained, out / "asset", resolution, asset, console, bar, deviations)

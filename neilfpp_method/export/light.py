@@ -1,9 +1,9 @@
-"""The light of a run as files for other programs: the environment map, the lamps before it, and light probes (docs/light.md).
+"""The light of a run as files for other programs: the environment map, the lamps before it, and light probes
+(docs/light.md).
 
-<out>/environment.exr    radiance from far away, where the run has an environment map
-<out>/lamps.json         lamps close to the scene, in the world frame of the capture; beside every environment map
-<out>/probes/<k>.exr     what arrives at points of the surface
-<out>/probes.json        where these points are
+<out>/environment.exr    radiance from far away, where the run has an environment map <out>/lamps.json
+lamps close to the scene, in the world frame of the capture; beside every environment map <out>/probes/<k>.exr
+what arrives at points of the surface <out>/probes.json        where these points are
 """
 
 from __future__ import annotations
@@ -57,7 +57,8 @@ def check_light(run: Run, probes: int | None) -> None:
 
 
 def export_light(run: Run, out: Path, probes: int | None = None) -> ExportedLight:
-    """Write the light of a run. Radiance is in the units of the images, lengths in those of the capture's world.
+    """Write the light of a run. Radiance is in the units of the images, lengths in those of the capture's
+    world.
 
     Args:
         run: the run.
@@ -82,9 +83,11 @@ def export_light(run: Run, out: Path, probes: int | None = None) -> ExportedLigh
 
 
 def lamps_in_world(run: Run) -> list[dict[str, Any]]:
-    """The lamps of a run as `lamps.json` has them (docs/light.md), in the capture's world; none where the light has none.
+    """The lamps of a run as `lamps.json` has them (docs/light.md), in the capture's world; none where the
+    light has none.
 
-    Radiance is the same in every frame; intensity, radiance times the area of a disc, scales as that area does.
+    Radiance is the same in every frame; intensity, radiance times the area of a disc, scales as that area
+    does.
     """
     lamps = run.model.lamps
     frame = run.capture.normalisation
@@ -93,8 +96,16 @@ def lamps_in_world(run: Run) -> list[dict[str, Any]]:
     axes = [axis if any(axis) else None for axis in lamps.axis[lit].tolist()]
     intensities = (lamps.intensity[lit].double() * frame.scale**2).tolist()
     return [
-        {"position": position, "axis": axis, "radius": lamps.radius * frame.scale, "intensity": intensity, "radiance": radiance}
-        for position, axis, intensity, radiance in zip(positions, axes, intensities, lamps.radiance().tolist(), strict=True)
+        {
+            "position": position,
+            "axis": axis,
+            "radius": lamps.radius * frame.scale,
+            "intensity": intensity,
+            "radiance": radiance,
+        }
+        for position, axis, intensity, radiance in zip(
+            positions, axes, intensities, lamps.radiance().tolist(), strict=True
+        )
     ]
 
 

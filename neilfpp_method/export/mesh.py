@@ -1,5 +1,6 @@
-"""The surface of a run as a triangle mesh: the one that it was given, or marching cubes on a grid that is queried only near
-the zero set."""
+"""The surface of a run as a triangle mesh: the one that it was given, or marching cubes on a grid that is
+queried only near the zero set.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +51,8 @@ def extract_mesh(
 ) -> trimesh.Trimesh:
     """The zero set of a signed distance field within a sphere about the origin; faces are wound outwards.
 
-    The grid is asked for its block centres first, then for every point of the blocks that the surface may cross.
+    The grid is asked for its block centres first, then for every point of the blocks that the surface may
+    cross.
 
     Args:
         sdf: signed distance, negative inside; its slope should be about 1.
@@ -64,10 +66,13 @@ def extract_mesh(
     """
     blocks = math.ceil(resolution / BLOCK)
     step = 2.0 * radius / (blocks * BLOCK - 1)
-    volume = _sparse_grid(lambda x: torch.cat([sdf(part) for part in x.split(chunk)]), radius, blocks, step, device)
+    volume = _sparse_grid(
+        lambda x: torch.cat([sdf(part) for part in x.split(chunk)]), radius, blocks, step, device
+    )
     if not volume.min() < 0.0 < volume.max():
         raise _no_surface(radius)
-    # scikit-image counts faces by the left hand: its default winds them towards growing values, which is outwards.
+    # scikit-image counts faces by the left hand: its default winds them towards growing values, which is
+    # outwards.
     vertices, faces, _, _ = marching_cubes(volume, 0.0, allow_degenerate=False)
     vertices = vertices * step - radius
     inside = np.linalg.norm(vertices, axis=-1) <= radius
@@ -89,7 +94,8 @@ def surface_mesh(run: Run, resolution: int = 256) -> trimesh.Trimesh:
 
     Args:
         run: the run.
-        resolution: of `extract_mesh`; a mesh that the run was given keeps its triangles, and corners at one place become one.
+        resolution: of `extract_mesh`; a mesh that the run was given keeps its triangles, and corners at one
+            place become one.
 
     Raises:
         UserError: the host has no surface that is known as one, or none is found.
@@ -102,7 +108,8 @@ def surface_mesh(run: Run, resolution: int = 256) -> trimesh.Trimesh:
         return mesh
     if not isinstance(host, HasSdf):
         raise UserError(
-            f"{run.path}: the host of this run has no distance field and no mesh", "export from a run of another host"
+            f"{run.path}: the host of this run has no distance field and no mesh",
+            "export from a run of another host",
         )
     volume = run.config.volume
     # The sphere that may close the scene (METHOD §3) is no surface of the object.
@@ -113,14 +120,16 @@ def surface_mesh(run: Run, resolution: int = 256) -> trimesh.Trimesh:
 def export_mesh(run: Run, path: Path, resolution: int = 256) -> trimesh.Trimesh:
     """Write the surface of a run as a PLY file, in the frame and the scale of its capture.
 
-    Vertices carry normals and, once a stage has moved the material, the base colour, sRGB-encoded, and the properties
-    `roughness` and `metallic`, floats in [0, 1].
+    Vertices carry normals and, once a stage has moved the material, the base colour, sRGB-encoded, and the
+    properties `roughness` and `metallic`, floats in [0, 1].
 
     Raises:
         UserError: see `surface_mesh`.
     """
     mesh = surface_mesh(run, resolution)
-    position = torch.as_tensor(np.array(mesh.vertices), dtype=torch.float32, device=next(run.model.parameters()).device)
+    position = torch.as_tensor(
+        np.array(mesh.vertices), dtype=torch.float32, device=next(run.model.parameters()).device
+    )
     if run.step > run.config.train.sdf_steps:
         material = materials_in_parts(run, position)
         mesh.visual.vertex_colors = (tone_map(material.base_color) * 255.0).round().byte().cpu().numpy()
@@ -136,10 +145,17 @@ def export_mesh(run: Run, path: Path, resolution: int = 256) -> trimesh.Trimesh:
 def materials_in_parts(run: Run, position: Float[Tensor, "N 3"]) -> Material:
     """The material at any number of points of the scene frame."""
     parts = [run.model.materials(part) for part in position.split(POINTS_AT_ONCE)]
-    return Material(*(torch.cat([getattr(part, name) for part in parts]) for name in ("base_color", "roughness", "metallic")))
+    return Material(
+        *(
+            torch.cat([getattr(part, name) for part in parts])
+            for name in ("base_color", "roughness", "metallic")
+        )
+    )
 
 
-def _sparse_grid(sdf: Sdf, radius: float, blocks: int, step: float, device: torch.device | str) -> Float[np.ndarray, "G G G"]:
+def _sparse_grid(
+    sdf: Sdf, radius: float, blocks: int, step: float, device: torch.device | str
+) -> Float[np.ndarray, "G G G"]:
     """sdf on the grid of cubes; a block far from the surface holds the value of its centre throughout."""
     corners = _lattice(blocks, device) * (BLOCK * step) - radius
     half_edge = 0.5 * (BLOCK - 1) * step
@@ -165,5 +181,6 @@ def _lattice(count: int, device: torch.device | str) -> Float[Tensor, "P 3"]:
 
 def _no_surface(radius: float) -> UserError:
     return UserError(
-        f"no surface within {radius:g} scene units", "train the stage sdf_init for longer, and look at its previews"
+        f"no surface within {radius:g} scene units",
+        "train the stage sdf_init for longer, and look at its previews",
     )

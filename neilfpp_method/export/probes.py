@@ -1,4 +1,6 @@
-"""Light probes: all the light that arrives at points of the surface, unrolled; and points where it differs."""
+"""Light probes: all the light that arrives at points of the surface, unrolled; and points where it
+differs.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ def spread_over_surface(run: Run, count: int) -> OrientedPoints:
     """
     device = next(run.model.parameters()).device
     seen = list(_seen(run, device))
-    points = OrientedPoints(torch.cat([part.position for part in seen]), torch.cat([part.normal for part in seen]))
+    points = OrientedPoints(
+        torch.cat([part.position for part in seen]), torch.cat([part.normal for part in seen])
+    )
     if not len(points):
         raise UserError(f"{run.path}: no training view sees a surface", "train the run for longer")
     return points[spread(points, count)]
@@ -39,10 +43,11 @@ def spread_over_surface(run: Run, count: int) -> OrientedPoints:
 
 @torch.no_grad()
 def spread(points: OrientedPoints, count: int) -> Int[Tensor, " N"]:
-    """Rows of up to `count` points unlike one another: each the farthest from those before it, the first from their mean.
+    """Rows of up to `count` points unlike one another: each the farthest from those before it, the first from
+    their mean.
 
-    What arrives depends on the place and on which way the surface faces, so both count, in scene units and by the normal:
-    else the corners of a floor come before anything that stands on it.
+    What arrives depends on the place and on which way the surface faces, so both count, in scene units and by
+    the normal: else the corners of a floor come before anything that stands on it.
     """
     place = torch.cat((points.position, points.normal), -1)
     rows = [int((place - place.mean(0)).square().sum(-1).argmax())]
@@ -54,8 +59,12 @@ def spread(points: OrientedPoints, count: int) -> Int[Tensor, " N"]:
 
 
 @torch.no_grad()
-def probe(run: Run, position: Float[Tensor, " 3"], normal: Float[Tensor, " 3"], height: int) -> Float[Tensor, "height width 3"]:
-    """Linear radiance that arrives at a surface point, in the layout of environment maps; 0 from below the surface."""
+def probe(
+    run: Run, position: Float[Tensor, " 3"], normal: Float[Tensor, " 3"], height: int
+) -> Float[Tensor, "height width 3"]:
+    """Linear radiance that arrives at a surface point, in the layout of environment maps; 0 from below the
+    surface.
+    """
     directions = map_directions(height, 2 * height).to(position)
     radiance = torch.zeros_like(directions)
     above = directions @ normal > 0

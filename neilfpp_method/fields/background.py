@@ -17,7 +17,9 @@ __all__ = ["InvertedSphere", "field_beyond"]
 POSITION_OCTAVES = 10
 DIRECTION_OCTAVES = 4
 DARKEST = 1e-2
-"""Share of the largest radiance that the field starts as at least, and stays below the largest by: a sigmoid has no ends."""
+"""Share of the largest radiance that the field starts as at least, and stays below the largest by: a sigmoid
+has no ends.
+"""
 START_SCALE = 1e-3
 """Of the weights that make it vary at the start."""
 
@@ -32,8 +34,8 @@ def field_beyond(
 class InvertedSphere(nn.Module):
     """A point at distance r > radius from the origin is (x/r, 1/r): unbounded space in a bounded chart.
 
-    Density is per unit of 1/r, and samples are the midpoints of equal steps of 1/r from the sphere to infinity. What
-    passes them all has the colour of the last.
+    Density is per unit of 1/r, and samples are the midpoints of equal steps of 1/r from the sphere to
+    infinity. What passes them all has the colour of the last.
 
     Args:
         config: the settings.
@@ -56,13 +58,17 @@ class InvertedSphere(nn.Module):
         self.position = FrequencyEncoding(POSITION_OCTAVES, dimensions=4)
         self.direction = FrequencyEncoding(DIRECTION_OCTAVES)
         width = config.width
-        self.trunk = Mlp(self.position.width, 1 + width, config.layers, width, "relu", skip=config.layers // 2)
+        self.trunk = Mlp(
+            self.position.width, 1 + width, config.layers, width, "relu", skip=config.layers // 2
+        )
         self.head = Mlp(width + self.direction.width, 3, 1, width // 2, "relu", output_scale=START_SCALE)
         if start is not None:
             with torch.no_grad():
                 self.head.layers[-1].bias.copy_(torch.logit(start / scale, eps=DARKEST))
 
-    def forward(self, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    def forward(
+        self, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N 3"]:
         """Radiance in [0, scale] that reaches the sphere along each ray from outside.
 
         Args:
@@ -73,7 +79,8 @@ class InvertedSphere(nn.Module):
         points = _on_sphere(origins, directions, 1 / inverse)
         chart = torch.cat((points, inverse[None, :, None].expand(len(points), -1, 1)), -1)
         trunk = self.trunk(self.position(chart))
-        # In units of 1/radius, the length of the chart: a fresh field stops half of the light, so all samples are seen.
+        # In units of 1/radius, the length of the chart: a fresh field stops half of the light, so all samples
+        # are seen.
         density = self.radius * functional.softplus(trunk[..., 0])
         towards_viewer = self.direction(-directions)[:, None].expand(-1, self.samples, -1)
         color = self.scale * torch.sigmoid(self.head(torch.cat((trunk[..., 1:], towards_viewer), -1)))
@@ -91,6 +98,8 @@ def _on_sphere(
 ) -> Float[Tensor, "N M 3"]:
     """Where rays from within cross spheres around the origin, as unit vectors."""
     along = (origins * directions).sum(-1, keepdim=True)
-    missed = origins.square().sum(-1, keepdim=True) - along.square()  # squared distance of the line from the origin
+    missed = (
+        origins.square().sum(-1, keepdim=True) - along.square()
+    )  # squared distance of the line from the origin
     distance = (radii.square() - missed).clamp_min(0).sqrt() - along
     return (origins[:, None] + distance[..., None] * directions[:, None]) / radii[:, None]

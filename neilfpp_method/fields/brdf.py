@@ -27,7 +27,8 @@ class BrdfSample:
 
 
 class BrdfField(nn.Module):
-    """Every parameter is ½ + ½ tanh of an output of the network; roughness starts close to ½, the others to what is set.
+    """Every parameter is ½ + ½ tanh of an output of the network; roughness starts close to ½, the others to
+    what is set.
 
     `metals` off: metallic is 0 everywhere, with no gradient.
     """
@@ -39,7 +40,9 @@ class BrdfField(nn.Module):
         # Sines reach the detail that six octaves do not; a grid has it already (NeILF++ §5).
         activation = "sine" if isinstance(encoding, FrequencyConfig) else "relu"
         skip = middle_skip(config.layers)
-        self.mlp = Mlp(self.encoding.width, 5, config.layers, config.width, activation, skip, output_scale=1e-2)
+        self.mlp = Mlp(
+            self.encoding.width, 5, config.layers, config.width, activation, skip, output_scale=1e-2
+        )
         nn.init.zeros_(self.mlp.layers[-1].bias)
         with torch.no_grad():
             self.mlp.layers[-1].bias[:3] = math.atanh(2 * config.initial_base_color - 1)
@@ -49,13 +52,17 @@ class BrdfField(nn.Module):
         return self._material(torch.tanh(self.mlp(self.encoding(x))))
 
     def with_gradients(self, x: Float[Tensor, "N 3"]) -> BrdfSample:
-        """The material and the gradients of roughness and metallic. A loss on them needs only first-order autograd."""
+        """The material and the gradients of roughness and metallic. A loss on them needs only first-order
+        autograd.
+        """
         encoded = self.encoding.with_jacobian(x)
         sample = self.mlp.with_gradient(encoded.features, slice(3, 5))
         saturation = torch.tanh(sample.value)
         slope = 0.5 * (1 - saturation[:, 3:].square())
         roughness, metallic = (slope[..., None] * pull_back(sample.gradient, encoded)).unbind(1)
-        return BrdfSample(self._material(saturation), roughness, metallic if self.metals else torch.zeros_like(metallic))
+        return BrdfSample(
+            self._material(saturation), roughness, metallic if self.metals else torch.zeros_like(metallic)
+        )
 
     def _material(self, saturation: Float[Tensor, "N 5"]) -> Material:
         base_color, roughness, metallic = (0.5 + 0.5 * saturation).split((3, 1, 1), -1)

@@ -1,7 +1,7 @@
 """Maps over the sphere of directions, in latitude and longitude about +z.
 
-Row j is at the angle θ = π j/(h − 1) from +z, column i at the azimuth φ = 2π (i + ½)/w, and the direction there is
-(sin φ sin θ, cos φ sin θ, cos θ): the layout of environment maps (docs/conventions.md).
+Row j is at the angle θ = π j/(h − 1) from +z, column i at the azimuth φ = 2π (i + ½)/w, and the direction
+there is (sin φ sin θ, cos φ sin θ, cos θ): the layout of environment maps (docs/conventions.md).
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ def interpolate(values: Float[Tensor, "C H W"], wi: Float[Tensor, "M S 3"]) -> F
     # One column more on each side closes the map; the azimuth of a column is at its middle.
     closed = torch.cat((values[..., -1:], values, values[..., :1]), -1)
     at = torch.stack((2 * (column + 1) / (width + 1) - 1, 2 * row / (height - 1) - 1), -1)
-    return functional.grid_sample(closed[None], at[None].to(closed.dtype), align_corners=True)[0].permute(1, 2, 0)
+    return functional.grid_sample(closed[None], at[None].to(closed.dtype), align_corners=True)[0].permute(
+        1, 2, 0
+    )
 
 
 def texels_of(wi: Float[Tensor, "*B 3"], height: int, width: int) -> Int[Tensor, "*B"]:
@@ -40,7 +42,9 @@ def map_directions(height: int, width: int) -> Float[Tensor, "height width 3"]:
     return torch.stack(axes, -1).float()
 
 
-def _columns_and_rows(wi: Float[Tensor, "*B 3"], height: int, width: int) -> tuple[Float[Tensor, "*B"], Float[Tensor, "*B"]]:
+def _columns_and_rows(
+    wi: Float[Tensor, "*B 3"], height: int, width: int
+) -> tuple[Float[Tensor, "*B"], Float[Tensor, "*B"]]:
     """Where a direction lies in a map, in texels: column in [−½, w − ½), row in [0, h − 1]."""
     x, y, z = wi.unbind(-1)
     turn = torch.atan2(x, y) / (2 * math.pi)

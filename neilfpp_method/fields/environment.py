@@ -22,9 +22,13 @@ from neilfpp_method.structures import IncidentSamples
 __all__ = ["EnvironmentLight", "TexelDirections"]
 
 UNIFORM_SHARE = 0.1
-"""Share of the samples that is spread evenly over the sphere, so that no direction is left out of the density."""
+"""Share of the samples that is spread evenly over the sphere, so that no direction is left out of the
+density.
+"""
 MEAN_OF_CELL = (1 / 8, 3 / 4)
-"""What is linear between the middles of cells has this mean in one: shares of each neighbour, and of the cell itself."""
+"""What is linear between the middles of cells has this mean in one: shares of each neighbour, and of the cell
+itself.
+"""
 DARKEST = 1e-6
 """Of the mean of a map that is shown: what is darker counts as this, as radiance is kept as its logarithm."""
 
@@ -38,7 +42,8 @@ class TexelDirections:
 
 
 class EnvironmentLight(nn.Module):
-    """A grid of log radiance; between the texels radiance is bilinear, so that it brings what the texels hold together.
+    """A grid of log radiance; between the texels radiance is bilinear, so that it brings what the texels hold
+    together.
 
     The map is no parameter: what surfaces send is linear in it, so `lighting` solves for it.
 
@@ -62,7 +67,9 @@ class EnvironmentLight(nn.Module):
 
     @torch.no_grad()
     def at_most(self, height: int) -> EnvironmentLight:
-        """This map; where it has more rows, one of so many, whose texels are the means of what lies in each."""
+        """This map; where it has more rows, one of so many, whose texels are the means of what lies in
+        each.
+        """
         _, rows, columns = self.log_radiance.shape
         if rows <= height:
             return self
@@ -73,7 +80,9 @@ class EnvironmentLight(nn.Module):
         row = (torch.arange(rows, device=weight.device) * (height - 1) / (rows - 1) + 0.5).long()
         column = ((torch.arange(columns, device=weight.device) + 0.5) * width / columns).long()
         cell = (row[:, None] * width + column).reshape(-1)
-        sums = weight.new_zeros(3, height * width).index_add(1, cell, self.log_radiance.exp().flatten(1) * weight)
+        sums = weight.new_zeros(3, height * width).index_add(
+            1, cell, self.log_radiance.exp().flatten(1) * weight
+        )
         total = weight.new_zeros(height * width).index_add(0, cell, weight)
         coarse.show((sums / total).view_as(coarse.log_radiance))
         return coarse
@@ -83,22 +92,32 @@ class EnvironmentLight(nn.Module):
         return interpolate(self.log_radiance.exp(), wi)
 
     def technique(self, normal: Float[Tensor, "N 3"]) -> Technique:
-        """Directions in proportion to the radiance, for the points of these normals; some fall below their horizons."""
+        """Directions in proportion to the radiance, for the points of these normals; some fall below their
+        horizons.
+        """
         return Technique(lambda count, stochastic: self.sample(normal, count, stochastic).wi, self.pdf)
 
     @torch.no_grad()
     def sample(self, like: Float[Tensor, "N 3"], count: int, stochastic: bool) -> IncidentSamples:
-        """`count` directions for each row of `like`, in proportion to the radiance; half of them may be below a horizon."""
+        """`count` directions for each row of `like`, in proportion to the radiance; half of them may be below
+        a horizon.
+        """
         shape = (len(like), count)
         strata = torch.arange(count, device=like.device, dtype=like.dtype)
-        within = torch.rand(3, *shape, device=like.device, dtype=like.dtype) if stochastic else like.new_full((3, *shape), 0.5)
+        within = (
+            torch.rand(3, *shape, device=like.device, dtype=like.dtype)
+            if stochastic
+            else like.new_full((3, *shape), 0.5)
+        )
         cell = torch.searchsorted(self._texel_shares().cumsum(0), (strata + within[0]) / count)
         wi = self._within(cell, within[1], within[2])
         return IncidentSamples(wi, self.pdf(wi))
 
     @torch.no_grad()
     def texel_directions(self, like: Float[Tensor, "N 3"]) -> TexelDirections:
-        """A random direction within every texel, row by row, for each row of `like`: the sphere in T strata."""
+        """A random direction within every texel, row by row, for each row of `like`: the sphere in T
+        strata.
+        """
         _, height, width = self.log_radiance.shape
         cell = torch.arange(height * width, device=like.device).expand(len(like), -1)
         within = torch.rand(2, *cell.shape, device=like.device, dtype=like.dtype)
@@ -107,7 +126,9 @@ class EnvironmentLight(nn.Module):
     @torch.no_grad()
     def pdf(self, wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S"]:
         """Density of `sample`, per steradian of the sphere: constant on each texel."""
-        return (self._texel_shares() / self._texel_solid_angles())[texels_of(wi, *self.log_radiance.shape[1:])]
+        return (self._texel_shares() / self._texel_solid_angles())[
+            texels_of(wi, *self.log_radiance.shape[1:])
+        ]
 
     def _resize(self, height: int, width: int) -> None:
         """A map of this size, of which nothing is known."""
@@ -117,7 +138,9 @@ class EnvironmentLight(nn.Module):
     def _within(
         self, cell: Int[Tensor, "N S"], down: Float[Tensor, "N S"], across: Float[Tensor, "N S"]
     ) -> Float[Tensor, "N S 3"]:
-        """Directions in texels, by number, at shares of their height and width; even shares spread evenly over the texel."""
+        """Directions in texels, by number, at shares of their height and width; even shares spread evenly
+        over the texel.
+        """
         _, height, width = self.log_radiance.shape
         cell = cell.clamp_max(height * width - 1)
         row, column = cell // width, cell % width
@@ -132,7 +155,9 @@ class EnvironmentLight(nn.Module):
         return rows[:, None].expand(-1, width).reshape(-1)
 
     def _texel_shares(self) -> Float[Tensor, " T"]:
-        """The probability of each texel: of what bilinear radiance brings within it, also next to a lamp of one texel."""
+        """The probability of each texel: of what bilinear radiance brings within it, also next to a lamp of
+        one texel.
+        """
         solid_angles = self._texel_solid_angles()
         mean = luminance(self.log_radiance.detach().permute(1, 2, 0).exp())
         mean = MEAN_OF_CELL[0] * (mean.roll(1, 1) + mean.roll(-1, 1)) + MEAN_OF_CELL[1] * mean

@@ -1,7 +1,7 @@
 """L: the incident light field, position and direction → linear RGB that arrives (METHOD §5).
 
-Light is sharp in direction and smooth in position. So the direction enters encoded, at the first and at the middle
-layer, and the position raw, at the middle layer only.
+Light is sharp in direction and smooth in position. So the direction enters encoded, at the first and at the
+middle layer, and the position raw, at the middle layer only.
 """
 
 from __future__ import annotations
@@ -26,29 +26,39 @@ DIRECTION_OCTAVES, DIRECTION_BANDS = 6, 5
 class IncidentLightField(nn.Module):
     """radiance = initial_radiance · base^output. The outputs start near 0.
 
-    Beside a frequency encoding of positions directions are encoded by frequencies too, beside a hash grid by spherical
-    harmonics, as in R (NeILF++ §5).
+    Beside a frequency encoding of positions directions are encoded by frequencies too, beside a hash grid by
+    spherical harmonics, as in R (NeILF++ §5).
 
-    The middle layer is linear in what it sees, so the share of the direction and the share of the position are computed
-    apart and added: the position costs one small product per point, and the directions can be shared between points.
+    The middle layer is linear in what it sees, so the share of the direction and the share of the position
+    are computed apart and added: the position costs one small product per point, and the directions can be
+    shared between points.
     """
 
     def __init__(
-        self, config: FreeLightConfig, encoding: FrequencyConfig | HashGridConfig, base: float, initial_radiance: float
+        self,
+        config: FreeLightConfig,
+        encoding: FrequencyConfig | HashGridConfig,
+        base: float,
+        initial_radiance: float,
     ) -> None:
         super().__init__()
         self.log_base = math.log(base)
         self.initial_radiance = initial_radiance
         self.direction = direction_encoding(
-            "frequency" if isinstance(encoding, FrequencyConfig) else "spherical_harmonics", DIRECTION_OCTAVES, DIRECTION_BANDS
+            "frequency" if isinstance(encoding, FrequencyConfig) else "spherical_harmonics",
+            DIRECTION_OCTAVES,
+            DIRECTION_BANDS,
         )
         middle, width = config.layers // 2, config.width
         self.direction_part = Mlp(self.direction.width, width, middle, width, config.activation, skip=middle)
         self.position_part = nn.Linear(3, width, bias=False)
         outputs = 1 if config.monochrome else 3
-        self.tail = Mlp(width, outputs, config.layers - middle - 1, width, config.activation, output_scale=0.1)
+        self.tail = Mlp(
+            width, outputs, config.layers - middle - 1, width, config.activation, output_scale=0.1
+        )
         nn.init.zeros_(self.tail.layers[-1].bias)
-        # Position and direction meet in one layer: its weights start alike. So do those of the tail, a hidden layer's.
+        # Position and direction meet in one layer: its weights start alike. So do those of the tail, a hidden
+        # layer's.
         bound = self.direction_part.layers[-1].weight.abs().max().item()
         nn.init.uniform_(self.position_part.weight, -bound, bound)
         self.tail.activation.init_(self.tail.layers[0])
@@ -60,7 +70,9 @@ class IncidentLightField(nn.Module):
         """
         directions = self.direction_part(self.direction(wi))
         middle = directions + self.position_part(x)[:, None]
-        return exponential(self.log_base * self.tail(self.tail.activation.value(middle)), self.initial_radiance)
+        return exponential(
+            self.log_base * self.tail(self.tail.activation.value(middle)), self.initial_radiance
+        )
 
     def technique(self, normal: Float[Tensor, "N 3"]) -> None:
         """None: a network cannot be sampled."""

@@ -25,8 +25,9 @@ class LampPlaces(Indexable):
 
 @dataclass(frozen=True)
 class LampRays:
-    """From N points towards K lamps: direction, distance, the solid angle of each lamp, and the share of its intensity that
-    it sends this way."""
+    """From N points towards K lamps: direction, distance, the solid angle of each lamp, and the share of its
+    intensity that it sends this way.
+    """
 
     wi: Float[Tensor, "N K 3"]
     distance: Float[Tensor, "N K"]
@@ -34,16 +35,18 @@ class LampRays:
     emission: Float[Tensor, "N K"]
 
     def samples(self) -> IncidentSamples:
-        """One direction per lamp as samples of an estimator: the mean over K of f/pdf is the sum over the lamps."""
+        """One direction per lamp as samples of an estimator: the mean over K of f/pdf is the sum over the
+        lamps.
+        """
         return IncidentSamples(self.wi, 1 / (self.wi.shape[1] * self.solid_angle))
 
 
 class Lamps(nn.Module):
     """Spheres of one radius; as many as are lit come first.
 
-    A lamp whose axis is zero sends the same light in all directions, as a bulb does; one with a unit axis sends I cos θ at
-    an angle θ from it and nothing backwards, as a small window or a flat panel does. Lamps are no parameters: they are found
-    together with the environment map (`lighting`).
+    A lamp whose axis is zero sends the same light in all directions, as a bulb does; one with a unit axis
+    sends I cos θ at an angle θ from it and nothing backwards, as a small window or a flat panel does. Lamps
+    are no parameters: they are found together with the environment map (`lighting`).
 
     Args:
         most: how many there can be.
@@ -60,11 +63,15 @@ class Lamps(nn.Module):
 
     @torch.no_grad()
     def place(
-        self, position: Float[Tensor, "K 3"], intensity: Float[Tensor, "K 3"], axis: Float[Tensor, "K 3"] | None = None
+        self,
+        position: Float[Tensor, "K 3"],
+        intensity: Float[Tensor, "K 3"],
+        axis: Float[Tensor, "K 3"] | None = None,
     ) -> None:
         """These lamps and no others, the first of them where they are too many.
 
-        `intensity` is power per solid angle, on the axis where there is one; no `axis`: alike in all directions.
+        `intensity` is power per solid angle, on the axis where there is one; no `axis`: alike in all
+        directions.
         """
         self.lit = min(len(position), len(self.position))
         self.position.zero_()[: self.lit] = position[: self.lit]
@@ -85,11 +92,17 @@ class Lamps(nn.Module):
         """Radiance along rays towards the lit lamps where nothing is in the way."""
         return rays.emission[..., None] * self.radiance()
 
-    def met(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"], before: Float[Tensor, "N S"]) -> Float[Tensor, "N S 3"]:
-        """Radiance of the lamps that directions meet nearer than a distance; where they overlap, all of them."""
+    def met(
+        self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"], before: Float[Tensor, "N S"]
+    ) -> Float[Tensor, "N S 3"]:
+        """Radiance of the lamps that directions meet nearer than a distance; where they overlap, all of
+        them.
+        """
         total = torch.zeros_like(wi)
         towards = self.position[: self.lit] - x[:, None]
-        for offset, axis, radiance in zip(towards.unbind(1), self.axis[: self.lit], self.radiance(), strict=True):
+        for offset, axis, radiance in zip(
+            towards.unbind(1), self.axis[: self.lit], self.radiance(), strict=True
+        ):
             along = dot(wi, offset)
             miss = offset.square().sum(-1)[:, None] - along.square()
             hit = (along > 0) & (miss < self.radius**2) & (along < before)
@@ -108,7 +121,9 @@ class Lamps(nn.Module):
 def rays_towards(
     x: Float[Tensor, "N 3"], position: Float[Tensor, "K 3"], axis: Float[Tensor, "K 3"], radius: float
 ) -> LampRays:
-    """Towards lamps at `position`; from within two radii of its middle, a lamp looks as from two radii away."""
+    """Towards lamps at `position`; from within two radii of its middle, a lamp looks as from two radii
+    away.
+    """
     offset = position - x[:, None]
     distance = offset.square().sum(-1).clamp_min((2 * radius) ** 2).sqrt()
     wi = safe_normalize(offset)

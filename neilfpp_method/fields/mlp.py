@@ -1,7 +1,7 @@
 """Multilayer perceptrons, and the gradient of their outputs with respect to their input.
 
-That gradient is an adjoint pass written out in differentiable operations: a loss on it needs one ordinary backward
-pass, where autograd would have to differentiate its own backward pass.
+That gradient is an adjoint pass written out in differentiable operations: a loss on it needs one ordinary
+backward pass, where autograd would have to differentiate its own backward pass.
 """
 
 from __future__ import annotations
@@ -20,15 +20,24 @@ from torch.nn.utils import parametrizations
 from neilfpp_method.errors import UserError
 from neilfpp_method.kernels.softplus import UnitSample, softplus, softplus_and_slope
 
-__all__ = ["ACTIVATIONS", "Activation", "Mlp", "MlpSample", "geometric_init_", "middle_skip", "weight_normalise_"]
+__all__ = [
+    "ACTIVATIONS",
+    "Activation",
+    "Mlp",
+    "MlpSample",
+    "geometric_init_",
+    "middle_skip",
+    "weight_normalise_",
+]
 
 SOFTPLUS_SHARPNESS = 100.0  # VolSDF, IDR
 SINE_FREQUENCY = 30.0  # SIREN's ω
 SPHERE_SAMPLES = 4096  # points at which the geometric start is corrected
 RIDGE = 1e-2  # price of that correction, relative to the mean square of a unit
 SKIP_FROM = 4
-"""Hidden layers from which a network sees its input once more, at the middle: deep ones forget it (DeepSDF), shallow ones
-have it close by."""
+"""Hidden layers from which a network sees its input once more, at the middle: deep ones forget it (DeepSDF),
+shallow ones have it close by.
+"""
 
 
 @dataclass(frozen=True)
@@ -95,15 +104,21 @@ class Mlp(nn.Module):
     ) -> None:
         super().__init__()
         if layers < 1 or (skip is not None and not 1 <= skip <= layers):
-            raise UserError(f"an MLP of {layers} layers with its skip at layer {skip}", "choose 1 ≤ skip ≤ layers")
+            raise UserError(
+                f"an MLP of {layers} layers with its skip at layer {skip}", "choose 1 ≤ skip ≤ layers"
+            )
         self.activation = ACTIVATIONS[activation]
         self.skip = skip
         fan_in = [inputs] + [width + (inputs if layer == skip else 0) for layer in range(1, layers + 1)]
-        self.layers = nn.ModuleList(nn.Linear(n, m) for n, m in zip(fan_in, [width] * layers + [outputs], strict=True))
+        self.layers = nn.ModuleList(
+            nn.Linear(n, m) for n, m in zip(fan_in, [width] * layers + [outputs], strict=True)
+        )
         for layer in self.layers:
             self.activation.init_(layer)
         with torch.no_grad():
-            if activation == "sine":  # SIREN's first layer: its input fills [−1, 1], not a sine's range of phases
+            if (
+                activation == "sine"
+            ):  # SIREN's first layer: its input fills [−1, 1], not a sine's range of phases
                 self.layers[0].weight.uniform_(-1 / inputs, 1 / inputs)
             self.layers[-1].weight.mul_(output_scale)
 
@@ -122,10 +137,12 @@ class Mlp(nn.Module):
     def with_gradient(self, x: Float[Tensor, "N I"], outputs: slice) -> MlpSample:
         """All outputs, and the gradient of the chosen ones with respect to x.
 
-        With z_l = W_l h_l + b_l and h_{l+1} = a(z_l), the adjoint runs g ← (g ⊙ a'(z_l)) W_l from the last layer to the
-        first; where the input entered again, its share of g is set aside and added at the end.
+        With z_l = W_l h_l + b_l and h_{l+1} = a(z_l), the adjoint runs g ← (g ⊙ a'(z_l)) W_l from the last
+        layer to the first; where the input entered again, its share of g is set aside and added at the end.
         """
-        weights = [layer.weight for layer in self.layers]  # once: a normalised weight is computed when it is read
+        weights = [
+            layer.weight for layer in self.layers
+        ]  # once: a normalised weight is computed when it is read
         hidden, slopes = x, []
         for number, layer in enumerate(self.layers[:-1]):
             units = self.activation.with_slope(
@@ -149,10 +166,12 @@ class Mlp(nn.Module):
 
 @torch.no_grad()
 def geometric_init_(mlp: Mlp, radius: float, extent: float, encoded: float) -> None:
-    """Start a softplus network as the signed distance to a sphere: output 0 ≈ ‖x‖ − radius where ‖x‖ ≤ extent.
+    """Start a softplus network as the signed distance to a sphere: output 0 ≈ ‖x‖ − radius where ‖x‖ ≤
+    extent.
 
-    The start of SAL (Atzmon & Lipman 2020, theorem 1) is exact for infinite width; at 64 units it is off by tens of per
-    cent. So the output row is then corrected by the smallest change that fits the distance: a ridge regression.
+    The start of SAL (Atzmon & Lipman 2020, theorem 1) is exact for infinite width; at 64 units it is off by
+    tens of per cent. So the output row is then corrected by the smallest change that fits the distance: a
+    ridge regression.
 
     Args:
         mlp: its first three inputs are x.
@@ -179,7 +198,9 @@ def geometric_init_(mlp: Mlp, radius: float, extent: float, encoded: float) -> N
 
 
 def weight_normalise_(mlp: Mlp) -> None:
-    """Split every weight row into length and direction (Salimans & Kingma 2016); the function stays as it is."""
+    """Split every weight row into length and direction (Salimans & Kingma 2016); the function stays as it
+    is.
+    """
     for layer in mlp.layers:
         parametrizations.weight_norm(layer)
 

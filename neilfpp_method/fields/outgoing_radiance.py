@@ -20,9 +20,11 @@ DIRECTION_OCTAVES, DIRECTION_BANDS = 4, 4
 
 
 class OutgoingRadianceField(nn.Module):
-    """A sigmoid times `scale`, the largest radiance it reaches; starts near the radiance `start`, at most at scale/2.
+    """A sigmoid times `scale`, the largest radiance it reaches; starts near the radiance `start`, at most at
+    scale/2.
 
-    Positions may enter raw (`config.positions`) where there is a feature of G, which has seen their encoding (NeILF++ §5).
+    Positions may enter raw (`config.positions`) where there is a feature of G, which has seen their encoding
+    (NeILF++ §5).
     """
 
     def __init__(
@@ -38,8 +40,12 @@ class OutgoingRadianceField(nn.Module):
         self.scale = scale
         self.mirrored = config.direction == "mirrored"
         waves = isinstance(encoding, FrequencyConfig)
-        self.position = Raw() if config.positions == "raw" and feature_width else position_encoding(encoding, radius)
-        self.direction = direction_encoding("frequency" if waves else "spherical_harmonics", DIRECTION_OCTAVES, DIRECTION_BANDS)
+        self.position = (
+            Raw() if config.positions == "raw" and feature_width else position_encoding(encoding, radius)
+        )
+        self.direction = direction_encoding(
+            "frequency" if waves else "spherical_harmonics", DIRECTION_OCTAVES, DIRECTION_BANDS
+        )
         inputs = self.position.width + self.direction.width + self.mirrored + 3 + feature_width
         self.mlp = Mlp(inputs, 3, config.layers, config.width, "relu", output_scale=0.1)
         share = min(start / scale, 0.5)

@@ -16,7 +16,9 @@ from neilfpp_method.settings.types import FrequencyConfig, HashGridConfig, SdfCo
 __all__ = ["SdfField", "SdfSample"]
 
 FIRST_RADIUS = 0.6
-"""Of the sphere that the field starts as, scene units: within the unit sphere that holds the object, and most of it."""
+"""Of the sphere that the field starts as, scene units: within the unit sphere that holds the object, and most
+of it.
+"""
 
 
 @dataclass(frozen=True)
@@ -31,8 +33,9 @@ class SdfSample:
 class SdfField(nn.Module):
     """Starts as a sphere around the origin, negative inside.
 
-    Behind a frequency encoding (the paper's MLP setting) the waves start with no weight and the weights are normalised,
-    as in IDR and VolSDF. Behind a hash grid, whose features start near 0 themselves, neither is called for.
+    Behind a frequency encoding (the paper's MLP setting) the waves start with no weight and the weights are
+    normalised, as in IDR and VolSDF. Behind a hash grid, whose features start near 0 themselves, neither is
+    called for.
     """
 
     def __init__(self, config: SdfConfig, encoding: FrequencyConfig | HashGridConfig, radius: float) -> None:
@@ -40,7 +43,9 @@ class SdfField(nn.Module):
         waves = isinstance(encoding, FrequencyConfig)
         self.encoding = position_encoding(encoding, radius, None if waves else encoding.sdf_log2_entries)
         outputs = 1 + config.feature_width
-        self.mlp = Mlp(self.encoding.width, outputs, config.layers, config.width, "softplus", middle_skip(config.layers))
+        self.mlp = Mlp(
+            self.encoding.width, outputs, config.layers, config.width, "softplus", middle_skip(config.layers)
+        )
         geometric_init_(self.mlp, FIRST_RADIUS, extent=radius, encoded=0.0 if waves else 1.0)
         if waves:
             weight_normalise_(self.mlp)
@@ -60,12 +65,14 @@ class SdfField(nn.Module):
     ) -> Float[Tensor, "N 3 3"]:
         """H_ij = ∂²G / ∂x_i ∂x_j; a loss on it reaches the parameters.
 
-        analytic: autograd through `with_gradient`. Exact, but inside a grid cell a trilinear function has no curvature
-        along the axes. finite_difference: forward differences of the gradient over one cell of the finest grid (for
-        waves, a fiftieth of a radian of the finest), which see the curvature that lies in the kinks between cells. None: the
-        former for waves, the latter for a grid.
+        analytic: autograd through `with_gradient`. Exact, but inside a grid cell a trilinear function has no
+        curvature along the axes. finite_difference: forward differences of the gradient over one cell of the
+        finest grid (for waves, a fiftieth of a radian of the finest), which see the curvature that lies in
+        the kinks between cells. None: the former for waves, the latter for a grid.
         """
-        method = method or ("analytic" if isinstance(self.encoding, FrequencyEncoding) else "finite_difference")
+        method = method or (
+            "analytic" if isinstance(self.encoding, FrequencyEncoding) else "finite_difference"
+        )
         return self._analytic_hessian(x) if method == "analytic" else self._difference_hessian(x)
 
     def _analytic_hessian(self, x: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3 3"]:
@@ -73,7 +80,9 @@ class SdfField(nn.Module):
         with torch.enable_grad():
             x = x if x.requires_grad else x.detach().requires_grad_()
             components = self.with_gradient(x).gradient.sum(0)
-            rows = [torch.autograd.grad(c, x, create_graph=keep_graph, retain_graph=True)[0] for c in components]
+            rows = [
+                torch.autograd.grad(c, x, create_graph=keep_graph, retain_graph=True)[0] for c in components
+            ]
         return torch.stack(rows, 1)
 
     def _difference_hessian(self, x: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3 3"]:

@@ -1,4 +1,6 @@
-"""What a model shows of some training pixels: does a surface stand there, and is its material more than its bounds?"""
+"""What a model shows of some training pixels: does a surface stand there, and is its material more than its
+bounds?
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,8 @@ class Look:
         rays: how many pixels on the object, as far as masks tell, were looked at.
         opaque: share of them that show something.
         sharp: share of the opaque ones that meet one surface rather than fog or the mean of several surfaces.
-        at_bound: share of the surface points whose base colour is within 0.02 of 0 or of 1 in every channel; none without a
-            material.
+        at_bound: share of the surface points whose base colour is within 0.02 of 0 or of 1 in every channel;
+            none without a material.
     """
 
     rays: int

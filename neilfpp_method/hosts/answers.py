@@ -1,18 +1,18 @@
 """What a host has rendered, in whatever form it hands that out, as `SurfaceHits`.
 
-| form                             | how it is read                                                                       |
-|----------------------------------|--------------------------------------------------------------------------------------|
-| `SurfaceHits`                    | as it is                                                                             |
-| a dictionary                     | by the host's own `read_outputs`, or by the names below                              |
-| (color, position, normal)        | as the answer of a function: a zero normal is a miss                                 |
+| form                      | how it is read                                          |
+|---------------------------|---------------------------------------------------------|
+| `SurfaceHits`             | as it is                                                |
+| a dictionary              | by the host's own `read_outputs`, or by the names below |
+| (color, position, normal) | as the answer of a function: a zero normal is a miss    |
 
-| of a dictionary   | names                                                                                               |
-|-------------------|-----------------------------------------------------------------------------------------------------|
-| color             | `color`, `rgb`: linear radiance                                                                     |
-| position          | `position`; or `depth`, a distance along the unit ray                                               |
-| normal            | `normal`, `normals`: vectors of any length                                                          |
-| opacity           | `opacity`, `accumulation`, `alpha`, (N,) or (N, 1); without one, 1 where there is a normal          |
-| concentration     | `concentration`; without one, the opacity                                                           |
+| of a dictionary | names                                                                                      |
+|-----------------|--------------------------------------------------------------------------------------------|
+| color           | `color`, `rgb`: linear radiance                                                            |
+| position        | `position`; or `depth`, a distance along the unit ray                                      |
+| normal          | `normal`, `normals`: vectors of any length                                                 |
+| opacity         | `opacity`, `accumulation`, `alpha`, (N,) or (N, 1); without one, 1 where there is a normal |
+| concentration   | `concentration`; without one, the opacity                                                  |
 """
 
 from __future__ import annotations
@@ -102,5 +102,8 @@ def _first(name: str, outputs: Mapping[str, Tensor], names: Sequence[str]) -> Te
 def _column(name: str, output: str, rays: RayBatch, value: Tensor) -> Float[Tensor, " N"]:
     """One number a ray, given as (N,) or (N, 1)."""
     if value.shape not in ((len(rays),), (len(rays), 1)):
-        raise UserError(f"{name}: its {output} has the shape {tuple(value.shape)}", f"return ({len(rays)},), a number per ray")
+        raise UserError(
+            f"{name}: its {output} has the shape {tuple(value.shape)}",
+            f"return ({len(rays)},), a number per ray",
+        )
     return value.reshape(-1)

@@ -1,7 +1,7 @@
 """What the method asks of geometry and radiance, so that it can sit on any NeRF-like system.
 
-A host renders rays. All else is an optional capability, found by `isinstance` on one of the small protocols below: a host
-that lacks one loses what the protocol says, nothing more.
+A host renders rays. All else is an optional capability, found by `isinstance` on one of the small protocols
+below: a host that lacks one loses what the protocol says, nothing more.
 """
 
 from __future__ import annotations
@@ -36,21 +36,28 @@ __all__ = [
 
 @runtime_checkable
 class Host(Protocol):
-    """Geometry and radiance of a scene. One that cannot answer rays that leave a surface says so by the attribute
-    `answers_secondary_rays = False`; `render` is then asked with camera rays alone."""
+    """Geometry and radiance of a scene. One that cannot answer rays that leave a surface says so by the
+    attribute `answers_secondary_rays = False`; `render` is then asked with camera rays alone.
+    """
 
     def render(self, rays: RayBatch) -> SurfaceHits:
-        """Colour, hit position and normal of each ray, differentiable with respect to the host's parameters."""
+        """Colour, hit position and normal of each ray, differentiable with respect to the host's
+        parameters.
+        """
         ...
 
 
 @runtime_checkable
 class ImageHost(Protocol):
-    """Geometry and radiance that come as whole images: splats and other rasterisers. It answers no secondary rays; what a
-    surface sends to another is asked of a proxy (`hosts.proxy`), and the hits of a training step are handed to `losses`."""
+    """Geometry and radiance that come as whole images: splats and other rasterisers. It answers no secondary
+    rays; what a surface sends to another is asked of a proxy (`hosts.proxy`), and the hits of a training step
+    are handed to `losses`.
+    """
 
     def render_image(self, camera: Camera) -> SurfaceHits:
-        """What the camera sees in the scene frame, a row per pixel, row by row; `hosts.image.image_hits` makes it from maps."""
+        """What the camera sees in the scene frame, a row per pixel, row by row; `hosts.image.image_hits`
+        makes it from maps.
+        """
         ...
 
 
@@ -67,16 +74,22 @@ class Regularised(Protocol):
     """A host with losses of its own. Without: L_vol alone moves the geometry."""
 
     def render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
-        """As `render`, and those of the named losses that the host has. A loss that is not named is not computed."""
+        """As `render`, and those of the named losses that the host has. A loss that is not named is not
+        computed.
+        """
         ...
 
 
 @runtime_checkable
 class LightsItself(Protocol):
-    """A host that traces many rays cheaply. Without: hard inter-reflection renders every ray, at the price of rendering."""
+    """A host that traces many rays cheaply. Without: hard inter-reflection renders every ray, at the price of
+    rendering.
+    """
 
     def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
-        """What arrives at surface points x from the scene's own surfaces in the directions wi; constants, no gradient."""
+        """What arrives at surface points x from the scene's own surfaces in the directions wi; constants, no
+        gradient.
+        """
         ...
 
 
@@ -91,8 +104,9 @@ class KnowsMisses(Protocol):
 
 @runtime_checkable
 class KnowsRadiance(Protocol):
-    """A host that knows what a point of its surface sends, without a ray. Without: the proxy of a host that traces no rays
-    brings the mean of what the training rays saw there."""
+    """A host that knows what a point of its surface sends, without a ray. Without: the proxy of a host that
+    traces no rays brings the mean of what the training rays saw there.
+    """
 
     def radiance(self, x: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """Linear radiance that leaves surface points x towards wo."""
@@ -101,7 +115,9 @@ class KnowsRadiance(Protocol):
 
 @runtime_checkable
 class ReadsOutputs(Protocol):
-    """A host whose renderer returns a dictionary of its own. Without: the names of `hosts.answers` are looked for."""
+    """A host whose renderer returns a dictionary of its own. Without: the names of `hosts.answers` are looked
+    for.
+    """
 
     def read_outputs(self, rays: RayBatch, outputs: Mapping[str, Tensor]) -> SurfaceHits:
         """The hits of the rays, from what the host's renderer returned for them."""
@@ -110,7 +126,9 @@ class ReadsOutputs(Protocol):
 
 @runtime_checkable
 class HasSurfaceWidth(Protocol):
-    """A host whose surface is a soft layer. Without: rays for L_ref start at a fixed distance from the surface."""
+    """A host whose surface is a soft layer. Without: rays for L_ref start at a fixed distance from the
+    surface.
+    """
 
     def surface_width(self) -> Float[Tensor, ""]:
         """Scale of the layer, scene units (VolSDF's β)."""
@@ -119,9 +137,13 @@ class HasSurfaceWidth(Protocol):
 
 @runtime_checkable
 class SmoothsNormals(Protocol):
-    """A host whose normals are wavy, and which knows better ones. Without: surfaces are shaded with the normals of the hits."""
+    """A host whose normals are wavy, and which knows better ones. Without: surfaces are shaded with the
+    normals of the hits.
+    """
 
-    def smooth_normals(self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    def smooth_normals(
+        self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N 3"]:
         """Unit normals at hits for shading; constants, no gradient."""
         ...
 

@@ -1,4 +1,5 @@
-"""What goes wrong when a host meets the method for the first time, looked for in the first batches and said once.
+"""What goes wrong when a host meets the method for the first time, looked for in the first batches and said
+once.
 
 An error where nothing right can come of it; a warning where it may be meant.
 """
@@ -26,7 +27,9 @@ OFF_RAY = 0.02
 MOST_OFF = 0.5
 """Share of hits that may be off their rays or turned away: blended hits at edges are, a few."""
 REACH = 1.5
-"""Where positions are far outside the unit sphere, scene units: a little room for what an object stands on."""
+"""Where positions are far outside the unit sphere, scene units: a little room for what an object stands
+on.
+"""
 SIZES = 30.0
 """Factor between the median of the pixels and `median_radiance` that no exposure explains."""
 
@@ -69,13 +72,17 @@ class FirstLook:
         worst = (length - 1.0).abs().max().item() if len(batch) else 0.0
         if not worst <= UNIT:
             raise UserError(
-                f"directions of rays are no unit vectors: the lengths go from {length.min():.3g} to {length.max():.3g}",
+                f"directions of rays are no unit vectors: the lengths go from {length.min():.3g} to "
+                f"{length.max():.3g}",
                 "divide them by their lengths, so that a distance along a ray is a length",
             )
         for name in ("origins", "color"):
             rows = ~getattr(batch, name).isfinite().all(-1)
             if rows.any():
-                raise UserError(f"{name} of {int(rows.sum())} of {len(batch)} pixels are not finite", "leave those pixels out")
+                raise UserError(
+                    f"{name} of {int(rows.sum())} of {len(batch)} pixels are not finite",
+                    "leave those pixels out",
+                )
         self._look_at_colors(batch.color[batch.mask > 0.5])
 
     def hits(self, batch: PixelBatch, hits: SurfaceHits) -> None:
@@ -93,7 +100,8 @@ class FirstLook:
             if rows.any():
                 raise UserError(
                     f"{self.name}: its {name} is not finite for {int(rows.sum())} of {len(batch)} rays",
-                    "return zeros, and the concentration 0, where a ray meets nothing; look for a division by zero elsewhere",
+                    "return zeros, and the concentration 0, where a ray meets nothing; look for a division "
+                    "by zero elsewhere",
                 )
         self.any_hit = self.any_hit or bool(hit.any())
         if hit.any():
@@ -103,7 +111,8 @@ class FirstLook:
             self._say(
                 "no hit",
                 f"none of {len(batch)} rays meets a surface, so nothing is learned of them",
-                f"is the frame of the rays the host's, the object in the unit sphere? A hit has a concentration of "
+                "is the frame of the rays the host's, the object in the unit sphere? A hit has a "
+                "concentration of "
                 f"{self.hit_share} or more (of a function: a normal)",
             )
 
@@ -111,7 +120,9 @@ class FirstLook:
         if len(color) == 0:
             return
         if color.min() < -1e-3 * self.median_radiance:
-            self._say("negative", "some pixels are negative", "give linear radiance or display values, 0 and above")
+            self._say(
+                "negative", "some pixels are negative", "give linear radiance or display values, 0 and above"
+            )
         if self.response == "srgb" and color.max() > 1.001:
             raise UserError(
                 f"pixels reach {color.max():.3g}, and display values end at 1",
@@ -137,7 +148,8 @@ class FirstLook:
         if off > MOST_OFF:
             raise UserError(
                 f"{self.name}: {off:.0%} of its hits do not lie on their rays",
-                "return positions in the frame of the rays, origin + distance · direction, with unit directions",
+                "return positions in the frame of the rays, origin + distance · direction, with unit "
+                "directions",
             )
         away = ((hits.normal[hit] * directions).sum(-1) > 0).float().mean().item()
         if away > MOST_OFF:
@@ -149,7 +161,8 @@ class FirstLook:
         if reach > REACH:
             self._say(
                 "far",
-                f"half of its hits lie {reach:.3g} and more from the origin; material and light know the unit sphere",
+                f"half of its hits lie {reach:.3g} and more from the origin; material and light know the "
+                "unit sphere",
                 "move and scale cameras and host so that the object lies in the unit sphere",
             )
 
@@ -184,12 +197,18 @@ def check_rows(name: str, value: Tensor, count: int, width: int | None = None) -
         UserError: there is not.
     """
     if not value.is_floating_point():
-        remedy = "divide 8-bit pixels by 255 and attach with response='srgb'" if name == "color" else "give floats"
+        remedy = (
+            "divide 8-bit pixels by 255 and attach with response='srgb'" if name == "color" else "give floats"
+        )
         raise UserError(f"{name} of the batch is {value.dtype}", remedy)
     wanted = (count,) if width is None else (count, width)
     if tuple(value.shape) != wanted:
         pixels = math.prod(value.shape[:-1]) if width is not None and value.ndim > 2 else count
-        shape = f"({pixels}, {width}): a row per pixel, reshape(-1, {width})" if width else f"({pixels},): a number per pixel"
+        shape = (
+            f"({pixels}, {width}): a row per pixel, reshape(-1, {width})"
+            if width
+            else f"({pixels},): a number per pixel"
+        )
         raise UserError(f"{name} of the batch has the shape {tuple(value.shape)}", f"give {shape}")
 
 

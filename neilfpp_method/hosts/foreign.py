@@ -1,5 +1,6 @@
-"""A host that somebody else wrote, as the method asks it: never with zero rays, always in the precision of the rays, and with
-a proxy in its place where it traces no rays."""
+"""A host that somebody else wrote, as the method asks it: never with zero rays, always in the precision of
+the rays, and with a proxy in its place where it traces no rays.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +23,15 @@ from neilfpp_method.structures import PixelBatch, RayBatch, SurfaceHits
 
 __all__ = ["ForeignHost", "answers_secondary_rays"]
 
-PASSED_ON = ("may_meet", "surface_width", "smooth_normals", "parameter_groups", "sdf", "stages", "scene_light")
+PASSED_ON = (
+    "may_meet",
+    "surface_width",
+    "smooth_normals",
+    "parameter_groups",
+    "sdf",
+    "stages",
+    "scene_light",
+)
 """Optional capabilities of `hosts.base` that are the host's own."""
 COARSE = (torch.float16, torch.bfloat16)
 
@@ -30,7 +39,9 @@ log = logging.getLogger(__name__)
 
 
 def answers_secondary_rays(host: object) -> bool:
-    """Whether a host renders rays that leave a surface: not one that draws whole images, nor one that says no."""
+    """Whether a host renders rays that leave a surface: not one that draws whole images, nor one that says
+    no.
+    """
     return hasattr(host, "render") and bool(getattr(host, "answers_secondary_rays", True))
 
 
@@ -83,7 +94,8 @@ class ForeignHost(nn.Module):
         if not hasattr(self.inner, "render"):
             raise UserError(
                 f"{self.name} draws whole images, not rays",
-                "hand in what it has drawn: losses(batch, step, hits) and maps(rays, hits), see docs/hosts.md",
+                "hand in what it has drawn: losses(batch, step, hits) and maps(rays, hits), see "
+                "docs/hosts.md",
             )
         return no_hits(rays) if len(rays) == 0 else self._usable(rays, self.inner.render(rays))
 
@@ -94,7 +106,9 @@ class ForeignHost(nn.Module):
             UserError: it has no `render_image`.
         """
         if not isinstance(self.inner, ImageHost):
-            raise UserError(f"{self.name} has no render_image(camera)", "give rays: data.views.camera_rays(camera)")
+            raise UserError(
+                f"{self.name} has no render_image(camera)", "give rays: data.views.camera_rays(camera)"
+            )
         rays = rays_like(camera, like)
         return rays, self.read(rays, self.inner.render_image(camera))
 
@@ -121,7 +135,8 @@ class ForeignHost(nn.Module):
             self.coarse_said = True
             digits = torch.finfo(hits.position.dtype).eps
             log.warning(
-                "%s: its position is %s, which knows places to %.0e; leave half precision for the position: return float32",
+                "%s: its position is %s, which knows places to %.0e; leave half precision for the position: "
+                "return float32",
                 self.name,
                 hits.position.dtype,
                 digits,

@@ -20,8 +20,8 @@ RenderFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 class CallableHost:
     """A function (origins, directions) → (color, position, normal) as a host.
 
-    A ray misses where its normal is shorter than one half or not finite. This is no `nn.Module`: a function that is one
-    stays where it belongs.
+    A ray misses where its normal is shorter than one half or not finite. This is no `nn.Module`: a function
+    that is one stays where it belongs.
     """
 
     def __init__(self, function: RenderFunction) -> None:

@@ -1,8 +1,8 @@
 """Whole images as hits: what a rasteriser draws (splats, meshes), a row per pixel.
 
-hits = image_hits(camera, color, depth, opacity)        # (H, W, 3), (H, W), (H, W) as the rasteriser returns them
-batch = pixel_batch(rays.origins, rays.directions, photograph.reshape(-1, 3))       # rays = camera_rays(camera)
-loss = loss + neilf.losses(batch[rows], step, hits[rows]).loss
+hits = image_hits(camera, color, depth, opacity)        # (H, W, 3), (H, W), (H, W) as the rasteriser returns
+them batch = pixel_batch(rays.origins, rays.directions, photograph.reshape(-1, 3))       # rays =
+camera_rays(camera) loss = loss + neilf.losses(batch[rows], step, hits[rows]).loss
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from neilfpp_method.structures import RayBatch, SurfaceHits
 __all__ = ["depth_normals", "image_hits", "rays_like"]
 
 JUMP = 0.1
-"""Neighbouring pixels whose distances from the eye differ by more than this share of it are on two surfaces."""
+"""Neighbouring pixels whose distances from the eye differ by more than this share of it are on two
+surfaces.
+"""
 SOLID = 0.5
 """Least opacity of a pixel that has a surface."""
 
@@ -43,8 +45,8 @@ def image_hits(
     Args:
         camera: in the scene frame, OpenCV axes.
         color: linear radiance, background included.
-        depth: of the surface, scene units, along the camera's axis (z-depth, what rasterisers draw). Blended depths are to be
-            divided by the opacity before.
+        depth: of the surface, scene units, along the camera's axis (z-depth, what rasterisers draw). Blended
+            depths are to be divided by the opacity before.
         opacity: share of the ray that the surface stops. A pixel below one half is a miss.
         normal: of any length, scene frame, away from the surface; none: of the depths of neighbouring pixels.
         along_ray: depth is a distance along the ray.
@@ -53,12 +55,16 @@ def image_hits(
         UserError: a map has another size than the camera.
     """
     size = (camera.height, camera.width)
-    maps = {"color": color, "depth": depth, "opacity": opacity} | ({} if normal is None else {"normal": normal})
+    maps = {"color": color, "depth": depth, "opacity": opacity} | (
+        {} if normal is None else {"normal": normal}
+    )
     for name, value in maps.items():
         wanted = (*size, 3) if name in ("color", "normal") else size
         if tuple(value.shape) != wanted:
             shape = tuple(value.shape)
-            raise UserError(f"the {name} of an image has the shape {shape}", f"give {wanted}, as the camera has it")
+            raise UserError(
+                f"the {name} of an image has the shape {shape}", f"give {wanted}, as the camera has it"
+            )
     rays = rays_like(camera, color)
     axis = torch.as_tensor(camera.w2c[2, :3], dtype=color.dtype, device=color.device)
     distance = depth.reshape(-1) if along_ray else depth.reshape(-1) / (rays.directions @ axis)
@@ -79,8 +85,9 @@ def image_hits(
 
 
 def depth_normals(position: Float[Tensor, "H W 3"], eye: Float[Tensor, " 3"]) -> Float[Tensor, "H W 3"]:
-    """Unit normals of a surface from the positions of pixels, towards the eye: the cross product of the steps to the nearer of
-    both neighbours along each axis. Zero where a neighbour lies on another surface."""
+    """Unit normals of a surface from the positions of pixels, towards the eye: the cross product of the steps
+    to the nearer of both neighbours along each axis. Zero where a neighbour lies on another surface.
+    """
     distance = (position - eye).norm(dim=-1)
     right, right_ok = _nearer_step(position, distance, 1)
     down, down_ok = _nearer_step(position, distance, 0)
@@ -89,8 +96,12 @@ def depth_normals(position: Float[Tensor, "H W 3"], eye: Float[Tensor, " 3"]) ->
     return torch.where(towards < 0, -normal, normal) * (right_ok & down_ok)[..., None]
 
 
-def _nearer_step(position: Float[Tensor, "H W 3"], distance: Float[Tensor, "H W"], axis: int) -> tuple[Tensor, Tensor]:
-    """The step to the neighbour along an axis whose depth differs least, and whether that is on the same surface."""
+def _nearer_step(
+    position: Float[Tensor, "H W 3"], distance: Float[Tensor, "H W"], axis: int
+) -> tuple[Tensor, Tensor]:
+    """The step to the neighbour along an axis whose depth differs least, and whether that is on the same
+    surface.
+    """
     forward, backward = (position.roll(-1, axis) - position), (position - position.roll(1, axis))
     rise = (distance.roll(-1, axis) - distance).abs()
     edge = torch.arange(position.shape[axis], device=position.device).view(-1, *([1] * (1 - axis)))

@@ -36,7 +36,9 @@ RADIANCE_AT_ONCE = 2**16
 
 @dataclass(frozen=True)
 class Crossings:
-    """The rays that meet the mesh: their rows, where they meet it, its normal there, and whether on its outside."""
+    """The rays that meet the mesh: their rows, where they meet it, its normal there, and whether on its
+    outside.
+    """
 
     rows: Int[Tensor, " K"]
     position: Float[Tensor, "K 3"]
@@ -47,7 +49,8 @@ class Crossings:
 class MeshHost(nn.Module):
     """A mesh and R on it. Positions and normals are constants; the colour moves R.
 
-    Faces are wound outwards: their inside stops a ray, but is no surface point. Geometry is no part of the weights.
+    Faces are wound outwards: their inside stops a ray, but is no surface point. Geometry is no part of the
+    weights.
 
     Args:
         mesh: triangles in the scene frame.
@@ -71,9 +74,13 @@ class MeshHost(nn.Module):
     ) -> None:
         super().__init__()
         radius = config.volume.radius
-        self.radiance_field = OutgoingRadianceField(config.radiance, config.encoding, 0, radius, radiance_scale, radiance_start)
+        self.radiance_field = OutgoingRadianceField(
+            config.radiance, config.encoding, 0, radius, radiance_scale, radiance_start
+        )
         self.register_buffer("background_color", torch.tensor(background_color))
-        self.background = field_beyond(background, config.background, radius, radiance_scale, self.background_color)
+        self.background = field_beyond(
+            background, config.background, radius, radiance_scale, self.background_color
+        )
         triangles = mesh.vertices[mesh.faces]
         across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         outward = safe_normalize(across, eps=TINY)
@@ -85,7 +92,7 @@ class MeshHost(nn.Module):
         self.normal_radius = config.volume.normal_radius
         self._tracers: dict[torch.device, FirstHits] = {}
 
-    # ------------------------------------------------------------------------------------------------ the host contract
+    # -------------------------------------------------------------------------------------- the host contract
 
     def render(self, rays: RayBatch) -> SurfaceHits:
         """What each ray meets first, and R there; what lies beyond where it meets nothing."""
@@ -113,13 +120,19 @@ class MeshHost(nn.Module):
         seen = torch.nonzero(met.outside)[:, 0]
         for part in seen.split(RADIANCE_AT_ONCE):
             rows, position = met.rows[part], met.position[part]
-            radiance[rows] = self.radiance_field(position, -directions[rows], met.normal[part], position[:, :0])
+            radiance[rows] = self.radiance_field(
+                position, -directions[rows], met.normal[part], position[:, :0]
+            )
         distance = distance.view(wi.shape[:2])
         return SceneLight(distance.isfinite(), radiance.view(wi.shape), distance)
 
     @torch.no_grad()
-    def smooth_normals(self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """For meshes that are noisy, the normals of `volume.normal_radius` about hits, edges kept; at 0 those of the hits."""
+    def smooth_normals(
+        self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N 3"]:
+        """For meshes that are noisy, the normals of `volume.normal_radius` about hits, edges kept; at 0 those
+        of the hits.
+        """
         if self.normal_radius == 0:
             return normal
         up = normal.repeat_interleave(NEIGHBOURS, 0)
@@ -133,9 +146,11 @@ class MeshHost(nn.Module):
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
         """R, and the background where it is a field."""
         groups = {"radiance": list(self.radiance_field.parameters())}
-        return groups if self.background is None else groups | {"background": list(self.background.parameters())}
+        return (
+            groups if self.background is None else groups | {"background": list(self.background.parameters())}
+        )
 
-    # --------------------------------------------------------------------------------------------------------- geometry
+    # ----------------------------------------------------------------------------------------------- geometry
 
     def cross(self, rays: RayBatch) -> Crossings:
         """Where rays meet the mesh first."""
@@ -144,8 +159,11 @@ class MeshHost(nn.Module):
         numbers, origins, directions = numbers[rows], rays.origins[rows], rays.directions[rows]
         meeting = meet(origins, directions, self.triangles[numbers].to(origins.dtype))
         flat = self.outward[numbers].to(origins.dtype)
-        smooth = safe_normalize((meeting.weights[..., None] * self.corner_normals[numbers].to(origins.dtype)).sum(1))
-        # Seen along the surface, the interpolated normal can point away from the viewer; the triangle's does not.
+        smooth = safe_normalize(
+            (meeting.weights[..., None] * self.corner_normals[numbers].to(origins.dtype)).sum(1)
+        )
+        # Seen along the surface, the interpolated normal can point away from the viewer; the triangle's does
+        # not.
         faces_viewer = (smooth * directions).sum(-1, keepdim=True) < 0.0
         return Crossings(
             rows=rows,
@@ -172,9 +190,10 @@ class MeshHost(nn.Module):
 
 
 def corner_normals(mesh: Mesh, outward: Float[Tensor, "F 3"]) -> Float[Tensor, "F 3 3"]:
-    """Unit normals at the corners of faces: of the faces around the vertex that lie on the same side of every crease, by their
-    angles there, as of how many triangles a face is made says nothing (Thürmer and Wüthrich 1998). Vertices that faces do
-    not share make edges."""
+    """Unit normals at the corners of faces: of the faces around the vertex that lie on the same side of every
+    crease, by their angles there, as of how many triangles a face is made says nothing (Thürmer and Wüthrich
+    1998). Vertices that faces do not share make edges.
+    """
     count, faces = 3 * len(mesh.faces), mesh.faces.numpy()
     shape = trimesh.Trimesh(mesh.vertices.numpy(), faces, process=False)
     pair, ends = shape.face_adjacency, shape.face_adjacency_edges
@@ -184,7 +203,9 @@ def corner_normals(mesh: Mesh, outward: Float[Tensor, "F 3"]) -> Float[Tensor, "
     # Corners of one vertex in two faces that share a smooth edge are one corner.
     slot = (faces[pair][:, :, None] == ends[:, None, :, None]).argmax(-1)
     corner = 3 * pair[..., None] + slot
-    joined = coo_array((np.ones(ends.size), (corner[:, 0].ravel(), corner[:, 1].ravel())), shape=(count, count))
+    joined = coo_array(
+        (np.ones(ends.size), (corner[:, 0].ravel(), corner[:, 1].ravel())), shape=(count, count)
+    )
     number, group = connected_components(joined, directed=False)
     angle = torch.from_numpy(np.nan_to_num(shape.face_angles)).to(outward)
     turned = (angle[..., None] * outward[:, None]).view(-1, 3)

@@ -37,9 +37,15 @@ class Meeting:
     weights: Float[Tensor, "N 3"]
 
 
-def meet(origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"], triangles: Float[Tensor, "N 3 3"]) -> Meeting:
+def meet(
+    origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"], triangles: Float[Tensor, "N 3 3"]
+) -> Meeting:
     """Each ray with the plane of its own triangle (Möller & Trumbore 1997); not finite for a ray along it."""
-    corner, first, second = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    corner, first, second = (
+        triangles[:, 0],
+        triangles[:, 1] - triangles[:, 0],
+        triangles[:, 2] - triangles[:, 0],
+    )
     across = torch.linalg.cross(directions, second)
     determinant = (first * across).sum(-1)
     offset = origins - corner
@@ -49,7 +55,7 @@ def meet(origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"], triang
     return Meeting((second * turned).sum(-1) / determinant, torch.stack([1.0 - u - v, u, v], dim=-1))
 
 
-# ------------------------------------------------------------------------------------------------------ a tree of boxes
+# -------------------------------------------------------------------------------------------- a tree of boxes
 
 
 @dataclass(frozen=True)
@@ -62,10 +68,12 @@ class Boxes:
 
 @dataclass(frozen=True)
 class BoxTree:
-    """Triangles along a space-filling curve, and boxes around every 8, 64, 512, … neighbours on it, the root first.
+    """Triangles along a space-filling curve, and boxes around every 8, 64, 512, … neighbours on it, the root
+    first.
 
-    Node i of a level holds the nodes 8 i … 8 i + 7 of the next one, and of the last level the triangles. Levels are
-    filled up to eights with boxes that are inside out, and the triangles with ones that are not finite.
+    Node i of a level holds the nodes 8 i … 8 i + 7 of the next one, and of the last level the triangles.
+    Levels are filled up to eights with boxes that are inside out, and the triangles with ones that are not
+    finite.
     """
 
     triangles: Float[Tensor, "P 3 3"]
@@ -98,22 +106,29 @@ def tree_tracer(tree: BoxTree) -> FirstHits:
     return first_hits
 
 
-def _descend(tree: BoxTree, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
+def _descend(
+    tree: BoxTree, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]
+) -> Int[Tensor, " N"]:
     """All rays go down the tree together: a level takes pairs (ray, node) and leaves those that meet."""
     count, device = len(origins), origins.device
-    inverse = 1.0 / torch.where(directions < 0.0, directions.clamp_max(-MIN_COMPONENT), directions.clamp_min(MIN_COMPONENT))
+    inverse = 1.0 / torch.where(
+        directions < 0.0, directions.clamp_max(-MIN_COMPONENT), directions.clamp_min(MIN_COMPONENT)
+    )
     rays = torch.arange(count, device=device)
     nodes = torch.zeros_like(rays)
     children = torch.arange(BRANCHES, device=device)
     for boxes in tree.levels:
-        kept = torch.nonzero(_meets_box(origins[rays], inverse[rays], boxes.low[nodes], boxes.high[nodes]))[:, 0]
+        kept = torch.nonzero(_meets_box(origins[rays], inverse[rays], boxes.low[nodes], boxes.high[nodes]))[
+            :, 0
+        ]
         rays = rays[kept].repeat_interleave(BRANCHES)
         nodes = (BRANCHES * nodes[kept][:, None] + children).reshape(-1)
     meeting = meet(origins[rays], directions[rays], tree.triangles[nodes])
     inside = (meeting.weights >= -SLACK).all(-1) & (meeting.distance > 0.0)
     distance = torch.where(inside, meeting.distance, torch.inf)
     nearest = distance.new_full((count,), torch.inf).scatter_reduce(0, rays, distance, "amin")
-    # Of triangles that a ray meets at the same distance, the one that comes last in the mesh: the same in every run.
+    # Of triangles that a ray meets at the same distance, the one that comes last in the mesh: the same in
+    # every run.
     winner = torch.where(inside & (distance == nearest[rays]), tree.numbers[nodes], -1)
     return torch.full_like(nearest, -1, dtype=torch.int64).scatter_reduce(0, rays, winner, "amax")
 
@@ -124,7 +139,9 @@ def _meets_box(
     low: Float[Tensor, "K 3"],
     high: Float[Tensor, "K 3"],
 ) -> Bool[Tensor, " K"]:
-    """Whether rays pass through boxes. The direction chooses the sides, so that a box that is inside out is never met."""
+    """Whether rays pass through boxes. The direction chooses the sides, so that a box that is inside out is
+    never met.
+    """
     forward = inverse > 0.0
     enter = ((torch.where(forward, low, high) - origins) * inverse).amax(-1)
     leave = ((torch.where(forward, high, low) - origins) * inverse).amin(-1)
@@ -148,7 +165,7 @@ def _morton(points: Float[Tensor, "F 3"]) -> Int[Tensor, " F"]:
     return code
 
 
-# --------------------------------------------------------------------------------------------------------------- Embree
+# ----------------------------------------------------------------------------------------------------- Embree
 
 
 def embree_tracer(triangles: Float[Tensor, "F 3 3"]) -> FirstHits | None:

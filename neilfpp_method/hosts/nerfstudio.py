@@ -1,11 +1,12 @@
-"""Any ray-based nerfstudio `Model` as a host: NeuS, nerfacto with normals, or one of your own. The model is not touched.
+"""Any ray-based nerfstudio `Model` as a host: NeuS, nerfacto with normals, or one of your own. The model is
+not touched.
 
-| of the host          | output of the model, the first that it has                                              |
-|----------------------|-----------------------------------------------------------------------------------------|
-| color                | `rgb`: display values (sRGB) or linear, times the radiance that its 1 stands for          |
-| position             | `expected_depth`, `depth`: distance along a unit ray                                    |
-| normal               | `normal` (a vector), `pred_normals`, `normals` (colours (n + 1)/2), made unit           |
-| opacity              | `accumulation`                                                                          |
+| of the host | output of the model, the first that it has                                       |
+|-------------|----------------------------------------------------------------------------------|
+| color       | `rgb`: display values (sRGB) or linear, times the radiance that its 1 stands for |
+| position    | `expected_depth`, `depth`: distance along a unit ray                             |
+| normal      | `normal` (a vector), `pred_normals`, `normals` (colours (n + 1)/2), made unit    |
+| opacity     | `accumulation`                                                                   |
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ OWN_LOSSES = "own"
 DEPTHS = ("expected_depth", "depth")
 NORMALS = ("normal", "pred_normals", "normals")
 COLOR_CODED = ("pred_normals", "normals")
-# Cone-casting samplers read a pixel's area at distance 1; traced rays have none. That of a pixel of a 1000-pixel view.
+# Cone-casting samplers read a pixel's area at distance 1; traced rays have none. That of a pixel of a
+# 1000-pixel view.
 PIXEL_AREA = 1e-6
 SAME_FRAME = Normalisation(1.0, (0.0, 0.0, 0.0))
 
@@ -45,16 +47,17 @@ Outputs = Mapping[str, Tensor]
 class NerfstudioHost(nn.Module):
     """A nerfstudio model behind the host contract.
 
-    The share of weight that lies close to the hit is not among a model's outputs: `concentration` is the opacity. A ray
-    that grazes two surfaces of a density model counts as a hit between them.
+    The share of weight that lies close to the hit is not among a model's outputs: `concentration` is the
+    opacity. A ray that grazes two surfaces of a density model counts as a hit between them.
 
     Args:
         model: a model that takes rays; `NeuSModel`, `NerfactoModel` with `predict_normals`, …
         response: what the model draws: "srgb" (trained on 8-bit images) or "linear".
-        radiance_scale: the linear radiance that a drawn 1 stands for; above 1 for a model that draws [0, 1] of an HDR scene.
+        radiance_scale: the linear radiance that a drawn 1 stands for; above 1 for a model that draws [0, 1]
+            of an HDR scene.
         frame: from the model's frame, as world, to the scene frame, where the object lies in the unit sphere.
-        own_losses: `render_regularised` adds the term `own`: the model's own losses but its `rgb_loss`. The caller
-            weighs it with 1. Off: the model is trained elsewhere, or not at all.
+        own_losses: `render_regularised` adds the term `own`: the model's own losses but its `rgb_loss`. The
+            caller weighs it with 1. Off: the model is trained elsewhere, or not at all.
     """
 
     def __init__(
@@ -73,10 +76,11 @@ class NerfstudioHost(nn.Module):
         self.radiance_scale = radiance_scale
         self.frame = frame
         self.own_losses = own_losses
-        # Told now: a stage that freezes the host lets its parameters move again, and a model has some that never do.
+        # Told now: a stage that freezes the host lets its parameters move again, and a model has some that
+        # never do.
         self._moving = [p for group in model.get_param_groups().values() for p in group if p.requires_grad]
 
-    # -------------------------------------------------------------------------------------------------- the host contract
+    # -------------------------------------------------------------------------------------- the host contract
 
     def render(self, rays: RayBatch) -> SurfaceHits:
         """What the model says of each ray.
@@ -86,13 +90,15 @@ class NerfstudioHost(nn.Module):
         """
         if len(rays) == 0:  # some models cannot be asked for nothing
             return no_hits(rays)
-        return self.read_outputs(rays, self._ask(rays, torch.zeros_like(rays.origins[:, 0], dtype=torch.long)))
+        return self.read_outputs(
+            rays, self._ask(rays, torch.zeros_like(rays.origins[:, 0], dtype=torch.long))
+        )
 
     def render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
         """As `render`, with `eikonal` or `own` where the model has them and a gradient flows.
 
-        `eikonal` is asked for by its name, and counts the gradients that a `SurfaceModel` hands out in training. With
-        `own_losses` the model's own, with its own weights, stands in for it.
+        `eikonal` is asked for by its name, and counts the gradients that a `SurfaceModel` hands out in
+        training. With `own_losses` the model's own, with its own weights, stands in for it.
         """
         if len(batch) == 0:
             return RegularisedHits(no_hits(batch.rays), {})
@@ -109,7 +115,7 @@ class NerfstudioHost(nn.Module):
         """All that the model would train, as `geometry`: a nerfstudio field holds shape and colour in one."""
         return {"geometry": self._moving}
 
-    # ---------------------------------------------------------------------------------------------------------- the model
+    # ---------------------------------------------------------------------------------------------- the model
 
     def _ask(self, rays: RayBatch, view: Int[Tensor, " N"]) -> Outputs:
         ones = torch.ones_like(rays.origins[:, :1])
@@ -130,9 +136,13 @@ class NerfstudioHost(nn.Module):
             UserError: an output is missing.
         """
         depth = outputs[self._first(outputs, DEPTHS, "use a model that renders its depth")] / self.frame.scale
-        name = self._first(outputs, NORMALS, "switch its normals on (nerfacto: predict_normals=True), or use a surface model")
+        name = self._first(
+            outputs, NORMALS, "switch its normals on (nerfacto: predict_normals=True), or use a surface model"
+        )
         normal = 2.0 * outputs[name] - 1.0 if name in COLOR_CODED else outputs[name]
-        opacity = outputs[self._first(outputs, ("accumulation",), "have it output the sum of its weights")][:, 0]
+        opacity = outputs[self._first(outputs, ("accumulation",), "have it output the sum of its weights")][
+            :, 0
+        ]
         drawn = outputs[self._first(outputs, ("rgb",), "use a model that renders a colour")]
         linear = srgb_to_linear(drawn) if self.response == "srgb" else drawn
         return SurfaceHits(

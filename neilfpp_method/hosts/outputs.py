@@ -21,8 +21,8 @@ UNIT = 1e-2
 class OutputCheck:
     """Refuses what a host must not return.
 
-    Shapes, devices and graphs are looked at in every step and cost nothing. Normals are looked at until a first hit was
-    among them: after that, a step that is not finite is the training loop's affair.
+    Shapes, devices and graphs are looked at in every step and cost nothing. Normals are looked at until a
+    first hit was among them: after that, a step that is not finite is the training loop's affair.
     """
 
     def __init__(self, host: object, hit_share: float) -> None:
@@ -67,7 +67,9 @@ def check_tensors(name: str, rays: RayBatch, outputs: dict[str, object]) -> None
         wanted = (len(rays), *SHAPES[output])
         if not isinstance(value, Tensor) or not value.is_floating_point():
             kind = str(value.dtype) if isinstance(value, Tensor) else type(value).__name__
-            raise UserError(f"{name}: its {output} is a {kind}", f"return a floating-point tensor {_shape(wanted)}")
+            raise UserError(
+                f"{name}: its {output} is a {kind}", f"return a floating-point tensor {_shape(wanted)}"
+            )
         if tuple(value.shape) != wanted:
             shape = f"the shape {_shape(value.shape)}"
             raise UserError(f"{name}: its {output} has {shape}", f"return {_shape(wanted)}, a row per ray")
@@ -92,7 +94,8 @@ def check_normals(name: str, hits: SurfaceHits, hit_share: float) -> bool:
             "divide by the length with a floor under it, and return zeros where a ray meets nothing",
         )
     length = normal[hits.is_hit(hit_share)].norm(dim=-1)
-    # Where a ray meets both faces of a thin sheet, their blended normals may cancel: a zero is excused, unless most are.
+    # Where a ray meets both faces of a thin sheet, their blended normals may cancel: a zero is excused,
+    # unless most are.
     off = (length - 1.0).abs()
     wrong = off.where(length > 0.0, off.median()) if len(length) else off
     if len(length) and wrong.max() > UNIT:

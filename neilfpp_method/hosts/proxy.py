@@ -1,11 +1,13 @@
-"""A traceable stand-in for the surface of a host that cannot trace cheaply, gathered from the rays of training.
+"""A traceable stand-in for the surface of a host that cannot trace cheaply, gathered from the rays of
+training.
 
-Hits of camera rays are oriented points; the newest of them are fused into a grid of distances (`volume.fusion`) with the mean
-of the radiance that was seen there. Rays that leave a surface are sphere-traced in the grid. So visibility, hard
-inter-reflection, an environment map and lamps work on any host.
+Hits of camera rays are oriented points; the newest of them are fused into a grid of distances
+(`volume.fusion`) with the mean of the radiance that was seen there. Rays that leave a surface are
+sphere-traced in the grid. So visibility, hard inter-reflection, an environment map and lamps work on any
+host.
 
-Before new rays go in, they are traced through what was known: that measures the error, and takes out points that they pass
-through. A host that moves is followed in that way, a few dozen steps behind.
+Before new rays go in, they are traced through what was known: that measures the error, and takes out points
+that they pass through. A host that moves is followed in that way, a few dozen steps behind.
 """
 
 from __future__ import annotations
@@ -31,13 +33,19 @@ POINTS = 32_768
 EVERY = 64
 """Steps between two refreshes, once there have been as many; before that at steps 1, 2, 4, 8, …"""
 ROUNDS, ROUND = 16, 512
-"""A look around before the first step, and its rays: from the cameras of the first batch to where its hits are."""
+"""A look around before the first step, and its rays: from the cameras of the first batch to where its hits
+are.
+"""
 SPREAD = 0.2
 """How far about a hit the look around aims, scene units: beside it is more of the surface."""
 START = 0.75
-"""Height above the grid's surface at which rays leave it, in cells: the tracing ends at a quarter of a cell."""
+"""Height above the grid's surface at which rays leave it, in cells: the tracing ends at a quarter of a
+cell.
+"""
 APART = 2.0
-"""A ray that goes this much further than the grid lets it, in cells, passes through points that are no longer true."""
+"""A ray that goes this much further than the grid lets it, in cells, passes through points that are no longer
+true.
+"""
 CLEAR = 0.01
 """Largest opacity of a ray that meets nothing."""
 GRAZING = 0.2
@@ -70,7 +78,8 @@ class ProxyReport:
 
     def __str__(self) -> str:
         return (
-            f"proxy of {self.points} points, seen {self.age:.0f} steps ago: {self.agreement:.1%} of rays agree with the host, "
+            f"proxy of {self.points} points, seen {self.age:.0f} steps ago: {self.agreement:.1%} of rays "
+            "agree with the host, "
             f"distances are off by {self.error:.4f} (95 %: {self.error_95:.4f}; a cell is {self.cell:.4f})"
         )
 
@@ -84,21 +93,27 @@ class Looks:
 
 
 class SurfaceProxy(nn.Module):
-    """The newest points of a surface, and the grid that they make. The points are part of a checkpoint, the grid follows.
+    """The newest points of a surface, and the grid that they make. The points are part of a checkpoint, the
+    grid follows.
 
     Args:
         radius: half the edge of the cube that holds the scene, scene units.
         resolution: vertices of the grid along an edge.
         hit_share: least concentration of a hit.
-        radiance: what a point of the surface sends, where the host knows it without a ray; none: the mean of what was seen.
+        radiance: what a point of the surface sends, where the host knows it without a ray; none: the mean of
+            what was seen.
     """
 
-    def __init__(self, radius: float, resolution: int, hit_share: float, radiance: Radiance | None = None) -> None:
+    def __init__(
+        self, radius: float, resolution: int, hit_share: float, radiance: Radiance | None = None
+    ) -> None:
         super().__init__()
         self.radius = radius
         self.resolution = resolution
         self.hit_share = hit_share
-        self.points = Ring(POINTS, 10)  # position, normal, radiance, the step that saw it; a normal of 0 is no point
+        self.points = Ring(
+            POINTS, 10
+        )  # position, normal, radiance, the step that saw it; a normal of 0 is no point
         self.steps = 0
         self._radiance = radiance
         self._pending: list[tuple[RayBatch, SurfaceHits]] = []
@@ -110,19 +125,25 @@ class SurfaceProxy(nn.Module):
         """Edge of a cell of the grid, scene units."""
         return 2 * self.radius / (self.resolution - 1)
 
-    # ---------------------------------------------------------------------------------------------------------- gathering
+    # ---------------------------------------------------------------------------------------------- gathering
 
     @torch.no_grad()
     def observe(self, rays: RayBatch, hits: SurfaceHits) -> None:
-        """One training step's camera rays, and what the host says of them. Refreshes the grid when it is time."""
+        """One training step's camera rays, and what the host says of them. Refreshes the grid when it is
+        time.
+        """
         self.steps += 1
         self._pending.append((rays.to(rays.origins.device), hits.detach()))
         if self.steps % EVERY == 0 or (self.steps < EVERY and self.steps & (self.steps - 1) == 0):
             self.refresh()
 
     @torch.no_grad()
-    def look_around(self, render: Callable[[RayBatch], SurfaceHits], rays: RayBatch, hits: SurfaceHits) -> None:
-        """Before the first step, see enough of the surface to trace: from where the first rays start, to about their hits."""
+    def look_around(
+        self, render: Callable[[RayBatch], SurfaceHits], rays: RayBatch, hits: SurfaceHits
+    ) -> None:
+        """Before the first step, see enough of the surface to trace: from where the first rays start, to
+        about their hits.
+        """
         known = hits.position[hits.is_hit(self.hit_share)].detach()
         for _ in range(ROUNDS if len(known) else 0):
             origins = rays.origins[torch.randint(len(rays), (ROUND,), device=known.device)]
@@ -139,8 +160,12 @@ class SurfaceProxy(nn.Module):
         """Measure what is known by the rays that came since, take them in, and make the grid anew."""
         if not self._pending:
             return
-        rays = RayBatch(*(torch.cat([getattr(r, name) for r, _ in self._pending]) for name in ("origins", "directions")))
-        joined = [torch.cat(parts) for parts in zip(*(self._columns(r, h) for r, h in self._pending), strict=True)]
+        rays = RayBatch(
+            *(torch.cat([getattr(r, name) for r, _ in self._pending]) for name in ("origins", "directions"))
+        )
+        joined = [
+            torch.cat(parts) for parts in zip(*(self._columns(r, h) for r, h in self._pending), strict=True)
+        ]
         points, distance, hit, clear = joined
         self._pending.clear()
         if self._surface is not None:
@@ -169,7 +194,9 @@ class SurfaceProxy(nn.Module):
         error = (found.distance - looks.distance)[both].abs()
         rows = self.points.kept()
         held = rows[:, 3:6].square().sum(-1) > 0
-        middle, most = error.quantile(torch.tensor([0.5, 0.95]).to(error)).tolist() if len(error) else (0.0, 0.0)
+        middle, most = (
+            error.quantile(torch.tensor([0.5, 0.95]).to(error)).tolist() if len(error) else (0.0, 0.0)
+        )
         self._report = ProxyReport(
             points=int(held.sum()),
             age=(self.steps - rows[held, 9]).mean().item() if held.any() else 0.0,
@@ -182,18 +209,21 @@ class SurfaceProxy(nn.Module):
         place = looks.rays.origins + found.distance[:, None] * looks.rays.directions
         stale = torch.zeros(self.resolution**3, dtype=torch.bool, device=place.device)
         stale[self._cells(place[through])] = True
-        around = nn.functional.max_pool3d(stale.view(1, 1, *[self.resolution] * 3).float(), 3, 1, 1).view(-1) > 0
+        around = (
+            nn.functional.max_pool3d(stale.view(1, 1, *[self.resolution] * 3).float(), 3, 1, 1).view(-1) > 0
+        )
         rows[around[self._cells(rows[:, :3])], 3:6] = 0.0  # a view of the ring: written in place
 
     def _cells(self, x: Float[Tensor, "P 3"]) -> Int[Tensor, " P"]:
         i, j, k = ((x + self.radius) / self.cell).round().long().clamp(0, self.resolution - 1).unbind(-1)
         return (k * self.resolution + j) * self.resolution + i
 
-    # ------------------------------------------------------------------------------------------------------------ tracing
+    # ------------------------------------------------------------------------------------------------ tracing
 
     @torch.no_grad()
     def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
-        """What the scene sends to surface points (`hosts.base.LightsItself`); nothing, before anything was seen.
+        """What the scene sends to surface points (`hosts.base.LightsItself`); nothing, before anything was
+        seen.
 
         Rays start above the grid's own surface, so that its error shadows nothing.
         """
@@ -202,7 +232,10 @@ class SurfaceProxy(nn.Module):
         if surface is None:
             nothing = torch.zeros_like(wi[..., 0])
             return SceneLight(nothing > 0, torch.zeros_like(wi), torch.full_like(nothing, torch.inf))
-        normal, height = grid_normal(surface.distance, self.radius, x), look_up(surface.distance, self.radius, x)
+        normal, height = (
+            grid_normal(surface.distance, self.radius, x),
+            look_up(surface.distance, self.radius, x),
+        )
         lift = (START * self.cell - height).clamp(0, (START + 1) * self.cell)
         start = (x + lift[:, None] * normal)[:, None].expand_as(wi).reshape(-1, 3)
         found = self._trace(RayBatch(start, directions))
@@ -267,11 +300,13 @@ class SurfaceProxy(nn.Module):
     def _entry(self, rays: RayBatch) -> tuple[Float[Tensor, " P"], Bool[Tensor, " P"]]:
         """The distance at which rays enter the cube, 0 from within, and which ones do."""
         direction = torch.where(rays.directions.abs() < 1e-9, 1e-9, rays.directions)
-        ends = torch.stack(((-self.radius - rays.origins) / direction, (self.radius - rays.origins) / direction))
+        ends = torch.stack(
+            ((-self.radius - rays.origins) / direction, (self.radius - rays.origins) / direction)
+        )
         near, far = ends.amin(0).amax(-1).clamp_min(0.0), ends.amax(0).amin(-1)
         return torch.where(near > 0, near + 1e-4 * self.radius, near), far > near
 
-    # --------------------------------------------------------------------------------------------------------- checkpoints
+    # -------------------------------------------------------------------------------------------- checkpoints
 
     def get_extra_state(self) -> dict[str, int]:
         """Steps that were observed."""

@@ -1,9 +1,10 @@
 """Normals for shading: those of a surface's neighbourhood, with its edges kept.
 
-A learned distance field is a little wavy, by the cells of its grid, and a highlight moves twice as far as the normal that
-throws it: a ripple of three degrees blurs all that tells a metal from paint. So the normals around a point are fitted by a
-plane, robustly: they may turn evenly, as on a ball, and those beyond an edge do not count (Öztireli, Guennebaud and Gross 2009,
-"Feature preserving point set surfaces based on non-linear kernel regression").
+A learned distance field is a little wavy, by the cells of its grid, and a highlight moves twice as far as the
+normal that throws it: a ripple of three degrees blurs all that tells a metal from paint. So the normals
+around a point are fitted by a plane, robustly: they may turn evenly, as on a ball, and those beyond an edge
+do not count (Öztireli, Guennebaud and Gross 2009, "Feature preserving point set surfaces based on non-linear
+kernel regression").
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ def smooth_normals(
         gradient: of the signed distance; asked at `NEIGHBOURS` places about each point.
         position: points on the surface, scene frame.
         normal: their unit normals, as noisy as they are.
-        radius: of the neighbourhood, scene units. Relief that is finer than this and flatter than `UNLIKE` is lost.
+        radius: of the neighbourhood, scene units. Relief that is finer than this and flatter than `UNLIKE` is
+            lost.
     """
     ring = _rings(position)
     around = position[:, None] + radius * (ring @ local_frame(normal)[:, :2])
@@ -63,7 +65,10 @@ def smooth_normals(
 
 def _rings(like: Tensor) -> Float[Tensor, "K 2"]:
     """Places in the tangent plane for a radius of 1; each ring is turned against the one before."""
-    angles = [(torch.arange(count) + 0.5 * number) * (2 * math.pi / count) for number, (count, _) in enumerate(RINGS)]
+    angles = [
+        (torch.arange(count) + 0.5 * number) * (2 * math.pi / count)
+        for number, (count, _) in enumerate(RINGS)
+    ]
     shares = torch.cat([torch.full((count,), share) for count, share in RINGS])
     angle = torch.cat(angles)
     return (shares * torch.stack((angle.cos(), angle.sin()))).t().to(like)

@@ -1,10 +1,10 @@
 """The host contract as a test, for whoever writes a host: `check_host(host, rays)`.
 
-`testing_geometry` looks at surfaces twice, `testing_conduct` at how the host behaves; the rest is here. What the suite finds of
-planted defects is in docs/hosts.md.
+`testing_geometry` looks at surfaces twice, `testing_conduct` at how the host behaves; the rest is here. What
+the suite finds of planted defects is in docs/hosts.md.
 
-What it cannot see is whether colours are linear: that takes a photograph whose radiance is known. It does see the
-commonest symptom, colours that stop at 1.
+What it cannot see is whether colours are linear: that takes a photograph whose radiance is known. It does see
+the commonest symptom, colours that stop at 1.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ FAR = 100.0
 
 @dataclass(frozen=True)
 class HostReport:
-    """A host that kept the contract: how many rays hit, what was checked, and whether its geometry is trained."""
+    """A host that kept the contract: how many rays hit, what was checked, and whether its geometry is
+    trained.
+    """
 
     host: str
     hits: int
@@ -49,11 +51,14 @@ class HostReport:
     trains_geometry: bool
 
 
-def check_host(host: Host | RenderFunction, rays: RayBatch, parameters: Sequence[nn.Parameter] | None = None) -> HostReport:
+def check_host(
+    host: Host | RenderFunction, rays: RayBatch, parameters: Sequence[nn.Parameter] | None = None
+) -> HostReport:
     """Hold a host to `hosts.base.Host`.
 
     Args:
-        host: the host, or a function (origins, directions) → (color, position, normal); its mode is left as it is.
+        host: the host, or a function (origins, directions) → (color, position, normal); its mode is left as
+            it is.
         rays: some hundred rays in the scene frame, from outside the object; several must hit it.
         parameters: what the host trains; none: its own parameters, where it is a module.
 
@@ -78,7 +83,9 @@ def check_host(host: Host | RenderFunction, rays: RayBatch, parameters: Sequence
         hit = hits.is_hit(HIT_SHARE).detach()
         now = partial(Modes.of, modules, parameters)
         case = Case(host, name, before, now, rays, parameters, trains_geometry, hits, hit)
-        case.require(torch.equal(copy[0], rays.origins) and torch.equal(copy[1], rays.directions), "changes its input")
+        case.require(
+            torch.equal(copy[0], rays.origins) and torch.equal(copy[1], rays.directions), "changes its input"
+        )
         _run(case)
     finally:
         before.restore(modules, parameters)
@@ -95,7 +102,7 @@ def _run(case: Case) -> None:
             raise
 
 
-# --------------------------------------------------------------------------------------------------------------- checks
+# ----------------------------------------------------------------------------------------------------- checks
 
 
 def _precision(case: Case) -> None:
@@ -105,12 +112,17 @@ def _precision(case: Case) -> None:
 
 
 def _hits(case: Case) -> None:
-    case.require(case.hit.any(), f"{len(case.rays)} rays hit nothing: aim them at the surface, in the scene frame")
+    case.require(
+        case.hit.any(), f"{len(case.rays)} rays hit nothing: aim them at the surface, in the scene frame"
+    )
     for share in ("opacity", "concentration"):
         value = getattr(case.hits, share).detach()
         case.require(((value >= 0.0) & (value <= 1.0 + 1e-3)).all(), f"its {share} leaves [0, 1]")
     solid = case.hits.opacity.detach()[case.hit].median().item()
-    case.require(solid > 0.5, f"its opacity is {solid:.2g} where it says that rays hit: pictures would show no surface there")
+    case.require(
+        solid > 0.5,
+        f"its opacity is {solid:.2g} where it says that rays hit: pictures would show no surface there",
+    )
 
 
 def _normals(case: Case) -> None:
@@ -120,7 +132,9 @@ def _normals(case: Case) -> None:
         raise ContractBroken(str(error)) from error
     facing = (case.hits.normal.detach() * case.rays.directions).sum(-1)[case.hit] < 0.0
     share = facing.float().mean().item()
-    case.require(share >= FACING, f"{1.0 - share:.0%} of its normals point away from the viewer: turned inwards?")
+    case.require(
+        share >= FACING, f"{1.0 - share:.0%} of its normals point away from the viewer: turned inwards?"
+    )
 
 
 def _positions(case: Case) -> None:
@@ -129,7 +143,9 @@ def _positions(case: Case) -> None:
     depth = (offset * directions).sum(-1)
     case.require((depth > 0.0).all(), "hits lie behind the origin of their ray")
     beside = (offset - depth[:, None] * directions).norm(dim=-1)
-    case.require((beside <= OFF_RAY * depth).all(), "hits do not lie on their ray: is the depth a distance along it?")
+    case.require(
+        (beside <= OFF_RAY * depth).all(), "hits do not lie on their ray: is the depth a distance along it?"
+    )
 
 
 def _colors(case: Case) -> None:
@@ -139,7 +155,9 @@ def _colors(case: Case) -> None:
     seen = color[case.hit]
     clipped = (seen == 1.0).float().mean().item()
     stops = seen.max() == 1.0 and CLIPPED < clipped < 1.0
-    case.require(not stops, f"{clipped:.0%} of its colours are exactly 1 and none is above: return them unclipped")
+    case.require(
+        not stops, f"{clipped:.0%} of its colours are exactly 1 and none is above: return them unclipped"
+    )
 
 
 def _misses(case: Case) -> None:
@@ -156,10 +174,14 @@ def _misses(case: Case) -> None:
 def _gradients_flow(case: Case) -> None:
     if not case.parameters:
         return
-    case.require(_reaches(case, case.hits.color[case.hit]), "no gradient leads from its colour to its parameters")
+    case.require(
+        _reaches(case, case.hits.color[case.hit]), "no gradient leads from its colour to its parameters"
+    )
     if case.trains_geometry:
         shape = torch.cat([case.hits.position[case.hit], case.hits.normal[case.hit]], dim=-1)
-        case.require(_reaches(case, shape), "no gradient leads from its hits to its parameters: L_phys moves nothing")
+        case.require(
+            _reaches(case, shape), "no gradient leads from its hits to its parameters: L_phys moves nothing"
+        )
 
 
 def _gradients_stop(case: Case) -> None:
@@ -178,8 +200,12 @@ def _reaches(case: Case, output: Tensor) -> bool:
     if not output.requires_grad:
         return False
     # Weights of both signs, for sums that are constant, such as the squares of a unit vector.
-    weights = torch.linspace(-1.0, 1.5, output.numel(), dtype=output.dtype, device=output.device).reshape(output.shape)
-    gradients = torch.autograd.grad((weights * output).sum(), case.parameters, retain_graph=True, allow_unused=True)
+    weights = torch.linspace(-1.0, 1.5, output.numel(), dtype=output.dtype, device=output.device).reshape(
+        output.shape
+    )
+    gradients = torch.autograd.grad(
+        (weights * output).sum(), case.parameters, retain_graph=True, allow_unused=True
+    )
     found = [g for g in gradients if g is not None]
     case.require(all(g.isfinite().all() for g in found), "a gradient of its parameters is not finite")
     return any(bool(g.abs().max() > 0.0) for g in found)

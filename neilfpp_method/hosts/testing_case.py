@@ -40,7 +40,9 @@ class Modes:
 
     def restore(self, modules: Sequence[nn.Module], parameters: Sequence[nn.Parameter]) -> None:
         """Make it so again."""
-        for part, training in zip((p for module in modules for p in module.modules()), self.training, strict=True):
+        for part, training in zip(
+            (p for module in modules for p in module.modules()), self.training, strict=True
+        ):
             part.training = training
         for parameter, moves in zip(parameters, self.moves, strict=True):
             parameter.requires_grad_(moves)
@@ -53,7 +55,8 @@ class Case:
     Attributes:
         host: under test.
         name: of the host, for messages.
-        before: the modes of the host's modules, and which parameters move, before it was asked for the first time.
+        before: the modes of the host's modules, and which parameters move, before it was asked for the first
+            time.
         now: the same, as it is now.
         rays: what it was asked.
         parameters: what it trains.

@@ -1,4 +1,6 @@
-"""Checks of the contract suite on how a host behaves: the same for every batch, and leaving alone what is not its own."""
+"""Checks of the contract suite on how a host behaves: the same for every batch, and leaving alone what is not
+its own.
+"""
 
 from __future__ import annotations
 
@@ -52,12 +54,16 @@ def _alone_as_together(case: Case) -> None:
 def _repeatable(case: Case) -> None:
     first, second = case.constants(case.rays), case.constants(case.rays)
     for field in fields(SurfaceHits):
-        same = torch.allclose(getattr(first, field.name), getattr(second, field.name), rtol=1e-4, atol=1e-6, equal_nan=True)
+        same = torch.allclose(
+            getattr(first, field.name), getattr(second, field.name), rtol=1e-4, atol=1e-6, equal_nan=True
+        )
         what = f"renders differently after the same seed ({field.name})"
         case.require(same, f"{what}: draw from torch's global generator")
     other = case.constants(case.rays, seed=1)
     moved = (other.position - first.position)[case.hit].norm(dim=-1).median().item()
-    broken = f"half of its positions move by {moved:.2g} and more from call to call: less noise, or more samples"
+    broken = (
+        f"half of its positions move by {moved:.2g} and more from call to call: less noise, or more samples"
+    )
     case.require(moved <= RESTLESS + case.width, broken)
 
 
@@ -65,7 +71,9 @@ def _same_without_gradient(case: Case) -> None:
     with torch.enable_grad():
         kept = case.seeded(case.rays).detach()
     for name in ("color", "position", "normal"):
-        same = torch.allclose(getattr(kept, name), getattr(case.constants(case.rays), name), rtol=1e-3, atol=1e-4)
+        same = torch.allclose(
+            getattr(kept, name), getattr(case.constants(case.rays), name), rtol=1e-3, atol=1e-4
+        )
         case.require(same, f"its {name} is another one under torch.no_grad")
 
 
@@ -80,7 +88,9 @@ def _keeps_what_it_gave(case: Case) -> None:
 
 def _leaves_modes_alone(case: Case) -> None:
     now = case.now()
-    case.require(now.training == case.before.training, "rendering calls train() or eval(): its mode is its owner's")
+    case.require(
+        now.training == case.before.training, "rendering calls train() or eval(): its mode is its owner's"
+    )
     case.require(now.moves == case.before.moves, "rendering freezes or frees its parameters")
     grad, dtype = torch.is_grad_enabled(), torch.get_default_dtype()
     case.host.render(case.rays)
@@ -91,7 +101,10 @@ def _leaves_modes_alone(case: Case) -> None:
 
 
 def _leaves_randomness_alone(case: Case) -> None:
-    case.require(not torch.equal(_next_draw(case, 1), _next_draw(case, 2)), "calls torch.manual_seed: seeds are the loop's")
+    case.require(
+        not torch.equal(_next_draw(case, 1), _next_draw(case, 2)),
+        "calls torch.manual_seed: seeds are the loop's",
+    )
 
 
 def _next_draw(case: Case, seed: int) -> Tensor:

@@ -1,6 +1,7 @@
 """Checks of the contract suite that look at a surface twice: from elsewhere, from close by, and beside.
 
-A surface stays where it is, whoever looks. That tells a depth that is none, a normal that is none, and rays that do not arrive.
+A surface stays where it is, whoever looks. That tells a depth that is none, a normal that is none, and rays
+that do not arrive.
 """
 
 from __future__ import annotations
@@ -15,9 +16,13 @@ from neilfpp_method.structures import RayBatch
 __all__ = ["GEOMETRY_CHECKS"]
 
 APART = 0.01
-"""How far the hits of two views of one place may lie apart, scene units; a soft layer adds twice its width."""
+"""How far the hits of two views of one place may lie apart, scene units; a soft layer adds twice its
+width.
+"""
 AGREE = 0.6
-"""Least share of places that look the same from elsewhere. Others may be hidden from there, or lie on a silhouette."""
+"""Least share of places that look the same from elsewhere. Others may be hidden from there, or lie on a
+silhouette.
+"""
 NEAR = 0.05
 """Distance from which light between surfaces may see a place, scene units."""
 ASIDE = 0.6
@@ -34,7 +39,9 @@ SPHERE = 1.5
 
 def _in_the_sphere(case: Case) -> None:
     reach = case.hits.position.detach()[case.hit].norm(dim=-1).median().item()
-    broken = f"half of its hits lie {reach:.3g} and more from the origin: scale the scene into the unit sphere"
+    broken = (
+        f"half of its hits lie {reach:.3g} and more from the origin: scale the scene into the unit sphere"
+    )
     case.require(reach < SPHERE, broken)
 
 
@@ -45,13 +52,17 @@ def _another_view(case: Case) -> None:
 
 def _from_afar(case: Case) -> None:
     position, distance, _ = _places(case)
-    _look_again(case, position, -case.rays.directions[case.hit], 2 * distance, "twice the distance", "a far plane?")
+    _look_again(
+        case, position, -case.rays.directions[case.hit], 2 * distance, "twice the distance", "a far plane?"
+    )
 
 
 def _from_close_by(case: Case) -> None:
     position, distance, aside = _places(case)
     broken = "light between surfaces would not see it (a near plane?)"
-    _look_again(case, position, normalize(aside, dim=-1), torch.full_like(distance, NEAR), f"{NEAR} away", broken)
+    _look_again(
+        case, position, normalize(aside, dim=-1), torch.full_like(distance, NEAR), f"{NEAR} away", broken
+    )
 
 
 def _normals_of_neighbours(case: Case) -> None:
@@ -60,7 +71,9 @@ def _normals_of_neighbours(case: Case) -> None:
     side = normalize(torch.linalg.cross(d, d.roll(1, dims=-1) + torch.tensor([0.3, 0.1, -0.2]).to(d)), dim=-1)
     up = torch.linalg.cross(d, side)
     origins = case.rays.origins[case.hit]
-    found = [case.constants(RayBatch(origins + sign * BESIDE * axis, d)) for axis in (side, up) for sign in (1, -1)]
+    found = [
+        case.constants(RayBatch(origins + sign * BESIDE * axis, d)) for axis in (side, up) for sign in (1, -1)
+    ]
     across, along = (a.position - b.position for a, b in (found[:2], found[2:]))
     seen = torch.stack([f.is_hit(HIT_SHARE) for f in found]).all(0)
     near = torch.stack([across.norm(dim=-1), along.norm(dim=-1)]).amax(0) < 2 * STEEP * BESIDE
@@ -82,7 +95,9 @@ def _places(case: Case) -> tuple[Tensor, Tensor, Tensor]:
     return position, (position - case.rays.origins[case.hit]).norm(dim=-1), normal + back + ASIDE * tangent
 
 
-def _look_again(case: Case, position: Tensor, way: Tensor, distance: Tensor, whence: str, broken: str = "") -> None:
+def _look_again(
+    case: Case, position: Tensor, way: Tensor, distance: Tensor, whence: str, broken: str = ""
+) -> None:
     start = position + distance[:, None] * way
     again = case.constants(RayBatch(start, -way))
     apart = (again.position - position).norm(dim=-1)

@@ -30,10 +30,13 @@ from neilfpp_method.volume.samplers import error_bounded_samples
 __all__ = ["VolSdfHost"]
 
 POINTS_ABOUT_OBJECT = 2
-"""Points for regularisers per ray in the cube about the object, beside one in the cube about the scene: 8192 and 4096 in
-the published code."""
+"""Points for regularisers per ray in the cube about the object, beside one in the cube about the scene: 8192
+and 4096 in the published code.
+"""
 HIT_RADIUS = 0.05
-"""Scene units: the blending weight within this distance of the blended hit is its concentration (METHOD §2)."""
+"""Scene units: the blending weight within this distance of the blended hit is its concentration (METHOD
+§2).
+"""
 SURFACE_WIDTH = {"scene": 10.0, "rays": 0.05}
 """Scene units, by `loss.points`: width of the smoothed delta of L_surf. The former is the published one."""
 GRID_LIFE = 100
@@ -96,7 +99,9 @@ class VolSdfHost(nn.Module):
         )
         self.density = LaplaceDensity(config.volume.beta_init)
         self.register_buffer("background_color", torch.tensor(background_color))
-        self.background = field_beyond(background, config.background, radius, radiance_scale, self.background_color)
+        self.background = field_beyond(
+            background, config.background, radius, radiance_scale, self.background_color
+        )
         within = torch.empty(0, 3) if cameras is None else cameras_within(cameras, radius)
         self.free_space = FreeSpace(within, radius) if len(within) else None
         self.empty_space = EmptySpace(radius) if config.volume.skip_empty else None
@@ -105,16 +110,17 @@ class VolSdfHost(nn.Module):
         # Kept in checkpoints, with its age: a resumed run must trace the very same grid.
         self.register_buffer("distance_grid", torch.zeros(resolution, resolution, resolution))
         self.grid_age: int | None = None
-        # Of pictures, not of training, so no part of a checkpoint: the versions of G's parameters, and their grid.
+        # Of pictures, not of training, so no part of a checkpoint: the versions of G's parameters, and their
+        # grid.
         self._pictured: tuple[list[tuple[int, int]], EmptySpace] | None = None
 
-    # -------------------------------------------------------------------------------------------------- the host contract
+    # -------------------------------------------------------------------------------------- the host contract
 
     def render(self, rays: RayBatch) -> SurfaceHits:
         """Colour, position and normal of each ray, blended with the rendering weights (METHOD §3).
 
-        In evaluation without gradients, with `volume.skip_empty`, only the parts of rays are looked at that may show
-        something, on a grid of the field as it is.
+        In evaluation without gradients, with `volume.skip_empty`, only the parts of rays are looked at that
+        may show something, on a grid of the field as it is.
         """
         # Without a background R paints the scene sphere, so no ray shows nothing.
         whole = self.empty_space is None or self.background_kind == "none"
@@ -143,14 +149,17 @@ class VolSdfHost(nn.Module):
             "beta": list(self.density.parameters()),
             "radiance": list(self.radiance_field.parameters()),
         }
-        return groups if self.background is None else groups | {"background": list(self.background.parameters())}
+        return (
+            groups if self.background is None else groups | {"background": list(self.background.parameters())}
+        )
 
     @torch.no_grad()
     def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
-        """What arrives at surface points from the scene: rays are traced on a grid of the SDF, and read R where they hit.
+        """What arrives at surface points from the scene: rays are traced on a grid of the SDF, and read R
+        where they hit.
 
-        A ray starts one cell of the grid above the surface, along the normal. The grid is sampled when first asked for, and
-        again after `GRID_LIFE` steps in which the geometry moved.
+        A ray starts one cell of the grid above the surface, along the normal. The grid is sampled when first
+        asked for, and again after `GRID_LIFE` steps in which the geometry moved.
         """
         radius = self.config.volume.radius
         grid = self._grid()
@@ -162,19 +171,31 @@ class VolSdfHost(nn.Module):
         points = origins[rows] + found.distance[rows, None] * directions[rows]
         surface = self.sdf_field.with_gradient(points)
         radiance = torch.zeros_like(directions)
-        radiance[rows] = self.radiance_field(points, -directions[rows], safe_normalize(surface.gradient), surface.feature)
+        radiance[rows] = self.radiance_field(
+            points, -directions[rows], safe_normalize(surface.gradient), surface.feature
+        )
         distance = torch.where(found.hit, found.distance, torch.inf)
         return SceneLight(found.hit.view(wi.shape[:2]), radiance.view(wi.shape), distance.view(wi.shape[:2]))
 
     @torch.no_grad()
-    def smooth_normals(self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """The normals of `volume.normal_radius` about hits, edges kept; where that is 0, those of the hits."""
+    def smooth_normals(
+        self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N 3"]:
+        """The normals of `volume.normal_radius` about hits, edges kept; where that is 0, those of the
+        hits.
+        """
         radius = self.config.volume.normal_radius
-        return smooth_normals(lambda x: self._surface(x).gradient, position, normal, radius) if radius > 0 else normal
+        return (
+            smooth_normals(lambda x: self._surface(x).gradient, position, normal, radius)
+            if radius > 0
+            else normal
+        )
 
     @torch.no_grad()
     def may_meet(self, rays: RayBatch) -> Bool[Tensor, " N"]:
-        """Which rays that leave a surface may meet one, as the grid of empty space has it; all, where there is none."""
+        """Which rays that leave a surface may meet one, as the grid of empty space has it; all, where there
+        is none.
+        """
         if self.empty_space is None:
             return torch.ones(len(rays), dtype=torch.bool, device=rays.origins.device)
         interval = sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
@@ -188,11 +209,13 @@ class VolSdfHost(nn.Module):
         """The inverse of `get_extra_state`."""
         self.grid_age = state["grid_age"]
 
-    # ---------------------------------------------------------------------------------------------------------- geometry
+    # ----------------------------------------------------------------------------------------------- geometry
 
     def _grid(self) -> Float[Tensor, "R R R"]:
         if self.grid_age is None or self.grid_age >= GRID_LIFE:
-            fresh = sample_grid(self.sdf, self.config.volume.radius, self.distance_grid.shape[0], self.distance_grid)
+            fresh = sample_grid(
+                self.sdf, self.config.volume.radius, self.distance_grid.shape[0], self.distance_grid
+            )
             self.distance_grid.copy_(fresh)
             self.grid_age = 0
         return self.distance_grid
@@ -200,7 +223,11 @@ class VolSdfHost(nn.Module):
     def sdf(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
         """Signed distance of the scene's surface: G, with free space cut out of it."""
         distance = self.sdf_field(x)
-        return distance if self.free_space is None else torch.maximum(distance, self.free_space(x).depth.to(distance.dtype))
+        return (
+            distance
+            if self.free_space is None
+            else torch.maximum(distance, self.free_space(x).depth.to(distance.dtype))
+        )
 
     def _surface(self, x: Float[Tensor, "P 3"]) -> SdfSample:
         """As `sdf`, with its gradient and the feature for R."""
@@ -215,7 +242,7 @@ class VolSdfHost(nn.Module):
             sample.feature,
         )
 
-    # --------------------------------------------------------------------------------------------------------- rendering
+    # ---------------------------------------------------------------------------------------------- rendering
 
     def _still(self, rays: RayBatch) -> SurfaceHits:
         """Rays through a field that stands still: those that pass everything by cost a few look-ups."""
@@ -238,7 +265,8 @@ class VolSdfHost(nn.Module):
         part = Interval(span.interval.near[rows], span.interval.far[rows])
         met = self._march(rays[rows], part).hits
         return replace(
-            missed, **{f.name: getattr(missed, f.name).index_put((rows,), getattr(met, f.name)) for f in fields(met)}
+            missed,
+            **{f.name: getattr(missed, f.name).index_put((rows,), getattr(met, f.name)) for f in fields(met)},
         )
 
     def _march(self, rays: RayBatch, part: Interval | None = None) -> March:
@@ -266,7 +294,9 @@ class VolSdfHost(nn.Module):
         near, far = interval.near, interval.far
         with torch.no_grad():
             beta = self.density.beta()
-            found = error_bounded_samples(self.sdf, rays.origins, rays.directions, near, far, beta, volume, self.training)
+            found = error_bounded_samples(
+                self.sdf, rays.origins, rays.directions, near, far, beta, volume, self.training
+            )
         return found.distances
 
     def _blend(
@@ -289,11 +319,14 @@ class VolSdfHost(nn.Module):
             concentration=share_near(distances, intervals.weights.detach(), depth.detach(), HIT_RADIUS),
         )
 
-    def _beyond(self, rays: RayBatch, transmittance: Float[Tensor, " N"], at_far: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """What still arrives from the scene sphere: from beyond it, or where there is no background from R on the sphere.
+    def _beyond(
+        self, rays: RayBatch, transmittance: Float[Tensor, " N"], at_far: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N 3"]:
+        """What still arrives from the scene sphere: from beyond it, or where there is no background from R on
+        the sphere.
 
-        The published code makes the sphere a surface of the distance field that nothing passes; a ray that reaches it
-        shows R there, `at_far`. It is no surface of the object: opacity and hit leave it out.
+        The published code makes the sphere a surface of the distance field that nothing passes; a ray that
+        reaches it shows R there, `at_far`. It is no surface of the object: opacity and hit leave it out.
         """
         if self.background_kind == "none":
             return transmittance[:, None] * at_far
@@ -301,7 +334,7 @@ class VolSdfHost(nn.Module):
             return transmittance[:, None] * self.background(rays.origins, rays.directions)
         return transmittance[:, None] * self.background_color
 
-    # ------------------------------------------------------------------------------------------------------- regularisers
+    # ------------------------------------------------------------------------------------------- regularisers
 
     @doing("regularisers")
     def _regularisers(self, march: March, batch: PixelBatch, names: Collection[str]) -> dict[str, LossTerm]:
@@ -316,9 +349,13 @@ class VolSdfHost(nn.Module):
         if "point_cloud" in names and self.point_position is not None:
             rows = torch.randint(len(self.point_position), (len(batch),), device=self.point_position.device)
             sample = self.sdf_field.with_gradient(self.point_position[rows])
-            terms["point_cloud"] = losses.point_cloud(sample.distance, sample.gradient, self.point_normal[rows])
+            terms["point_cloud"] = losses.point_cloud(
+                sample.distance, sample.gradient, self.point_normal[rows]
+            )
         if "mask" in names:
-            terms["mask"] = losses.mask(march.hits.opacity, self._depth_of_object(march), batch.mask, batch.mask_known)
+            terms["mask"] = losses.mask(
+                march.hits.opacity, self._depth_of_object(march), batch.mask, batch.mask_known
+            )
         return terms
 
     def _depth_of_object(self, march: March) -> Float[Tensor, " N"]:
@@ -337,5 +374,9 @@ class VolSdfHost(nn.Module):
         points = torch.cat((about_object, anywhere))
         sample = self.sdf_field.with_gradient(points)
         rays, count = march.distances.shape
-        one_of_ray = torch.arange(rays, device=points.device) * count + torch.randint(count, (rays,), device=points.device)
-        return Places(torch.cat((sample.gradient, march.surface.gradient[one_of_ray])), sample.distance, points)
+        one_of_ray = torch.arange(rays, device=points.device) * count + torch.randint(
+            count, (rays,), device=points.device
+        )
+        return Places(
+            torch.cat((sample.gradient, march.surface.gradient[one_of_ray])), sample.distance, points
+        )

@@ -1,4 +1,6 @@
-"""What arrives along incident directions: the light, the scene where it stands before the light, and the lamps."""
+"""What arrives along incident directions: the light, the scene where it stands before the light, and the
+lamps.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +24,8 @@ class Sources:
     Attributes:
         light: an environment map, or a field that is free at every point.
         lamps: small lamps close to the scene; perhaps none is lit.
-        scene: the scene's own surfaces, which stand before light and lamps; none: nothing is traced (a free field holds what
-            arrives from everywhere).
+        scene: the scene's own surfaces, which stand before light and lamps; none: nothing is traced (a free
+            field holds what arrives from everywhere).
     """
 
     light: Light
@@ -34,8 +36,9 @@ class Sources:
 def arriving(sources: Sources, x: Float[Tensor, "N 3"], drawn: IncidentSamples) -> Incident:
     """What arrives at surface points along drawn directions, and from the lamps.
 
-    A drawn direction never meets a lamp: each lamp is a direction of its own, with a shadow ray where there is a scene. So the
-    sum over all directions of weight · radiance · f · cos estimates the integral of the rendering equation.
+    A drawn direction never meets a lamp: each lamp is a direction of its own, with a shadow ray where there
+    is a scene. So the sum over all directions of weight · radiance · f · cos estimates the integral of the
+    rendering equation.
 
     Args:
         sources: what may send light.
@@ -49,7 +52,9 @@ def arriving(sources: Sources, x: Float[Tensor, "N 3"], drawn: IncidentSamples) 
     return incident.beside(_from_lamps(sources, x)) if sources.lamps.lit else incident
 
 
-def incident_radiance(sources: Sources, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
+def incident_radiance(
+    sources: Sources, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]
+) -> Float[Tensor, "N S 3"]:
     """Linear radiance that arrives at x from any directions wi, lamps that they meet included."""
     if sources.scene is None:
         radiance, nearest = sources.light.radiance(x, wi), torch.full_like(wi[..., 0], torch.inf)
@@ -80,7 +85,9 @@ def _from_lamps(sources: Sources, x: Float[Tensor, "N 3"]) -> Incident:
 def _behind_scene(
     scene: SceneLight, light: Light, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]
 ) -> Float[Tensor, "N S 3"]:
-    """The scene's radiance where a direction meets it, elsewhere that of the light, which is asked there alone."""
+    """The scene's radiance where a direction meets it, elsewhere that of the light, which is asked there
+    alone.
+    """
     point, direction = torch.nonzero(~scene.hit, as_tuple=True)
     beyond = light.radiance(x[point], wi[point, direction][:, None])[:, 0]
     return scene.radiance.index_put((point, direction), beyond)

@@ -14,8 +14,10 @@ from neilfpp_method.timing.ledger import doing
 __all__ = ["off_surface", "scene_light", "scene_tracer"]
 
 HEIGHT_IN_WIDTHS = 4.0
-"""Height above a surface of scale β at which a ray starts, in β. A ray that leaves from a height h has the optical depth
-exp(−h/β) / (2 cos θ) before it: from four scales up that is 1 % along the normal and 5 % at 80°."""
+"""Height above a surface of scale β at which a ray starts, in β. A ray that leaves from a height h has the
+optical depth exp(−h/β) / (2 cos θ) before it: from four scales up that is 1 % along the normal and 5 % at
+80°.
+"""
 
 MIN_COSINE = 0.1
 """Directions closer to the surface than 6° start as far along as those at 6°."""
@@ -52,7 +54,9 @@ def scene_light(
         return host.scene_light(x, wi)
     start = (x[:, None] + config.offset * wi).reshape(-1, 3)
     radiance, distance = [], []
-    for origins, directions in zip(start.split(RAYS_AT_ONCE), wi.reshape(-1, 3).split(RAYS_AT_ONCE), strict=True):
+    for origins, directions in zip(
+        start.split(RAYS_AT_ONCE), wi.reshape(-1, 3).split(RAYS_AT_ONCE), strict=True
+    ):
         hits = host.render(RayBatch(origins, directions))
         hit = hits.is_hit(hit_share)
         distance.append(torch.where(hit, (hits.position - origins).norm(dim=-1), torch.inf))
@@ -64,7 +68,9 @@ def scene_light(
 def off_surface(
     host: Host, x: Float[Tensor, "K 3"], normal: Float[Tensor, "K 3"], w: Float[Tensor, "K 3"], offset: float
 ) -> Float[Tensor, "K 3"]:
-    """Points along w above the soft layer that a host's surface is, at a height of `offset` and four widths of it."""
+    """Points along w above the soft layer that a host's surface is, at a height of `offset` and four widths
+    of it.
+    """
     width = host.surface_width() if isinstance(host, HasSurfaceWidth) else 0.0
     cosine = (w * normal).sum(-1, keepdim=True).clamp_min(MIN_COSINE)
     return x + ((offset + HEIGHT_IN_WIDTHS * width) / cosine) * w

@@ -21,13 +21,16 @@ __all__ = ["TracedLight", "trace_light"]
 MAX_ANGLE_DEG = 80.0
 """From the normal: a flatter ray stays within the soft layer of its own surface, and brings little light."""
 FARTHEST_START = 0.2
-"""Distance from its point, scene units, beyond which no ray starts (published code). Further out it could start behind a
-neighbouring surface, and nearer than its angle asks for it would meet the layer that it leaves: it is left out."""
+"""Distance from its point, scene units, beyond which no ray starts (published code). Further out it could
+start behind a neighbouring surface, and nearer than its angle asks for it would meet the layer that it
+leaves: it is left out.
+"""
 
 
 @dataclass(frozen=True)
 class TracedLight:
-    """Rays that left the surface: where from, which way, the radiance that arrives along them, and which ones hit.
+    """Rays that left the surface: where from, which way, the radiance that arrives along them, and which ones
+    hit.
 
     Rays that start too far away, or of which the host knows at once that they meet nothing, are left out.
     """
@@ -47,13 +50,14 @@ def trace_light(
 ) -> TracedLight:
     """Trace random directions from random points through the host.
 
-    Directions are uniform in solid angle within `MAX_ANGLE_DEG` of the normal. A ray starts off the surface: at a
-    height of `config.offset` and four widths of the host's surface, so the displacement along the ray grows as 1/cos.
-    A ray that would have to start further than `FARTHEST_START` from its point is left out.
+    Directions are uniform in solid angle within `MAX_ANGLE_DEG` of the normal. A ray starts off the surface:
+    at a height of `config.offset` and four widths of the host's surface, so the displacement along the ray
+    grows as 1/cos. A ray that would have to start further than `FARTHEST_START` from its point is left out.
     Positions are constants: L_ref says what arrives at a point, not where the point is.
 
     Args:
-        host: renders the rays; its radiance gets a gradient scaled by `config.radiance_gradient`, none when that is 0.
+        host: renders the rays; its radiance gets a gradient scaled by `config.radiance_gradient`, none when
+            that is 0.
         position: surface points, scene frame.
         normal: unit normals, away from the surface.
         config: how many, how far, how steep.
@@ -79,7 +83,9 @@ def _random_rows(points: int, per_point: float, device: torch.device) -> Tensor:
     """Rows of the points that send a ray: every point ⌊per_point⌋ times, and a random choice for the rest."""
     whole = int(per_point)
     rest = round(points * (per_point - whole))
-    return torch.cat([torch.arange(points, device=device).repeat(whole), torch.randperm(points, device=device)[:rest]])
+    return torch.cat(
+        [torch.arange(points, device=device).repeat(whole), torch.randperm(points, device=device)[:rest]]
+    )
 
 
 def _cone_directions(normal: Float[Tensor, "K 3"], min_cosine: float) -> Float[Tensor, "K 3"]:

@@ -18,7 +18,14 @@ from neilfpp_method.inspection.picture import draw
 
 __all__ = ["run_inspection", "to_json"]
 
-STYLES = {"problem": "bold red", "warning": "yellow", "good": "bold green", "limited": "bold yellow", "poor": "bold red"}
+STYLES = {
+    "problem": "bold red",
+    "warning": "yellow",
+    "good": "bold green",
+    "limited": "bold yellow",
+    "poor": "bold red",
+}
+
 
 def run_inspection(
     root: Path,
@@ -79,7 +86,13 @@ def to_json(inspection: Inspection) -> dict[str, Any]:
         },
         "verdict": {"quality": inspection.verdict.quality, "text": inspection.verdict.text},
         "findings": [
-            {"kind": f.kind, "severity": f.severity, "text": f.text, "remedy": f.remedy, "views": list(f.views)}
+            {
+                "kind": f.kind,
+                "severity": f.severity,
+                "text": f.text,
+                "remedy": f.remedy,
+                "views": list(f.views),
+            }
             for f in inspection.findings
         ],
         "views": [
@@ -92,7 +105,9 @@ def to_json(inspection: Inspection) -> dict[str, Any]:
                 "exposure_factor": factor,
                 **{name: getattr(measured, name) for name in figures},
             }
-            for view, measured, factor in zip(capture.views, inspection.views, inspection.factors, strict=True)
+            for view, measured, factor in zip(
+                capture.views, inspection.views, inspection.factors, strict=True
+            )
         ],
     }
 
@@ -103,7 +118,10 @@ def _print(inspection: Inspection, console: Console) -> None:
 
     where, verdict = inspection.stand, inspection.verdict
     say(inspection.capture.summary)
-    say(f"cameras: {where.gap:.0f}° from one to the next; {100 * where.coverage:.0f} % of all directions are covered")
+    say(
+        f"cameras: {where.gap:.0f}° from one to the next; {100 * where.coverage:.0f} % of all directions are "
+        "covered"
+    )
     say("radiance: ", (verdict.quality, STYLES[verdict.quality]), f"; {verdict.text}")
     if not inspection.findings:
         say(("nothing is wrong with it", STYLES["good"]))

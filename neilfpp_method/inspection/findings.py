@@ -1,4 +1,6 @@
-"""What is wrong with a capture: the figures held against limits, each finding with its remedy, and a verdict."""
+"""What is wrong with a capture: the figures held against limits, each finding with its remedy, and a
+verdict.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,11 @@ EDGE, STRAY_POINTS, SMALL_CLOUD = 1.05, 0.1, 0.2
 FEW_LEVELS = 256
 ENOUGH = 16
 """Pixels a level, that their number means something."""
-BETTER_WITHOUT: Mapping[str, str] = {"black": "black", "blurred": "blurred", "duplicate": "the same picture as another"}
+BETTER_WITHOUT: Mapping[str, str] = {
+    "black": "black",
+    "blurred": "blurred",
+    "duplicate": "the same picture as another",
+}
 """Findings whose views a capture is better without, and why, in a word or two."""
 SHOWN = 6
 """Views that a line names; the others are counted."""
@@ -40,8 +46,8 @@ SHOWN = 6
 class Finding:
     """Something that is wrong, and what to do about it.
 
-    A problem spoils or prevents a result, a warning worsens it. `views` are the names of the views concerned; none: it is
-    about the whole capture. `kind` is a short name that does not change between versions.
+    A problem spoils or prevents a result, a warning worsens it. `views` are the names of the views concerned;
+    none: it is about the whole capture. `kind` is a short name that does not change between versions.
     """
 
     kind: str
@@ -99,11 +105,14 @@ def inspect_capture(capture: Capture, on_view: Callable[[str], None] = lambda na
 
 def problems(inspection: Inspection) -> tuple[str, ...]:
     """What spoils or prevents a result, in lines for people."""
-    return tuple(f"problem: {finding.line()}" for finding in inspection.findings if finding.severity == "problem")
+    return tuple(
+        f"problem: {finding.line()}" for finding in inspection.findings if finding.severity == "problem"
+    )
 
 
 def to_leave_out(inspection: Inspection) -> Mapping[str, str]:
-    """The views that the capture is better without, and why: those that are black or blurred, and pictures that it has twice.
+    """The views that the capture is better without, and why: those that are black or blurred, and pictures
+    that it has twice.
 
     None where too few would remain.
 
@@ -123,26 +132,53 @@ def to_leave_out(inspection: Inspection) -> Mapping[str, str]:
 def _of_views(views: Sequence[ViewFigures], factors: Sequence[float], capture: Capture) -> Iterator[Finding]:
     if damaged := [view for view in views if view.unreadable]:
         names = tuple(view.name for view in damaged)
-        yield Finding("unreadable", "problem", damaged[0].unreadable, "export these images again, or leave them out", names)
+        yield Finding(
+            "unreadable",
+            "problem",
+            damaged[0].unreadable,
+            "export these images again, or leave them out",
+            names,
+        )
     if broken := tuple(view.name for view in views if view.broken > 0):
         most = max(view.broken for view in views)
         text = f"pixels are NaN, infinite or negative, up to {100 * most:.2g} % of a view"
-        yield Finding("broken_pixels", "problem", text, "repair them, or mark them in a validity mask", broken)
+        yield Finding(
+            "broken_pixels", "problem", text, "repair them, or mark them in a validity mask", broken
+        )
     if black := tuple(view.name for view in views if not view.unreadable and view.luminance <= 0):
-        yield Finding("black", "problem", "no pixel of the object is lit", "leave these views out, or correct the masks", black)
-    jumps = [(view.name, factor) for view, factor in zip(views, factors, strict=True) if max(factor, 1 / factor) > JUMP]
+        yield Finding(
+            "black",
+            "problem",
+            "no pixel of the object is lit",
+            "leave these views out, or correct the masks",
+            black,
+        )
+    jumps = [
+        (view.name, factor)
+        for view, factor in zip(views, factors, strict=True)
+        if max(factor, 1 / factor) > JUMP
+    ]
     if jumps:
-        named = ", ".join(f"{name} ×{factor:.2g}" for name, factor in jumps[:4]) + ("…" if len(jumps) > 4 else "")
-        own, alike = "give these views their exposure in capture.json", "expose all images alike, or merge brackets"
+        named = ", ".join(f"{name} ×{factor:.2g}" for name, factor in jumps[:4]) + (
+            "…" if len(jumps) > 4 else ""
+        )
+        own, alike = (
+            "give these views their exposure in capture.json",
+            "expose all images alike, or merge brackets",
+        )
         text = f"brighter or darker than the views around them: {named}"
-        yield Finding("exposure_jump", "problem", text, own if capture.hdr else alike, tuple(name for name, _ in jumps))
+        yield Finding(
+            "exposure_jump", "problem", text, own if capture.hdr else alike, tuple(name for name, _ in jumps)
+        )
     sharp = np.median([view.sharpness for view in views if view.sharpness > 0] or [0.0])
     if blurred := tuple(view.name for view in views if 0 < view.sharpness < BLURRED * sharp):
         text = f"blurred: less than {100 * BLURRED:.0f} % of the usual fine detail"
         yield Finding("blurred", "warning", text, "leave these views out, or take them again", blurred)
     readable = [view for view in views if not view.unreadable]
     if pairs := duplicates([view.small for view in readable]) if readable else ():
-        names = ", ".join(f"{readable[i].name} and {readable[j].name}" for i, j in pairs[:3]) + ("…" if len(pairs) > 3 else "")
+        names = ", ".join(f"{readable[i].name} and {readable[j].name}" for i, j in pairs[:3]) + (
+            "…" if len(pairs) > 3 else ""
+        )
         again = tuple(dict.fromkeys(readable[j].name for _, j in pairs))
         yield Finding("duplicate", "warning", f"the same picture twice: {names}", "keep one of each", again)
     if clipped := [view for view in views if view.clipped > CLIPPED_VIEW]:
@@ -167,11 +203,15 @@ def _of_cameras(capture: Capture, where: Stand) -> Iterator[Finding]:
         yield Finding("looking_away", "problem", text, remedy, tuple(names[where.away]))
     if where.within.any():
         text = "cameras within the unit sphere, which is to hold the object alone"
-        yield Finding("camera_inside", "warning", text, "make the scene box smaller", tuple(names[where.within]))
+        yield Finding(
+            "camera_inside", "warning", text, "make the scene box smaller", tuple(names[where.within])
+        )
     count = len(names)
     if count < FEW_COUNT:
         severity: Severity = "problem" if count < MIN_COUNT else "warning"
-        yield Finding("few_views", severity, f"{count} views", f"take {FEW_COUNT} or more, better 50, from all around")
+        yield Finding(
+            "few_views", severity, f"{count} views", f"take {FEW_COUNT} or more, better 50, from all around"
+        )
     if count >= MIN_COUNT and where.coverage < MIN_COVERAGE:
         text = f"the views cover {100 * where.coverage:.0f} % of the directions around the object"
         yield Finding("coverage", "warning", text, "add views from other sides, and from other heights")
@@ -213,11 +253,17 @@ def _verdict(capture: Capture, views: Sequence[ViewFigures], findings: Sequence[
     said = f"{stops:.1f} stops on the object, {100 * clipped:.2g} % of it clipped"
     if not capture.hdr:
         if clipped > CLIPPED_MUCH or "exposure_jump" in kinds:
-            return Verdict("poor", f"display values (sRGB), {said}: highlights are lost, gloss and light cannot be told")
-        return Verdict("limited", f"display values (sRGB), {said}: colours come out, gloss and light only roughly")
+            return Verdict(
+                "poor", f"display values (sRGB), {said}: highlights are lost, gloss and light cannot be told"
+            )
+        return Verdict(
+            "limited", f"display values (sRGB), {said}: colours come out, gloss and light only roughly"
+        )
     if "few_levels" in kinds or "exposure_jump" in kinds or clipped > CLIPPED_MUCH:
         reasons = {"few_levels": "made from 8-bit images", "exposure_jump": "not on one scale"}
-        why = next((reason for kind, reason in reasons.items() if kind in kinds), "clipped where it is bright")
+        why = next(
+            (reason for kind, reason in reasons.items() if kind in kinds), "clipped where it is bright"
+        )
         return Verdict("poor", f"linear, {said}, but {why}")
     if clipped > CLIPPED_A_BIT:
         return Verdict("limited", f"linear, {said}: mark what is clipped in a validity mask")

@@ -34,20 +34,24 @@ SOME = 200_000
 
 @dataclass(frozen=True)
 class ViewFigures:
-    """What an image holds. Shares are of the object's pixels, where a mask, the alpha channel or an even background tells it.
+    """What an image holds. Shares are of the object's pixels, where a mask, the alpha channel or an even
+    background tells it.
 
     Attributes:
         name: the view's.
         unreadable: why the pixels cannot be read, else empty; nothing else is known then.
-        luminance: the geometric mean of the linear luminance of the object, on the scale that all views share; 0 for a black
-            image. A median jumps where the image is half sky and half ground; the mean of stops moves as the exposure does.
+        luminance: the geometric mean of the linear luminance of the object, on the scale that all views
+            share; 0 for a black image. A median jumps where the image is half sky and half ground; the mean
+            of stops moves as the exposure does.
         stops: between the 1st and the 99.9th percentile of that luminance, in powers of two.
-        sharpness: variance of the Laplacian over the variance of the picture, at one brightness for all views.
+        sharpness: variance of the Laplacian over the variance of the picture, at one brightness for all
+            views.
         clipped: share at 255 (display values), or at a level at which an HDR image piles up, in any channel.
         invalid: share of all pixels that the validity mask leaves out.
         broken: share of all pixels that are NaN, infinite or negative and not marked as invalid.
         pixels: number of the object's pixels that are valid.
-        levels: distinct values among up to 400 000 of the object's pixels, in the channel that has most of them.
+        levels: distinct values among up to 400 000 of the object's pixels, in the channel that has most of
+            them.
         small: linear radiance, at most 160 pixels a side.
     """
 
@@ -61,7 +65,9 @@ class ViewFigures:
     broken: float = 0.0
     pixels: int = 0
     levels: int = 0
-    small: Float32[np.ndarray, "h w 3"] = field(default_factory=lambda: np.zeros((1, 1, 3), np.float32), repr=False)
+    small: Float32[np.ndarray, "h w 3"] = field(
+        default_factory=lambda: np.zeros((1, 1, 3), np.float32), repr=False
+    )
 
 
 def measure(view: View, hdr: bool) -> ViewFigures:
@@ -70,7 +76,11 @@ def measure(view: View, hdr: bool) -> ViewFigures:
         image = read_image(view.image)
         color = pixel_colors(view, image, hdr).numpy()
         valid = _mask(view, "valid", color.shape[:2])
-        mask = _mask(view, "mask", color.shape[:2]) if view.mask else image.alpha is not None and image.alpha > 0.5
+        mask = (
+            _mask(view, "mask", color.shape[:2])
+            if view.mask
+            else image.alpha is not None and image.alpha > 0.5
+        )
     except UserError as error:
         return ViewFigures(view.name, unreadable=error.problem)
     sound = (np.isfinite(color) & (color >= 0)).all(axis=-1)
@@ -106,7 +116,9 @@ def _mask(view: View, kind: str, size: tuple[int, int]) -> Bool[np.ndarray, "H W
     return values > 0.5
 
 
-def _off_the_background(color: Float32[np.ndarray, "H W 3"], usable: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+def _off_the_background(
+    color: Float32[np.ndarray, "H W 3"], usable: Bool[np.ndarray, "H W"]
+) -> Bool[np.ndarray, "H W"]:
     """All but the colour that most of the border shares."""
     edge = np.zeros(usable.shape, bool)
     edge[[0, -1]] = edge[:, [0, -1]] = True

@@ -1,4 +1,6 @@
-"""The picture of an inspection: where the cameras stand, along two axes, and all views, flagged ones first."""
+"""The picture of an inspection: where the cameras stand, along two axes, and all views, flagged ones
+first.
+"""
 
 from __future__ import annotations
 
@@ -47,15 +49,21 @@ def draw(inspection: Inspection) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def _colors(inspection: Inspection) -> list[tuple[int, int, int]]:
-    problems = {name for finding in inspection.findings if finding.severity == "problem" for name in finding.views}
+    problems = {
+        name for finding in inspection.findings if finding.severity == "problem" for name in finding.views
+    }
     warnings = {name for finding in inspection.findings for name in finding.views}
-    return [PROBLEM if v.name in problems else WARNING if v.name in warnings else FINE for v in inspection.views]
+    return [
+        PROBLEM if v.name in problems else WARNING if v.name in warnings else FINE for v in inspection.views
+    ]
 
 
 def _plan(
     inspection: Inspection, axes: tuple[int, int], colors: list[tuple[int, int, int]], title: str
 ) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Cameras as dots with their viewing directions, seen along an axis of the world; the circle is the unit sphere."""
+    """Cameras as dots with their viewing directions, seen along an axis of the world; the circle is the unit
+    sphere.
+    """
     plan = Image.new("RGB", (PLAN, PLAN), (255, 255, 255))
     pen = ImageDraw.Draw(plan)
     centres, forward = inspection.stand.centres[:, axes], inspection.stand.axes[:, axes]
@@ -65,7 +73,9 @@ def _plan(
         return PLAN / 2 * (1 + points / reach * np.array([1, -1]))
 
     pen.ellipse([*place(np.array([-1.0, 1.0])), *place(np.array([1.0, -1.0]))], outline=PALE_INK)
-    for start, end, color in zip(place(centres), place(centres + 0.12 * reach * forward), colors, strict=True):
+    for start, end, color in zip(
+        place(centres), place(centres + 0.12 * reach * forward), colors, strict=True
+    ):
         pen.line([*start, *end], fill=color, width=2)
         pen.ellipse([*(start - 4), *(start + 4)], fill=color)
     _write(pen, (10, 8), title, 14, PALE_INK)
@@ -94,7 +104,9 @@ def _cell(
     picture = Image.fromarray(_shown(view.small, KEY / middle))
     picture.thumbnail((CELL, CELL))
     sheet.paste(picture, (corner[0] + (CELL - picture.width) // 2, corner[1] + (CELL - picture.height) // 2))
-    pen.rectangle([corner[0] - 3, corner[1] - 3, corner[0] + CELL + 2, corner[1] + CELL + 2], outline=color, width=3)
+    pen.rectangle(
+        [corner[0] - 3, corner[1] - 3, corner[0] + CELL + 2, corner[1] + CELL + 2], outline=color, width=3
+    )
     kinds = [finding.kind.replace("_", " ") for finding in inspection.findings if view.name in finding.views]
     _write(pen, (corner[0], corner[1] + CELL + 4), view.name[:22], 14)
     _write(pen, (corner[0], corner[1] + CELL + 21), ", ".join(kinds)[:26], 12, color)
@@ -104,5 +116,7 @@ def _shown(radiance: Float[np.ndarray, "h w 3"], exposure: float) -> UInt8[np.nd
     return (tone_map(torch.from_numpy(radiance * np.float32(exposure))).numpy() * 255 + 0.5).astype(np.uint8)
 
 
-def _write(pen: ImageDraw.ImageDraw, corner: tuple[int, int], text: str, size: int, color: tuple[int, int, int] = INK) -> None:
+def _write(
+    pen: ImageDraw.ImageDraw, corner: tuple[int, int], text: str, size: int, color: tuple[int, int, int] = INK
+) -> None:
     pen.text(corner, text, font=ImageFont.load_default(size), fill=color)

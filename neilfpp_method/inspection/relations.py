@@ -26,9 +26,9 @@ SPHERE = 1000
 class Stand:
     """Where the cameras stand about the scene; in the scene frame, whose unit sphere holds the object.
 
-    `away` views do not show the scene's centre, `within` stand in the unit sphere. `coverage` is the share of all
-    directions from the centre with a camera at most 30° away, `gap` the median angle, degrees, from one camera to the
-    next.
+    `away` views do not show the scene's centre, `within` stand in the unit sphere. `coverage` is the share of
+    all directions from the centre with a camera at most 30° away, `gap` the median angle, degrees, from one
+    camera to the next.
     """
 
     centres: Float64[np.ndarray, "V 3"]
@@ -71,10 +71,11 @@ def _lattice() -> Float64[np.ndarray, "S 3"]:
 
 
 def exposure_factors(luminances: Sequence[float], where: Stand) -> Float64[np.ndarray, " V"]:
-    """How much brighter each view is than the median of the views nearest in pose; 1 where that cannot be told.
+    """How much brighter each view is than the median of the views nearest in pose; 1 where that cannot be
+    told.
 
-    Near is what stands near and looks the same way: the distance of the centres, in their median distance from the
-    scene's, and the angle of the axes count alike.
+    Near is what stands near and looks the same way: the distance of the centres, in their median distance
+    from the scene's, and the angle of the axes count alike.
     """
     light = np.array(luminances)
     scale = max(float(np.median(np.linalg.norm(where.centres, axis=1))), 1e-9)
@@ -92,9 +93,12 @@ def exposure_factors(luminances: Sequence[float], where: Stand) -> Float64[np.nd
 def duplicates(pictures: Sequence[Float[np.ndarray, "_ _ 3"]]) -> tuple[tuple[int, int], ...]:
     """Pairs of pictures that are the same but for compression and brightness.
 
-    Their thumbnails, standardised, differ by less than 2 % of their spread. Pictures without any contrast are left out.
+    Their thumbnails, standardised, differ by less than 2 % of their spread. Pictures without any contrast are
+    left out.
     """
-    thumbnails = np.stack([cv2.resize(np.sqrt(p.mean(axis=-1)), THUMBNAIL, interpolation=cv2.INTER_AREA) for p in pictures])
+    thumbnails = np.stack(
+        [cv2.resize(np.sqrt(p.mean(axis=-1)), THUMBNAIL, interpolation=cv2.INTER_AREA) for p in pictures]
+    )
     flat = thumbnails.reshape(len(pictures), -1)
     spread = flat.std(axis=1)
     flat = (flat - flat.mean(axis=1, keepdims=True)) / np.maximum(spread, 1e-9)[:, None]

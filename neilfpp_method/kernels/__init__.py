@@ -1,7 +1,9 @@
-"""What is worth code of its own: hash-grid encoding, rays through a sampled distance field, and softplus units (`softplus`).
+"""What is worth code of its own: hash-grid encoding, rays through a sampled distance field, and softplus
+units (`softplus`).
 
-Every backend of the encoding computes what `reference.encode` computes, which the tests hold it to. `GridSpec.backend`
-names one; "auto" takes the compiled loops on a CPU, Triton's kernels on a GPU, and the reference anywhere else.
+Every backend of the encoding computes what `reference.encode` computes, which the tests hold it to.
+`GridSpec.backend` names one; "auto" takes the compiled loops on a CPU, Triton's kernels on a GPU, and the
+reference anywhere else.
 """
 
 from __future__ import annotations
@@ -30,15 +32,17 @@ def encode(x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpe
     """Features of a multiresolution grid at points of the unit cube, by the backend that `spec` names.
 
     Args:
-        x01: points; outside [0, 1]³ the nearest point of the cube counts, and the derivative across its face is 0.
+        x01: points; outside [0, 1]³ the nearest point of the cube counts, and the derivative across its face
+            is 0.
         table: `spec.entries` rows of `spec.features`.
         spec: the layout of the table.
         jacobian: whether to return d features / d x01 as well.
 
     Returns:
-        `spec.width` features per point, in the dtype of the table. Features and Jacobian can be differentiated with
-        respect to the table and the points, any number of times: the reference does what goes beyond the first order,
-        and types other than float32 and float64. The memory order of what is returned is the backend's own.
+        `spec.width` features per point, in the dtype of the table. Features and Jacobian can be
+        differentiated with respect to the table and the points, any number of times: the reference does what
+        goes beyond the first order, and types other than float32 and float64. The memory order of what is
+        returned is the backend's own.
 
     Raises:
         UserError: the backend that `spec` names does not run here.
@@ -60,11 +64,16 @@ def _kernels(backend: str, device: str) -> Kernels | None:
         module = importlib.import_module(f"neilfpp_method.kernels.{name}")
     except ImportError as error:
         if backend != "auto":
-            raise UserError(f"hash-grid backend '{name}': {error}", "install what is missing, or set it to auto") from error
+            raise UserError(
+                f"hash-grid backend '{name}': {error}", "install what is missing, or set it to auto"
+            ) from error
         warnings.warn(f"hash grids take the slow reference: {error}", RuntimeWarning, stacklevel=3)
         return None
     if device not in module.KERNELS.devices:
-        raise UserError(f"hash-grid backend '{name}' does not run on {device}", "set the backend of its `GridSpec` to auto")
+        raise UserError(
+            f"hash-grid backend '{name}' does not run on {device}",
+            "set the backend of its `GridSpec` to auto",
+        )
     return module.KERNELS
 
 

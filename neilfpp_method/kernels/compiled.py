@@ -1,10 +1,12 @@
-"""The loops of the CPU, of hash grids, rays and softplus units, compiled by Numba on first use and kept on disk from then on.
+"""The loops of the CPU, of hash grids, rays and softplus units, compiled by Numba on first use and kept on
+disk from then on.
 
-They hold no lock of the interpreter, start no threads and add up in a fixed order. All compiled code stands in this one
-file, because what is kept on disk is renewed when its own file changes, and for no other.
+They hold no lock of the interpreter, start no threads and add up in a fixed order. All compiled code stands
+in this one file, because what is kept on disk is renewed when its own file changes, and for no other.
 
-A hash grid comes in parts, one entry per level: `offsets` (first table row; and the end), `cells` along an edge, and `dense`.
-The vertices of a cell are numbered x + 2 y + 4 z, each coordinate 0 or 1. Arrays are dense, and all of one float type.
+A hash grid comes in parts, one entry per level: `offsets` (first table row; and the end), `cells` along an
+edge, and `dense`. The vertices of a cell are numbered x + 2 y + 4 z, each coordinate 0 or 1. Arrays are
+dense, and all of one float type.
 """
 
 from __future__ import annotations
@@ -41,12 +43,14 @@ def compiled(function: Callable) -> Callable:
         return njit(**options)(function)
 
 
-# ------------------------------------------------------------------------------------------------------------- one cell
+# --------------------------------------------------------------------------------------------------- one cell
 
 
 @compiled
 def _locate(points, n, axis, cells):
-    """Along one axis: the cell, the fraction of it, and d(position in cells) / d(coordinate), which is 0 off the cube."""
+    """Along one axis: the cell, the fraction of it, and d(position in cells) / d(coordinate), which is 0 off
+    the cube.
+    """
     number = points.dtype.type
     free = points[n, axis] * number(cells)
     position = min(max(free, number(0)), number(cells))
@@ -102,7 +106,7 @@ def _corners(rows, vertices, f):
     return rows[a, f], rows[b, f], rows[c, f], rows[d, f], rows[e, f], rows[g, f], rows[h, f], rows[i, f]
 
 
-# ------------------------------------------------------------------------------------------------------------ the loops
+# -------------------------------------------------------------------------------------------------- the loops
 
 
 @compiled
@@ -113,9 +117,13 @@ def interpolate(points, table, offsets, cells, dense, features, jacobian, with_j
         for level in range(len(cells)):
             rows = table[offsets[level] : offsets[level + 1]]
             if dense[level]:  # asked once here, not once per point
-                _interpolate_level(points, rows, level, cells[level], True, features, jacobian, with_jacobian, block, end)
+                _interpolate_level(
+                    points, rows, level, cells[level], True, features, jacobian, with_jacobian, block, end
+                )
             else:
-                _interpolate_level(points, rows, level, cells[level], False, features, jacobian, with_jacobian, block, end)
+                _interpolate_level(
+                    points, rows, level, cells[level], False, features, jacobian, with_jacobian, block, end
+                )
 
 
 @compiled
@@ -138,7 +146,9 @@ def _interpolate_level(points, rows, level, cells, dense, features, jacobian, wi
 
 @compiled
 def add_to_table(points, offsets, cells, dense, features, jacobian, with_jacobian, table, first, last):
-    """Add to the table what the gradients of features and Jacobian ask of it, for the levels from `first` to `last`."""
+    """Add to the table what the gradients of features and Jacobian ask of it, for the levels from `first` to
+    `last`.
+    """
     width = table.shape[1]
     number = points.dtype.type
     for level in range(first, last):
@@ -172,7 +182,9 @@ def add_to_table(points, offsets, cells, dense, features, jacobian, with_jacobia
 
 
 @compiled
-def pull_to_points(points, table, offsets, cells, dense, features, jacobian, with_jacobian, gradient, start, stop):
+def pull_to_points(
+    points, table, offsets, cells, dense, features, jacobian, with_jacobian, gradient, start, stop
+):
     """Write what the gradients of features and Jacobian ask of the points from `start` to `stop`."""
     width = table.shape[1]
     number = points.dtype.type
@@ -205,7 +217,9 @@ def pull_to_points(points, table, offsets, cells, dense, features, jacobian, wit
 
 @compiled
 def sphere_trace(grid, radius, origins, directions, least, most_steps, distance, hit, start, stop):
-    """Write how far the rays from `start` to `stop` go, and whether they come closer to a surface than `least`."""
+    """Write how far the rays from `start` to `stop` go, and whether they come closer to a surface than
+    `least`.
+    """
     number = grid.dtype.type
     cells = len(grid) - 1
     edge, reach = number(2 * radius / cells), number(radius)
@@ -227,11 +241,17 @@ def sphere_trace(grid, radius, origins, directions, least, most_steps, distance,
 
 @compiled
 def _at_vertices(grid, x, y, z, cells):
-    """Trilinear interpolation at a place in units of cells; what is not a number takes the first cell, and stays none."""
+    """Trilinear interpolation at a place in units of cells; what is not a number takes the first cell, and
+    stays none.
+    """
     number = grid.dtype.type
     last = number(cells - 1)
     low_x, low_y, low_z = min(np.floor(x), last), min(np.floor(y), last), min(np.floor(z), last)
-    i, j, k = (int(low_x) if low_x > 0 else 0), (int(low_y) if low_y > 0 else 0), (int(low_z) if low_z > 0 else 0)
+    i, j, k = (
+        (int(low_x) if low_x > 0 else 0),
+        (int(low_y) if low_y > 0 else 0),
+        (int(low_z) if low_z > 0 else 0),
+    )
     x, y, z = x - low_x, y - low_y, z - low_z
     near = grid[k, j, i] + x * (grid[k, j, i + 1] - grid[k, j, i])
     far = grid[k, j + 1, i] + x * (grid[k, j + 1, i + 1] - grid[k, j + 1, i])
@@ -242,7 +262,7 @@ def _at_vertices(grid, x, y, z, cells):
     return front + z * (back - front)
 
 
-# ------------------------------------------------------------------------------------------- softplus, computed in float32
+# ------------------------------------------------------------------------------ softplus, computed in float32
 
 FAINT = np.float32(40)  # e^−40 is nothing beside 1, and its square no denormal number yet
 HALF, UNIT = np.float32(0.5), np.float32(1)
@@ -276,7 +296,9 @@ def _falling_exponential(t):
 
 @compiled
 def _log_of_one_and(e):
-    """ln(1 + e) for 0 ≤ e ≤ 1, off by 2e-8 at most: e times the Chebyshev approximation of ln(1 + e) / e of degree 8."""
+    """ln(1 + e) for 0 ≤ e ≤ 1, off by 2e-8 at most: e times the Chebyshev approximation of ln(1 + e) / e of
+    degree 8.
+    """
     tail = np.float32(0.07836167) + e * (np.float32(-0.029588507) + e * np.float32(0.005253458))
     tail = np.float32(-0.24844369) + e * (np.float32(0.19111431) + e * (np.float32(-0.1367477) + e * tail))
     return e * (UNIT + e * (np.float32(-0.49999502) + e * (np.float32(0.3331927) + e * tail)))

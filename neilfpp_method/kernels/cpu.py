@@ -1,7 +1,7 @@
 """Hash-grid encoding on the CPU by compiled loops.
 
-Points are shared out between threads; for the gradient of the table, levels are, whose rows are not shared: reruns
-agree to the last bit, whatever the number of threads.
+Points are shared out between threads; for the gradient of the table, levels are, whose rows are not shared:
+reruns agree to the last bit, whatever the number of threads.
 """
 
 from __future__ import annotations
@@ -36,10 +36,14 @@ class Layout:
 @lru_cache(maxsize=32)
 def _layout(spec: GridSpec) -> Layout:
     levels = range(len(spec.resolutions))
-    return Layout(np.array(spec.offsets), np.array(spec.resolutions), np.array([spec.is_dense(i) for i in levels]))
+    return Layout(
+        np.array(spec.offsets), np.array(spec.resolutions), np.array([spec.is_dense(i) for i in levels])
+    )
 
 
-def forward(x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpec, jacobian: bool) -> Encoded:
+def forward(
+    x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpec, jacobian: bool
+) -> Encoded:
     """See `Kernels`."""
     count = len(x01)
     features = table.new_empty(count, spec.width)
@@ -50,7 +54,9 @@ def forward(x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSp
     return Encoded(features, slopes if jacobian else None)
 
 
-def table_gradient(x01: Float[Tensor, "N 3"], spec: GridSpec, gradients: OutputGradients) -> Float[Tensor, "T F"]:
+def table_gradient(
+    x01: Float[Tensor, "N 3"], spec: GridSpec, gradients: OutputGradients
+) -> Float[Tensor, "T F"]:
     """See `Kernels`."""
     table = x01.new_zeros(spec.entries, spec.features)
     grid = _layout(spec)
@@ -67,8 +73,17 @@ def point_gradient(
     """See `Kernels`."""
     found = torch.empty_like(x01)
     grid = _layout(spec)
-    fixed = (*_arrays(x01, table), grid.offsets, grid.cells, grid.dense, *_gradients(gradients), *_arrays(found))
-    for_each(lambda start, stop: compiled.pull_to_points(*fixed, start, stop), _shares_of_points(len(x01), spec))
+    fixed = (
+        *_arrays(x01, table),
+        grid.offsets,
+        grid.cells,
+        grid.dense,
+        *_gradients(gradients),
+        *_arrays(found),
+    )
+    for_each(
+        lambda start, stop: compiled.pull_to_points(*fixed, start, stop), _shares_of_points(len(x01), spec)
+    )
     return found
 
 
@@ -83,7 +98,9 @@ def _arrays(*tensors: Tensor) -> tuple[np.ndarray, ...]:
 def _gradients(gradients: OutputGradients) -> tuple[np.ndarray, np.ndarray, bool]:
     """Both gradients, and whether there is one of the Jacobian; an empty one stands for none."""
     features, jacobian = gradients.features, gradients.jacobian
-    return *_arrays(features, features.new_empty(0, 0, 3) if jacobian is None else jacobian), jacobian is not None
+    return *_arrays(
+        features, features.new_empty(0, 0, 3) if jacobian is None else jacobian
+    ), jacobian is not None
 
 
 KERNELS = Kernels(("cpu",), forward, table_gradient, point_gradient)

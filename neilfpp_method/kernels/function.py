@@ -1,4 +1,6 @@
-"""Where a backend's kernels meet autograd: first order by the kernels, every higher order by the reference."""
+"""Where a backend's kernels meet autograd: first order by the kernels, every higher order by the
+reference.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,9 @@ def encode_with(
         ValueError: the table is not the one that `spec` lays out; kernels do not look where they read.
     """
     if table.shape != (spec.entries, spec.features) or x01.device != table.device:
-        raise ValueError(f"a table of {tuple(table.shape)} on {table.device} for {spec} and points on {x01.device}")
+        raise ValueError(
+            f"a table of {tuple(table.shape)} on {table.device} for {spec} and points on {x01.device}"
+        )
     return Encoded(*_Encode.apply(x01, table, spec, jacobian, kernels))
 
 

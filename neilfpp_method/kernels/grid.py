@@ -1,7 +1,8 @@
 """The layout of a multiresolution grid in memory, and what its encoding returns.
 
-A level of resolution r has (r + 1)³ vertices. Where they fit into the table of a level they are stored one after the
-other, x fastest; where they do not, vertices share entries by the spatial hash of Müller et al. (2022, eq. 4).
+A level of resolution r has (r + 1)³ vertices. Where they fit into the table of a level they are stored one
+after the other, x fastest; where they do not, vertices share entries by the spatial hash of Müller et al.
+(2022, eq. 4).
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ FEATURES = 2
 
 @dataclass(frozen=True)
 class GridSpec:
-    """Levels, coarse to fine, of a grid over the unit cube. All levels lie one after the other in one table."""
+    """Levels, coarse to fine, of a grid over the unit cube. All levels lie one after the other in one
+    table.
+    """
 
     resolutions: tuple[int, ...]
     """Cells along an edge, per level."""
@@ -34,7 +37,9 @@ class GridSpec:
     features: int
     """Length of a table row."""
     backend: str = "auto"
-    """Who computes it: auto (the fastest that runs on the device), reference (plain torch), cpu (Numba) or triton (CUDA)."""
+    """Who computes it: auto (the fastest that runs on the device), reference (plain torch), cpu (Numba) or
+    triton (CUDA).
+    """
 
     @cached_property
     def offsets(self) -> tuple[int, ...]:
@@ -85,9 +90,15 @@ def grid_spec(
     Raises:
         UserError: this describes no grid.
     """
-    if levels < 1 or features < 1 or not 1 <= base_resolution <= max_resolution or not 1 <= log2_entries <= 24:
+    if (
+        levels < 1
+        or features < 1
+        or not 1 <= base_resolution <= max_resolution
+        or not 1 <= log2_entries <= 24
+    ):
         raise UserError(
-            f"no hash grid has {levels} levels of {base_resolution} to {max_resolution} cells and 2^{log2_entries} entries",
+            f"no hash grid has {levels} levels of {base_resolution} to {max_resolution} cells and "
+            f"2^{log2_entries} entries",
             f"choose levels ≥ 1, max_resolution ≥ {base_resolution}, 1 ≤ log2_entries ≤ 24",
         )
     growth = (max_resolution / base_resolution) ** (1 / max(levels - 1, 1))

@@ -1,7 +1,7 @@
 """How a process computes: without denormal numbers, and with memory that it keeps.
 
-Both are settings of the whole process, so a command makes them and a library does not. docs/performance.md has what
-they gain.
+Both are settings of the whole process, so a command makes them and a library does not. docs/performance.md
+has what they gain.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ import torch
 
 __all__ = ["computing_fast"]
 
-# Options of glibc's allocator (malloc.h), and the values that it comes to by itself in a process with large arrays.
+# Options of glibc's allocator (malloc.h), and the values that it comes to by itself in a process with large
+# arrays.
 TRIM_THRESHOLD, MMAP_THRESHOLD, MMAP_MAX = -1, -3, -4
 OWN_TRIM, OWN_MMAP, OWN_MAPS = 64 << 20, 32 << 20, 65_536
 NEVER = 2**31 - 1
@@ -24,10 +25,10 @@ NEVER = 2**31 - 1
 def computing_fast() -> Iterator[None]:
     """Settings for long computations on a CPU; afterwards the process is as it started.
 
-    Denormal numbers, below 1.2e-38 in float32, count as 0. A steep softplus brings them by the million, and arithmetic on
-    them takes some ten times as long; threads that start meanwhile inherit this. Memory that is freed stays with the process:
-    glibc hands large arrays back, and gets the next one page by page, which takes longer than an elementwise pass over it.
-    Where there is no glibc the second is left undone.
+    Denormal numbers, below 1.2e-38 in float32, count as 0. A steep softplus brings them by the million, and
+    arithmetic on them takes some ten times as long; threads that start meanwhile inherit this. Memory that is
+    freed stays with the process: glibc hands large arrays back, and gets the next one page by page, which
+    takes longer than an elementwise pass over it. Where there is no glibc the second is left undone.
     """
     _set(fast=True)
     try:

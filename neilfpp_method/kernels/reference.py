@@ -1,11 +1,12 @@
 """Hash-grid encoding in plain torch: any device, any float dtype, any order of differentiation.
 
-Per level: eight table rows around the point, interpolated trilinearly along z, then y, then x. The Jacobian comes from
-the same rows, with the difference of two neighbours in place of their interpolation along one axis. Points are the last
-axis of every intermediate, so each operation runs over contiguous memory; one level at a time keeps them in cache.
+Per level: eight table rows around the point, interpolated trilinearly along z, then y, then x. The Jacobian
+comes from the same rows, with the difference of two neighbours in place of their interpolation along one
+axis. Points are the last axis of every intermediate, so each operation runs over contiguous memory; one level
+at a time keeps them in cache.
 
-Table rows are gathered and scattered by a pair of functions that are each other's derivative. The scatter runs the
-features in parallel but the points in order: on a CPU, reruns agree to the last bit.
+Table rows are gathered and scattered by a pair of functions that are each other's derivative. The scatter
+runs the features in parallel but the points in order: on a CPU, reruns agree to the last bit.
 """
 
 from __future__ import annotations
@@ -44,8 +45,12 @@ def encode(x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpe
     return Encoded(torch.cat(features).t(), torch.cat(jacobians, 1).permute(2, 1, 0) if jacobian else None)
 
 
-def _vertex_rows(cell: Int[Tensor, "3 N"], resolution: int, entries: int, dense: bool) -> Int[Tensor, "2 2 2 N"]:
-    """The table rows of a cell's eight vertices; the first three axes say which end of the cell in x, y, z."""
+def _vertex_rows(
+    cell: Int[Tensor, "3 N"], resolution: int, entries: int, dense: bool
+) -> Int[Tensor, "2 2 2 N"]:
+    """The table rows of a cell's eight vertices; the first three axes say which end of the cell in x, y,
+    z.
+    """
     factors = (1, resolution + 1, (resolution + 1) ** 2) if dense else PRIMES
     x, y, z = (torch.stack((c, c + 1)) * factor for c, factor in zip(cell, factors, strict=True))
     x, y = x[:, None, None], y[:, None]
@@ -77,7 +82,9 @@ class _Gather(torch.autograd.Function):
     """Table rows by number, features first."""
 
     @staticmethod
-    def forward(ctx: FunctionCtx, table: Float[Tensor, "T F"], rows: Int[Tensor, "2 2 2 N"]) -> Float[Tensor, "F 2 2 2 N"]:
+    def forward(
+        ctx: FunctionCtx, table: Float[Tensor, "T F"], rows: Int[Tensor, "2 2 2 N"]
+    ) -> Float[Tensor, "F 2 2 2 N"]:
         ctx.save_for_backward(rows)
         ctx.entries = table.shape[0]
         return table.index_select(0, rows.reshape(-1)).t().contiguous().view(table.shape[1], *rows.shape)
@@ -102,6 +109,8 @@ class _Scatter(torch.autograd.Function):
         return sums.scatter_add_(1, index, values.reshape(index.shape)).t().contiguous()
 
     @staticmethod
-    def backward(ctx: FunctionCtx, table: Float[Tensor, "T F"]) -> tuple[Float[Tensor, "F 2 2 2 N"], None, None]:
+    def backward(
+        ctx: FunctionCtx, table: Float[Tensor, "T F"]
+    ) -> tuple[Float[Tensor, "F 2 2 2 N"], None, None]:
         (rows,) = ctx.saved_tensors
         return _Gather.apply(table, rows), None, None

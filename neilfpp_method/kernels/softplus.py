@@ -1,4 +1,6 @@
-"""Softplus units, and their slope with them: compiled loops on a CPU, where torch takes ten passes over memory."""
+"""Softplus units, and their slope with them: compiled loops on a CPU, where torch takes ten passes over
+memory.
+"""
 
 from __future__ import annotations
 
@@ -90,7 +92,10 @@ def _loops() -> ModuleType | None:
 @torch.compiler.disable
 def _run(loop: str, sharpness: float, *tensors: Tensor) -> None:
     work, arrays = getattr(_loops(), loop), [_flat(tensor) for tensor in tensors]
-    for_each(lambda start, stop: work(*arrays, sharpness, start, stop), shares(tensors[0].numel(), MIN_VALUES_PER_THREAD))
+    for_each(
+        lambda start, stop: work(*arrays, sharpness, start, stop),
+        shares(tensors[0].numel(), MIN_VALUES_PER_THREAD),
+    )
 
 
 def _flat(tensor: Tensor) -> np.ndarray:

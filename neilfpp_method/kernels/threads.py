@@ -1,7 +1,7 @@
 """Work shared between threads of this process, as many as torch uses.
 
-Compiled loops that let go of the interpreter's lock need no more than Python's own threads. A threading layer of the
-compiler's would bring a second OpenMP beside torch's, or one that does not survive a fork.
+Compiled loops that let go of the interpreter's lock need no more than Python's own threads. A threading layer
+of the compiler's would bring a second OpenMP beside torch's, or one that does not survive a fork.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ __all__ = ["for_each", "shares"]
 
 
 def shares(count: int, least: int) -> list[tuple[int, int]]:
-    """`count` things cut into equal runs, (start, stop) each: one per thread, and none shorter than `least`."""
+    """`count` things cut into equal runs, (start, stop) each: one per thread, and none shorter than
+    `least`.
+    """
     parts = max(1, min(torch.get_num_threads(), count // max(least, 1)))
     edges = [count * part // parts for part in range(parts + 1)]
     return list(itertools.pairwise(edges))

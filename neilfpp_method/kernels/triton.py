@@ -1,8 +1,8 @@
 """Hash-grid encoding on a GPU by Triton, or on CPU tensors by Triton's interpreter (`TRITON_INTERPRET=1`).
 
-A program takes a block of points through one level. Features and Jacobian are written with the points last, so that
-neighbouring lanes write neighbouring numbers. The gradient of the table is added up by atomics: reruns differ by rounding.
-The vertices of a cell are numbered x + 2 y + 4 z.
+A program takes a block of points through one level. Features and Jacobian are written with the points last,
+so that neighbouring lanes write neighbouring numbers. The gradient of the table is added up by atomics:
+reruns differ by rounding. The vertices of a cell are numbered x + 2 y + 4 z.
 """
 
 from __future__ import annotations
@@ -32,12 +32,14 @@ def kernel(function: Callable) -> triton.runtime.KernelInterface:
     return triton.jit(inspect.unwrap(function))
 
 
-# ------------------------------------------------------------------------------------------------------------- one cell
+# --------------------------------------------------------------------------------------------------- one cell
 
 
 @kernel
 def _locate(points, n, here, axis, cells):
-    """Along one axis: the cell, the fraction of it, and d(position in cells) / d(coordinate), which is 0 off the cube."""
+    """Along one axis: the cell, the fraction of it, and d(position in cells) / d(coordinate), which is 0 off
+    the cube.
+    """
     scale = cells.to(points.dtype.element_ty)
     free = tl.load(points + 3 * n + axis, mask=here, other=0.0) * scale
     inner = tl.maximum(free, 0.0, propagate_nan=tl.PropagateNan.ALL)
@@ -95,7 +97,7 @@ def _value_and_slopes(c0, c1, c2, c3, c4, c5, c6, c7, x, y, z):
     return left + x * (right - left), right - left, y0 + x * (y1 - y0), back + x * (front - back)
 
 
-# ---------------------------------------------------------------------------------------------------------- the kernels
+# ------------------------------------------------------------------------------------------------ the kernels
 
 
 @kernel
@@ -205,22 +207,36 @@ def _pull_to_points(
     tl.store(gradient + 3 * n + 2, to_z, mask=here)
 
 
-# ----------------------------------------------------------------------------------------------------------- the backend
+# ------------------------------------------------------------------------------------------------ the backend
 
 
-def forward(x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpec, jacobian: bool) -> Encoded:
+def forward(
+    x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpec, jacobian: bool
+) -> Encoded:
     """See `Kernels`."""
     count, levels = len(x01), len(spec.resolutions)
     features = table.new_empty(spec.width, count)
     slopes = table.new_empty(spec.width, 3, count if jacobian else 0)
     with torch.cuda.device_of(x01):
         _interpolate[_blocks(count), levels](
-            x01, table, _grid(spec, x01.device), features, slopes, count, levels, spec.features, jacobian, BLOCK, **FUSED
+            x01,
+            table,
+            _grid(spec, x01.device),
+            features,
+            slopes,
+            count,
+            levels,
+            spec.features,
+            jacobian,
+            BLOCK,
+            **FUSED,
         )
     return Encoded(features.t(), slopes.permute(2, 0, 1) if jacobian else None)
 
 
-def table_gradient(x01: Float[Tensor, "N 3"], spec: GridSpec, gradients: OutputGradients) -> Float[Tensor, "T F"]:
+def table_gradient(
+    x01: Float[Tensor, "N 3"], spec: GridSpec, gradients: OutputGradients
+) -> Float[Tensor, "T F"]:
     """See `Kernels`."""
     table = x01.new_zeros(spec.entries, spec.features)
     count, levels = len(x01), len(spec.resolutions)
@@ -259,7 +275,9 @@ def _jacobian(gradients: OutputGradients) -> Float[Tensor, "M F 3"]:
 
 @lru_cache(maxsize=32)
 def _grid(spec: GridSpec, device: torch.device) -> Int[Tensor, "4 L"]:
-    """Per level: its first table row, its cells along an edge, its rows, and whether each vertex has its own row."""
+    """Per level: its first table row, its cells along an edge, its rows, and whether each vertex has its own
+    row.
+    """
     dense = [spec.is_dense(level) for level in range(len(spec.resolutions))]
     rows = [spec.offsets[:-1], spec.resolutions, spec.entries_per_level, dense]
     return torch.tensor([list(map(int, row)) for row in rows], device=device)

@@ -14,8 +14,9 @@ from neilfpp_method.shading.frame import safe_normalize
 __all__ = ["FoundLamps", "merge", "propose"]
 
 REACH = 1.25
-"""Lamps are sought within this distance of the scene's middle: the object lies in the unit sphere, and what is much farther
-away looks the same from all of it."""
+"""Lamps are sought within this distance of the scene's middle: the object lies in the unit sphere, and what
+is much farther away looks the same from all of it.
+"""
 CLEARANCE = 3.0
 """In radii: lamps are sought at this distance from every surface point and more."""
 CLONES = 12
@@ -23,8 +24,9 @@ CLONES = 12
 BULB_SHARE = 1 / 3
 """Share of the candidates that send alike in all directions; the others are panels with an axis."""
 AXIS_SPREAD = 0.7
-"""Standard deviation added to the direction to the scene's middle, per axis, for the axis of a panel: a lamp mostly faces what
-it lights."""
+"""Standard deviation added to the direction to the scene's middle, per axis, for the axis of a panel: a lamp
+mostly faces what it lights.
+"""
 MIN_MEAN_AXIS = 0.5
 """Length of the mean axis above which merged candidates make a panel; opposite axes make a bulb."""
 MERGE_DISTANCE = 0.2
@@ -45,7 +47,9 @@ class FoundLamps:
 
 @torch.no_grad()
 def propose(lamps: Lamps, surface: Float[Tensor, "N 3"], count: int) -> LampPlaces:
-    """Up to `count` places: the lit lamps as they are, first and in order, others close to each, and the rest anywhere."""
+    """Up to `count` places: the lit lamps as they are, first and in order, others close to each, and the rest
+    anywhere.
+    """
     lit, axis = lamps.position[: lamps.lit], lamps.axis[: lamps.lit]
     moved = lit.repeat_interleave(CLONES, 0)
     moved = moved + STEP * torch.randn_like(moved)
@@ -60,10 +64,14 @@ def propose(lamps: Lamps, surface: Float[Tensor, "N 3"], count: int) -> LampPlac
 
 
 @torch.no_grad()
-def merge(places: LampPlaces, intensity: Float[Tensor, "M 3"], reach: Float[Tensor, " M"], most: int) -> FoundLamps:
-    """Neighbours made one, in their middle by power and of their joint intensity; those that bring little are left out.
+def merge(
+    places: LampPlaces, intensity: Float[Tensor, "M 3"], reach: Float[Tensor, " M"], most: int
+) -> FoundLamps:
+    """Neighbours made one, in their middle by power and of their joint intensity; those that bring little are
+    left out.
 
-    `reach` is the light that a lamp of intensity 1 brings to the scene: a strong one that reaches nothing counts for nothing.
+    `reach` is the light that a lamp of intensity 1 brings to the scene: a strong one that reaches nothing
+    counts for nothing.
     """
     power = intensity.sum(-1) * reach
     left = torch.ones_like(power, dtype=torch.bool)

@@ -1,8 +1,9 @@
 """Descent of a light fit, with a factor on the base colour of every point as an unknown beside the light.
 
-Surfaces have learned their base colour under the light so far: a lamp in the wrong place leaves its glow in it, which then
-holds the lamp there. So a fit keeps the mean base colour and asks of each point only that it is like its neighbours: surfaces
-are mostly made of few materials, and light changes slowly along them (Land and McCann 1971, "Lightness and Retinex Theory").
+Surfaces have learned their base colour under the light so far: a lamp in the wrong place leaves its glow in
+it, which then holds the lamp there. So a fit keeps the mean base colour and asks of each point only that it
+is like its neighbours: surfaces are mostly made of few materials, and light changes slowly along them (Land
+and McCann 1971, "Lightness and Retinex Theory").
 """
 
 from __future__ import annotations
@@ -40,9 +41,9 @@ def descend(
 ) -> Float[Tensor, ""]:
     """Move the unknowns to where a loss is least, and with them factors on the base colour of the points.
 
-    Every point has factors of its own; all share one per channel where the weight of evenness is 0. The mean of their
-    logarithms is 0: light and base colour share a scale, and surfaces have learned what there is to know of it. Where cameras
-    saw some of the light itself it is free.
+    Every point has factors of its own; all share one per channel where the weight of evenness is 0. The mean
+    of their logarithms is 0: light and base colour share a scale, and surfaces have learned what there is to
+    know of it. Where cameras saw some of the light itself it is free.
 
     Args:
         unknowns: what moves, in place.

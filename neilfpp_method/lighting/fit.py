@@ -1,8 +1,9 @@
-"""Light is solved for, not descended to: a map and lamps under which remembered points look as the images show them.
+"""Light is solved for, not descended to: a map and lamps under which remembered points look as the images
+show them.
 
-With the transport of these points at hand (`lighting.transport`), a hundred steps on the light cost less than as many steps
-of training. They find lamps that stochastic descent, through few and noisy samples of every texel, spreads into a haze that
-the base colour then makes up for.
+With the transport of these points at hand (`lighting.transport`), a hundred steps on the light cost less than
+as many steps of training. They find lamps that stochastic descent, through few and noisy samples of every
+texel, spreads into a haze that the base colour then makes up for.
 """
 
 from __future__ import annotations
@@ -20,19 +21,25 @@ from neilfpp_method.lighting.transport import Transport
 __all__ = ["MIN_POINTS", "Evidence", "Light", "compare", "evidence", "fit_light"]
 
 RATE = 0.1
-"""Of log radiance at the start of a fit; roots of lamps and gains of base colour move at these shares of it:"""
+"""Of log radiance at the start of a fit; roots of lamps and gains of base colour move at these shares of
+it:
+"""
 ROOT_RATE, GAIN_RATE = 0.5, 0.1
-"""Rates of the roots of what lamps bring, and of the logarithms of the factors on base colour, over that of log radiance."""
+"""Rates of the roots of what lamps bring, and of the logarithms of the factors on base colour, over that of
+log radiance.
+"""
 MIN_REACH = 0.05
-"""A lamp that brings less than this share of the mean over all lamps, at equal intensity, is not sought: behind a wall any
-intensity fits."""
+"""A lamp that brings less than this share of the mean over all lamps, at equal intensity, is not sought:
+behind a wall any intensity fits.
+"""
 MIN_GAIN = 0.01
 """Relative error that lamps must save: those that explain less than a hundredth are not kept."""
 MIN_POINTS = 20
 """Points kept back from which something is concluded."""
 MIN_VISIBLE_SHARE = 0.05
-"""Share of the points that must see a texel for the images to set it. Texels seen by few points follow the smoothness prior
-only."""
+"""Share of the points that must see a texel for the images to set it. Texels seen by few points follow the
+smoothness prior only.
+"""
 FIRST_SHARE = 0.1
 """Of the light that typical points receive, what all lamps that are not yet lit start with together."""
 
@@ -51,18 +58,20 @@ class Light:
 
 @dataclass(frozen=True)
 class Evidence:
-    """How much lower the relative error of the second of two lights is at `points` that neither was fitted to, and the
-    standard error of that mean."""
+    """How much lower the relative error of the second of two lights is at `points` that neither was fitted
+    to, and the standard error of that mean.
+    """
 
     gain: float
     deviation: float
     points: int
 
     def favours(self, chosen: bool) -> bool:
-        """Whether to take the more complicated light; `chosen`: it is what surfaces have learned under so far.
+        """Whether to take the more complicated light; `chosen`: it is what surfaces have learned under so
+        far.
 
-        To be chosen it must gain more than chance brings about once in forty times, and enough to be worth it; to stay, it
-        may well do so.
+        To be chosen it must gain more than chance brings about once in forty times, and enough to be worth
+        it; to stay, it may well do so.
         """
         if self.points < MIN_POINTS:
             return False
@@ -81,10 +90,10 @@ def evidence(gain: Float[Tensor, " N"]) -> Evidence:
 def fit_light(start: Light, carried: Transport, target: Target, objective: Objective) -> Light:
     """The light that explains the points best, the smoothest and with the fewest lamps where they do not say.
 
-    Minimises the relative error, robustly; the total variation of the map's log radiance, so that lamps in it may be sharp
-    and what no point sees takes after its surroundings; how far the map is from what cameras saw of it; the unevenness of
-    base colour, which is free during the fit (`descent`); and the price of lamps and of tint, which images hardly tell from
-    that of the surfaces (`objective`).
+    Minimises the relative error, robustly; the total variation of the map's log radiance, so that lamps in it
+    may be sharp and what no point sees takes after its surroundings; how far the map is from what cameras saw
+    of it; the unevenness of base colour, which is free during the fit (`descent`); and the price of lamps and
+    of tint, which images hardly tell from that of the surfaces (`objective`).
 
     Args:
         start: where the search starts.
@@ -100,7 +109,8 @@ def fit_light(start: Light, carried: Transport, target: Target, objective: Objec
     config, unit = objective.config, objective.unit
     texels = start.log_radiance[0].numel()
     log_radiance = start.log_radiance.clone().requires_grad_()
-    # In units of what a lamp brings to a white surface in the mean over the points: its unknowns are then of one size.
+    # In units of what a lamp brings to a white surface in the mean over the points: its unknowns are then of
+    # one size.
     brought = carried.sources[0, :, texels:].mean(0)[:, None] / unit
     reaches = brought > MIN_REACH * brought.mean()
     first = FIRST_SHARE / max(1, len(brought))
@@ -134,7 +144,9 @@ def fit_light(start: Light, carried: Transport, target: Target, objective: Objec
 def compare(
     lights: tuple[Light, Light], carried: tuple[Transport, Transport], target: Target, objective: Objective
 ) -> Float[Tensor, " N"]:
-    """How much lower the relative error of the second of two lights is, at points that neither was fitted to."""
+    """How much lower the relative error of the second of two lights is, at points that neither was fitted
+    to.
+    """
     one, other = (
         objective.relative_error(light.strength(), transport, target, 1.0).abs().clamp_max(1).mean(-1)
         for light, transport in zip(lights, carried, strict=True)

@@ -13,12 +13,14 @@ from neilfpp_method.structures import Observed
 __all__ = ["SurfaceMemory"]
 
 FIRST_WAIT = 4
-"""Steps after which the first fit is due even if the memory is not full: surfaces learn under a light that is a guess."""
+"""Steps after which the first fit is due even if the memory is not full: surfaces learn under a light that is
+a guess.
+"""
 
 
 class SurfaceMemory(nn.Module):
-    """The newest surface points of all images, and when to fit to them next: for the first time when the memory is full, or
-    after a few steps. It is part of a checkpoint.
+    """The newest surface points of all images, and when to fit to them next: for the first time when the
+    memory is full, or after a few steps. It is part of a checkpoint.
 
     Args:
         capacity: how many points are kept.

@@ -1,8 +1,9 @@
-"""The objective of a light fit: the error of remembered points against their pixels, and priors on light and base colour.
+"""The objective of a light fit: the error of remembered points against their pixels, and priors on light and
+base colour.
 
-The priors are of ratios, so that none prefers a dimmer light and brighter surfaces: the total variation of the map's log
-radiance, differences of log base colour, lamps by their share of all light, and the tint. A price per amount of light would
-dim the light at every fit, as the base colour follows.
+The priors are of ratios, so that none prefers a dimmer light and brighter surfaces: the total variation of
+the map's log radiance, differences of log base colour, lamps by their share of all light, and the tint. A
+price per amount of light would dim the light at every fit, as the base colour follows.
 """
 
 from __future__ import annotations
@@ -20,15 +21,29 @@ from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.shading.color import apply_response, response_slope
 from neilfpp_method.structures import Indexable, Material
 
-__all__ = ["FLOOR", "Objective", "Target", "error_unit", "nearest_points", "tint", "total_variation", "unevenness"]
+__all__ = [
+    "FLOOR",
+    "Objective",
+    "Target",
+    "error_unit",
+    "nearest_points",
+    "tint",
+    "total_variation",
+    "unevenness",
+]
 
 FLOOR = 0.1
-"""Errors are relative to the pixel and this share of a typical one, so that dark pixels do not count for their noise."""
+"""Errors are relative to the pixel and this share of a typical one, so that dark pixels do not count for
+their noise.
+"""
 OUTLIER = 0.1
-"""Relative errors beyond this count by their size rather than by their square: some points no light explains."""
+"""Relative errors beyond this count by their size rather than by their square: some points no light
+explains.
+"""
 SKY = 1.0
-"""Weight of the difference between the map's log radiance and what cameras saw beyond the scene, per texel, against the
-relative error: that much is certain, and the scale of light and base colour hangs on it."""
+"""Weight of the difference between the map's log radiance and what cameras saw beyond the scene, per texel,
+against the relative error: that much is certain, and the scale of light and base colour hangs on it.
+"""
 SPARSITY = 0.001
 """Weight of the lamps, by the logarithm of their shares of all light, against the relative error."""
 QUADRATIC_BELOW = 1e-2
@@ -59,8 +74,9 @@ class Objective:
 
     Attributes:
         response: of the capture, "linear" or "srgb".
-        unit: what a pixel of typical brightness changes by per unit of log radiance (`response_slope`): itself, where the
-            response is linear. Errors are relative to that of the pixel and a share of this.
+        unit: what a pixel of typical brightness changes by per unit of log radiance (`response_slope`):
+            itself, where the response is linear. Errors are relative to that of the pixel and a share of
+            this.
         config: the weights.
         sky: what cameras saw of the light itself; none where they saw nothing of it.
     """
@@ -71,10 +87,15 @@ class Objective:
     sky: KnownSky | None = None
 
     def relative_error(
-        self, strength: Float[Tensor, "T 3"], carried: Transport, target: Target, gain: Float[Tensor, "#N 3"] | float
+        self,
+        strength: Float[Tensor, "T 3"],
+        carried: Transport,
+        target: Target,
+        gain: Float[Tensor, "#N 3"] | float,
     ) -> Float[Tensor, "N 3"]:
-        """How far radiance is off, of itself: what the camera stores of the points, their base colour times `gain`, against
-        their pixels."""
+        """How far radiance is off, of itself: what the camera stores of the points, their base colour times
+        `gain`, against their pixels.
+        """
         material = target.material
         tinted = Material((material.base_color * gain).clamp(0, 1), material.roughness, material.metallic)
         shown = apply_response(carried.outgoing(tinted, strength), self.response)
@@ -88,16 +109,20 @@ class Objective:
         return functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER)
 
     def unlikely(self, log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, ""]:
-        """What speaks against a map by itself: that it is uneven, and that it is not what cameras saw of it."""
+        """What speaks against a map by itself: that it is uneven, and that it is not what cameras saw of
+        it.
+        """
         uneven = self.config.smoothness * total_variation(log_radiance)
         if self.sky is None or not log_radiance.numel():
             return uneven
         return uneven + SKY * self.sky.misfit(log_radiance)
 
     def price(self, brought: Float[Tensor, " M"], all_light: Float[Tensor, " 3"]) -> Float[Tensor, ""]:
-        """Of lamps, by the light that each brings to the points, and of the tint of all light that reaches them.
+        """Of lamps, by the light that each brings to the points, and of the tint of all light that reaches
+        them.
 
-        Σ ln(1 + share/s) over the lamps' shares of all light is concave: one strong lamp is cheaper than two half as strong.
+        Σ ln(1 + share/s) over the lamps' shares of all light is concave: one strong lamp is cheaper than two
+        half as strong.
         """
         share = brought / all_light.mean()
         lamps = SPARSITY * (share / LINEAR_SHARE).log1p().sum()

@@ -19,7 +19,8 @@ class Replay(nn.Module):
     """The newest surface points of a stage in which no surface moves. It is part of a checkpoint.
 
     Args:
-        fresh: share of the points of a step that are new, once there are enough to draw from; 1: nothing is kept.
+        fresh: share of the points of a step that are new, once there are enough to draw from; 1: nothing is
+            kept.
         rays: of a step.
     """
 

@@ -1,8 +1,9 @@
 """Refine found lamps: their places, axes and intensities by descent, and drop those that are not needed.
 
-Candidates lie beside a lamp, never on it, so a fit finds a lamp in pieces: several candidates around it, too strong
-together. Their places are refined by descent, in turns with the choice of candidates: conditional gradients with moving
-atoms (Boyd, Schiebinger and Recht 2017, "The alternating descent conditional gradient method for sparse inverse problems").
+Candidates lie beside a lamp, never on it, so a fit finds a lamp in pieces: several candidates around it, too
+strong together. Their places are refined by descent, in turns with the choice of candidates: conditional
+gradients with moving atoms (Boyd, Schiebinger and Recht 2017, "The alternating descent conditional gradient
+method for sparse inverse problems").
 """
 
 from __future__ import annotations
@@ -34,9 +35,13 @@ AXIS_RATE = 0.06
 GAIN_RATE = 0.1
 """Per step, at the start, of the logarithms of the factors on base colour."""
 PANEL_GAIN = 0.01
-"""Share of the loss that a panel must save over a bulb: its axis is one more unknown, and any unknown lowers the loss."""
+"""Share of the loss that a panel must save over a bulb: its axis is one more unknown, and any unknown lowers
+the loss.
+"""
 FAINT_SHARE = 1e-3
-"""Share of the strongest channel to which darker ones are raised at the start, where the logarithm has a slope."""
+"""Share of the strongest channel to which darker ones are raised at the start, where the logarithm has a
+slope.
+"""
 
 
 @dataclass(frozen=True)
@@ -58,8 +63,9 @@ def settle_lamps(
 ) -> FoundLamps:
     """Lamps whose places, axes and intensities minimise the objective, and as few of them as do.
 
-    From the weakest to the strongest, a lamp is dropped where the others, its power given to its neighbour, have a lower loss.
-    Each lamp that is left is tried as a panel and as a bulb, as one at another place looks much like the other.
+    From the weakest to the strongest, a lamp is dropped where the others, its power given to its neighbour,
+    have a lower loss. Each lamp that is left is tried as a panel and as a bulb, as one at another place looks
+    much like the other.
 
     Args:
         found: lamps to start from, the strongest first.
@@ -72,7 +78,9 @@ def settle_lamps(
     if not len(found.intensity) or not len(observed):
         return found
 
-    def loss_of(lamps: FoundLamps, sight: Bool[Tensor, "N M"], gain: Float[Tensor, "#N 3"]) -> Float[Tensor, ""]:
+    def loss_of(
+        lamps: FoundLamps, sight: Bool[Tensor, "N M"], gain: Float[Tensor, "#N 3"]
+    ) -> Float[Tensor, ""]:
         kernel = lamp_kernel(lamps.places, radius, sight, observed, target.material.roughness, lobe)
         brought = kernel[0].mean(0)[:, None] * lamps.intensity
         all_light = brought.sum(0) + beside.scene[0].mean(0)
@@ -80,7 +88,8 @@ def settle_lamps(
         return misfit + objective.price(brought.mean(-1), all_light)
 
     def settle(lamps: FoundLamps) -> _Settled:
-        # A shadow's edge has no derivative here: what is hidden at the start stays so, and the next fit looks again.
+        # A shadow's edge has no derivative here: what is hidden at the start stays so, and the next fit looks
+        # again.
         sight = in_sight(lamps.places, radius, observed.position, scene)
         return _descend(lamps, target, objective, lambda moved, gain: loss_of(moved, sight, gain))
 
@@ -123,14 +132,18 @@ def _descend(
     objective: Objective,
     loss_of: Callable[[FoundLamps, Float[Tensor, "#N 3"]], Float[Tensor, ""]],
 ) -> _Settled:
-    """To the nearest minimum of a loss over place, axis and intensity. Where that leads to what is not finite: the start."""
+    """To the nearest minimum of a loss over place, axis and intensity. Where that leads to what is not
+    finite: the start.
+    """
     bare = start.places.axis.square().sum(-1, keepdim=True) == 0
     position = start.places.position.clone().requires_grad_()
     axis = start.places.axis.clone().requires_grad_()
     log_intensity = start.intensity.clamp_min(FAINT_SHARE * start.intensity.max()).log().requires_grad_()
 
     def lamps() -> FoundLamps:
-        return FoundLamps(LampPlaces(position, safe_normalize(axis).masked_fill(bare, 0.0)), log_intensity.exp())
+        return FoundLamps(
+            LampPlaces(position, safe_normalize(axis).masked_fill(bare, 0.0)), log_intensity.exp()
+        )
 
     unknowns = (Unknown(position, RATE), Unknown(axis, AXIS_RATE), Unknown(log_intensity, AXIS_RATE))
     loss = descend(unknowns, GAIN_RATE, STEPS, target, objective, lambda gain: loss_of(lamps(), gain)).item()

@@ -1,7 +1,7 @@
 """What cameras saw of the light itself: pixels that show what lies beyond the scene.
 
-A map has one radiance for a direction, from wherever one looks. What lies near is seen from every camera in another direction;
-its texels disagree with themselves, and count for less.
+A map has one radiance for a direction, from wherever one looks. What lies near is seen from every camera in
+another direction; its texels disagree with themselves, and count for less.
 """
 
 from __future__ import annotations
@@ -28,14 +28,18 @@ DARK_FLOOR = 1e-3
 
 @dataclass(frozen=True)
 class KnownSky:
-    """Log radiance of the texels of a map as cameras saw them, and how much that counts: 0 where none looked, at most 1."""
+    """Log radiance of the texels of a map as cameras saw them, and how much that counts: 0 where none looked,
+    at most 1.
+    """
 
     log_radiance: Float[Tensor, "3 H W"]
     weight: Float[Tensor, "H W"]
 
     def misfit(self, log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, ""]:
         """How far a map is from what was seen, in the mean over its texels."""
-        off = functional.smooth_l1_loss(log_radiance, self.log_radiance, beta=QUADRATIC_BELOW, reduction="none")
+        off = functional.smooth_l1_loss(
+            log_radiance, self.log_radiance, beta=QUADRATIC_BELOW, reduction="none"
+        )
         return (self.weight * off.mean(0)).mean()
 
 
@@ -44,8 +48,8 @@ class SkySightings(nn.Module):
 
     Args:
         height: rows of the map; it has twice as many columns.
-        response: of the capture, "linear" or "srgb". A pixel of an LDR image that is clipped says too little: its texel
-            counts as unseen.
+        response: of the capture, "linear" or "srgb". A pixel of an LDR image that is clipped says too little:
+            its texel counts as unseen.
     """
 
     def __init__(self, height: int, response: str) -> None:

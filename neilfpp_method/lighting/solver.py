@@ -1,11 +1,13 @@
-"""The light solver: it remembers what training steps showed, and now and then solves for the light that explains it.
+"""The light solver: it remembers what training steps showed, and now and then solves for the light that
+explains it.
 
     solver = model.light_solver()
     step = model.step(batch, stage)
     solver.observe(step)
     evidence = solver.solve(model.brdf, model.scene)
 
-A light that is free at every point is learned by gradients instead; `NothingToSolve` then stands in the solver's place.
+A light that is free at every point is learned by gradients instead; `NothingToSolve` then stands in the
+solver's place.
 """
 
 from __future__ import annotations
@@ -32,7 +34,9 @@ __all__ = ["LightSolver", "MapSolver", "NothingToSolve", "make_light_solver"]
 
 @runtime_checkable
 class LightSolver(Protocol):
-    """What a training loop calls after every step. It is an `nn.Module`: what it remembers is part of a checkpoint."""
+    """What a training loop calls after every step. It is an `nn.Module`: what it remembers is part of a
+    checkpoint.
+    """
 
     @property
     def due(self) -> bool:
@@ -60,7 +64,8 @@ class LightSolver(Protocol):
             scene: stands between the points and the light, and shines on them; none where nothing is traced.
 
         Returns:
-            What the points that were kept back say of lamps; none where nothing was solved, or the settings had decided.
+            What the points that were kept back say of lamps; none where nothing was solved, or the settings
+            had decided.
         """
         ...
 
@@ -91,13 +96,19 @@ class MapSolver(nn.Module):
     """
 
     def __init__(
-        self, config: MapLightConfig, facts: SceneFacts, units: RadianceUnits, light: LightModel, lobe: Lobe | None
+        self,
+        config: MapLightConfig,
+        facts: SceneFacts,
+        units: RadianceUnits,
+        light: LightModel,
+        lobe: Lobe | None,
     ) -> None:
         super().__init__()
         self.config, self.response, self.unit = config, facts.response, units.physical
         self.light, self.lobe = light, lobe
         self.memory = SurfaceMemory(config.fit.points, config.fit.every)
-        # Only a background that is no backdrop shows the light, and only a map that is sought has to keep to it.
+        # Only a background that is no backdrop shows the light, and only a map that is sought has to keep to
+        # it.
         sightings = config.map is None and facts.background == "inverted_sphere"
         self.sky = SkySightings(config.environment_height, facts.response) if sightings else None
 
@@ -131,11 +142,17 @@ class MapSolver(nn.Module):
         first, observed = self.memory.age is None, self.memory.recall()
         sky = None if self.sky is None else self.sky.known()
         objective = Objective(self.response, self.unit, self.config.fit, sky)
-        return solve_light(self.light, observed, brdf(observed.position), self.lobe, scene, objective, self.config, first)
+        return solve_light(
+            self.light, observed, brdf(observed.position), self.lobe, scene, objective, self.config, first
+        )
 
 
 def make_light_solver(
-    config: FreeLightConfig | MapLightConfig, facts: SceneFacts, units: RadianceUnits, light: LightModel, lobe: Lobe | None
+    config: FreeLightConfig | MapLightConfig,
+    facts: SceneFacts,
+    units: RadianceUnits,
+    light: LightModel,
+    lobe: Lobe | None,
 ) -> MapSolver | NothingToSolve:
     """The solver that a light needs; arguments as of `MapSolver`."""
     if isinstance(config, FreeLightConfig) or _is_given(config):

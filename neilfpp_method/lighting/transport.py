@@ -1,11 +1,12 @@
-"""How light travels to a surface and on to its viewer, as matrices: what a surface sends is linear in the light.
+"""How light travels to a surface and on to its viewer, as matrices: what a surface sends is linear in the
+light.
 
 With geometry and roughness fixed, a map of T texels of radiance E and M lamps of intensity I,
 
     L_o = k_d (D E + D' I + d) + F0 (F E + F' I + f) + (G E + G' I + g),   k_d = (1 − m) b,   F0 = 0.04 (1 − m) + b m
 
-D, F, G hold cosine, visibility, solid angle, and the diffuse, the facing and the grazing part of the BRDF; d, f, g are what
-the scene's own surfaces add.
+D, F, G hold cosine, visibility, solid angle, and the diffuse, the facing and the grazing part of the BRDF; d,
+f, g are what the scene's own surfaces add.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ PAIRS_AT_ONCE = 2**18
 
 @dataclass(frozen=True)
 class Transport:
-    """How light leaves N points towards their viewers: the diffuse, the facing and the grazing part, in this order; K is 3,
-    or 1 for Lambertian surfaces.
+    """How light leaves N points towards their viewers: the diffuse, the facing and the grazing part, in this
+    order; K is 3, or 1 for Lambertian surfaces.
 
     `sources` is per unit of each of T sources, `scene` what the scene's own surfaces send through the points.
     """
@@ -58,7 +59,9 @@ class Transport:
         return Transport(self.sources[..., :0], self.scene + self.sources @ strength)
 
     def outgoing(self, material: Material, strength: Float[Tensor, "T 3"]) -> Float[Tensor, "N 3"]:
-        """L_o under sources of this strength; `material` brings the colours, its roughness is in the matrices."""
+        """L_o under sources of this strength; `material` brings the colours, its roughness is in the
+        matrices.
+        """
         diffuse, *reflected = _SumOverSources.apply(self.sources, strength) + self.scene
         color = diffuse_reflectance(material, bool(reflected)) * diffuse
         if reflected:
@@ -70,8 +73,8 @@ class Transport:
 class _SumOverSources(torch.autograd.Function):
     """sources @ strength: K N T, T 3 → K N 3.
 
-    Autograd's own slope in the strength reads the sources across their order in memory, which takes longer than along it; a fit
-    does little else.
+    Autograd's own slope in the strength reads the sources across their order in memory, which takes longer
+    than along it; a fit does little else.
     """
 
     @staticmethod
@@ -83,7 +86,9 @@ class _SumOverSources(torch.autograd.Function):
     def backward(ctx, slope: Tensor) -> tuple[Tensor | None, Tensor | None]:
         sources, strength = ctx.saved_tensors
         of_sources = slope @ strength.t() if ctx.needs_input_grad[0] else None
-        of_strength = (slope.flatten(0, 1).t() @ sources.flatten(0, 1)).t() if ctx.needs_input_grad[1] else None
+        of_strength = (
+            (slope.flatten(0, 1).t() @ sources.flatten(0, 1)).t() if ctx.needs_input_grad[1] else None
+        )
         return of_sources, of_strength
 
 
@@ -120,9 +125,11 @@ def from_texels_at(
     lobe: Lobe,
     scene: SceneTracer | None,
 ) -> Transport:
-    """As `from_texels`, at several roughnesses for which each direction is traced once; `sources` in half precision.
+    """As `from_texels`, at several roughnesses for which each direction is traced once; `sources` in half
+    precision.
 
-    Layer 0 is the diffuse part, layers 1 + 2k and 2 + 2k are the facing and the grazing part at roughness number k.
+    Layer 0 is the diffuse part, layers 1 + 2k and 2 + 2k are the facing and the grazing part at roughness
+    number k.
     """
     texels = environment.log_radiance[0].numel()
     parts = []
@@ -130,14 +137,17 @@ def from_texels_at(
         rays = _texel_rays(environment, part, scene)
         kernels = [_kernel(part, torch.full_like(rough, r), rays.wi, rays.weight, lobe) for r in roughnesses]
         layers = [rays.carried(kernel if k == 0 else kernel[1:]) for k, kernel in enumerate(kernels)]
-        parts.append(Transport(torch.cat([x.sources.half() for x in layers]), torch.cat([x.scene for x in layers])))
+        parts.append(
+            Transport(torch.cat([x.sources.half() for x in layers]), torch.cat([x.scene for x in layers]))
+        )
     return _joined(parts)
 
 
 @dataclass(frozen=True)
 class _TexelRays:
-    """For N points a direction in each texel above the horizon, its number among T texels, cosine times solid angle, and what
-    stands there of the scene."""
+    """For N points a direction in each texel above the horizon, its number among T texels, cosine times solid
+    angle, and what stands there of the scene.
+    """
 
     wi: Float[Tensor, "N S 3"]
     number: Int[Tensor, "N S"]
@@ -159,7 +169,8 @@ def _texel_rays(environment: EnvironmentLight, observed: Observed, scene: SceneT
     drawn = environment.texel_directions(observed.position)
     texels = len(drawn.solid_angle)
     weight = dot(drawn.wi, observed.normal).clamp_min(0) * drawn.solid_angle
-    # The map is even about every plane through its middle: half of its texels are above a horizon, up to grazing ones.
+    # The map is even about every plane through its middle: half of its texels are above a horizon, up to
+    # grazing ones.
     weight, number = weight.topk(texels // 2, dim=1)
     wi = drawn.wi.gather(1, number[..., None].expand(-1, -1, 3))
     met = None if scene is None else scene(observed.position, wi)
@@ -167,7 +178,9 @@ def _texel_rays(environment: EnvironmentLight, observed: Observed, scene: SceneT
 
 
 def _joined(parts: Sequence[Transport]) -> Transport:
-    return Transport(torch.cat([part.sources for part in parts], 1), torch.cat([part.scene for part in parts], 1))
+    return Transport(
+        torch.cat([part.sources for part in parts], 1), torch.cat([part.scene for part in parts], 1)
+    )
 
 
 @torch.no_grad()
@@ -179,7 +192,9 @@ def from_lamps(
     lobe: Lobe | None,
     scene: SceneTracer | None,
 ) -> Transport:
-    """From small lamps, per unit of intensity: the direction to their middle is traced. Arguments as of `from_texels`."""
+    """From small lamps, per unit of intensity: the direction to their middle is traced. Arguments as of
+    `from_texels`.
+    """
     sources = []
     for part, rough in _chunks(observed, roughness, len(lamps.position)):
         sight = in_sight(lamps, radius, part.position, scene)
@@ -189,7 +204,9 @@ def from_lamps(
 
 
 @torch.no_grad()
-def in_sight(lamps: LampPlaces, radius: float, x: Float[Tensor, "N 3"], scene: SceneTracer | None) -> Bool[Tensor, "N M"]:
+def in_sight(
+    lamps: LampPlaces, radius: float, x: Float[Tensor, "N 3"], scene: SceneTracer | None
+) -> Bool[Tensor, "N M"]:
     """Whether the middle of a lamp is to be observed from a point."""
     rays = rays_towards(x, lamps.position, lamps.axis, radius)
     if scene is None:
@@ -205,7 +222,9 @@ def lamp_kernel(
     roughness: Float[Tensor, "N 1"],
     lobe: Lobe | None,
 ) -> Float[Tensor, "K N M"]:
-    """`sources` of a transport from lamps; differentiable in where they are and which way they send, up to `sight`."""
+    """`sources` of a transport from lamps; differentiable in where they are and which way they send, up to
+    `sight`.
+    """
     rays = rays_towards(observed.position, lamps.position, lamps.axis, radius)
     weight = sight * rays.emission * dot(rays.wi, observed.normal).clamp_min(0) / rays.distance.square()
     return _kernel(observed, roughness, rays.wi, weight, lobe)
@@ -225,7 +244,9 @@ def _kernel(
     return torch.stack((weight / math.pi, weight * terms.facing, weight * terms.grazing))
 
 
-def _chunks(observed: Observed, roughness: Float[Tensor, "N 1"], sources: int) -> list[tuple[Observed, Tensor]]:
+def _chunks(
+    observed: Observed, roughness: Float[Tensor, "N 1"], sources: int
+) -> list[tuple[Observed, Tensor]]:
     rows = max(1, PAIRS_AT_ONCE // max(1, sources))
     spans = [slice(start, start + rows) for start in range(0, len(observed), rows)]
     return [(observed[span], roughness[span]) for span in spans]

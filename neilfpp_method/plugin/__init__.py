@@ -1,7 +1,8 @@
 """The method inside nerfstudio: `ns-train neilfpp --data CAPTURE`, and every `ns-*` command that follows it.
 
-Nerfstudio loads the specifications below in every command that it has. They are made when it asks for them, and one
-that cannot be made is reported and left out: a broken installation of this package costs its own methods, no others.
+Nerfstudio loads the specifications below in every command that it has. They are made when it asks for them,
+and one that cannot be made is reported and left out: a broken installation of this package costs its own
+methods, no others.
 """
 
 from __future__ import annotations

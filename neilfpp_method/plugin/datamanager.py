@@ -1,4 +1,6 @@
-"""Pixels for nerfstudio's own data manager: float images, and with each pixel its ray and what the losses ask of it."""
+"""Pixels for nerfstudio's own data manager: float images, and with each pixel its ray and what the losses ask
+of it.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,14 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.plugin.dataparser import capture_of
 from neilfpp_method.structures import PixelBatch
 
-__all__ = ["PIXELS", "VALID", "CaptureDataManager", "CaptureDataManagerConfig", "CaptureDataset", "pixel_batch"]
+__all__ = [
+    "PIXELS",
+    "VALID",
+    "CaptureDataManager",
+    "CaptureDataManagerConfig",
+    "CaptureDataset",
+    "pixel_batch",
+]
 
 PIXELS = "neilfpp_pixels"
 """Key of a dataset's metadata under which the model finds the `PixelDataset`."""
@@ -44,7 +53,12 @@ class CaptureDataset(InputDataset):
         UserError: the views differ in size, or are to be scaled.
     """
 
-    exclude_batch_keys_from_device: ClassVar = [*InputDataset.exclude_batch_keys_from_device, *FACTS, VALID, NEAR]
+    exclude_batch_keys_from_device: ClassVar = [
+        *InputDataset.exclude_batch_keys_from_device,
+        *FACTS,
+        VALID,
+        NEAR,
+    ]
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
         super().__init__(dataparser_outputs, scale_factor)
@@ -52,7 +66,9 @@ class CaptureDataset(InputDataset):
         if scale_factor != 1.0:
             raise UserError("camera_res_scale_factor is not 1", "scale the capture instead")
         if len({(int(w), int(h)) for w, h in zip(self.cameras.width, self.cameras.height, strict=True)}) > 1:
-            raise UserError(f"{capture.root}: views of several sizes", "use `neilfpp train`, or bring them to one size")
+            raise UserError(
+                f"{capture.root}: views of several sizes", "use `neilfpp train`, or bring them to one size"
+            )
         views = {view.image: view for view in capture.views}
         self.pixels = PixelDataset(capture, [views[image] for image in dataparser_outputs.image_filenames])
         self.metadata[PIXELS] = self.pixels
@@ -66,7 +82,10 @@ class CaptureDataset(InputDataset):
         i = data["image_idx"]
         pixels = self.pixels.view(i)
         facts = {key: self._image(i, getattr(pixels, name)) for key, name in FACTS.items()}
-        return facts | {VALID: self._image(i, self.pixels.valid(i)), NEAR: self._image(i, self.pixels.near(i))}
+        return facts | {
+            VALID: self._image(i, self.pixels.valid(i)),
+            NEAR: self._image(i, self.pixels.near(i)),
+        }
 
     def _image(self, i: int, values: Tensor) -> Shaped[Tensor, "H W C"]:
         camera = self.pixels.views[i].camera
@@ -104,15 +123,19 @@ class CapturePixelSampler(PixelSampler):
         number = self._draws.draw(num_rays_per_batch)
         row, column = number // width % height, number % width
         place = order[number // (height * width)]
-        drawn = {key: values[place, row, column] for key, values in batch.items() if key not in ("image_idx", VALID, NEAR)}
+        drawn = {
+            key: values[place, row, column]
+            for key, values in batch.items()
+            if key not in ("image_idx", VALID, NEAR)
+        }
         return drawn | {"indices": torch.stack([batch["image_idx"].cpu()[place], row, column], dim=-1)}
 
 
 class CaptureRayGenerator(RayGenerator):
     """Rays of the capture's cameras, to the bit those that the standalone loop learns from.
 
-    Nerfstudio's own differ by rounding, where a lens bends them by a little more, and training is chaotic: two runs that
-    part by a rounding error end about as far apart as two seeds do.
+    Nerfstudio's own differ by rounding, where a lens bends them by a little more, and training is chaotic:
+    two runs that part by a rounding error end about as far apart as two seeds do.
     """
 
     def __init__(self, dataset: CaptureDataset, device: torch.device | str) -> None:
@@ -134,7 +157,9 @@ class CaptureDataManagerConfig(VanillaDataManagerConfig):
     """Nerfstudio's data manager with float images."""
 
     _target: type = field(default_factory=lambda: CaptureDataManager)
-    pixel_sampler: PixelSamplerConfig = field(default_factory=lambda: PixelSamplerConfig(_target=CapturePixelSampler))
+    pixel_sampler: PixelSamplerConfig = field(
+        default_factory=lambda: PixelSamplerConfig(_target=CapturePixelSampler)
+    )
     """Who draws the pixels of a step."""
 
 

@@ -1,7 +1,7 @@
 """`neilfpp-data`: every capture that `neilfpp train` reads, HDR included, for nerfstudio's data managers.
 
-Nerfstudio's frame is then the scene frame: the object lies in the unit sphere. No data manager is imported here; they
-import this.
+Nerfstudio's frame is then the scene frame: the object lies in the unit sphere. No data manager is imported
+here; they import this.
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ class CaptureParserConfig(DataParserConfig):
     test_every: Optional[int] = None  # noqa: UP045  (tyro reads it at run time on every Python)
     """Hold out every k-th view; none: as the capture says, else every 8th."""
     response: Literal["auto", "linear", "srgb"] = "auto"
-    """Whether pixels are linear radiance or display values; auto: as the capture says, else floating-point files are linear."""
+    """Whether pixels are linear radiance or display values; auto: as the capture says, else floating-point
+    files are linear.
+    """
 
 
 @dataclass
@@ -56,7 +58,8 @@ class CaptureParser(DataParser):
     def _generate_dataparser_outputs(self, split: str = "train", **_) -> DataparserOutputs:
         chosen = self.config
         capture = load_capture(chosen.data, chosen.format, chosen.test_every, response=chosen.response)
-        # Nerfstudio cannot do without a view to evaluate; where none is held out it gets one from the training set.
+        # Nerfstudio cannot do without a view to evaluate; where none is held out it gets one from the
+        # training set.
         views = capture.train_views if split == "train" else capture.test_views or capture.train_views[:1]
         frame = capture.normalisation
         transform = torch.eye(4)[:3]
@@ -101,12 +104,15 @@ def _distortion(camera: Camera) -> list[float]:
     """
     known = nerfstudio_coefficients(camera)
     if known is None:
-        raise UserError(f"nerfstudio has no lens {camera.lens.model}", "undistort the images, or use `neilfpp train`")
+        raise UserError(
+            f"nerfstudio has no lens {camera.lens.model}", "undistort the images, or use `neilfpp train`"
+        )
     return [known.get(name, 0.0) for name in ORDER]
 
 
 def capture_of(outputs: DataparserOutputs) -> Capture:
-    """The capture behind a dataparser's outputs: that of `neilfpp-data`, or one made of what another dataparser found.
+    """The capture behind a dataparser's outputs: that of `neilfpp-data`, or one made of what another
+    dataparser found.
 
     Raises:
         UserError: a camera has no image plane: it is a panorama, or orthographic.
@@ -122,7 +128,9 @@ def capture_of(outputs: DataparserOutputs) -> Capture:
     if len(kinds) > 1:
         raise UserError(f"{views[0].image.parent}: HDR and LDR images together", "use images of one kind")
     folder = views[0].image.parent
-    return Capture(folder, "nerfstudio", folder, views, Normalisation(1.0, (0.0, 0.0, 0.0)), kinds.pop(), frozenset())
+    return Capture(
+        folder, "nerfstudio", folder, views, Normalisation(1.0, (0.0, 0.0, 0.0)), kinds.pop(), frozenset()
+    )
 
 
 def _camera(cameras: Cameras, i: int) -> Camera:
@@ -140,4 +148,6 @@ def _camera(cameras: Cameras, i: int) -> Camera:
     return camera
 
 
-neilfpp_data = DataParserSpecification(CaptureParserConfig(), "Captures that `neilfpp train` reads, HDR included.")
+neilfpp_data = DataParserSpecification(
+    CaptureParserConfig(), "Captures that `neilfpp train` reads, HDR included."
+)

@@ -35,7 +35,8 @@ def trainer(name: str, settings: NeilfConfig) -> TrainerConfig:
         ),
         # The rates are those of `pipeline.model.neilf.optimizer`, set at each step.
         optimizers={
-            field: {"optimizer": FieldAdamConfig(name=field), "scheduler": None} for field in sorted(GEOMETRY | MATERIAL)
+            field: {"optimizer": FieldAdamConfig(name=field), "scheduler": None}
+            for field in sorted(GEOMETRY | MATERIAL)
         },
         viewer=ViewerConfig(num_rays_per_chunk=loop.eval_chunk),
         vis="viewer",

@@ -1,4 +1,6 @@
-"""`NeilfModel` as a nerfstudio model: its losses, stages and rates are those of the standalone loop, called from here."""
+"""`NeilfModel` as a nerfstudio model: its losses, stages and rates are those of the standalone loop, called
+from here.
+"""
 
 from __future__ import annotations
 
@@ -58,10 +60,13 @@ class NeilfMethodConfig(ModelConfig):
     enable_collider: bool = False
     """Unused: hosts bound their rays themselves."""
     host: Optional[str] = None  # noqa: UP045  (tyro reads it at run time)
-    """A nerfstudio method that renders rays as the host (neus, nerfacto, …); none: the host of `neilf`. It trains at its
-    own rate and with its own regularisers."""
+    """A nerfstudio method that renders rays as the host (neus, nerfacto, …); none: the host of `neilf`. It
+    trains at its own rate and with its own regularisers.
+    """
     host_losses: float = 1.0
-    """Weight of the regularisers of `host`; 0: none of them, and of ours L_Eik where it is a surface model."""
+    """Weight of the regularisers of `host`; 0: none of them, and of ours L_Eik where it is a surface
+    model.
+    """
     neilf: NeilfConfig = field(default_factory=lambda: preset("fast"))
     """The settings of the method. Of `train` only the seed and the steps of the stages count here."""
 
@@ -80,10 +85,15 @@ class NeilfMethod(Model):
         super().populate_modules()
         pixels: PixelDataset | None = self.kwargs["metadata"].get(PIXELS)
         if pixels is None:
-            raise UserError("the data manager is not ours", "leave --pipeline.datamanager as `ns-train neilfpp` sets it")
+            raise UserError(
+                "the data manager is not ours", "leave --pipeline.datamanager as `ns-train neilfpp` sets it"
+            )
         settings = self.config.neilf
         if self.config.host is not None and settings.inter_reflection.mode == "hard":
-            CONSOLE.log(f"{self.config.host} traces no rays cheaply: a free light field and L_ref replace hard tracing")
+            CONSOLE.log(
+                f"{self.config.host} traces no rays cheaply: a free light field and L_ref replace hard "
+                "tracing"
+            )
             settings = free_light(settings)
         facts = scene_facts(pixels.capture, pixels, settings)
         seed_step(settings.train.seed, step=-1)
@@ -116,22 +126,30 @@ class NeilfMethod(Model):
         """Parameters by field."""
         return {name: parameters for name, parameters in self.neilf.parameter_groups().items() if parameters}
 
-    # ------------------------------------------------------------------------------------------------------------- stages
+    # ------------------------------------------------------------------------------------------------- stages
 
-    def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
         """Ours, and those of a host that comes from nerfstudio.
 
         Raises:
-            UserError: training on several devices; the losses are computed where nerfstudio's wrapper does not look. Or
-                an environment map that is known cannot be read.
+            UserError: training on several devices; the losses are computed where nerfstudio's wrapper does
+                not look. Or an environment map that is known cannot be read.
         """
         trainer, optimizers = training_callback_attributes.trainer, training_callback_attributes.optimizers
         if trainer.world_size > 1:
-            raise UserError("several devices under nerfstudio", "use `neilfpp train --devices N`, or one device")
+            raise UserError(
+                "several devices under nerfstudio", "use `neilfpp train --devices N`, or one device"
+            )
         if self.step < 0:  # no checkpoint was loaded, which would hold the map
             show_known_light(self.neilf)
         host = self.neilf.host
-        theirs = host.model.get_training_callbacks(training_callback_attributes) if isinstance(host, NerfstudioHost) else []
+        theirs = (
+            host.model.get_training_callbacks(training_callback_attributes)
+            if isinstance(host, NerfstudioHost)
+            else []
+        )
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
         return [
@@ -169,7 +187,7 @@ class NeilfMethod(Model):
         """The step of a checkpoint that has been loaded."""
         self.step = step
 
-    # ------------------------------------------------------------------------------------------------------------- losses
+    # ------------------------------------------------------------------------------------------------- losses
 
     def get_loss_dict(
         self, outputs: dict[str, Tensor], batch: dict[str, Any], metrics_dict: dict[str, Tensor] | None = None
@@ -192,15 +210,22 @@ class NeilfMethod(Model):
         return {name: weigh({name: term}, weights).loss for name, term in terms.items()}
 
     def _light_found(self) -> dict[str, Tensor]:
-        """What the last fit of the light measured for and against lamps, where the settings leave that open."""
+        """What the last fit of the light measured for and against lamps, where the settings leave that
+        open.
+        """
         if self.evidence is None:
             return {}
-        return {"lamp_gain": torch.tensor(self.evidence.gain), "lamps": torch.tensor(float(self.neilf.lamps.lit))}
+        return {
+            "lamp_gain": torch.tensor(self.evidence.gain),
+            "lamps": torch.tensor(float(self.neilf.lamps.lit)),
+        }
 
-    # ------------------------------------------------------------------------------------------------------------ outputs
+    # ------------------------------------------------------------------------------------------------ outputs
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
-        """In evaluation every map; in training the rays themselves: what must be rendered, the losses decide."""
+        """In evaluation every map; in training the rays themselves: what must be rendered, the losses
+        decide.
+        """
         rays = RayBatch(ray_bundle.origins, ray_bundle.directions)
         if self.training:
             return {"origins": rays.origins, "directions": rays.directions}
@@ -224,27 +249,38 @@ class NeilfMethod(Model):
 
     @torch.no_grad()
     def _incident_light(self, rays: RayBatch, maps: Maps) -> Float[Tensor, "N 3"]:
-        """Irradiance over π where a ray meets the surface: the mean incident radiance, weighted by the cosine."""
+        """Irradiance over π where a ray meets the surface: the mean incident radiance, weighted by the
+        cosine.
+        """
         light = torch.zeros_like(maps.rgb)
-        rows = torch.nonzero(maps.roughness[:, 0])[:, 0]  # what is no hit, or has no material yet, holds zeros
+        rows = torch.nonzero(maps.roughness[:, 0])[
+            :, 0
+        ]  # what is no hit, or has no material yet, holds zeros
         if not len(rows):
             return light
         normal, wo = maps.normal[rows], -rays.directions[rows]
         position = rays.origins[rows] + maps.depth[rows] * rays.directions[rows]
         count = self.config.neilf.shading.train_samples
         # The density of a cosine sampler cancels the cosine: what is left is a plain mean.
-        drawn = sample_directions("cosine", normal, wo, maps.roughness[rows], count, self.neilf.lobe, stochastic=False)
+        drawn = sample_directions(
+            "cosine", normal, wo, maps.roughness[rows], count, self.neilf.lobe, stochastic=False
+        )
         light[rows] = self.neilf.incident_light(position, drawn.wi).mean(dim=1)
         return light
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """PSNR and SSIM of display values over the object, as `neilfpp eval` has them without true depths, and all maps as
-        pictures."""
+        """PSNR and SSIM of display values over the object, as `neilfpp eval` has them without true depths,
+        and all maps as pictures.
+        """
         truth, rgb, volume = (self._display(image.to(self.device)) for image in _images(batch, outputs))
         # Where nothing is known of the object, what is rendered of it chooses the pixels.
-        shown = batch["object_mask"].cpu() > 0.5 if batch["mask_known"].any() else outputs["accumulation"].cpu() > 0.5
+        shown = (
+            batch["object_mask"].cpu() > 0.5
+            if batch["mask_known"].any()
+            else outputs["accumulation"].cpu() > 0.5
+        )
         mask = (shown & batch[VALID].cpu())[..., 0].numpy()
         arrays = {"": rgb, "volume_": volume}
         figures = {

@@ -1,4 +1,6 @@
-"""Native calls that take minutes: they run beside the main thread, which shows their progress and can stop them."""
+"""Native calls that take minutes: they run beside the main thread, which shows their progress and can stop
+them.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ Result = TypeVar("Result")
 INTERVAL = 0.2
 
 
-def in_background(call: Callable[[pycolmap.CancellationToken], Result], look: Callable[[], None] = lambda: None) -> Result:
+def in_background(
+    call: Callable[[pycolmap.CancellationToken], Result], look: Callable[[], None] = lambda: None
+) -> Result:
     """What `call` returns or raises; `look` is called several times a second meanwhile, and once at the end.
 
     Raises:
@@ -51,7 +55,9 @@ def in_background(call: Callable[[pycolmap.CancellationToken], Result], look: Ca
 
 @contextmanager
 def sigterm_as_ctrl_c() -> Iterator[None]:
-    """SIGTERM, by which schedulers and containers end a command, is a person's stop: a `KeyboardInterrupt`."""
+    """SIGTERM, by which schedulers and containers end a command, is a person's stop: a
+    `KeyboardInterrupt`.
+    """
     try:
         before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     except ValueError:  # not the main thread: somebody else handles signals

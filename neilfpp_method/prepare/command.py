@@ -1,9 +1,10 @@
 """`neilfpp prepare`: from a folder of photographs to a capture.
 
-merged ──► copies ──► matches ──► model ──► views ──► cloud ──► capture       each a step in CAPTURE/work, done once
+merged ──► copies ──► matches ──► model ──► views ──► cloud ──► capture       each a step in CAPTURE/work,
+done once
 
-The capture's own files are laid out from the steps' results at the end, `capture.json` last: a folder without it is no
-capture yet.
+The capture's own files are laid out from the steps' results at the end, `capture.json` last: a folder without
+it is no capture yet.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ __all__ = ["run_prepare"]
 
 
 def run_prepare(options: Prepare, console: Console) -> Path:
-    """Make a capture and return its folder. One that is finished, of the same images and options, is left as it is.
+    """Make a capture and return its folder. One that is finished, of the same images and options, is left as
+    it is.
 
     Raises:
         UserError: bad input, or images that do not make a scene.
@@ -59,27 +61,39 @@ def _prepare(options: Prepare, console: Console) -> Path:
     brackets = photos and brackets_among(photos, options.brackets)
     with writing(options.out):
         with bars(console) as open_bar:
-            source = _from_capture(capture, options) if capture else _from_photos(photos, brackets, options, open_bar)
+            source = (
+                _from_capture(capture, options)
+                if capture
+                else _from_photos(photos, brackets, options, open_bar)
+            )
             summary = lay_out(source, options, open_bar)
         if summary is None:
             console.print(f"{options.out}: finished already", highlight=False, soft_wrap=True)
             return options.out
         for line in summary.lines:
             console.print(line, highlight=False, soft_wrap=True)
-        console.print(f"written to {options.out}; look at {options.out / 'summary.png'}", highlight=False, soft_wrap=True)
+        console.print(
+            f"written to {options.out}; look at {options.out / 'summary.png'}",
+            highlight=False,
+            soft_wrap=True,
+        )
     return options.out
 
 
 def _check_place(options: Prepare) -> None:
     images, out = options.images.resolve(), options.out.resolve()
     if images.is_relative_to(out) or out.is_relative_to(images):
-        raise UserError(f"{options.out}: the images and the capture lie within one another", "choose another --out")
+        raise UserError(
+            f"{options.out}: the images and the capture lie within one another", "choose another --out"
+        )
     if out.exists() and not out.is_dir():
         raise UserError(f"{options.out}: not a folder", "choose another --out")
     if out.is_dir() and any(out.iterdir()) and not (out / WORK).is_dir():
         raise UserError(f"{options.out}: not empty, and not made by this command", "choose another --out")
     if options.test_every is not None and (options.test_every < 0 or options.test_every == 1):
-        raise UserError(f"every {options.test_every}-th view cannot be held out", "give 2 or more, or 0 for none")
+        raise UserError(
+            f"every {options.test_every}-th view cannot be held out", "give 2 or more, or 0 for none"
+        )
 
 
 @contextmanager
@@ -97,10 +111,12 @@ def _way_on(options: Prepare) -> Iterator[None]:
                 given.append(f"--{name}" if value else f"--no-{name}")
             elif value != field.default:
                 given += [f"--{name}", *map(str, value if isinstance(value, tuple) else [value])]
-        raise Stopped("stopped; what is done is kept", f"continue with: neilfpp prepare {shlex.join(given)}") from None
+        raise Stopped(
+            "stopped; what is done is kept", f"continue with: neilfpp prepare {shlex.join(given)}"
+        ) from None
 
 
-# -------------------------------------------------------------------------------------------------------------- sources
+# ---------------------------------------------------------------------------------------------------- sources
 
 
 def _check_readable(problems: tuple[str, ...], options: Prepare) -> None:
@@ -113,7 +129,9 @@ def _from_capture(capture: Capture, options: Prepare) -> Source:
     posed = posed_by_capture(capture)
     files = [path for view in posed.views for path in (view.image, view.mask, view.valid) if path]
     poses = [[view.name, view.camera.w2c.tolist(), view.camera.intrinsics.tolist()] for view in posed.views]
-    step = begin(options.out / WORK / "poses", images=stamp(files, capture.root), poses=poses, linear=posed.linear)
+    step = begin(
+        options.out / WORK / "poses", images=stamp(files, capture.root), poses=poses, linear=posed.linear
+    )
     step.complete({})
     points = None
     if capture.format == "colmap":

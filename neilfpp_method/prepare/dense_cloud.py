@@ -45,9 +45,13 @@ def dense_cloud(capture: Capture, folder: Path, open_bar: Bars) -> WorldPoints:
             write_exr(path, {"Z": sweep(grey, [views[j] for j in others], capture.normalisation)})
         depths.append(read_image(path).pixels[..., 0])
         bar.advance()
-    grains = [grain(camera, [cameras[j] for j in others]) for camera, others in zip(cameras, sources, strict=True)]
+    grains = [
+        grain(camera, [cameras[j] for j in others]) for camera, others in zip(cameras, sources, strict=True)
+    ]
     asked = choose_sources(cameras, centre, ASKED)
     points = fuse(cameras, depths, grains, asked, open_bar("fusing depth", len(views)).advance)
     if not len(points.position):
-        raise UserError(f"{capture.root}: the views agree on no surface", "leave out --dense; stereo needs texture")
+        raise UserError(
+            f"{capture.root}: the views agree on no surface", "leave out --dense; stereo needs texture"
+        )
     return without_outliers(points)

@@ -38,7 +38,9 @@ WRITERS = {"nerfstudio": write_transforms, "neilf": write_sfm_scene}
 
 @dataclass(frozen=True)
 class Source:
-    """What a capture is made from: views with poses, the step that found them, and what is known about how."""
+    """What a capture is made from: views with poses, the step that found them, and what is known about
+    how.
+    """
 
     posed: Posed
     step: Step
@@ -50,21 +52,35 @@ class Source:
 
 
 def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
-    """Write the capture's folder and say what it came to; none where it is there already, of the same source and options.
+    """Write the capture's folder and say what it came to; none where it is there already, of the same source
+    and options.
 
     Raises:
         UserError: an image cannot be read, or nothing tells where the scene is.
     """
     work, posed = options.out / WORK, source.posed
     step = begin(work / "views", source.step, undistort=options.undistort)
-    asked = {"test_every": options.test_every, "dense": options.dense, "also": options.also, "auto": options.auto}
+    asked = {
+        "test_every": options.test_every,
+        "dense": options.dense,
+        "also": options.also,
+        "auto": options.auto,
+    }
     last = begin(work / "capture", step, **asked)
     if last.result is not None and recognise(options.out):
         return None
-    known = source.points.position[reliable(source.points)] if source.points is not None and len(source.points) else None
+    known = (
+        source.points.position[reliable(source.points)]
+        if source.points is not None and len(source.points)
+        else None
+    )
     if step.result is None:
-        views = write_views(posed, step.folder, options.undistort, open_bar("writing images", len(posed.views)).advance)
-        box = SceneBox(posed.normalisation, posed.scene_from) if posed.normalisation else find_box(views, known)
+        views = write_views(
+            posed, step.folder, options.undistort, open_bar("writing images", len(posed.views)).advance
+        )
+        box = (
+            SceneBox(posed.normalisation, posed.scene_from) if posed.normalisation else find_box(views, known)
+        )
         files = CaptureFiles(step.folder, views, box.normalisation, scene_from=box.source)
         write_capture(step.folder, files, response="linear" if posed.linear else "srgb")
         step.complete({})
@@ -81,7 +97,9 @@ def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
     return _publish(source, prepared, cloud, kind, problems(inspection), options, last)
 
 
-def _cloud(source: Source, prepared: Capture, options: Prepare, after: Step, open_bar: Bars) -> tuple[WorldPoints, str]:
+def _cloud(
+    source: Source, prepared: Capture, options: Prepare, after: Step, open_bar: Bars
+) -> tuple[WorldPoints, str]:
     """The oriented points, and what they are."""
     if options.dense:
         step = begin(options.out / WORK / "dense", after, views=[view.name for view in prepared.views])
@@ -94,7 +112,9 @@ def _cloud(source: Source, prepared: Capture, options: Prepare, after: Step, ope
         return without_outliers(read_oriented_ply(source.posed.cloud)), "those of the images' own capture"
     if source.points is not None:
         return oriented(source.points), "sparse: structure from motion"
-    return WorldPoints(np.empty((0, 3)), np.empty((0, 3))), "none: poses came without points; --dense makes them"
+    return WorldPoints(
+        np.empty((0, 3)), np.empty((0, 3))
+    ), "none: poses came without points; --dense makes them"
 
 
 def _publish(
@@ -143,7 +163,9 @@ def _publish(
 
 def _moved(view: View, old: Path, new: Path) -> View:
     moved = {
-        name: path and new / path.relative_to(old) for name in ("image", "mask", "valid") for path in [getattr(view, name)]
+        name: path and new / path.relative_to(old)
+        for name in ("image", "mask", "valid")
+        for path in [getattr(view, name)]
     }
     return replace(view, **moved)
 

@@ -1,8 +1,8 @@
 """Features and matches: SIFT on the CPU, pairs compared and verified, all kept in COLMAP's database.
 
-The database grows image by image and pair by pair, and COLMAP passes over what it holds, so an interrupted step goes on
-where it stopped. It is read by COLMAP's own SQLite only: beside a second copy of SQLite in the process, such as Python's,
-neither sees the other's locks, and the process dies.
+The database grows image by image and pair by pair, and COLMAP passes over what it holds, so an interrupted
+step goes on where it stopped. It is read by COLMAP's own SQLite only: beside a second copy of SQLite in the
+process, such as Python's, neither sees the other's locks, and the process dies.
 """
 
 from __future__ import annotations
@@ -88,7 +88,9 @@ def extract_features(
         in_background(extract, lambda: progress(sum(map(bool, _features(watched).values())), len(photos)))
 
 
-def match_features(database: Path, pairing: Pairing, work: Path, progress: Callable[[int, int], None]) -> None:
+def match_features(
+    database: Path, pairing: Pairing, work: Path, progress: Callable[[int, int], None]
+) -> None:
     """Compare pairs of images and verify them by their epipolar geometry.
 
     Args:
@@ -106,10 +108,14 @@ def match_features(database: Path, pairing: Pairing, work: Path, progress: Calla
     if sum(count > 0 for count in counts.values()) < 2:
         raise UserError(
             "no features in the images",
-            "structure from motion needs texture: put printed paper around the object, or check that images are not black",
+            "structure from motion needs texture: put printed paper around the object, or check that images "
+            "are not black",
         )
     pairs = images * (images - 1) // 2
-    expected = min({"exhaustive": pairs, "sequential": images * NEIGHBOURS, "vocabulary": images * LOOK_ALIKES}[pairing], pairs)
+    expected = min(
+        {"exhaustive": pairs, "sequential": images * NEIGHBOURS, "vocabulary": images * LOOK_ALIKES}[pairing],
+        pairs,
+    )
 
     def match(token: pycolmap.CancellationToken) -> None:
         known = {"device": pycolmap.Device.cpu, "cancellation_token": token}
@@ -118,7 +124,9 @@ def match_features(database: Path, pairing: Pairing, work: Path, progress: Calla
         elif pairing == "sequential":
             pycolmap.match_sequential(database, pairing_options=_sequential(), **known)
         else:
-            pycolmap.match_vocabtree(database, pairing_options=_vocabulary(database, work / "vocabulary.bin"), **known)
+            pycolmap.match_vocabtree(
+                database, pairing_options=_vocabulary(database, work / "vocabulary.bin"), **known
+            )
 
     with closing(pycolmap.Database.open(database)) as watched:
         in_background(match, lambda: progress(min(watched.num_matched_image_pairs(), expected), expected))

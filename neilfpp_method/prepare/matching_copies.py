@@ -1,7 +1,7 @@
 """8-bit copies of the photographs, for finding features: COLMAP reads no EXR and no RAW.
 
-All linear images are shown at one exposure, so that a point looks alike wherever it is seen; differences in the camera's own
-exposure are divided out. Display values are copied as they are.
+All linear images are shown at one exposure, so that a point looks alike wherever it is seen; differences in
+the camera's own exposure are divided out. Display values are copied as they are.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ BRIGHT, SHOWN_AT = 90.0, 0.7
 
 
 def write_copies(photos: Photos, folder: Path, advance: Callable[[], None]) -> tuple[str, ...]:
-    """Write `folder/NAME.png` for every photograph that has none yet; returns what is wrong with those that cannot be read.
+    """Write `folder/NAME.png` for every photograph that has none yet; returns what is wrong with those that
+    cannot be read.
 
     Args:
         photos: the photographs.
@@ -52,7 +53,9 @@ def write_copies(photos: Photos, folder: Path, advance: Callable[[], None]) -> t
 
 
 def relative_exposures(photos: Photos) -> dict[str, float]:
-    """The exposure of each photograph in units of their median, by name; all 1 unless EXIF says it for every one."""
+    """The exposure of each photograph in units of their median, by name; all 1 unless EXIF says it for every
+    one.
+    """
     known = [photo.exposure for photo in photos.items if photo.exposure is not None]
     if not photos.linear or len(known) < len(photos.items):
         return {photo.name: 1.0 for photo in photos.items}
@@ -64,8 +67,14 @@ def _common_gain(photos: Photos) -> float:
     """The factor that brings the bright end of what a dozen photographs show to a light grey."""
     exposures = relative_exposures(photos)
     step = -(-len(photos.items) // LOOKED_AT)
-    levels = {photo.name: level for photo in photos.items[::step] if (level := _bright_level(photo)) is not None}
-    return SHOWN_AT / float(np.median([level / exposures[name] for name, level in levels.items()])) if levels else 1.0
+    levels = {
+        photo.name: level for photo in photos.items[::step] if (level := _bright_level(photo)) is not None
+    }
+    return (
+        SHOWN_AT / float(np.median([level / exposures[name] for name, level in levels.items()]))
+        if levels
+        else 1.0
+    )
 
 
 def _bright_level(photo: Photo) -> float | None:

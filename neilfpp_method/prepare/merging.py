@@ -1,4 +1,6 @@
-"""Exposure brackets among the photographs: each becomes one linear image, which then stands for its photographs."""
+"""Exposure brackets among the photographs: each becomes one linear image, which then stands for its
+photographs.
+"""
 
 from __future__ import annotations
 
@@ -27,9 +29,10 @@ AS_THEY_ARE = "or take the photographs as they are: --brackets off"
 def brackets_among(photos: Photos, wanted: Literal["auto", "off"]) -> Brackets | None:
     """The brackets that the photographs are; none where they are single pictures.
 
-    A list of brackets or of exposures beside the photographs says that they are brackets. Without one they are where
-    `find_brackets` puts every one of them into a bracket, there are enough poses, and all brackets have the same steps:
-    exposures that the camera chose for each picture do not. A bracket with a photograph that cannot be read is left out.
+    A list of brackets or of exposures beside the photographs says that they are brackets. Without one they
+    are where `find_brackets` puts every one of them into a bracket, there are enough poses, and all brackets
+    have the same steps: exposures that the camera chose for each picture do not. A bracket with a photograph
+    that cannot be read is left out.
 
     Raises:
         UserError: there is a list, and the photographs are no brackets, or too few.
@@ -46,13 +49,19 @@ def brackets_among(photos: Photos, wanted: Literal["auto", "off"]) -> Brackets |
         raise UserError(error.problem, f"{error.remedy}, {AS_THEY_ARE}") from error
     photographs = {photo.path for photo in photos.items}
     used = {path for bracket in found.values() for path in bracket if path not in photos.unreadable}
-    found = {name: bracket for name, bracket in found.items() if not any(path in photos.unreadable for path in bracket)}
+    found = {
+        name: bracket
+        for name, bracket in found.items()
+        if not any(path in photos.unreadable for path in bracket)
+    }
     if listed is not None:
         if strange := sorted(used - photographs):
             raise UserError(f"{listed}: {strange[0]} is no photograph that can be read", "correct the list")
         if len(found) < FEWEST:
             problem = f"{listed}: {len(found)} bracket{'s' * (len(found) != 1)}"
-            raise UserError(problem, f"give at least {FEWEST}, better 30, from all around the object, {AS_THEY_ARE}")
+            raise UserError(
+                problem, f"give at least {FEWEST}, better 30, from all around the object, {AS_THEY_ARE}"
+            )
         return found
     return found if used == photographs and len(found) >= FEWEST and _same_steps(found) else None
 
@@ -73,7 +82,11 @@ class Merged:
 
 
 def merge_photos(
-    photos: Photos, brackets: Brackets, response: Literal["auto", "linear", "srgb"], folder: Path, open_bar: Bars
+    photos: Photos,
+    brackets: Brackets,
+    response: Literal["auto", "linear", "srgb"],
+    folder: Path,
+    open_bar: Bars,
 ) -> Merged:
     """Merge brackets, as a step.
 
@@ -109,8 +122,12 @@ def merge_photos(
     return Merged(replace(photos, root=folder, items=tuple(items), linear=True), step, remark)
 
 
-def _merge(brackets: Brackets, folder: Path, response: Literal["auto", "linear", "srgb"], bar: Bar) -> dict[str, float]:
-    """Merge what is not merged yet; returns by how many pixels the photographs of each pose were moved, now or before."""
+def _merge(
+    brackets: Brackets, folder: Path, response: Literal["auto", "linear", "srgb"], bar: Bar
+) -> dict[str, float]:
+    """Merge what is not merged yet; returns by how many pixels the photographs of each pose were moved, now
+    or before.
+    """
     known = folder / MOVED
     moved = dict(Entry.load(known).entries()) if known.is_file() else {}
 

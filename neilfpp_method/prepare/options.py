@@ -18,17 +18,25 @@ class Prepare:
     images: tyro.conf.Positional[Path]
     """The folder of photographs; sub-folders count. A capture with poses keeps them."""
     out: Path
-    """The capture's folder. Steps that are done are kept in its folder work, so that a stopped command continues."""
+    """The capture's folder. Steps that are done are kept in its folder work, so that a stopped command
+    continues.
+    """
     matching: Literal["auto", "exhaustive", "sequential", "vocabulary"] = "auto"
-    """Which pairs are compared: all, neighbours in the order of the names, or look-alikes; auto: all up to 200 images,
-    look-alikes beyond."""
+    """Which pairs are compared: all, neighbours in the order of the names, or look-alikes; auto: all up to
+    200 images, look-alikes beyond.
+    """
     cameras: Literal["auto", "shared", "folder", "image"] = "auto"
-    """Which images share focal length and distortion: all, those of a folder, or none; auto: those of one size, camera
-    and focal length in EXIF."""
-    camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = "SIMPLE_RADIAL"
+    """Which images share focal length and distortion: all, those of a folder, or none; auto: those of one
+    size, camera and focal length in EXIF.
+    """
+    camera_model: Literal[
+        "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"
+    ] = "SIMPLE_RADIAL"
     """COLMAP's model of the lens that is estimated."""
     response: Literal["auto", "linear", "srgb"] = "auto"
-    """What the pixels are: linear radiance (HDR) or sRGB (LDR); auto: floating-point and RAW files are linear."""
+    """What the pixels are: linear radiance (HDR) or sRGB (LDR); auto: floating-point and RAW files are
+    linear.
+    """
     brackets: Literal["auto", "off"] = "auto"
     """Merge exposure brackets into linear images first; auto: where the folder is one of brackets."""
     undistort: bool = False
@@ -36,9 +44,13 @@ class Prepare:
     dense: bool = False
     """Compute a dense oriented cloud by plane-sweep stereo; otherwise the sparse points are used."""
     test_every: int | None = None
-    """Hold out every k-th view for testing, 0 none; none given: the split that poses came with, or every 8th."""
+    """Hold out every k-th view for testing, 0 none; none given: the split that poses came with, or every
+    8th.
+    """
     auto: bool = False
-    """Leave out the views that `neilfpp inspect` proposes to: black or blurred ones, and pictures that are there twice."""
+    """Leave out the views that `neilfpp inspect` proposes to: black or blurred ones, and pictures that are
+    there twice.
+    """
     allow_partial: bool = False
     """Leave out images that cannot be read or placed, however many."""
     also: tuple[Literal["nerfstudio", "neilf"], ...] = ()

@@ -1,4 +1,6 @@
-"""The photographs of a folder: which files, under which names, and what their headers and EXIF entries say."""
+"""The photographs of a folder: which files, under which names, and what their headers and EXIF entries
+say.
+"""
 
 from __future__ import annotations
 
@@ -30,10 +32,10 @@ FILM_WIDTH = 36.0
 class Photo:
     """A photograph that is to become a view.
 
-    `exposure` is the light that the picture took in, relative to the others, where EXIF says it. `device` names camera
-    and focal length as far as EXIF does, `focal` is the focal length in units of the image's longer side. `held` is EXIF's
-    orientation: pixels stay as the sensor has them, but it tells which way is up. `valid` is a validity mask, where there is
-    one.
+    `exposure` is the light that the picture took in, relative to the others, where EXIF says it. `device`
+    names camera and focal length as far as EXIF does, `focal` is the focal length in units of the image's
+    longer side. `held` is EXIF's orientation: pixels stay as the sensor has them, but it tells which way is
+    up. `valid` is a validity mask, where there is one.
     """
 
     name: str
@@ -48,7 +50,9 @@ class Photo:
 
 @dataclass(frozen=True)
 class Photos:
-    """The photographs of a folder in the order of their paths; all of one kind. `unreadable`: what is wrong with others."""
+    """The photographs of a folder in the order of their paths; all of one kind. `unreadable`: what is wrong
+    with others.
+    """
 
     root: Path
     items: tuple[Photo, ...]
@@ -60,8 +64,8 @@ class Photos:
 class Picture:
     """The pixels of a photograph: linear radiance, or display values in [0, 1].
 
-    `valid` is false where a pixel means nothing: saturated in a RAW file, or not a finite number ≥ 0 (these are 0).
-    `alpha` in [0, 1] is the object's mask where the file has one.
+    `valid` is false where a pixel means nothing: saturated in a RAW file, or not a finite number ≥ 0 (these
+    are 0). `alpha` in [0, 1] is the object's mask where the file has one.
     """
 
     pixels: Float32[np.ndarray, "H W 3"]
@@ -70,7 +74,8 @@ class Picture:
 
 
 def survey(root: Path, response: Literal["auto", "linear", "srgb"]) -> Photos:
-    """Find the photographs under a folder and read their headers; hidden files and other files are passed over.
+    """Find the photographs under a folder and read their headers; hidden files and other files are passed
+    over.
 
     Args:
         root: the folder.
@@ -91,8 +96,12 @@ def survey(root: Path, response: Literal["auto", "linear", "srgb"]) -> Photos:
             problems[path] = error.problem
     if len(kinds) < FEWEST:
         count = f"{len(kinds) or 'no'} image{'s' * (len(kinds) != 1)}"
-        also = f", and {len(problems)} that cannot be read ({next(iter(problems.values()))})" if problems else ""
-        raise UserError(f"{root}: {count}{also}", f"give at least {FEWEST}, better 30, from all around the object")
+        also = (
+            f", and {len(problems)} that cannot be read ({next(iter(problems.values()))})" if problems else ""
+        )
+        raise UserError(
+            f"{root}: {count}{also}", f"give at least {FEWEST}, better 30, from all around the object"
+        )
     if response == "auto" and len(set(kinds.values())) > 1:
         hdr, ldr = (next(path for path, kind in kinds.items() if kind is wanted) for wanted in (True, False))
         raise UserError(f"{hdr} is linear and {ldr} is not", "keep images of one kind, or give --response")
@@ -106,7 +115,9 @@ def survey(root: Path, response: Literal["auto", "linear", "srgb"]) -> Photos:
 def unreadable(problems: Sequence[str]) -> UserError:
     """One error for all images that cannot be read."""
     more = f" (and {len(problems) - 1} more such images)" if len(problems) > 1 else ""
-    return UserError(f"{problems[0]}{more}", "export the image again or remove it, or leave it out with --allow-partial")
+    return UserError(
+        f"{problems[0]}{more}", "export the image again or remove it, or leave it out with --allow-partial"
+    )
 
 
 def read_photo(path: Path) -> Picture:
@@ -147,7 +158,9 @@ def check_names(names: Sequence[str], paths: Sequence[Path]) -> None:
 def _photo(root: Path, name: str, path: Path, linear: bool) -> Photo:
     entries, details = _exif(path)
     focal_35mm, focal = (_number(details.get(tag)) for tag in (FOCAL_35MM, FOCAL))
-    device = " ".join(str(part).strip() for part in (entries.get(MAKE), entries.get(MODEL), focal or focal_35mm) if part)
+    device = " ".join(
+        str(part).strip() for part in (entries.get(MAKE), entries.get(MODEL), focal or focal_35mm) if part
+    )
     return Photo(
         name=name,
         path=path,

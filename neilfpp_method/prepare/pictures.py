@@ -1,4 +1,6 @@
-"""A picture of what was found: cameras and points from above and from the side, and how well each image fits."""
+"""A picture of what was found: cameras and points from above and from the side, and how well each image
+fits.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,8 @@ def write_picture(
 def draw_scene(
     views: Sequence[View], test: Collection[str], points: WorldPoints, box: Normalisation
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Cameras as pyramids, points coloured by their normals and the scene's unit sphere, from above and from the side.
+    """Cameras as pyramids, points coloured by their normals and the scene's unit sphere, from above and from
+    the side.
 
     Args:
         views: in the world frame; +z is up in the picture.
@@ -84,7 +87,9 @@ def draw_scene(
 
 
 def draw_fit(placed: Sequence[Placement], width: int) -> UInt8[np.ndarray, "H W 3"]:
-    """A bar per image: its reprojection error in pixels; an image that is not placed has a red bar of full height."""
+    """A bar per image: its reprojection error in pixels; an image that is not placed has a red bar of full
+    height.
+    """
     sheet = Image.new("RGB", (width, FIT_HEIGHT + AXIS + MARGIN), PAPER)
     draw = ImageDraw.Draw(sheet)
     _write(draw, (MARGIN, 0), "reprojection error of each image, pixels", NOTE)
@@ -119,11 +124,21 @@ class _Place:
 
 def _pyramid(camera: Camera, scale: float) -> Float64[np.ndarray, "5 3"]:
     """The eye and the corners of the image, in the world."""
-    corners = np.array([[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], dtype=np.float64)
-    rays = np.pad((corners - camera.intrinsics[2:]) / camera.intrinsics[:2], ((0, 0), (0, 1)), constant_values=1.0)
+    corners = np.array(
+        [[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], dtype=np.float64
+    )
+    rays = np.pad(
+        (corners - camera.intrinsics[2:]) / camera.intrinsics[:2], ((0, 0), (0, 1)), constant_values=1.0
+    )
     rays *= FRUSTUM * scale / np.abs(rays[:, :2]).max()
     return np.concatenate([np.zeros((1, 3)), rays]) @ camera.c2w[:, :3].T + camera.c2w[:, 3]
 
 
-def _write(draw: ImageDraw.ImageDraw, corner: tuple[int, int], text: str, size: int, color: tuple[int, int, int] = INK) -> None:
+def _write(
+    draw: ImageDraw.ImageDraw,
+    corner: tuple[int, int],
+    text: str,
+    size: int,
+    color: tuple[int, int, int] = INK,
+) -> None:
     draw.text(corner, text, font=ImageFont.load_default(size), fill=color)

@@ -33,7 +33,9 @@ NEAREST = 0.05
 
 @dataclass(frozen=True)
 class GreyView:
-    """A view as it is compared: a pinhole, small enough to be searched densely, and its grey values from 0 to 1."""
+    """A view as it is compared: a pinhole, small enough to be searched densely, and its grey values from 0 to
+    1.
+    """
 
     camera: Camera
     grey: Float32[np.ndarray, "H W"]
@@ -42,8 +44,8 @@ class GreyView:
 def grey_view(view: View, linear: bool) -> GreyView:
     """Read a view, undo its lens and scale it down where it has more than 640 pixels a side.
 
-    The square root of luminance evens out the noise of dark and bright pixels. Correlation does not see brightness and
-    contrast, so exposures need no care.
+    The square root of luminance evens out the noise of dark and bright pixels. Correlation does not see
+    brightness and contrast, so exposures need no care.
     """
     image = read_image(view.image).pixels
     usable = np.where(np.isfinite(image) & (image > 0), image, np.float32(0))
@@ -58,13 +60,21 @@ def grey_view(view: View, linear: bool) -> GreyView:
     if (width, height) != (camera.width, camera.height):
         grey = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
         across, down = width / camera.width, height / camera.height
-        scaled = {"fx": camera.fx * across, "cx": camera.cx * across, "fy": camera.fy * down, "cy": camera.cy * down}
+        scaled = {
+            "fx": camera.fx * across,
+            "cx": camera.cx * across,
+            "fy": camera.fy * down,
+            "cy": camera.cy * down,
+        }
         camera = replace(camera, **scaled, width=width, height=height)
     return GreyView(camera, np.ascontiguousarray(grey, np.float32))
 
 
-def choose_sources(cameras: Sequence[Camera], centre: Float64[np.ndarray, " 3"], count: int) -> list[list[int]]:
-    """For each camera at most `count` others to compare it with: those whose angle to it, at the scene's centre, is best.
+def choose_sources(
+    cameras: Sequence[Camera], centre: Float64[np.ndarray, " 3"], count: int
+) -> list[list[int]]:
+    """For each camera at most `count` others to compare it with: those whose angle to it, at the scene's
+    centre, is best.
 
     Wider angles tell depth better, narrower ones show the same picture. A camera may have none.
     """
@@ -78,17 +88,23 @@ def choose_sources(cameras: Sequence[Camera], centre: Float64[np.ndarray, " 3"],
 
 
 def grain(camera: Camera, sources: Sequence[Camera]) -> float:
-    """The difference of inverse depth that moves the picture of the farthest source by a pixel; without sources 0."""
-    return 1.0 / (camera.fx * max(float(np.linalg.norm(s.c2w[:, 3] - camera.c2w[:, 3])) for s in sources)) if sources else 0.0
+    """The difference of inverse depth that moves the picture of the farthest source by a pixel; without
+    sources 0.
+    """
+    return (
+        1.0 / (camera.fx * max(float(np.linalg.norm(s.c2w[:, 3] - camera.c2w[:, 3])) for s in sources))
+        if sources
+        else 0.0
+    )
 
 
 def sweep(reference: GreyView, sources: Sequence[GreyView], box: Normalisation) -> Float32[np.ndarray, "H W"]:
     """The depth of each pixel along the camera's axis, world units; 0 where it is not known.
 
-    Planes across the axis, evenly spaced in inverse depth, lie through the scene's sphere so that neighbours move the
-    picture by a pixel. Each source, warped over a plane, is correlated with the reference in windows; the two best sources
-    count, as others may be hidden. The plane of the highest mean correlation wins, refined by a parabola. Without sources
-    nothing is known.
+    Planes across the axis, evenly spaced in inverse depth, lie through the scene's sphere so that neighbours
+    move the picture by a pixel. Each source, warped over a plane, is correlated with the reference in
+    windows; the two best sources count, as others may be hidden. The plane of the highest mean correlation
+    wins, refined by a parabola. Without sources nothing is known.
     """
     if not sources:
         return np.zeros_like(reference.grey)
@@ -118,7 +134,9 @@ class _Windows:
         return self.variance > FLAT
 
 
-def _planes(reference: GreyView, sources: Sequence[GreyView], box: Normalisation) -> Float64[np.ndarray, " D"]:
+def _planes(
+    reference: GreyView, sources: Sequence[GreyView], box: Normalisation
+) -> Float64[np.ndarray, " D"]:
     camera = reference.camera
     middle = float(camera.w2c[2, :3] @ np.array(box.centre) + camera.w2c[2, 3])
     far = middle + ROOM * box.scale

@@ -1,4 +1,6 @@
-"""Photographs with poses: what every later step works on, whether the poses were found here or came with the images."""
+"""Photographs with poses: what every later step works on, whether the poses were found here or came with the
+images.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,9 @@ __all__ = ["Posed", "posed_by_capture", "posed_by_model", "write_views"]
 
 @dataclass(frozen=True)
 class Posed:
-    """Views whose files lie where they were taken from; `normalisation`, with what told it, and `cloud` where the source knows
-    them."""
+    """Views whose files lie where they were taken from; `normalisation`, with what told it, and `cloud` where
+    the source knows them.
+    """
 
     views: tuple[View, ...]
     linear: bool
@@ -43,7 +46,9 @@ def posed_by_model(photos: Photos, model: pycolmap.Reconstruction) -> Posed:
         if (image := poses.get(photo.name)) is not None:
             w2c = np.concatenate([image.cam_from_world().matrix(), [[0.0, 0.0, 0.0, 1.0]]])
             camera = camera_of(image.camera, w2c, str(photo.path))
-            views.append(View(photo.name, len(views), camera, photo.path, None, photo.valid, exposures[photo.name]))
+            views.append(
+                View(photo.name, len(views), camera, photo.path, None, photo.valid, exposures[photo.name])
+            )
     return Posed(tuple(views), photos.linear)
 
 

@@ -1,4 +1,6 @@
-"""The points of structure from motion as an oriented cloud: outliers out, normals by the neighbours, turned to the cameras."""
+"""The points of structure from motion as an oriented cloud: outliers out, normals by the neighbours, turned
+to the cameras.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +24,9 @@ FLAT = 0.1
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """Points with what is known of each: its reprojection error in pixels, in how many images it is, and the unit mean of the
-    directions to the cameras that see it."""
+    """Points with what is known of each: its reprojection error in pixels, in how many images it is, and the
+    unit mean of the directions to the cameras that see it.
+    """
 
     position: Float64[np.ndarray, "P 3"]
     error: Float64[np.ndarray, " P"]
@@ -56,8 +59,14 @@ def sparse_points(model: pycolmap.Reconstruction) -> SparsePoints:
 
 
 def reliable(points: SparsePoints) -> Bool[np.ndarray, " P"]:
-    """Which points can be trusted: seen in at least 3 images, within 2 pixels of where they should be, and not alone."""
-    good = (points.error <= LARGEST_ERROR) & (points.track >= SHORTEST_TRACK) & np.isfinite(points.position).all(axis=1)
+    """Which points can be trusted: seen in at least 3 images, within 2 pixels of where they should be, and
+    not alone.
+    """
+    good = (
+        (points.error <= LARGEST_ERROR)
+        & (points.track >= SHORTEST_TRACK)
+        & np.isfinite(points.position).all(axis=1)
+    )
     good[good] = _in_company(points.position[good])
     return good
 
@@ -82,8 +91,8 @@ def estimate_normals(
 ) -> tuple[Float64[np.ndarray, "P 3"], Bool[np.ndarray, " P"]]:
     """Unit normals on the side of `towards`, and where the neighbours are flat enough to mean one.
 
-    The normal is the direction in which the nearest neighbours spread least; the surroundings are flat where that spread,
-    a variance, is at most a tenth of the next larger one.
+    The normal is the direction in which the nearest neighbours spread least; the surroundings are flat where
+    that spread, a variance, is at most a tenth of the next larger one.
     """
     neighbours = cKDTree(position).query(position, k=NEIGHBOURS + 1)[1]
     spread = position[neighbours] - position[neighbours].mean(axis=1, keepdims=True)
@@ -94,13 +103,16 @@ def estimate_normals(
 
 
 def _in_company(position: Float64[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
-    """Which points have neighbours no farther away, in the mean, than is common among all: by 3 deviations of the logarithm.
+    """Which points have neighbours no farther away, in the mean, than is common among all: by 3 deviations of
+    the logarithm.
 
     The median and the median deviation tell what is common, so that outliers have no say in it.
     """
     if len(position) <= NEIGHBOURS:
         return np.ones(len(position), dtype=bool)
-    distance = np.log(np.maximum(cKDTree(position).query(position, k=NEIGHBOURS + 1)[0][:, 1:].mean(axis=1), 1e-12))
+    distance = np.log(
+        np.maximum(cKDTree(position).query(position, k=NEIGHBOURS + 1)[0][:, 1:].mean(axis=1), 1e-12)
+    )
     middle = np.median(distance)
     deviation = 1.4826 * np.median(np.abs(distance - middle))
     return distance <= middle + FAR * max(deviation, 1e-3)

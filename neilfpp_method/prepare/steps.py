@@ -1,7 +1,8 @@
-"""Steps that are done once: each has a folder, and a marker that says of what it was made and that it is complete.
+"""Steps that are done once: each has a folder, and a marker that says of what it was made and that it is
+complete.
 
-A marker is written in one step when the work is done. A step whose inputs have changed since starts from an empty folder,
-one that was interrupted goes on with what its folder holds.
+A marker is written in one step when the work is done. A step whose inputs have changed since starts from an
+empty folder, one that was interrupted goes on with what its folder holds.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ VERSION = 2
 
 @dataclass(frozen=True)
 class Step:
-    """A step of the work. `result` is what it left when it was completed; none: it is still to do, or to go on with."""
+    """A step of the work. `result` is what it left when it was completed; none: it is still to do, or to go
+    on with.
+    """
 
     folder: Path
     inputs: str
@@ -46,7 +49,9 @@ def begin(folder: Path, after: Step | None = None, **inputs: Any) -> Step:
         after: the step before, whose inputs are inputs of this one, too.
         inputs: all else that the step's outcome follows from, as JSON.
     """
-    made_of = hashlib.sha256(json.dumps([VERSION, after and after.inputs, inputs], sort_keys=True).encode()).hexdigest()
+    made_of = hashlib.sha256(
+        json.dumps([VERSION, after and after.inputs, inputs], sort_keys=True).encode()
+    ).hexdigest()
     marker = _marker(folder)
     if marker.get("inputs") != made_of:
         if folder.exists():

@@ -23,8 +23,9 @@ LARGE_ERROR = 1.5
 
 @dataclass(frozen=True)
 class Placement:
-    """An image in the model: how many features it has, how many of them became points, and how far off in pixels, in the
-    mean, these are; none where the image is not placed."""
+    """An image in the model: how many features it has, how many of them became points, and how far off in
+    pixels, in the mean, these are; none where the image is not placed.
+    """
 
     name: str
     features: int
@@ -34,8 +35,9 @@ class Placement:
 
 @dataclass(frozen=True)
 class Summary:
-    """The outcome. `placements` is empty and `models` too where poses came with the images. `remarks` are what a person should
-    know, `problems` what `neilfpp inspect` says spoils or prevents a result."""
+    """The outcome. `placements` is empty and `models` too where poses came with the images. `remarks` are
+    what a person should know, `problems` what `neilfpp inspect` says spoils or prevents a result.
+    """
 
     placements: tuple[Placement, ...]
     models: tuple[int, ...]
@@ -59,10 +61,16 @@ class Summary:
         """For people."""
         lines = []
         if self.placements:
-            lines.append(f"{self.views} of {len(self.placements)} images placed, reprojection error {self.error:.2f} pixels")
+            lines.append(
+                f"{self.views} of {len(self.placements)} images placed, reprojection error {self.error:.2f} "
+                "pixels"
+            )
         else:
             lines.append(f"{self.views} views, with the poses that they came with")
-        lines += [f"camera {camera['model']}: {camera['images']} images, {_parameters(camera)}" for camera in self.cameras]
+        lines += [
+            f"camera {camera['model']}: {camera['images']} images, {_parameters(camera)}"
+            for camera in self.cameras
+        ]
         lines.append(f"point cloud: {self.points} points with normals ({self.cloud})")
         lines.append(f"radius of the scene: {self.radius:.4g}{FOUND[self.scene_from]}")
         return [*lines, *(f"note: {remark}" for remark in self.remarks), *self.problems]
@@ -76,7 +84,9 @@ def placements(features: Mapping[str, int], model: pycolmap.Reconstruction) -> t
         points = [model.point3D(p.point3D_id) for p in image.points2D if p.has_point3D()]
         error = float(np.mean([point.error for point in points])) if points else 0.0
         found[image.name.removesuffix(".png")] = (len(points), error)
-    return tuple(Placement(name, count, *found.get(name, (None, None))) for name, count in sorted(features.items()))
+    return tuple(
+        Placement(name, count, *found.get(name, (None, None))) for name, count in sorted(features.items())
+    )
 
 
 def describe_cameras(model: pycolmap.Reconstruction) -> tuple[dict[str, Any], ...]:
@@ -101,13 +111,18 @@ def write_summary(path: Path, summary: Summary) -> None:
         temporary.write_text(json.dumps(entries, indent=1, allow_nan=False) + "\n", "utf-8")
 
 
-def remarks_on(placed: Sequence[Placement], models: Sequence[int], cameras: Sequence[Mapping[str, Any]]) -> list[str]:
+def remarks_on(
+    placed: Sequence[Placement], models: Sequence[int], cameras: Sequence[Mapping[str, Any]]
+) -> list[str]:
     """What a person should know about a model that is good enough."""
     remarks = []
     if missing := [p.name for p in placed if p.points is None]:
         remarks.append(f"not placed, and left out: {', '.join(missing)}")
     if len(models) > 1:
-        remarks.append(f"the images fell into {len(models)} models of {', '.join(map(str, models))} images; the first is used")
+        remarks.append(
+            f"the images fell into {len(models)} models of {', '.join(map(str, models))} images; the first "
+            "is used"
+        )
     if poor := [p.name for p in placed if p.features < FEW_FEATURES]:
         remarks.append(f"fewer than {FEW_FEATURES} features in {', '.join(poor)}")
     if off := [p.name for p in placed if (p.error or 0.0) > LARGE_ERROR]:

@@ -17,14 +17,16 @@ HELD = {
     6: np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
     8: np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
 }
-"""By EXIF's orientation, where the camera was not held level: from its axes to those of the picture as people look at it."""
+"""By EXIF's orientation, where the camera was not held level: from its axes to those of the picture as people
+look at it.
+"""
 
 
 def upright_rotation(rotations: Float64[np.ndarray, "N 3 3"]) -> Float64[np.ndarray, "3 3"]:
     """The rotation of the world after which the cameras, taken together, stand upright about +z.
 
-    Cameras that are held level have their x axes in the ground plane, so up is the direction across all x axes. Where these
-    do not span a plane, the mean of the cameras' own up directions has to do.
+    Cameras that are held level have their x axes in the ground plane, so up is the direction across all x
+    axes. Where these do not span a plane, the mean of the cameras' own up directions has to do.
 
     Args:
         rotations: world to camera.
@@ -47,10 +49,13 @@ def turn_upright(model: pycolmap.Reconstruction, held: Mapping[str, int]) -> Non
 
     Args:
         model: with placed images.
-        held: EXIF's orientation of each image, by its name in the model: a camera on its side has its x axis upright.
+        held: EXIF's orientation of each image, by its name in the model: a camera on its side has its x axis
+            upright.
     """
     images = [model.image(i) for i in model.reg_image_ids()]
     turns = [HELD.get(held[image.name], np.eye(3)) for image in images]
-    rotations = np.stack([q @ image.cam_from_world().rotation.matrix() for q, image in zip(turns, images, strict=True)])
+    rotations = np.stack(
+        [q @ image.cam_from_world().rotation.matrix() for q, image in zip(turns, images, strict=True)]
+    )
     turn = pycolmap.Rotation3d(upright_rotation(rotations))
     model.transform(pycolmap.Sim3d(1.0, turn, np.zeros(3)))

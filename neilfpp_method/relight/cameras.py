@@ -88,7 +88,9 @@ def resized(camera: Camera, factor: float) -> Camera:
     """
     width, height = round(camera.width * factor), round(camera.height * factor)
     if not (1 <= width <= MOST_SIDE and 1 <= height <= MOST_SIDE):
-        raise UserError(f"a picture of {width}×{height} pixels", f"choose --scale or --width for 1 to {MOST_SIDE} a side")
+        raise UserError(
+            f"a picture of {width}×{height} pixels", f"choose --scale or --width for 1 to {MOST_SIDE} a side"
+        )
     x, y = width / camera.width, height / camera.height
     sizes = {"fx": camera.fx * x, "cx": camera.cx * x, "fy": camera.fy * y, "cy": camera.cy * y}
     return replace(camera, **sizes, width=width, height=height)
@@ -105,7 +107,9 @@ def rays_through(camera: Camera, points: Float[Tensor, "N 2"]) -> tuple[RayBatch
     pose = camera.c2w
     directions = (local / np.linalg.norm(local, axis=1, keepdims=True)) @ pose[:, :3].T
     origins = np.broadcast_to(pose[:, 3], directions.shape)
-    rays = RayBatch(*(torch.from_numpy(part.astype(np.float32)).to(points.device) for part in (origins, directions)))
+    rays = RayBatch(
+        *(torch.from_numpy(part.astype(np.float32)).to(points.device) for part in (origins, directions))
+    )
     return rays, torch.from_numpy(shown).to(points.device)
 
 

@@ -100,7 +100,9 @@ def relight(
     folders = {name: PictureFolder(out / name, _settings(request, run, name)) for name in lights}
     truths = [find_truth(folder, [shot.view for shot in shots]) for folder in request.truth]
     materials = _materials(request, run)
-    missing = {name: [s for s in shots if request.force or not folder.has(s)] for name, folder in folders.items()}
+    missing = {
+        name: [s for s in shots if request.force or not folder.has(s)] for name, folder in folders.items()
+    }
     if any(missing.values()):
         surface = surface_of_run(run, request.resolution)
         lamps = lamps_of_run(run.model.lamps) if _with_lamps(request) else None
@@ -133,16 +135,22 @@ def _check(request: Request) -> None:
         if value is not None and not (0 < value < float("inf")):
             raise UserError(f"{option} is {value}", "give a positive number")
     if request.bounces > 64:
-        raise UserError(f"--bounces is {request.bounces}", "give 64 or fewer: what is left is a share below 1e-3")
+        raise UserError(
+            f"--bounces is {request.bounces}", "give 64 or fewer: what is left is a share below 1e-3"
+        )
     if not all(np.isfinite(value) for value in (request.rotate, request.exposure)):
         raise UserError("--rotate and --exposure are not finite", "give degrees and stops")
     if request.scale is not None and request.width is not None:
         raise UserError("--scale and --width both say how large", "give one of them")
     if request.box is not None and not request.edits:
-        raise UserError("--box without --set limits nothing", "say what changes within it, as --set roughness=0.2")
+        raise UserError(
+            "--box without --set limits nothing", "say what changes within it, as --set roughness=0.2"
+        )
     if request.truth:
         if request.views == "turntable" or request.scale is not None or request.width is not None:
-            raise UserError("true images are of views in full size", "leave --views turntable, --scale and --width out")
+            raise UserError(
+                "true images are of views in full size", "leave --views turntable, --scale and --width out"
+            )
         if len(request.truth) != max(1, len(request.env)):
             raise UserError(
                 f"{len(request.truth)} folders of true images for {len(request.env)} maps",
@@ -169,10 +177,14 @@ def _lights(request: Request, run: Run, say: Callable[[str], None]) -> dict[str,
     device = next(run.model.parameters()).device
     if not request.env:
         if not isinstance(run.model.light, EnvironmentLight):
-            raise UserError(f"{run.path}: the light of this run is no environment map", "name a map with --env MAP.exr")
+            raise UserError(
+                f"{run.path}: the light of this run is no environment map", "name a map with --env MAP.exr"
+            )
         sky = sky_of_run(run.model.light)
         start = sky.start - np.radians(request.rotate)
-        return {OWN: dataclasses.replace(sky, radiance=sky.radiance * 2.0**request.exposure, start=float(start))}
+        return {
+            OWN: dataclasses.replace(sky, radiance=sky.radiance * 2.0**request.exposure, start=float(start))
+        }
     lights = {}
     for name, path in zip(map_names(request.env), request.env, strict=True):
         read = read_map(path, request.env_layout, request.rotate, request.exposure)
@@ -244,7 +256,9 @@ def _before_sky(picture: Picture, sky: Sky, shot: Shot) -> Picture:
     rays, shown = rays_through(shot.camera, torch.stack((pixel % width, pixel // width), -1) + 0.5)
     behind = (sky.look(rays.directions) * shown[:, None]).view(height, width, 3)
     opaque = torch.ones_like(picture.alpha)
-    return dataclasses.replace(picture, radiance=picture.radiance + (1 - picture.alpha) * behind, alpha=opaque)
+    return dataclasses.replace(
+        picture, radiance=picture.radiance + (1 - picture.alpha) * behind, alpha=opaque
+    )
 
 
 def _measure(run: Run, folder: PictureFolder, shots: Sequence[Shot], truth: Mapping[str, Path]) -> str:
@@ -257,4 +271,6 @@ def _measure(run: Run, folder: PictureFolder, shots: Sequence[Shot], truth: Mapp
     figures = (found.figures[f"{name}_scaled"] for name in ("relight_psnr", "baseline_psnr"))
     scaled, baseline = (f"{figure:.2f} dB" for figure in figures)
     plain = f"PSNR {found.figures['relight_psnr']:.2f} dB"
-    return f"{folder.path.name}: {plain}, scale aligned {scaled} (the training image of each view: {baseline})"
+    return (
+        f"{folder.path.name}: {plain}, scale aligned {scaled} (the training image of each view: {baseline})"
+    )

@@ -61,7 +61,9 @@ def find_truth(folder: Path, views: Sequence[View]) -> dict[str, Path]:
     for view in views:
         files = [path for suffix in IMAGE_SUFFIXES if (path := folder / f"{view.name}{suffix}").is_file()]
         if not files:
-            raise UserError(f"{folder}: no true image of the view {view.name}", f"name it {view.name}.exr, or .png")
+            raise UserError(
+                f"{folder}: no true image of the view {view.name}", f"name it {view.name}.exr, or .png"
+            )
         header = image_header(files[0])
         if (header.width, header.height) != (view.camera.width, view.camera.height):
             wanted = f"{view.camera.width}×{view.camera.height}"
@@ -109,7 +111,9 @@ def compare(
     pairs = zip(opacity, truth, strict=True)
     masks = [seen > 0.5 if true.mask is None else true.mask for seen, true in pairs]
     if not any(mask.any() for mask in masks):
-        raise UserError("no pixel of the true images shows a surface", "give images of the views, with their masks")
+        raise UserError(
+            "no pixel of the true images shows a surface", "give images of the views, with their masks"
+        )
     images, names = [true.image for true in truth], [true.name for true in truth]
     figures, views, scale = _figures("relight", relit, images, masks, names)
     baseline, _, _ = _figures("baseline", [true.photograph for true in truth], images, masks, names)
@@ -125,7 +129,10 @@ def _figures(
     names: Sequence[str],
 ) -> tuple[dict[str, float], dict[str, float], tuple[float, ...]]:
     """Means over the views that have pixels, the scaled PSNR of each, and the factors."""
-    pooled = [np.concatenate([image[mask] for image, mask in zip(side, masks, strict=True)]) for side in (estimates, images)]
+    pooled = [
+        np.concatenate([image[mask] for image, mask in zip(side, masks, strict=True)])
+        for side in (estimates, images)
+    ]
     scale = metrics.align_scale(*pooled)
     scores: dict[str, list[float]] = {}
     views = {}

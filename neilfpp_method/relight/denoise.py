@@ -31,7 +31,8 @@ def denoised(picture: Picture) -> Picture:
     """
     oidn = _library()
     color, albedo, normal = (
-        np.ascontiguousarray(part.cpu().numpy(), np.float32) for part in (picture.radiance, picture.albedo, picture.normal)
+        np.ascontiguousarray(part.cpu().numpy(), np.float32)
+        for part in (picture.radiance, picture.albedo, picture.normal)
     )
     result = np.empty_like(color)
     with oidn.Device(oidn.OIDN_DEVICE_TYPE_CPU) as device:

@@ -59,7 +59,9 @@ def scene_box(corners: Sequence[float], normalisation: Normalisation) -> Box:
     ends = torch.tensor(corners, dtype=torch.float64).view(2, 3)
     low, high = ends.amin(0), ends.amax(0)
     if not ends.isfinite().all() or (low == high).any():
-        raise UserError("--box has no inside", "give two opposite corners, x y z x y z, in the capture's world frame")
+        raise UserError(
+            "--box has no inside", "give two opposite corners, x y z x y z, in the capture's world frame"
+        )
     return Box(normalisation.to_scene(low).float(), normalisation.to_scene(high).float())
 
 
@@ -84,7 +86,9 @@ def _parse(text: str) -> Edit:
     name, equals, numbers = text.partition("=")
     name = name.strip()
     if not equals or name not in CHANNELS:
-        raise UserError(f"--set {text}: no such parameter", f"write one of {', '.join(CHANNELS)}, then = and a number")
+        raise UserError(
+            f"--set {text}: no such parameter", f"write one of {', '.join(CHANNELS)}, then = and a number"
+        )
     try:
         value = tuple(float(number) for number in numbers.split(","))
     except ValueError:

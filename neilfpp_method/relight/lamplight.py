@@ -68,7 +68,9 @@ class Lamplight:
         (N, 3) from there."""
         return self._met(x, wi, torch.full_like(x[:, 0], lamp, dtype=torch.int64))
 
-    def _met(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N 3"], lamp: Int[Tensor, " N"]) -> tuple[Tensor, Tensor]:
+    def _met(
+        self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N 3"], lamp: Int[Tensor, " N"]
+    ) -> tuple[Tensor, Tensor]:
         offset = self.position[lamp] - x
         along = (offset * wi).sum(-1)
         miss = (offset - along[:, None] * wi).square().sum(-1)
@@ -102,7 +104,9 @@ def lamps_of_run(lamps: Lamps | None) -> Lamplight | None:
     if lamps is None or not lamps.lit or not lamps.radiance().any():
         return None
     lit = slice(lamps.lit)
-    return Lamplight(lamps.position[lit].clone(), lamps.axis[lit].clone(), lamps.radiance().clone(), lamps.radius)
+    return Lamplight(
+        lamps.position[lit].clone(), lamps.axis[lit].clone(), lamps.radiance().clone(), lamps.radius
+    )
 
 
 def _density(one_less_cosine: Float[Tensor, " N"]) -> Float[Tensor, " N"]:

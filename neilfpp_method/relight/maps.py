@@ -79,10 +79,14 @@ def read_map(path: Path, layout: Layout, rotate: float = 0.0, exposure: float = 
         raise UserError(f"{path}: a texel is NaN or infinite", "store linear radiance, from 0 on")
     negative = radiance < 0
     if radiance.amin() < -RINGING * radiance.mean().clamp_min(0):
-        raise UserError(f"{path}: a texel is negative ({radiance.amin():.3g})", "store linear radiance, from 0 on")
+        raise UserError(
+            f"{path}: a texel is negative ({radiance.amin():.3g})", "store linear radiance, from 0 on"
+        )
     radiance = radiance.clamp_min(0).expand(-1, -1, 3) * 2.0**exposure
     if not (radiance.any() and radiance.isfinite().all()):
-        raise UserError(f"{path}: the environment map is black, or beyond all numbers", "see to --exposure and to the map")
+        raise UserError(
+            f"{path}: the environment map is black, or beyond all numbers", "see to --exposure and to the map"
+        )
     start = -math.radians(rotate) - (QUARTER_TURN if layout == "common" else 0.0)
     sky = Sky(radiance.contiguous(), rows_at_poles=layout == "ours", start=start)
     return LightMap(sky, int(negative.sum()))
@@ -97,7 +101,10 @@ def map_names(paths: Sequence[Path]) -> list[str]:
     """
     stems = [path.stem for path in paths]
     folders = [path.absolute().parent.name for path in paths]
-    names = [f"{folder}-{stem}" if stems.count(stem) > 1 else stem for folder, stem in zip(folders, stems, strict=True)]
+    names = [
+        f"{folder}-{stem}" if stems.count(stem) > 1 else stem
+        for folder, stem in zip(folders, stems, strict=True)
+    ]
     for path, name in zip(paths, names, strict=True):
         if names.count(name) > 1:
             raise UserError(f"{path}: two maps of this name", "rename one of them")

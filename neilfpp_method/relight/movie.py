@@ -29,7 +29,9 @@ def write_movie(path: Path, pictures: Sequence[Path]) -> None:
     with replacing(path) as temporary:
         (_by_ffmpeg if _has_ffmpeg() else _by_opencv)(temporary, pictures)
         if not temporary.is_file() or not temporary.stat().st_size:
-            raise UserError(f"{path}: no MP4 encoder here", "install imageio-ffmpeg, or make a film of the PNG files")
+            raise UserError(
+                f"{path}: no MP4 encoder here", "install imageio-ffmpeg, or make a film of the PNG files"
+            )
 
 
 def _frames(pictures: Sequence[Path]) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
@@ -58,7 +60,9 @@ def _by_ffmpeg(path: Path, pictures: Sequence[Path]) -> None:
     for frame in _frames(pictures):
         if writer is None:
             size = (frame.shape[1], frame.shape[0])
-            writer = imageio_ffmpeg.write_frames(str(path), size, fps=FRAMES_PER_SECOND, quality=8, macro_block_size=2)
+            writer = imageio_ffmpeg.write_frames(
+                str(path), size, fps=FRAMES_PER_SECOND, quality=8, macro_block_size=2
+            )
             writer.send(None)
         writer.send(frame)
     if writer is not None:

@@ -75,7 +75,9 @@ def power_heuristic(own: Float[Tensor, " N"], other: Float[Tensor, " N"]) -> Flo
 
 
 @torch.no_grad()
-def trace_paths(scene: Scene, rays: RayBatch, numbers: Numbers, bounces: int, first_dimension: int = 0) -> Traced:
+def trace_paths(
+    scene: Scene, rays: RayBatch, numbers: Numbers, bounces: int, first_dimension: int = 0
+) -> Traced:
     """The light that arrives along camera rays; its mean over samples is unbiased up to `bounces`.
 
     Args:
@@ -147,7 +149,9 @@ def _from_sky(scene: Scene, at: Vertices, u: Float[Tensor, "N 2"]) -> Float[Tens
     return torch.zeros_like(drawn.wi).index_put((rows,), light)
 
 
-def _from_lamps(scene: Scene, lamps: Lamplight, at: Vertices, u: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+def _from_lamps(
+    scene: Scene, lamps: Lamplight, at: Vertices, u: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N 3"]:
     """Light of a lamp along a direction towards it."""
     origins = at.position + OFFSET * at.flat
     drawn = lamps.sample(origins, u)
@@ -161,7 +165,9 @@ def _from_lamps(scene: Scene, lamps: Lamplight, at: Vertices, u: Float[Tensor, "
     return torch.zeros_like(drawn.wi).index_put((rows,), light)
 
 
-def _scattering(scene: Scene, at: Vertices, wi: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "K 3"], Int[Tensor, " K"]]:
+def _scattering(
+    scene: Scene, at: Vertices, wi: Float[Tensor, "N 3"]
+) -> tuple[Float[Tensor, "K 3"], Int[Tensor, " K"]]:
     """f · cosine where it is not zero, and at which rows that is: only there a ray is worth its cost."""
     value = scattered(at, wi, scene.lobe)
     rows = torch.nonzero(value.amax(-1) > 0)[:, 0]

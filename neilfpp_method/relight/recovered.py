@@ -60,7 +60,8 @@ def surface_of_run(run: Run, resolution: int) -> Surface:
         )
     mesh = extract_mesh(host.sdf, run.config.volume.radius - HIT_RADIUS, resolution, device=device)
     vertices, normals = (
-        torch.from_numpy(np.asarray(part, dtype=np.float32)).to(device) for part in (mesh.vertices, mesh.vertex_normals)
+        torch.from_numpy(np.asarray(part, dtype=np.float32)).to(device)
+        for part in (mesh.vertices, mesh.vertex_normals)
     )
     if isinstance(host, SmoothsNormals):
         normals = _smoothed(host, vertices, normals)
@@ -68,6 +69,8 @@ def surface_of_run(run: Run, resolution: int) -> Surface:
     return Surface(vertices[faces], normals[faces])
 
 
-def _smoothed(host: SmoothsNormals, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+def _smoothed(
+    host: SmoothsNormals, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N 3"]:
     pairs = zip(position.split(NORMALS_AT_ONCE), normal.split(NORMALS_AT_ONCE), strict=True)
     return torch.cat([host.smooth_normals(x, n) for x, n in pairs])

@@ -63,7 +63,9 @@ def vertices(
         specular = (reflectance + (1 - reflectance) * (1 - cosine).pow(5)).mean(-1)
         diffuse = diffuse_reflectance(material).mean(-1)
         share = (specular / (specular + diffuse).clamp_min(1e-6)).clamp(LEAST_SHARE, 1 - LEAST_SHARE)
-    return Vertices(position, normal, flat, wo, material.base_color, material.roughness, material.metallic, share)
+    return Vertices(
+        position, normal, flat, wo, material.base_color, material.roughness, material.metallic, share
+    )
 
 
 def scatter(at: Vertices, u: Float[Tensor, "N 3"], lobe: Lobe | None) -> Float[Tensor, "N 3"]:

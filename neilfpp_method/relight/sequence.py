@@ -45,7 +45,9 @@ class Numbers:
         """Dimensions first … first + count − 1 of some of the paths."""
         dimension = torch.arange(first, first + count, device=self.points.device)
         shift = _hashed(_hashed(_hashed(self.pixel[paths][:, None]) ^ dimension) ^ self.seed)
-        moved = self.points[self.sample[paths], first : first + count] + shift.to(self.points.dtype) / (WORD + 1)
+        moved = self.points[self.sample[paths], first : first + count] + shift.to(self.points.dtype) / (
+            WORD + 1
+        )
         return (moved - moved.floor()).clamp_max(1 - 2**-24)
 
 

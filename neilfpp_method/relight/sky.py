@@ -63,7 +63,9 @@ class Sky:
         height, width = self.radiance.shape[:2]
         column, row = self._place(wi)
         at = torch.stack((2 * (column + 1) / (width + 1) - 1, 2 * row / (height - 1) - 1), -1)
-        found = functional.grid_sample(self._closed, at[None, None], padding_mode="border", align_corners=True)
+        found = functional.grid_sample(
+            self._closed, at[None, None], padding_mode="border", align_corners=True
+        )
         return found[0, :, 0].T
 
     def sample(self, u: Float[Tensor, "N 2"]) -> SkySample:

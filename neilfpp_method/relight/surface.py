@@ -47,11 +47,15 @@ class Surface:
     Embree finds first hits on a CPU, a tree of boxes anywhere else.
     """
 
-    def __init__(self, triangles: Float[Tensor, "F 3 3"], corner_normals: Float[Tensor, "F 3 3"] | None = None) -> None:
+    def __init__(
+        self, triangles: Float[Tensor, "F 3 3"], corner_normals: Float[Tensor, "F 3 3"] | None = None
+    ) -> None:
         across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         self.triangles = triangles
         self.outward = safe_normalize(across, eps=TINY)
-        self.corner_normals = self.outward[:, None].expand(-1, 3, -1) if corner_normals is None else corner_normals
+        self.corner_normals = (
+            self.outward[:, None].expand(-1, 3, -1) if corner_normals is None else corner_normals
+        )
         tracer = embree_tracer(triangles) if triangles.device.type == "cpu" else None
         self._first_hits = tracer or tree_tracer(build_tree(triangles))
 

@@ -1,4 +1,6 @@
-"""What lies in a run's folder besides its model: how far it came, figures, times, findings, effects, settings."""
+"""What lies in a run's folder besides its model: how far it came, figures, times, findings, effects,
+settings.
+"""
 
 from __future__ import annotations
 

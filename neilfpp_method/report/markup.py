@@ -22,8 +22,8 @@ def element(name: str, /, *children: str | None, **attributes: str | int | float
     Args:
         name: of the element.
         children: `Html` as it is, other text escaped; none is left out.
-        attributes: their values are escaped. True stands alone, False and none are left out. An underscore at the
-            end goes, as in `class_`; other underscores become dashes.
+        attributes: their values are escaped. True stands alone, False and none are left out. An underscore at
+            the end goes, as in `class_`; other underscores become dashes.
 
     >>> element("p", "a < b", class_="note", hidden=True)
     '<p class="note" hidden>a &lt; b</p>'
@@ -60,7 +60,9 @@ def cell(text: str) -> Html:
 
 
 def data_block(name: str, value: Any) -> Html:
-    """A value that scripts of the page read as JSON, by the identifier of the element; nothing in it ends the block."""
+    """A value that scripts of the page read as JSON, by the identifier of the element; nothing in it ends the
+    block.
+    """
     text = json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     return Html(f'<script type="application/json" id="{escape(name)}">{text}</script>')
 

@@ -106,7 +106,8 @@ def surface_section(packed: Mapping[str, Any] | None, reason: str) -> Html:
         ),
         element(
             "p",
-            "Only what a training camera saw is shown. The preview is lit from the camera, not by the light of the run.",
+            "Only what a training camera saw is shown. The preview is lit from the camera, not by the light "
+            "of the run.",
             class_="pale",
         ),
         data_block("surface-data", packed),

@@ -32,19 +32,25 @@ READING = {
         "Dark errors are small. Where the capture has no truth of a map, the photograph stands beside it."
     ),
     "Base colour and light share a factor.": (
-        "Twice the light on half the base colour gives the same images, in each channel. Unless the scene holds "
-        "something of known colour, that factor is free. So base colour is shown as estimated and, where the truth is known, "
+        "Twice the light on half the base colour gives the same images, in each channel. Unless the scene "
+        "holds "
+        "something of known colour, that factor is free. So base colour is shown as estimated and, where the "
+        "truth is known, "
         "with the best factor per channel, and the light with the inverse of it. Neither alone tells enough."
     ),
     "Roughness and metallic need highlights.": "Where a surface shows none, the priors decide: rough, and no metal.",
     "Light is known where it matters.": (
-        "It is estimated above surfaces that the images show. Where the surface is rough, only its broad shape "
+        "It is estimated above surfaces that the images show. Where the surface is rough, only its broad "
+        "shape "
         "leaves a trace in the images."
     ),
     "Figures.": (
-        "They are means over the test views, of the pixels that show the object. PSNR grows by 6 dB when the error "
-        "halves. The whole frame counts the background as free of error, as some published tables do, and is higher "
-        "by its share. What needs no method is a constant for roughness and metallic, and the mean image for base "
+        "They are means over the test views, of the pixels that show the object. PSNR grows by 6 dB when the "
+        "error "
+        "halves. The whole frame counts the background as free of error, as some published tables do, and is "
+        "higher "
+        "by its share. What needs no method is a constant for roughness and metallic, and the mean image for "
+        "base "
         "colour."
     ),
     "Display values clip.": "8-bit captures lose what is brighter than white; light and metallic then come out low.",
@@ -137,7 +143,8 @@ def time_section(
             element("img", class_="map", src=address, alt=f"Preview at the end of {stage}"),
             element(
                 "figcaption",
-                f"End of {STAGE_TITLES.get(stage, stage)}: photograph, R, normal, then PBR, base colour, roughness, metallic",
+                f"End of {STAGE_TITLES.get(stage, stage)}: photograph, R, normal, then PBR, base colour, "
+                "roughness, metallic",
             ),
         )
         for stage, address in previews

@@ -52,7 +52,9 @@ class LightPicture:
 
 @dataclass(frozen=True)
 class Shown:
-    """Views by name with their photographs and layers, the light at points, and figures of these views alone."""
+    """Views by name with their photographs and layers, the light at points, and figures of these views
+    alone.
+    """
 
     names: tuple[str, ...]
     photographs: tuple[str, ...]
@@ -64,8 +66,9 @@ class Shown:
 
 
 def shown_run(run: Run, views: int, size: int) -> Run:
-    """The run with so many views held out, spread over those that are, or over the training views where none is; no side of
-    a view is longer than `size` pixels, or than it was in training."""
+    """The run with so many views held out, spread over those that are, or over the training views where none
+    is; no side of a view is longer than `size` pixels, or than it was in training.
+    """
     chosen = run.capture.test_views or run.capture.train_views
     rows = np.linspace(0, len(chosen) - 1, min(views, len(chosen))).round().astype(int)
     longest = max(max(file_size(view)) for view in run.capture.views)

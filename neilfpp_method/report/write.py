@@ -31,7 +31,9 @@ VIEWS_SHARE = 0.85
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """How much a page shows: views, the longest side of a picture in pixels, and whether expected errors are among the maps."""
+    """How much a page shows: views, the longest side of a picture in pixels, and whether expected errors are
+    among the maps.
+    """
 
     views: int = 2
     size: int = 320
@@ -55,14 +57,16 @@ def write_report(
     """Write the page of a run, whole or not at all.
 
     Args:
-        path: the run's folder; a run that was stopped before its first checkpoint has a page of what is there.
+        path: the run's folder; a run that was stopped before its first checkpoint has a page of what is
+            there.
         out: the file.
         options: how much it shows.
         device: where to render.
         on_progress: told the share that is done.
 
     Raises:
-        UserError: no run there, its capture has moved, an option out of range, or a file that cannot be written.
+        UserError: no run there, its capture has moved, an option out of range, or a file that cannot be
+            written.
     """
     options.check()
     files = read_files(path)
@@ -91,12 +95,14 @@ def _with_model(run: Run, files: Files, options: ReportOptions, on_progress: Cal
         notes.append("No stage has moved the material and the light yet, so there is geometry alone.")
     if not run.capture.hdr:
         notes.append(
-            "The photographs are display values (LDR): what is brighter than white is lost, and light and metallic "
+            "The photographs are display values (LDR): what is brighter than white is lost, and light and "
+            "metallic "
             "come out low."
         )
     if not run.capture.test_views:
         notes.append(
-            "No view is held out for testing: nothing here says how new views look. Train with --test-every 8 to know."
+            "No view is held out for testing: nothing here says how new views look. Train with --test-every "
+            "8 to know."
         )
     figures, said = _figures(run, files, shown)
     words = (
@@ -126,16 +132,18 @@ def _without_model(files: Files) -> str:
         *_from_files(files),
         ("facts", "What made it", tables.facts_section(_facts(files))),
     ]
-    return page(
-        f"{files.path.resolve().name}, {files.config.preset}", f"step 0 of {files.steps}", sections
-    )
+    return page(f"{files.path.resolve().name}, {files.config.preset}", f"step 0 of {files.steps}", sections)
 
 
 def _from_files(files: Files) -> list[tuple[str, str, Html]]:
     return [
         ("time", "Time", tables.time_section(files.timing, files.work, _previews(files.path))),
         ("effects", "Effects", tables.effects_section(files.effects)),
-        ("settings", "Settings", tables.settings_section(files.config.preset, changed_settings(files.config))),
+        (
+            "settings",
+            "Settings",
+            tables.settings_section(files.config.preset, changed_settings(files.config)),
+        ),
     ]
 
 
@@ -150,7 +158,8 @@ def _figures(run: Run, files: Files, shown: Shown) -> tuple[dict[str, float], st
     size = f"{len(shown.names)} views shown here, of {shown.width}×{shown.height} pixels"
     return (
         shown.figures,
-        f"Of the {size}, not yet the figures of the protocol neilfpp: `neilfpp eval {run.path}` measures those.",
+        f"Of the {size}, not yet the figures of the protocol neilfpp: `neilfpp eval {run.path}` measures "
+        "those.",
     )
 
 

@@ -1,4 +1,6 @@
-"""Settings that contradict each other, or that nothing can be built from: told in one line, before anything is built."""
+"""Settings that contradict each other, or that nothing can be built from: told in one line, before anything
+is built.
+"""
 
 from __future__ import annotations
 

@@ -22,7 +22,8 @@ class SceneFacts:
         radiance_scale: the largest radiance that R can reach.
         background: "none", "constant" or "inverted_sphere".
         background_color: linear RGB of a constant background, and what an inverted sphere starts as.
-        far_points: points of the scene reach far beyond its box, to walls and trees: what lies behind has a shape.
+        far_points: points of the scene reach far beyond its box, to walls and trees: what lies behind has a
+            shape.
     """
 
     response: str
@@ -35,7 +36,9 @@ class SceneFacts:
 
 @dataclass(frozen=True)
 class RadianceUnits:
-    """What the losses on radiance are measured in, each in the units that it compares (METHOD §4, last line)."""
+    """What the losses on radiance are measured in, each in the units that it compares (METHOD §4, last
+    line).
+    """
 
     volume: float
     physical: float
@@ -45,8 +48,9 @@ class RadianceUnits:
 def radiance_units(config: NeilfConfig, facts: SceneFacts) -> RadianceUnits:
     """The units that `config.loss.unit` names.
 
-    "median": an error of as much as the median radiance is 1, whether the camera stores radiance or display values. The sRGB
-    curve halves all contrasts; in units of the pixel, what speaks against noise would count twice as much.
+    "median": an error of as much as the median radiance is 1, whether the camera stores radiance or display
+    values. The sRGB curve halves all contrasts; in units of the pixel, what speaks against noise would count
+    twice as much.
     """
     if config.loss.unit == "activation":
         return RadianceUnits(facts.radiance_scale, 1.0, 1.0)

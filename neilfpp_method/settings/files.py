@@ -19,8 +19,9 @@ LARGEST = 1 << 20
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML with the plain values of YAML 1.2: `off`, `on`, `no` and `12:30` are words, `5e-4` is a number, and no name comes
-    twice in a mapping. (YAML 1.1 takes `mode: off` for false and `5e-4` for a word.)"""
+    """YAML with the plain values of YAML 1.2: `off`, `on`, `no` and `12:30` are words, `5e-4` is a number,
+    and no name comes twice in a mapping. (YAML 1.1 takes `mode: off` for false and `5e-4` for a word.)
+    """
 
     yaml_implicit_resolvers: dict[str, list] = {}  # noqa: RUF012 (PyYAML keeps its resolvers in the class)
 
@@ -48,7 +49,8 @@ _Loader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(loader
 
 
 def read_settings(path: Path) -> Mapping[str, Any]:
-    """The settings that a file names: nested, or with dots in their names. A run folder's `config.json` gives its own.
+    """The settings that a file names: nested, or with dots in their names. A run folder's `config.json` gives
+    its own.
 
     Raises:
         UserError: there is no such file, or it holds no settings.
@@ -57,7 +59,9 @@ def read_settings(path: Path) -> Mapping[str, Any]:
         raise UserError(f"{path}: settings are read from .yaml and .json files", "give it one of these names")
     try:
         if path.stat().st_size > LARGEST:
-            raise UserError(f"{path}: too large for a file of settings", "name the file of settings with --config")
+            raise UserError(
+                f"{path}: too large for a file of settings", "name the file of settings with --config"
+            )
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise UserError(f"{path}: no such file", "name a file of settings with --config") from error

@@ -1,4 +1,6 @@
-"""Settings to and from plain values (those of JSON and YAML), and changed by them; every value is checked on the way in."""
+"""Settings to and from plain values (those of JSON and YAML), and changed by them; every value is checked on
+the way in.
+"""
 
 from __future__ import annotations
 
@@ -31,18 +33,24 @@ def from_dict(kind: type[Config], values: Mapping[str, Any], where: str = "confi
     arguments = {}
     for name, value in values.items():
         room = _room(hints[name], value, f"{where}.{name}")
-        arguments[name] = from_dict(room, value, f"{where}.{name}") if room else _leaf(value, hints[name], f"{where}.{name}")
+        arguments[name] = (
+            from_dict(room, value, f"{where}.{name}")
+            if room
+            else _leaf(value, hints[name], f"{where}.{name}")
+        )
     return kind(**arguments)
 
 
 def changed(config: Config, values: Mapping[str, Any], where: str = "config") -> Config:
     """The same settings but for these.
 
-    A room (a light, a host, an encoding) whose `kind` changes to one with other settings starts from the defaults of that kind.
+    A room (a light, a host, an encoding) whose `kind` changes to one with other settings starts from the
+    defaults of that kind.
 
     Args:
         config: a dataclass of settings.
-        values: by name; a room is a mapping of its own, or its settings are named with dots. Dashes count as underscores.
+        values: by name; a room is a mapping of its own, or its settings are named with dots. Dashes count as
+            underscores.
         where: what the settings are called in a complaint.
 
     Raises:
@@ -91,7 +99,9 @@ def _check_known(name: str, hints: Mapping[str, Any], where: str) -> None:
 
 
 def _room(hint: Any, value: Any, where: str, now: Any = None) -> type | None:
-    """The dataclass that a mapping of settings stands for: where there are several, that of its `kind`; none: a value."""
+    """The dataclass that a mapping of settings stands for: where there are several, that of its `kind`; none:
+    a value.
+    """
     rooms = [kind for kind in (hint, *get_args(hint)) if dataclasses.is_dataclass(kind)]
     if not rooms:
         return None
@@ -103,7 +113,9 @@ def _room(hint: Any, value: Any, where: str, now: Any = None) -> type | None:
         return type(now) if now is not None else rooms[0]
     kinds = {kind: room for room in rooms for kind in get_args(get_type_hints(room)["kind"])}
     if not isinstance(value["kind"], str) or value["kind"] not in kinds:
-        raise UserError(f"{where}.kind: '{value['kind']}' is not a choice", f"choose one of {', '.join(kinds)}")
+        raise UserError(
+            f"{where}.kind: '{value['kind']}' is not a choice", f"choose one of {', '.join(kinds)}"
+        )
     return kinds[value["kind"]]
 
 
@@ -116,7 +128,10 @@ def _leaf(value: Any, hint: Any, where: str) -> Any:
 
 def _check_items(values: list | tuple, hint: Any, where: str) -> list | tuple:
     """That a list is of a tuple's length, and of its types."""
-    wanted = next((get_args(kind) for kind in (hint, *get_args(hint)) if getattr(kind, "__origin__", None) is tuple), None)
+    wanted = next(
+        (get_args(kind) for kind in (hint, *get_args(hint)) if getattr(kind, "__origin__", None) is tuple),
+        None,
+    )
     if wanted is None:
         raise UserError(f"{where}: a list where one value belongs", "give one value")
     if len(wanted) == 2 and wanted[1] is Ellipsis:

@@ -1,4 +1,6 @@
-"""The presets: the published settings (`docs/paper.md`), and one for a laptop. Each is written as what it changes."""
+"""The presets: the published settings (`docs/paper.md`), and one for a laptop. Each is written as what it
+changes.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +14,9 @@ from neilfpp_method.settings.types import FrequencyConfig, MeshConfig, NeilfConf
 __all__ = ["PRESETS", "fixed_geometry", "free_light", "preset"]
 
 SINE_FREQUENCY = 30.0
-"""ω of the sine layers sin(ω (W x + b)) of B and L. In the published code ω is part of W and b, so that a step of Adam there
-is one of 1/ω here."""
+"""ω of the sine layers sin(ω (W x + b)) of B and L. In the published code ω is part of W and b, so that a
+step of Adam there is one of 1/ω here.
+"""
 
 # Beside the settings' own defaults.
 PAPER_MLP: Mapping[str, Any] = {
@@ -34,7 +37,9 @@ PAPER_MLP: Mapping[str, Any] = {
 
 
 def paper_mlp() -> NeilfConfig:
-    """The published MLP setting, for display images: 96k steps, 24 h on a V100. `docs/paper.md` has it line by line."""
+    """The published MLP setting, for display images: 96k steps, 24 h on a V100. `docs/paper.md` has it line
+    by line.
+    """
     return changed(NeilfConfig(), PAPER_MLP)
 
 
@@ -69,7 +74,9 @@ PAPER_NGP: Mapping[str, Any] = {
 
 
 def paper_ngp() -> NeilfConfig:
-    """The published hash-grid setting, for display images: 40k steps, 4 h on a V100; it asks for a point cloud."""
+    """The published hash-grid setting, for display images: 40k steps, 4 h on a V100; it asks for a point
+    cloud.
+    """
     return changed(paper_mlp(), PAPER_NGP)
 
 
@@ -147,7 +154,8 @@ FAST: Mapping[str, Any] = {
     "loss.lambertian": 0.0,
     "loss.position_gradient": 0.0,
     "loss.normal_gradient": 0.1,
-    # The joint stage is short: geometry goes on at the rate that SDF init ended with, and is not stirred up again.
+    # The joint stage is short: geometry goes on at the rate that SDF init ended with, and is not stirred up
+    # again.
     "optimizer.geometry": 2e-2,
     "optimizer.radiance": 5e-3,
     "optimizer.brdf": 5e-3,
@@ -165,9 +173,10 @@ FAST: Mapping[str, Any] = {
 
 
 def fast() -> NeilfConfig:
-    """Minutes on the two cores of a laptop: the same method with small hash grids, few rays, and as much light as most
-    scenes need: an environment map, what the scene reflects, and lamps close by where the images ask for them. `free_light`
-    has the paper's light field for it."""
+    """Minutes on the two cores of a laptop: the same method with small hash grids, few rays, and as much
+    light as most scenes need: an environment map, what the scene reflects, and lamps close by where the
+    images ask for them. `free_light` has the paper's light field for it.
+    """
     return changed(NeilfConfig(), FAST)
 
 
@@ -211,13 +220,14 @@ def free_light(config: NeilfConfig) -> NeilfConfig:
 
 
 def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
-    """A preset for geometry that is given as a mesh: R alone for a while, as the light is chosen by what surfaces send each
-    other, then one stage in which R, B and L move together.
+    """A preset for geometry that is given as a mesh: R alone for a while, as the light is chosen by what
+    surfaces send each other, then one stage in which R, B and L move together.
 
-    R has no feature of G that knows the place, so it encodes positions as G would; 8×128 is the paper's surface light
-    field. A surface without thickness needs no distance to leave it, and what leaves it is known well enough to learn
-    from L_ref (METHOD §2, §4). Its normals are taken as they are, so R need not help to find them. R is new as well, so
-    there are twice as many steps with a material. Rays through a mesh are cheap, so light is solved for more often.
+    R has no feature of G that knows the place, so it encodes positions as G would; 8×128 is the paper's
+    surface light field. A surface without thickness needs no distance to leave it, and what leaves it is
+    known well enough to learn from L_ref (METHOD §2, §4). Its normals are taken as they are, so R need not
+    help to find them. R is new as well, so there are twice as many steps with a material. Rays through a mesh
+    are cheap, so light is solved for more often.
     """
     train = config.train
     mesh = {

@@ -1,7 +1,7 @@
 """Every setting, one dataclass per room; `settings.presets` has the sets of them.
 
-Lengths are in scene units (the object lies in the unit sphere). A setting with `kind`, `mode` or a `bool` is a switch: an
-effect that is switched off asks no network and traces no ray.
+Lengths are in scene units (the object lies in the unit sphere). A setting with `kind`, `mode` or a `bool` is
+a switch: an effect that is switched off asks no network and traces no ray.
 """
 
 from __future__ import annotations
@@ -14,12 +14,14 @@ import tyro
 __all__ = ["NeilfConfig"]
 
 
-# ---------------------------------------------------------------------------------------------------------------- fields
+# ----------------------------------------------------------------------------------------------------- fields
 
 
 @dataclass(frozen=True)
 class FrequencyConfig:
-    """Positions by sines and cosines, six octaves: the paper's MLP setting. B's hidden units are sines (SIREN) then."""
+    """Positions by sines and cosines, six octaves: the paper's MLP setting. B's hidden units are sines
+    (SIREN) then.
+    """
 
     kind: Literal["frequency"] = "frequency"
     """frequency or hash: how G, R and B see positions."""
@@ -27,7 +29,9 @@ class FrequencyConfig:
 
 @dataclass(frozen=True)
 class HashGridConfig:
-    """Positions by multiresolution hash grids, one for each of G, B and, where it has an encoding, R (Müller et al. 2022)."""
+    """Positions by multiresolution hash grids, one for each of G, B and, where it has an encoding, R (Müller
+    et al. 2022).
+    """
 
     kind: Literal["hash"] = "hash"
     """frequency or hash: how G, R and B see positions."""
@@ -36,7 +40,9 @@ class HashGridConfig:
     log2_entries: int = 19
     """Table size of one level, as a power of two."""
     sdf_log2_entries: int = 19
-    """The same for G. The surface is all of a scene that is seen, and a table without collisions costs no more to read."""
+    """The same for G. The surface is all of a scene that is seen, and a table without collisions costs no
+    more to read.
+    """
     max_resolution: int = 4096
     """Cells along an edge of the scene's cube at the finest level; at the coarsest there are 16."""
 
@@ -55,7 +61,9 @@ class SdfConfig:
     feature_width: int = 256
     """Length of the feature handed to R."""
     start: Literal["sphere", "silhouettes"] = "sphere"
-    """silhouettes: before SDF init the field is brought to the visual hull of the masks, where the capture has masks."""
+    """silhouettes: before SDF init the field is brought to the visual hull of the masks, where the capture
+    has masks.
+    """
 
 
 @dataclass(frozen=True)
@@ -63,11 +71,14 @@ class OutgoingRadianceConfig:
     """R: position, direction, normal and feature of G → linear RGB (METHOD §5)."""
 
     positions: Literal["raw", "encoded"] = "raw"
-    """raw: R has no encoding of its own, and reads that of G by the feature. encoded: it has one of the kind that `encoding`
-    says, as it always has where there is no feature."""
+    """raw: R has no encoding of its own, and reads that of G by the feature. encoded: it has one of the kind
+    that `encoding` says, as it always has where there is no feature.
+    """
     direction: Literal["outgoing", "mirrored"] = "outgoing"
-    """Which direction is encoded: the outgoing one, as in the paper, or the one that it mirrors about the normal. What a shiny
-    surface sends changes evenly with the latter, so its normals are found (Verbin et al. 2022, "Ref-NeRF")."""
+    """Which direction is encoded: the outgoing one, as in the paper, or the one that it mirrors about the
+    normal. What a shiny surface sends changes evenly with the latter, so its normals are found (Verbin et al.
+    2022, "Ref-NeRF").
+    """
     layers: int = 4
     """Hidden layers."""
     width: int = 256
@@ -79,9 +90,13 @@ class BrdfConfig:
     """B: position → base colour, roughness, metallic (METHOD §5)."""
 
     initial_base_color: float = 0.5
-    """What the base colour starts as. Light and base colour share a scale that images hardly tell, so it stays near this."""
+    """What the base colour starts as. Light and base colour share a scale that images hardly tell, so it
+    stays near this.
+    """
     initial_metallic: float = 0.5
-    """What metallic starts as. Most surfaces are no metals, and a light that is found under metals is too weak for others."""
+    """What metallic starts as. Most surfaces are no metals, and a light that is found under metals is too
+    weak for others.
+    """
     metals: bool = True
     """Whether there may be metal; off, metallic is 0 everywhere."""
     layers: int = 8
@@ -103,11 +118,14 @@ class LightFitConfig:
     smoothness: float = 0.03
     """Weight of the total variation of log radiance, per texel, against the relative error."""
     whiteness: float = 0.05
-    """Weight of the tint of all light that reaches the points, against the relative error: images hardly tell the tint of the
-    light from that of the surfaces."""
+    """Weight of the tint of all light that reaches the points, against the relative error: images hardly tell
+    the tint of the light from that of the surfaces.
+    """
     evenness: float = 0.3
-    """Weight of the mean difference of log base colour between neighbouring points, against the relative error. The base colour
-    of every point is free while light is fitted; 0: it is what surfaces have learned, up to a factor per channel."""
+    """Weight of the mean difference of log base colour between neighbouring points, against the relative
+    error. The base colour of every point is free while light is fitted; 0: it is what surfaces have learned,
+    up to a factor per channel.
+    """
 
 
 @dataclass(frozen=True)
@@ -115,24 +133,31 @@ class MapLightConfig:
     """L: an environment map, and perhaps lamps before it. It goes with inter-reflection hard or off."""
 
     kind: Literal["distant", "distant_near", "auto"] = "auto"
-    """free: its own light at every point (the paper). distant: an environment map. distant_near: a map, and lamps close to the
-    scene. auto: a map, and lamps where points that were kept back from the fit ask for them."""
+    """free: its own light at every point (the paper). distant: an environment map. distant_near: a map, and
+    lamps close to the scene. auto: a map, and lamps where points that were kept back from the fit ask for
+    them.
+    """
     environment_height: int = 32
     """Rows of the environment map; it has twice as many columns."""
     map: str | None = None
-    """An environment map that is known, a linear EXR in the layout of docs/light.md; none: the map is recovered. Lamps
-    before it are sought where `kind` says so."""
+    """An environment map that is known, a linear EXR in the layout of docs/light.md; none: the map is
+    recovered. Lamps before it are sought where `kind` says so.
+    """
     fit: LightFitConfig = field(default_factory=LightFitConfig)
     """How the map is found."""
 
 
 @dataclass(frozen=True)
 class FreeLightConfig:
-    """L: the paper's field, its own light at every point (METHOD §5): sharp in direction, smooth in position."""
+    """L: the paper's field, its own light at every point (METHOD §5): sharp in direction, smooth in
+    position.
+    """
 
     kind: Literal["free"] = "free"
-    """free: its own light at every point (the paper). distant: an environment map. distant_near: a map, and lamps close to the
-    scene. auto: a map, and lamps where points that were kept back from the fit ask for them."""
+    """free: its own light at every point (the paper). distant: an environment map. distant_near: a map, and
+    lamps close to the scene. auto: a map, and lamps where points that were kept back from the fit ask for
+    them.
+    """
     activation: Literal["sine", "relu"] = "sine"
     """Hidden units; sine is SIREN's, with ω = 30."""
     layers: int = 8
@@ -151,10 +176,14 @@ class BackgroundConfig:
     """What a ray sees beyond the scene."""
 
     kind: Literal["auto", "none", "constant", "inverted_sphere"] = "auto"
-    """none: R paints the scene sphere, which closes the scene. constant: one colour. inverted_sphere: a NeRF++
-    field. auto: constant where one colour is all that the borders of the images show behind the scene, else inverted_sphere."""
+    """none: R paints the scene sphere, which closes the scene. constant: one colour. inverted_sphere: a
+    NeRF++ field. auto: constant where one colour is all that the borders of the images show behind the scene,
+    else inverted_sphere.
+    """
     color: tuple[float, float, float] | None = None
-    """Linear RGB of a constant background, and what an inverted_sphere starts as; none: read from the borders of the images."""
+    """Linear RGB of a constant background, and what an inverted_sphere starts as; none: read from the borders
+    of the images.
+    """
     layers: int = 8
     """Hidden layers of the NeRF++ field."""
     width: int = 256
@@ -163,7 +192,7 @@ class BackgroundConfig:
     """Samples per ray beyond the scene sphere."""
 
 
-# ---------------------------------------------------------------------------------------------------------------- hosts
+# ------------------------------------------------------------------------------------------------------ hosts
 
 
 @dataclass(frozen=True)
@@ -182,8 +211,9 @@ class MeshConfig:
     kind: Literal["mesh"] = "mesh"
     """volsdf or mesh: where geometry comes from."""
     path: str | None = None
-    """The triangle mesh, in the world frame of the capture; none: the capture's inputs/model/mesh.ply. Normals are interpolated
-    between its vertices, edges kept."""
+    """The triangle mesh, in the world frame of the capture; none: the capture's inputs/model/mesh.ply.
+    Normals are interpolated between its vertices, edges kept.
+    """
 
 
 HostConfig = Annotated[VolSdfConfig | MeshConfig, tyro.conf.AvoidSubcommands]
@@ -200,17 +230,20 @@ class VolumeConfig:
     skip_empty: bool = False
     """Rays skip what a coarse grid of the SDF shows to be empty; pictures, too, on a grid of their own."""
     initial_samples: int = 128
-    """SDF queries per ray of the first round; also those added in each refinement. Half as many for rays that skip empty space:
-    what is left of them is short."""
+    """SDF queries per ray of the first round; also those added in each refinement. Half as many for rays that
+    skip empty space: what is left of them is short.
+    """
     rounds: int = 5
     """Most refinement rounds."""
     samples: int = 98
-    """Samples per ray that are rendered: two thirds where it is stopped, the rest spread between, both ends among them."""
+    """Samples per ray that are rendered: two thirds where it is stopped, the rest even, ends included."""
     normal_radius: float = 0.0
-    """Surfaces are shaded with the normal of a neighbourhood of this radius, edges kept; 0: with that of the hit alone."""
+    """Surfaces are shaded with the normal of a neighbourhood of this radius, edges kept; 0: with that of the
+    hit alone.
+    """
 
 
-# --------------------------------------------------------------------------------------------------------------- shading
+# ---------------------------------------------------------------------------------------------------- shading
 
 
 @dataclass(frozen=True)
@@ -222,14 +255,17 @@ class ShadingConfig:
     specular: bool = True
     """Off: a Lambertian surface; roughness and metallic are not asked for."""
     sampler: Literal["fibonacci", "cosine", "lobe", "mis"] = "fibonacci"
-    """Who draws the incident directions: the paper's lattice, a cosine, the specular lobe, or cosine, lobe and (where it can
-    be sampled) light together by the balance heuristic."""
+    """Who draws the incident directions: the paper's lattice, a cosine, the specular lobe, or cosine, lobe
+    and (where it can be sampled) light together by the balance heuristic.
+    """
     train_samples: int = 128
     """Incident directions per point in training."""
     eval_samples: int = 256
     """Incident directions per point in evaluation."""
     hit_share: float = 0.8
-    """Least concentration of a ray's blending weight that makes its hit a surface point; the others are not shaded."""
+    """Least concentration of a ray's blending weight that makes its hit a surface point; the others are not
+    shaded.
+    """
 
 
 @dataclass(frozen=True)
@@ -237,7 +273,9 @@ class InterReflectionConfig:
     """L_ref: what arrives from another surface is what that surface sends (METHOD §2)."""
 
     mode: Literal["off", "soft", "hard"] = "soft"
-    """soft: the paper's loss. hard: a direction that meets the scene brings R from there; only the others ask the light."""
+    """soft: the paper's loss. hard: a direction that meets the scene brings R from there; only the others ask
+    the light.
+    """
     rays_per_point: float = 1.0
     """Traced directions per surface point and step, in expectation."""
     radiance_gradient: float = 0.0
@@ -246,23 +284,27 @@ class InterReflectionConfig:
     """Least displacement off the surface; it grows with β and as 1/cos towards grazing."""
 
 
-# -------------------------------------------------------------------------------------------------------------- training
+# --------------------------------------------------------------------------------------------------- training
 
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the losses (METHOD §4) beside L_phys, which has 1; `schedule.py` says in which stage each counts. 0 switches a
-    loss off."""
+    """Weights of the losses (METHOD §4) beside L_phys, which has 1; `schedule.py` says in which stage each
+    counts. 0 switches a loss off.
+    """
 
     unit: Literal["activation", "median"] = "activation"
-    """What radiance is measured in. activation: L_vol in the range of R's output, all else absolute, as the paper has it.
-    median: all in the median of the images, so that the weights depend neither on the exposure nor on what cameras store."""
+    """What radiance is measured in. activation: L_vol in the range of R's output, all else absolute, as the
+    paper has it. median: all in the median of the images, so that the weights depend neither on the exposure
+    nor on what cameras store.
+    """
     volume: float = 1.0
     eikonal: float = 0.1
     hessian: float = 1e-3
     hessian_growth: float = 1.0
-    """Weight of L_Hess at the end of SDF init over that at its start: early, shapes must be free to fold; late, ripples are
-    noise."""
+    """Weight of L_Hess at the end of SDF init over that at its start: early, shapes must be free to fold;
+    late, ripples are noise.
+    """
     hessian_joint: float = 1e-4
     surface: float = 1e-3
     surface_joint: float = 1e-4
@@ -273,9 +315,10 @@ class LossConfig:
     mask: float = 0.0
     """Opacity against the object mask, where the capture has masks or shows exactly its background."""
     points: Literal["scene", "rays"] = "rays"
-    """Where L_Eik, L_Hess and L_surf look. scene: at points all over the scene, more of them about the object, and L_Eik at
-    one sample of each ray as well; L_surf is so wide then that it hardly has a slope (published code). rays: at the samples
-    of the rays, and L_Hess about their hits."""
+    """Where L_Eik, L_Hess and L_surf look. scene: at points all over the scene, more of them about the
+    object, and L_Eik at one sample of each ray as well; L_surf is so wide then that it hardly has a slope
+    (published code). rays: at the samples of the rays, and L_Hess about their hits.
+    """
     position_gradient: float = 0.1
     """Scale of the gradient from the material into the hit position, joint stage."""
     normal_gradient: float = 1.0
@@ -301,8 +344,10 @@ class OptimizerConfig:
     warm_up: int = 0
     """Steps at the start of each stage in which the rate rises from a tenth."""
     background_from: float = 0.0
-    """Share of SDF init that is over when the field beyond the scene starts to move. Until then it is the colour that it starts
-    as, so that what lies within the scene is made of surfaces: a field that is seen from everywhere can paint it as well."""
+    """Share of SDF init that is over when the field beyond the scene starts to move. Until then it is the
+    colour that it starts as, so that what lies within the scene is made of surfaces: a field that is seen
+    from everywhere can paint it as well.
+    """
 
 
 @dataclass(frozen=True)
@@ -318,7 +363,9 @@ class TrainConfig:
     rays: int = 4096
     """Rays per step and process."""
     fresh: float = 1.0
-    """Share of a step's rays that are rendered while the surface stands still; the other points are those of earlier steps."""
+    """Share of a step's rays that are rendered while the surface stands still; the other points are those of
+    earlier steps.
+    """
     seed: int = 0
     """Every random number of step k follows from seed and k alone."""
     checkpoint_every: int = 500

@@ -29,9 +29,9 @@ def directional_albedo(
 
         ρ = (1 − m) b + F0 A(r, n·wo) + B(r, n·wo)
 
-    A and B are the integrals of the two terms of the lobe (`specular_terms`): one table for each, bilinear between its
-    entries; the split of Karis 2013 (Real Shading in Unreal Engine 4). `n`, `wo` are unit and constants; the gradient goes to
-    the material.
+    A and B are the integrals of the two terms of the lobe (`specular_terms`): one table for each, bilinear
+    between its entries; the split of Karis 2013 (Real Shading in Unreal Engine 4). `n`, `wo` are unit and
+    constants; the gradient goes to the material.
     """
     table = _lobe_integrals(lobe, n.device, n.dtype)
     cosine = (n * wo).sum(-1, keepdim=True).detach()
@@ -43,7 +43,9 @@ def directional_albedo(
 
 
 def initial_albedo(base_color: float, metallic: float, lobe: Lobe | None) -> float:
-    """Directional albedo of an even grey material of roughness 0.5 along its normal; no `lobe`: a Lambertian surface."""
+    """Directional albedo of an even grey material of roughness 0.5 along its normal; no `lobe`: a Lambertian
+    surface.
+    """
     if lobe is None:
         return base_color
     material = Material(torch.full((1, 3), base_color), torch.full((1, 1), 0.5), torch.full((1, 1), metallic))
@@ -54,7 +56,9 @@ def initial_albedo(base_color: float, metallic: float, lobe: Lobe | None) -> flo
 @lru_cache
 @torch.no_grad()
 def _lobe_integrals(lobe: Lobe, device: torch.device, dtype: torch.dtype) -> Float[Tensor, "1 2 R C"]:
-    """A and B at the middles of equal parts of roughness and of the viewer's cosine; made once for each device and type."""
+    """A and B at the middles of equal parts of roughness and of the viewer's cosine; made once for each
+    device and type.
+    """
     middle = (torch.arange(SIZE) + 0.5) / SIZE
     roughness, cosine = torch.cartesian_prod(middle, middle)[:, :, None].unbind(1)
     up = torch.tensor([0.0, 0.0, 1.0]).expand(len(cosine), 3)
@@ -63,5 +67,7 @@ def _lobe_integrals(lobe: Lobe, device: torch.device, dtype: torch.dtype) -> Flo
     wi = technique.draw(DIRECTIONS, False)
     terms = specular_terms(roughness, up, wo, wi, lobe)
     weight = dot(wi, up).clamp_min(0) / technique.pdf(wi).clamp_min(PDF_FLOOR)
-    table = torch.stack([(term * weight).mean(1).view(1, SIZE, SIZE) for term in (terms.facing, terms.grazing)], 1)
+    table = torch.stack(
+        [(term * weight).mean(1).view(1, SIZE, SIZE) for term in (terms.facing, terms.grazing)], 1
+    )
     return table.to(device, dtype)

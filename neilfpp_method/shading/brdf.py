@@ -3,8 +3,8 @@
     f_d = (1 − m)/π · b
     f_s = D(n·h) · F(wo·h) · V(n·wi, n·wo),  V = G / (4 (n·wi)(n·wo))
 
-V is always taken in the form in which the cosines have cancelled: it has no 0/0 at grazing angles. All is computed, and
-returned, in at least float32.
+V is always taken in the form in which the cosines have cancelled: it has no 0/0 at grazing angles. All is
+computed, and returned, in at least float32.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ __all__ = [
 ]
 
 
-# ---------------------------------------------------------------------------------------------------------------- lobes
+# ------------------------------------------------------------------------------------------------------ lobes
 
 
 @dataclass(frozen=True)
 class Lobe:
     """A microfacet lobe: functions of cosines (N, S) and roughness (N, 1), each (N, S).
 
-    A lobe keeps r at or above `roughness_floor`: a smoother surface shades as one of that roughness, and sends no
-    gradient to r.
+    A lobe keeps r at or above `roughness_floor`: a smoother surface shades as one of that roughness, and
+    sends no gradient to r.
     """
 
     distribution: Callable[[Tensor, Tensor], Tensor]
@@ -59,10 +59,12 @@ class Lobe:
 
 
 def roughness_floor(dtype: torch.dtype) -> float:
-    """The smallest roughness that a lobe can resolve: (32 ε)^¼, which is 0.044 in float32 and 2.9e-4 in float64.
+    """The smallest roughness that a lobe can resolve: (32 ε)^¼, which is 0.044 in float32 and 2.9e-4 in
+    float64.
 
-    D varies on the scale 1 − n·h ~ r⁴/2, and n·h, a number near 1, is rounded to ε/2. At the floor that rounding moves
-    D by 3 %; below, D would be noise. The floor also bounds the lobe: in float32 D ≤ 8.4e4 and V ≤ 1/r⁴ = 2.6e5.
+    D varies on the scale 1 − n·h ~ r⁴/2, and n·h, a number near 1, is rounded to ε/2. At the floor that
+    rounding moves D by 3 %; below, D would be noise. The floor also bounds the lobe: in float32 D ≤ 8.4e4 and
+    V ≤ 1/r⁴ = 2.6e5.
     """
     return (32 * torch.finfo(dtype).eps) ** 0.25
 
@@ -121,7 +123,8 @@ def _ggx_visibility(
     def masking(cosine: Tensor) -> Tensor:
         return (alpha_squared + (1 - alpha_squared) * cosine.square()).sqrt()
 
-    # V grows as 1/(n·wi + n·wo) towards the horizon; the bound acts where both directions lie within 0.03° of it.
+    # V grows as 1/(n·wi + n·wo) towards the horizon; the bound acts where both directions lie within 0.03° of
+    # it.
     return 0.5 / (cos_o * masking(cos_i) + cos_i * masking(cos_o)).clamp_min(1e-6)
 
 
@@ -140,7 +143,7 @@ GGX = Lobe(_ggx_distribution, _ggx_visibility, _ggx_sample_cos_h, _ggx_pdf_h)
 LOBES: Mapping[str, Lobe] = {"spherical_gaussian": SPHERICAL_GAUSSIAN, "ggx": GGX}
 
 
-# ------------------------------------------------------------------------------------------------------------- geometry
+# --------------------------------------------------------------------------------------------------- geometry
 
 
 @dataclass(frozen=True)
@@ -164,7 +167,7 @@ def cosines(n: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"], wi: Float[Tensor,
     return Cosines(i, o, ((i + o) / (2 * d)).clamp(-1, 1), d)
 
 
-# ----------------------------------------------------------------------------------------------------------------- BRDF
+# ------------------------------------------------------------------------------------------------------- BRDF
 
 
 @dataclass(frozen=True)
@@ -177,7 +180,9 @@ class BrdfValue:
 
 @dataclass(frozen=True)
 class SpecularTerms:
-    """f_s = F0 · `facing` + `grazing`: a scalar pair per direction, with the colour of the surface, F0, set aside."""
+    """f_s = F0 · `facing` + `grazing`: a scalar pair per direction, with the colour of the surface, F0, set
+    aside.
+    """
 
     facing: Float[Tensor, "N S"]
     grazing: Float[Tensor, "N S"]
@@ -205,11 +210,13 @@ def specular_terms(
     """The scalars of the specular lobe; zero for wi at or below the horizon.
 
     With s = (1 − wo·h)⁵, Schlick's F0 + (1 − F0) s is F0 (1 − s) + s. (The power is on the whole bracket; the
-    supplement of the paper misprints it.) A viewer below the horizon, which blended normals can bring about, counts as
-    one at the horizon.
+    supplement of the paper misprints it.) A viewer below the horizon, which blended normals can bring about,
+    counts as one at the horizon.
     """
     cos = cosines(n, wo, wi)
-    reflected = lobe.distribution(cos.h, roughness) * lobe.visibility(cos.i.clamp_min(0), cos.o.clamp_min(0), roughness)
+    reflected = lobe.distribution(cos.h, roughness) * lobe.visibility(
+        cos.i.clamp_min(0), cos.o.clamp_min(0), roughness
+    )
     reflected = torch.where(cos.i > 0, reflected, 0.0)
     grazing = reflected * (1 - cos.d).pow(5)
     return SpecularTerms(reflected - grazing, grazing)
@@ -225,7 +232,8 @@ def evaluate(
 ) -> BrdfValue:
     """f(wo, wi) of METHOD §1; exactly zero for wi at or below the horizon.
 
-    `n`, `wo`, `wi` are unit and point away from the surface. With `specular=False` the surface is Lambertian: f = b/π.
+    `n`, `wo`, `wi` are unit and point away from the surface. With `specular=False` the surface is Lambertian:
+    f = b/π.
     """
     above = (dot(wi, n) > 0).unsqueeze(-1)
     diffuse = (diffuse_reflectance(material, specular) / math.pi).unsqueeze(1) * above

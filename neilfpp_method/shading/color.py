@@ -17,7 +17,8 @@ KNEE = 0.04045
 def linear_to_srgb(color: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """The sRGB curve (IEC 61966-2-1): 12.92 c up to 0.0031308, then 1.055 c^(1/2.4) − 0.055.
 
-    Nothing is clipped: the linear part goes on below 0 and the power above 1, with a finite gradient everywhere.
+    Nothing is clipped: the linear part goes on below 0 and the power above 1, with a finite gradient
+    everywhere.
     """
     knee = 0.0031308
     return torch.where(color <= knee, 12.92 * color, 1.055 * color.clamp_min(knee).pow(1 / 2.4) - 0.055)
@@ -47,8 +48,10 @@ def apply_response(color: Float[Tensor, "*shape"], response: str) -> Float[Tenso
 
 
 def response_slope(pixel: Float[Tensor, "*shape"], response: str) -> Float[Tensor, "*shape"]:
-    """What a pixel changes by per unit of the logarithm of radiance, dp / d ln c: an error over this is one of radiance,
-    relative, whatever the camera stores. The pixel itself (HDR); along the power of the sRGB curve (p + 0.055) / 2.4."""
+    """What a pixel changes by per unit of the logarithm of radiance, dp / d ln c: an error over this is one
+    of radiance, relative, whatever the camera stores. The pixel itself (HDR); along the power of the sRGB
+    curve (p + 0.055) / 2.4.
+    """
     if response == "linear":
         return pixel
     return torch.where(pixel <= KNEE, pixel, (pixel + 0.055) / 2.4)

@@ -24,9 +24,10 @@ def shade(
 ) -> Shading:
     """L_o(wo) ≈ Σ weight f(wo, wi) L(wi) max(n·wi, 0), in at least float32.
 
-    The colour of a surface does not depend on the direction, so it leaves the sum: three scalar weights per direction
-    stand for f, and of tensors (N, S, 3) autograd keeps the directions and the radiance alone. `n`, `wo` are unit and
-    point away from the surface. Without a `lobe` the surface is Lambertian and nothing specular is computed.
+    The colour of a surface does not depend on the direction, so it leaves the sum: three scalar weights per
+    direction stand for f, and of tensors (N, S, 3) autograd keeps the directions and the radiance alone. `n`,
+    `wo` are unit and point away from the surface. Without a `lobe` the surface is Lambertian and nothing
+    specular is computed.
     """
     radiance = at_least_float32(incident.radiance)
     weight = dot(incident.wi, n).clamp_min(0) * incident.weight
@@ -36,7 +37,10 @@ def shade(
         return Shading(diffuse, diffuse, torch.zeros_like(diffuse))
 
     terms = specular_terms(material.roughness, n, wo, incident.wi, lobe)
-    facing, grazing = _integrate(weight * terms.facing, radiance), _integrate(weight * terms.grazing, radiance)
+    facing, grazing = (
+        _integrate(weight * terms.facing, radiance),
+        _integrate(weight * terms.grazing, radiance),
+    )
     reflected = normal_reflectance(material) * facing + grazing
     return Shading(diffuse + reflected, diffuse, reflected)
 

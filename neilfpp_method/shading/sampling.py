@@ -1,12 +1,14 @@
 """Incident directions and the densities that drew them.
 
-Every sampler integrates the same integral: the mean over S of f(wi)/pdf(wi) estimates ∫ f dwi over the hemisphere about
-n. A `Technique` maps a lattice of the unit square to directions; techniques differ in the density, and `combine` joins
-several by the balance heuristic. With `stochastic` each point's lattice is turned at random and each sample moves evenly
-within its stratum, so that the expectation is exact; without it the lattice lies at the midpoints, the same at every call.
+Every sampler integrates the same integral: the mean over S of f(wi)/pdf(wi) estimates ∫ f dwi over the
+hemisphere about n. A `Technique` maps a lattice of the unit square to directions; techniques differ in the
+density, and `combine` joins several by the balance heuristic. With `stochastic` each point's lattice is
+turned at random and each sample moves evenly within its stratum, so that the expectation is exact; without it
+the lattice lies at the midpoints, the same at every call.
 
-Directions and densities are constants, without gradient. The estimator's gradient is then the mean of (∂f)/pdf, which
-estimates ∂∫f without bias: with f·cos zero at the horizon, the moving edge of the hemisphere adds nothing.
+Directions and densities are constants, without gradient. The estimator's gradient is then the mean of
+(∂f)/pdf, which estimates ∂∫f without bias: with f·cos zero at the horizon, the moving edge of the hemisphere
+adds nothing.
 """
 
 from __future__ import annotations
@@ -41,7 +43,9 @@ GOLDEN_TURN = (3 - math.sqrt(5)) / 2
 """The golden angle as a share of a full turn."""
 
 LOBE_SHARE, LIGHT_SHARE = 0.25, 0.5
-"""Shares of the directions of mis, where there is a light to sample; the cosine has the rest (docs/performance.md)."""
+"""Shares of the directions of mis, where there is a light to sample; the cosine has the rest
+(docs/performance.md).
+"""
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,9 @@ class Technique:
 
 @dataclass(frozen=True)
 class _Lattice:
-    """A Fibonacci lattice of [0, 1)²: `u` has one sample in each of S strata, `v` advances by the golden angle."""
+    """A Fibonacci lattice of [0, 1)²: `u` has one sample in each of S strata, `v` advances by the golden
+    angle.
+    """
 
     u: Float[Tensor, "N S"]
     v: Float[Tensor, "N S"]
@@ -68,11 +74,15 @@ class _Lattice:
 def _lattice(n: Float[Tensor, "N 3"], count: int, stochastic: bool) -> _Lattice:
     k = torch.arange(count, device=n.device, dtype=n.dtype).expand(len(n), count)
     if stochastic:
-        return _Lattice((k + torch.rand_like(k)) / count, (k * GOLDEN_TURN + torch.rand_like(n[:, :1])).frac())
+        return _Lattice(
+            (k + torch.rand_like(k)) / count, (k * GOLDEN_TURN + torch.rand_like(n[:, :1])).frac()
+        )
     return _Lattice((k + 0.5) / count, (k * GOLDEN_TURN).frac())
 
 
-def _about(n: Float[Tensor, "N 3"], height: Float[Tensor, "N S"], turn: Float[Tensor, "N S"]) -> Float[Tensor, "N S 3"]:
+def _about(
+    n: Float[Tensor, "N 3"], height: Float[Tensor, "N S"], turn: Float[Tensor, "N S"]
+) -> Float[Tensor, "N S 3"]:
     """Unit vectors w of height n·w, at an azimuth given in turns."""
     sine = ((1 - height) * (1 + height)).clamp_min(0).sqrt()
     azimuth = 2 * math.pi * turn
@@ -81,7 +91,7 @@ def _about(n: Float[Tensor, "N 3"], height: Float[Tensor, "N S"], turn: Float[Te
     return x * tangent + y * bitangent + z * normal
 
 
-# ------------------------------------------------------------------------------------------------------------ densities
+# -------------------------------------------------------------------------------------------------- densities
 
 
 def pdf_fibonacci(wi: Float[Tensor, "N S 3"], n: Float[Tensor, "N 3"]) -> Float[Tensor, "N S"]:
@@ -107,11 +117,13 @@ def pdf_specular_lobe(
     return lobe.pdf_h(cos.h.abs(), roughness) / (4 * cos.d)
 
 
-# ----------------------------------------------------------------------------------------------------------- techniques
+# ------------------------------------------------------------------------------------------------- techniques
 
 
 def fibonacci(n: Float[Tensor, "N 3"]) -> Technique:
-    """The paper's lattice, with cells of equal solid angle and samples at their midpoints, n·wi = 1 − (k + ½)/S."""
+    """The paper's lattice, with cells of equal solid angle and samples at their midpoints, n·wi = 1 − (k +
+    ½)/S.
+    """
     return _hemisphere(n, lambda u: 1 - u, pdf_fibonacci)
 
 
@@ -133,7 +145,9 @@ def _hemisphere(
     return Technique(draw, lambda wi: pdf(wi, n))
 
 
-def specular_lobe(n: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"], roughness: Float[Tensor, "N 1"], lobe: Lobe) -> Technique:
+def specular_lobe(
+    n: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"], roughness: Float[Tensor, "N 1"], lobe: Lobe
+) -> Technique:
     """Mirror directions of wo about half vectors that the lobe draws; some fall below the horizon."""
     n, wo = at_least_float32(n), at_least_float32(wo)
 
@@ -145,15 +159,15 @@ def specular_lobe(n: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"], roughness: 
     return Technique(draw, lambda wi: pdf_specular_lobe(wi, n, wo, roughness, lobe))
 
 
-# ------------------------------------------------------------------------------------------------------------- samplers
+# --------------------------------------------------------------------------------------------------- samplers
 
 
 @torch.no_grad()
 def combine(techniques: Sequence[tuple[Technique, int]], stochastic: bool) -> IncidentSamples:
     """So many directions from each technique, joined by the balance heuristic (Veach 1997, §9.2).
 
-    The density is taken at the directions as they were rounded: then a lobe cancels exactly against that of the
-    integrand.
+    The density is taken at the directions as they were rounded: then a lobe cancels exactly against that of
+    the integrand.
     """
     techniques = [(technique, count) for technique, count in techniques if count]
     wi = torch.cat([technique.draw(count, stochastic) for technique, count in techniques], 1)
@@ -162,7 +176,9 @@ def combine(techniques: Sequence[tuple[Technique, int]], stochastic: bool) -> In
 
 
 def sphere_lattice(count: int, like: Tensor) -> Float[Tensor, "S 3"]:
-    """`count` directions spread evenly over the whole sphere, on the device and of the type of `like` (float32 at least)."""
+    """`count` directions spread evenly over the whole sphere, on the device and of the type of `like`
+    (float32 at least).
+    """
     up = at_least_float32(like).new_tensor([[0.0, 0.0, 1.0]])
     lattice = _lattice(up, count, stochastic=False)
     return _about(up, 1 - 2 * lattice.u, lattice.v)[0]
@@ -180,7 +196,8 @@ def sample_directions(
 ) -> IncidentSamples:
     """`count` incident directions per point, in at least float32, by fibonacci, cosine, lobe or mis.
 
-    mis is cosine and lobe by halves or, where there is a `light` that can be sampled, cosine, lobe and light together.
+    mis is cosine and lobe by halves or, where there is a `light` that can be sampled, cosine, lobe and light
+    together.
 
     Raises:
         UserError: there is no such sampler.
@@ -194,7 +211,10 @@ def sample_directions(
     elif kind == "mis":
         to_light = 0 if light is None else int(LIGHT_SHARE * count)
         to_lobe = int(LOBE_SHARE * count) if to_light else count // 2
-        techniques = [(cosine(n), count - to_lobe - to_light), (specular_lobe(n, wo, roughness, lobe), to_lobe)]
+        techniques = [
+            (cosine(n), count - to_lobe - to_light),
+            (specular_lobe(n, wo, roughness, lobe), to_lobe),
+        ]
         techniques += [(light, to_light)] if light is not None else []
     else:
         raise UserError(f"unknown sampler '{kind}'", "choose fibonacci, cosine, lobe or mis")

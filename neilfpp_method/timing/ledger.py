@@ -5,12 +5,12 @@ Code that computes says which kind of work begins, and nothing else; without a l
     with doing("tracing"):
         hits = host.scene_light(x, wi)
 
-A ledger that listens gives every moment to one kind: within `doing("tracing")` that of "shading" stands still. So its seconds
-add up to the time since it was made, and what no code has named is "rest".
+A ledger that listens gives every moment to one kind: within `doing("tracing")` that of "shading" stands
+still. So its seconds add up to the time since it was made, and what no code has named is "rest".
 
-On a GPU the clock of the host shows when work was asked for, not when it was done. A ledger that is given `synchronise`
-waits for the device whenever the kind of work changes, but only in one of `EVERY` steps; the time of the other steps of a
-stage is shared out as that of those that were told apart.
+On a GPU the clock of the host shows when work was asked for, not when it was done. A ledger that is given
+`synchronise` waits for the device whenever the kind of work changes, but only in one of `EVERY` steps; the
+time of the other steps of a stage is shared out as that of those that were told apart.
 """
 
 from __future__ import annotations
@@ -23,17 +23,30 @@ from typing import Literal, get_args
 __all__ = ["EVERY", "PREPARATION", "WORK", "Ledger", "Work", "doing", "listening"]
 
 Work = Literal[
-    "data", "rendering", "regularisers", "tracing", "shading", "gradients", "optimiser", "light_fits", "looks", "saving", "rest"
+    "data",
+    "rendering",
+    "regularisers",
+    "tracing",
+    "shading",
+    "gradients",
+    "optimiser",
+    "light_fits",
+    "looks",
+    "saving",
+    "rest",
 ]
-"""Drawing pixels · rays of cameras through the host · losses on geometry and material alone · rays that leave surfaces ·
-material, light and the rendering equation · the backward pass of all of these · the descent and its bookkeeping · solving for
-maps and lamps · pictures and figures on the way · checkpoints · what else there is."""
+"""Drawing pixels · rays of cameras through the host · losses on geometry and material alone · rays that leave
+surfaces · material, light and the rendering equation · the backward pass of all of these · the descent and
+its bookkeeping · solving for maps and lamps · pictures and figures on the way · checkpoints · what else there
+is.
+"""
 WORK: tuple[Work, ...] = get_args(Work)
 PREPARATION = "preparation"
 """The stage before the first: images are read, the model is made."""
 EVERY = 200
-"""On a GPU, one step in so many is told apart. A step that waits at each change of work takes at most about twice as long, so
-this costs at most half a per cent; an estimate, as no GPU was measured."""
+"""On a GPU, one step in so many is told apart. A step that waits at each change of work takes at most about
+twice as long, so this costs at most half a per cent; an estimate, as no GPU was measured.
+"""
 FIRST = 10
 """On a GPU, the step of a stage that is told apart first: those before it compile and allocate."""
 
@@ -42,7 +55,8 @@ class Ledger:
     """Seconds by stage and by work; begins to count when it is made.
 
     Args:
-        synchronise: waits until a device has done what it was asked; none: work is done when its call returns.
+        synchronise: waits until a device has done what it was asked; none: work is done when its call
+            returns.
         now: a clock, seconds.
     """
 
@@ -155,12 +169,13 @@ def listening(ledger: Ledger) -> Iterator[Ledger]:
 
 
 class doing(ContextDecorator):
-    """Says what kind of work is done within, to the ledger that listens, if one does. Also a decorator of functions.
+    """Says what kind of work is done within, to the ledger that listens, if one does. Also a decorator of
+    functions.
 
     Args:
         work: the kind.
-        apart: nothing within is told apart, as in a fit of the light that traces rays of its own; and the device is always
-            waited for, as this is rare and no part of every step.
+        apart: nothing within is told apart, as in a fit of the light that traces rays of its own; and the
+            device is always waited for, as this is rare and no part of every step.
     """
 
     def __init__(self, work: Work, apart: bool = False) -> None:

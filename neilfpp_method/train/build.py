@@ -26,8 +26,9 @@ from neilfpp_method.structures import OrientedPoints
 
 __all__ = ["build_model", "scene_facts", "show_known_light"]
 
-# The sigmoid of R reaches 1 for LDR input. Radiance has no unit: the paper's 3 for HDR is twenty times the median of a well
-# exposed image. Where more is bright R needs more room; the few brightest pixels (a lamp in view) do not decide for all.
+# The sigmoid of R reaches 1 for LDR input. Radiance has no unit: the paper's 3 for HDR is twenty times the
+# median of a well exposed image. Where more is bright R needs more room; the few brightest pixels (a lamp in
+# view) do not decide for all.
 LDR_SCALE = 1.0
 HDR_MEDIANS = 20.0
 BRIGHT_QUANTILE = 0.999
@@ -47,7 +48,9 @@ def scene_facts(capture: Capture, pixels: PixelDataset, config: NeilfConfig) -> 
         kind = "inverted_sphere" if color is None and pixels.border_color() is None else "constant"
     if color is None and kind != "none":
         color = tuple(pixels.border_median().tolist())
-    return SceneFacts(response, median, scale, kind, color or (0.0, 0.0, 0.0), far_points=capture.scene_from == "focus")
+    return SceneFacts(
+        response, median, scale, kind, color or (0.0, 0.0, 0.0), far_points=capture.scene_from == "focus"
+    )
 
 
 def build_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> NeilfModel:
@@ -82,7 +85,9 @@ def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
     path = config.host.path
     mesh = Truth(capture).mesh() if path is None else read_mesh(Path(path), capture.normalisation)
     if mesh is None:
-        raise UserError(f"{capture.root}: no inputs/model/mesh.ply for the mesh host", "name a mesh with --mesh PATH")
+        raise UserError(
+            f"{capture.root}: no inputs/model/mesh.ply for the mesh host", "name a mesh with --mesh PATH"
+        )
     scale, start = facts.radiance_scale, facts.median_radiance
     host = MeshHost(mesh, config, scale, facts.background, facts.background_color, start)
     _check_seen(host, capture, path or "inputs/model/mesh.ply")
@@ -100,7 +105,9 @@ def _check_seen(host: MeshHost, capture: Capture, path: str) -> None:
     if not len(outside):
         raise UserError(f"{path}: no camera sees this mesh", "give it in the world frame of the capture")
     if outside.float().mean() < 0.5:
-        raise UserError(f"{path}: the cameras see the inside of this mesh", "turn its faces: they are wound outwards")
+        raise UserError(
+            f"{path}: the cameras see the inside of this mesh", "turn its faces: they are wound outwards"
+        )
 
 
 def _points(capture: Capture, config: NeilfConfig) -> OrientedPoints | None:
@@ -115,5 +122,8 @@ def _points(capture: Capture, config: NeilfConfig) -> OrientedPoints | None:
     # What lies beyond the scene sphere is no business of G.
     within = points[points.position.norm(dim=-1) < config.volume.radius]
     if not len(within):
-        raise UserError(f"{capture.point_cloud}: no point lies in the scene", "check the scene box, or make the points again")
+        raise UserError(
+            f"{capture.point_cloud}: no point lies in the scene",
+            "check the scene box, or make the points again",
+        )
     return within

@@ -79,9 +79,11 @@ def run_training(
     Args:
         config: the settings; none, with `resume`: those of the run.
         format: the capture's format; none: told from what is in the folder.
-        scale: size of the images over that of their files; none: as large as the rays of the training can use.
+        scale: size of the images over that of their files; none: as large as the rays of the training can
+            use.
         strict: end with an error where the result is of no use.
-        effects: which effects are simulated (`effects.asked`); none: those of the settings, or with `resume` of the run.
+        effects: which effects are simulated (`effects.asked`); none: those of the settings, or with `resume`
+            of the run.
         command: what a person types to get here, for the line that says how a stopped run continues.
         at_end: called with the folder of a run that came to its end, sound or not, by the first process.
 
@@ -101,7 +103,9 @@ def run_training(
         _refuse_changes(out, described, data, config, test_every, response, format, scale)
         plan, source = read_plan(out, described.config), described.source
         if effects not in (None, plan.asked):
-            raise UserError(f"{out}: its effects are '{plan.asked}'", "leave --effects out, or start a new run")
+            raise UserError(
+                f"{out}: its effects are '{plan.asked}'", "leave --effects out, or start a new run"
+            )
         config = plan.config_of_model
         if _is_finished(out, config):
             console.print(f"run folder {out}: finished already, nothing to continue", soft_wrap=True)
@@ -149,11 +153,27 @@ def run_training(
             console.print(started.text, style="yellow" if started.warning else None, soft_wrap=True)
     fabric.barrier()
     continue_with = _continue_with(command, out, device, devices)
-    with listening(ledger), reporting(out, console, fabric.is_global_zero) as reporter, _stop_request() as stopped:
+    with (
+        listening(ledger),
+        reporting(out, console, fabric.is_global_zero) as reporter,
+        _stop_request() as stopped,
+    ):
         preview = _preview(out, capture, fabric, reporter)
         solver, watch = model.light_solver(), _watch(pixels, config, reporter)
         training = Training(
-            out, config, model, pixels, fabric, reporter, stopped, preview, continue_with, solver, watch, plan, ledger
+            out,
+            config,
+            model,
+            pixels,
+            fabric,
+            reporter,
+            stopped,
+            preview,
+            continue_with,
+            solver,
+            watch,
+            plan,
+            ledger,
         )
         train(training)
     if fabric.is_global_zero:
@@ -218,7 +238,9 @@ def _launch(place: torch.device, devices: int) -> Fabric:
     if devices < 1:
         raise UserError(f"{devices} processes cannot share the work", "set --devices to 1 or more")
     if place.type == "cuda" and devices > (torch.cuda.device_count() if place.index is None else 1):
-        raise UserError(f"{place} is not {devices} GPUs", "use --device cuda, and --devices up to the number of GPUs")
+        raise UserError(
+            f"{place} is not {devices} GPUs", "use --device cuda, and --devices up to the number of GPUs"
+        )
     chosen = devices if place.index is None else [place.index]
     strategy = DDPStrategy(find_unused_parameters=True) if devices > 1 else "auto"
     fabric = Fabric(accelerator=place.type, devices=chosen, strategy=strategy)
@@ -228,7 +250,9 @@ def _launch(place: torch.device, devices: int) -> Fabric:
 
 def _check(config: NeilfConfig) -> None:
     if min(stage_steps(config.train).values()) < 0 or sum(stage_steps(config.train).values()) == 0:
-        raise UserError("the stages have no steps", "set --config.train.sdf-steps and the others to 0 or more")
+        raise UserError(
+            "the stages have no steps", "set --config.train.sdf-steps and the others to 0 or more"
+        )
     for name in ("rays", "checkpoint_every", "eval_chunk"):
         if getattr(config.train, name) < 1:
             option = f"--config.train.{name.replace('_', '-')}"
@@ -242,7 +266,8 @@ def _check(config: NeilfConfig) -> None:
 
 def _scaled(scale: float, pixels: int, rays: int) -> str:
     return (
-        f"images at {scale:.3g} of their size: {pixels / 1e6:.1f} million pixels for {rays / 1e6:.1f} million rays; "
+        f"images at {scale:.3g} of their size: {pixels / 1e6:.1f} million pixels for {rays / 1e6:.1f} "
+        "million rays; "
         "--scale 1 takes them whole"
     )
 
@@ -264,7 +289,9 @@ def _nothing_left_on_failure(out: Path) -> Iterator[None]:
 
 @doing("data", apart=True)
 def _load_pixels(capture: Capture, folder: Path, fabric: Fabric, console: Console) -> PixelDataset:
-    """One process reads the images, and all find them in the folder; what is wrong with them is wrong for all."""
+    """One process reads the images, and all find them in the folder; what is wrong with them is wrong for
+    all.
+    """
     problem: tuple[str, str] | None = None
     if fabric.is_global_zero:
         try:
@@ -286,7 +313,9 @@ def _read_pixels(capture: Capture, folder: Path, fabric: Fabric, console: Consol
         return PixelDataset(capture, views, fabric.device, lambda _: progress.advance(task), folder)
 
 
-def _preview(out: Path, capture: Capture, fabric: Fabric, reporter: Reporter) -> Callable[[NeilfModel, Stage], None]:
+def _preview(
+    out: Path, capture: Capture, fabric: Fabric, reporter: Reporter
+) -> Callable[[NeilfModel, Stage], None]:
     def preview(model: NeilfModel, stage: Stage) -> None:
         if fabric.is_global_zero:
             pixels = write_preview(model, capture, stage, out / "previews" / f"{stage.value}.png")

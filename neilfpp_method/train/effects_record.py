@@ -1,9 +1,9 @@
-"""The effects of a run, in `RUN/effects.json`: every decision, and the table that follows; read by resumed and loaded runs.
+"""The effects of a run, in `RUN/effects.json`: every decision, and the table that follows; read by resumed
+and loaded runs.
 
-format      1
-asked       the value of --effects
-decisions   in order: step, effect, on, by, reason, evidence (null, or what, value, deviation, threshold, samples)
-effects     a row per effect as `effects.table.rows` has it, for whoever shows a run; it follows from the decisions
+format      1 asked       the value of --effects decisions   in order: step, effect, on, by, reason, evidence
+(null, or what, value, deviation, threshold, samples) effects     a row per effect as `effects.table.rows` has
+it, for whoever shows a run; it follows from the decisions
 """
 
 from __future__ import annotations
@@ -31,11 +31,15 @@ FILE = "effects.json"
 def write_plan(run: Path, plan: Plan) -> None:
     """The decisions so far, and the table that they come to."""
     decisions = [dataclasses.asdict(decision) for decision in plan.decisions]
-    write_json(run / FILE, {"format": FORMAT, "asked": str(plan.asked), "decisions": decisions, "effects": rows(plan)})
+    write_json(
+        run / FILE,
+        {"format": FORMAT, "asked": str(plan.asked), "decisions": decisions, "effects": rows(plan)},
+    )
 
 
 def read_plan(run: Path, settings: NeilfConfig, before: int | None = None) -> Plan:
-    """The plan of a run as it was after `before` steps; none: as it is. A run without one has its settings as they are.
+    """The plan of a run as it was after `before` steps; none: as it is. A run without one has its settings as
+    they are.
 
     Raises:
         UserError: the file is damaged or of another version.
@@ -45,18 +49,32 @@ def read_plan(run: Path, settings: NeilfConfig, before: int | None = None) -> Pl
         return Plan.begin(Asked("as-set"), settings)
     stored = read_json(path)
     if stored.get("format") != FORMAT or not isinstance(stored.get("decisions"), list):
-        raise UserError(f"{path}: a record of another version", "use the version of neilfpp that wrote the run")
+        raise UserError(
+            f"{path}: a record of another version", "use the version of neilfpp that wrote the run"
+        )
     try:
         decisions = [_decision(entry, str(path)) for entry in stored["decisions"]]
         asked = read_asked(stored["asked"])
-    except (TypeError, AttributeError, KeyError) as error:  # Something that must be there is missing, or is no object.
-        raise UserError(f"{path}: not a complete record ({error})", "restore the file or train again") from error
-    return Plan(asked, settings, [d for d in decisions if before is None or d.before_training or d.step <= before])
+    except (
+        TypeError,
+        AttributeError,
+        KeyError,
+    ) as error:  # Something that must be there is missing, or is no object.
+        raise UserError(
+            f"{path}: not a complete record ({error})", "restore the file or train again"
+        ) from error
+    return Plan(
+        asked, settings, [d for d in decisions if before is None or d.before_training or d.step <= before]
+    )
 
 
 def _decision(entry: dict[str, Any], where: str) -> Decision:
     evidence = entry["evidence"]
     plain = from_dict(Decision, {name: value for name, value in entry.items() if name != "evidence"}, where)
     if plain.effect not in EFFECTS:
-        raise UserError(f"{where}: no effect '{plain.effect}'", "use the version of neilfpp that wrote the run")
-    return dataclasses.replace(plain, evidence=None if evidence is None else from_dict(Measurement, evidence, where))
+        raise UserError(
+            f"{where}: no effect '{plain.effect}'", "use the version of neilfpp that wrote the run"
+        )
+    return dataclasses.replace(
+        plain, evidence=None if evidence is None else from_dict(Measurement, evidence, where)
+    )

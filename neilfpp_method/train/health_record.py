@@ -1,4 +1,6 @@
-"""The findings of a run, in `RUN/health.json`: written with every checkpoint, read by evaluation, report and resumed runs."""
+"""The findings of a run, in `RUN/health.json`: written with every checkpoint, read by evaluation, report and
+resumed runs.
+"""
 
 from __future__ import annotations
 
@@ -29,11 +31,15 @@ def read_findings(run: Path) -> list[Finding] | None:
         return None
     stored = read_json(path)
     if stored.get("format") != FORMAT or not isinstance(stored.get("findings"), list):
-        raise UserError(f"{path}: a record of another version", "remove the file, or use the version that wrote it")
+        raise UserError(
+            f"{path}: a record of another version", "remove the file, or use the version that wrote it"
+        )
     try:
         return [from_dict(Finding, finding, str(path)) for finding in stored["findings"]]
     except (TypeError, AttributeError) as error:
-        raise UserError(f"{path}: not a complete record ({error})", "remove the file, or train again") from error
+        raise UserError(
+            f"{path}: not a complete record ({error})", "remove the file, or train again"
+        ) from error
 
 
 def in_words(findings: list[Finding]) -> str:

@@ -28,7 +28,9 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         value = json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise UserError(f"{path}: not readable as JSON ({error})", "restore the file or train again") from error
+        raise UserError(
+            f"{path}: not readable as JSON ({error})", "restore the file or train again"
+        ) from error
     if not isinstance(value, dict):
         raise UserError(f"{path}: holds no JSON object", "restore the file or train again")
     return value

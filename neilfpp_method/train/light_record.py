@@ -1,4 +1,6 @@
-"""What the kept-back points said of lamps before the environment map: the record of a run, fit by fit, in `RUN/light.json`."""
+"""What the kept-back points said of lamps before the environment map: the record of a run, fit by fit, in
+`RUN/light.json`.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ class LightFit:
 
     Attributes:
         step: of the training.
-        gain: how much lower the mean relative error is with lamps, at points that were kept back from the fit.
+        gain: how much lower the mean relative error is with lamps, at points that were kept back from the
+            fit.
         deviation: the standard error of that mean.
         points: how many were kept back.
         lamps: how many are lit since.
@@ -61,11 +64,15 @@ def read_fits(run: Path, before: int) -> list[LightFit]:
         return []
     stored = read_json(path)
     if stored.get("format") != FORMAT or not isinstance(stored.get("fits"), list):
-        raise UserError(f"{path}: a record of another version", "remove the file, or use the version that wrote it")
+        raise UserError(
+            f"{path}: a record of another version", "remove the file, or use the version that wrote it"
+        )
     try:
         fits = [from_dict(LightFit, fit, str(path)) for fit in stored["fits"]]
     except (TypeError, AttributeError) as error:  # Something that must be there is missing, or is no object.
-        raise UserError(f"{path}: not a complete record ({error})", "remove the file, or train again") from error
+        raise UserError(
+            f"{path}: not a complete record ({error})", "remove the file, or train again"
+        ) from error
     return [fit for fit in fits if fit.step < before]
 
 

@@ -19,7 +19,16 @@ from neilfpp_method.errors import Diverged, Stopped, UserError
 from neilfpp_method.health.watch import Watch
 from neilfpp_method.lighting.solver import LightSolver
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, rate_factor, stage_at, stage_steps, weigh
+from neilfpp_method.schedule import (
+    Stage,
+    StagePosition,
+    Total,
+    active_losses,
+    rate_factor,
+    stage_at,
+    stage_steps,
+    weigh,
+)
 from neilfpp_method.settings.facts import RadianceUnits
 from neilfpp_method.settings.types import NeilfConfig, OptimizerConfig
 from neilfpp_method.structures import LossTerms, StepResult
@@ -94,7 +103,9 @@ def train(run: Training) -> None:
             model.train()
 
 
-def _train_stage(run: Training, model: NeilfModel, optimizer: torch.optim.Optimizer, step: int, position: StagePosition) -> int:
+def _train_stage(
+    run: Training, model: NeilfModel, optimizer: torch.optim.Optimizer, step: int, position: StagePosition
+) -> int:
     """The rest of a stage. Returns the number of the step that follows it."""
     settings = run.config.train
     stage = position.stage
@@ -131,7 +142,9 @@ def _train_stage(run: Training, model: NeilfModel, optimizer: torch.optim.Optimi
 
 
 def _solve_light(run: Training, model: NeilfModel, computed: StepResult, step: int) -> None:
-    """Show the light solver what a step showed; when it is time, it sets the light. The first process does it for all."""
+    """Show the light solver what a step showed; when it is time, it sets the light. The first process does it
+    for all.
+    """
     fabric, solver = run.fabric, run.light_solver
     if fabric.is_global_zero:
         with doing("light_fits"):
@@ -150,7 +163,9 @@ def _solve_light(run: Training, model: NeilfModel, computed: StepResult, step: i
 
 
 def _look_at_effects(run: Training, model: NeilfModel, step: int) -> None:
-    """Let the surface decide what is simulated from here on, where that is open. The first process decides for all."""
+    """Let the surface decide what is simulated from here on, where that is open. The first process decides
+    for all.
+    """
     if not wants_surface(run.plan):
         return
     decisions: list[Decision] = []
@@ -178,7 +193,12 @@ def _tell(run: Training, decisions: Sequence[Decision]) -> None:
 
 @doing("optimiser")
 def _update(
-    run: Training, model: NeilfModel, optimizer: torch.optim.Optimizer, terms: LossTerms, total: Total, step: int
+    run: Training,
+    model: NeilfModel,
+    optimizer: torch.optim.Optimizer,
+    terms: LossTerms,
+    total: Total,
+    step: int,
 ) -> bool:
     """One step down the gradient; a step whose loss or gradient is not finite is left out, counted and named.
 
@@ -191,8 +211,8 @@ def _update(
     norms = _gradient_norms(model)
     psnr = _psnr(terms, run.model.units)
     stop = torch.full_like(psnr, run.should_stop())
-    # The one transfer of the step: everything that the loop and the person must know. Every process takes the mean
-    # over all of them, so that all leave out the same steps and all stop after the same one.
+    # The one transfer of the step: everything that the loop and the person must know. Every process takes the
+    # mean over all of them, so that all leave out the same steps and all stop after the same one.
     known = run.fabric.all_reduce(torch.stack([total.loss.detach(), psnr, stop, *norms.values()])).tolist()
     loss, decibels, asked, found = known[0], known[1], known[2], dict(zip(norms, known[3:], strict=True))
     if all(math.isfinite(value) for value in (loss, *found.values())):
@@ -211,17 +231,22 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], step: int) ->
     run.skipped_in_a_row += 1
     culprits = [name for name, value in total.terms.items() if not math.isfinite(value.item())]
     fields = [name for name, value in norms.items() if not math.isfinite(value)]
-    where = f"loss {', '.join(culprits)}" if culprits else f"the gradient of {', '.join(fields) or 'another process'}"
+    where = (
+        f"loss {', '.join(culprits)}"
+        if culprits
+        else f"the gradient of {', '.join(fields) or 'another process'}"
+    )
     run.reporter.warn(f"step {step} skipped: {where} is not finite ({run.skipped} skipped so far)")
     if run.skipped_in_a_row >= MOST_SKIPPED:
         raise Diverged(
             f"{MOST_SKIPPED} steps in a row were not finite, the last one in {where}",
-            f"the last good checkpoint is kept in {run.path / 'checkpoints'}; look at the capture's brightest pixels "
+            f"the last good checkpoint is kept in {run.path / 'checkpoints'}; look at the capture's "
+            "brightest pixels "
             "or lower the learning rates",
         )
 
 
-# ------------------------------------------------------------------------------------------------------------ optimiser
+# -------------------------------------------------------------------------------------------------- optimiser
 
 
 def make_optimizer(model: NeilfModel, config: OptimizerConfig) -> torch.optim.Optimizer:
@@ -243,12 +268,16 @@ def adam(groups: Sequence[Mapping[str, object]]) -> torch.optim.Adam:
 
 
 def set_rates(
-    optimizer: torch.optim.Optimizer, config: OptimizerConfig, position: StagePosition, background_waits: bool = True
+    optimizer: torch.optim.Optimizer,
+    config: OptimizerConfig,
+    position: StagePosition,
+    background_waits: bool = True,
 ) -> None:
     """The rate of each field at a step of a stage.
 
-    `background_waits` off: what lies beyond the scene moves from the start, whatever `config.background_from` says. Where
-    structure from motion has found points there, one colour is no stand-in for it: training would fill the scene with clouds.
+    `background_waits` off: what lies beyond the scene moves from the start, whatever `config.background_from`
+    says. Where structure from motion has found points there, one colour is no stand-in for it: training would
+    fill the scene with clouds.
     """
     factor = rate_factor(config, position)
     waits = background_waits and position.stage is Stage.SDF_INIT and position.share < config.background_from
@@ -275,14 +304,17 @@ def _gradient_norms(model: NeilfModel) -> dict[str, Tensor]:
 def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
     """PSNR of the pixels that the stage compares, dB, in the capture's own response; NaN where there is none.
 
-    The peak is 1, and no error counts for more: a few HDR highlights would otherwise be all that the figure shows.
+    The peak is 1, and no error counts for more: a few HDR highlights would otherwise be all that the figure
+    shows.
     """
-    term, unit = (terms["physical"], units.physical) if "physical" in terms else (terms["volume"], units.volume)
+    term, unit = (
+        (terms["physical"], units.physical) if "physical" in terms else (terms["volume"], units.volume)
+    )
     error = (term.values.detach() * unit).clamp_max(1.0).square().mean()
     return -10.0 * torch.log10(error.clamp_min(1e-10))
 
 
-# ----------------------------------------------------------------------------------------------------- state and record
+# ------------------------------------------------------------------------------------------- state and record
 
 
 @doing("saving", apart=True)
@@ -294,7 +326,9 @@ def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str 
             write_findings(run.path, run.watch)
             write_plan(run.path, run.plan)
             for name in filter(None, (also, "last")):
-                save_checkpoint(run.path / "checkpoints" / f"{name}.pt", run.model, run.light_solver, optimizer, step)
+                save_checkpoint(
+                    run.path / "checkpoints" / f"{name}.pt", run.model, run.light_solver, optimizer, step
+                )
             write_json(run.path / "timing.json", run.seconds)
             write_work(run.path, run.ledger)
         except UserError as error:
@@ -326,5 +360,7 @@ def _log(run: Training, model: NeilfModel, total: Total, decibels: float, loss: 
     if width is not None:
         values["beta"] = width().item()
     if run.fits:
-        values |= {f"light/{name}": float(getattr(run.fits[-1], name)) for name in ("gain", "deviation", "lamps")}
+        values |= {
+            f"light/{name}": float(getattr(run.fits[-1], name)) for name in ("gain", "deviation", "lamps")
+        }
     run.reporter.scalars(step, values)

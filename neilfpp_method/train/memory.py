@@ -13,7 +13,9 @@ from neilfpp_method.data.views import View
 __all__ = ["check_training_memory", "training_bytes"]
 
 READING = 48
-"""Bytes to a pixel of the largest file while it is decoded, made linear, averaged and encoded. An estimate."""
+"""Bytes to a pixel of the largest file while it is decoded, made linear, averaged and encoded. An
+estimate.
+"""
 COUNTED = 3 * 8 / 1024
 """Bytes to a pixel of all views: counts of three sets of pixels, by block."""
 LOADED = 0.8e9
@@ -21,7 +23,8 @@ LOADED = 0.8e9
 
 
 def training_bytes(views: Sequence[View]) -> int:
-    """About how many bytes a training takes, at least, beside pages of files, which the system takes back at need.
+    """About how many bytes a training takes, at least, beside pages of files, which the system takes back at
+    need.
 
     What single steps take is left out: it follows from the settings, not from the images.
     """

@@ -28,15 +28,17 @@ MOST_PIXELS = 160
 def write_preview(model: NeilfModel, capture: Capture, stage: Stage, path: Path) -> np.ndarray:
     """Render the first test view (or training view) small, write it, and return the picture, (H, W, 3) uint8.
 
-    From left to right: photograph, R, normals; once there is a material also the PBR image, base colour, roughness and
-    metallic.
+    From left to right: photograph, R, normals; once there is a material also the PBR image, base colour,
+    roughness and metallic.
     """
     view = (capture.test_views or capture.train_views)[0]
     view = scaled_view(view, min(1.0, MOST_PIXELS / max(file_size(view))))
     shape = (view.camera.height, view.camera.width, 3)
     panels = [_photograph(view, capture.hdr)]
     rays = camera_rays(capture.normalisation.camera(view.camera))
-    panels += [p.reshape(shape) for p in _panels(model, rays, model.config, model.stages[stage].moves_material)]
+    panels += [
+        p.reshape(shape) for p in _panels(model, rays, model.config, model.stages[stage].moves_material)
+    ]
     picture = np.concatenate([(p.clip(0.0, 1.0) * 255.0 + 0.5).astype(np.uint8) for p in panels], axis=1)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_png(path, picture)

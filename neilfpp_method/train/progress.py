@@ -1,4 +1,6 @@
-"""What a person sees while a run trains: a bar per stage, TensorBoard, and a picture at the end of each stage."""
+"""What a person sees while a run trains: a bar per stage, TensorBoard, and a picture at the end of each
+stage.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ class Reporter:
     def begin_stage(self, stage: str, done: int, length: int) -> None:
         """Open a bar for a stage, `done` of whose `length` steps are behind it."""
         if self.progress is not None:
-            self.task = self.progress.add_task(TITLES[stage], total=length, completed=done, loss="–", psnr="–")
+            self.task = self.progress.add_task(
+                TITLES[stage], total=length, completed=done, loss="–", psnr="–"
+            )
 
     def step(self, loss: float, psnr: float) -> None:
         """One step further; `psnr` is NaN where the step compared no pixel."""
@@ -91,5 +95,7 @@ def reporting(run: Path, console: Console, first_process: bool) -> Iterator[Repo
         with progress:
             yield Reporter(console, progress, writer)
     finally:
-        with suppress(OSError):  # A disk that is full ends the run by what could not be saved, not by its log.
+        with suppress(
+            OSError
+        ):  # A disk that is full ends the run by what could not be saved, not by its log.
             writer.close()

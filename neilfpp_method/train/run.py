@@ -83,7 +83,9 @@ class CaptureSource:
 
     def load(self) -> Capture:
         """The capture, its views at `scale` times the size of their files."""
-        return at_scale(load_capture(Path(self.root), self.format, self.test_every, response=self.response), self.scale)
+        return at_scale(
+            load_capture(Path(self.root), self.format, self.test_every, response=self.response), self.scale
+        )
 
     def load_again(self, run: Path) -> Capture:
         """The capture of a run that is there already.
@@ -93,7 +95,10 @@ class CaptureSource:
         """
         if not Path(self.root).is_dir():
             place = run / "capture.json"
-            raise UserError(f"{self.root}: the run's capture is not there", f"move it back, or give its new place in {place}")
+            raise UserError(
+                f"{self.root}: the run's capture is not there",
+                f"move it back, or give its new place in {place}",
+            )
         return self.load()
 
 
@@ -104,11 +109,13 @@ class Run:
     Attributes:
         path: the run folder.
         config: every setting that it was trained with, the effects as they were decided last.
-        capture: the images that it was trained on, with their cameras in the world frame; `capture.normalisation` leads from
-            there to the scene frame, in which all fields of the model live.
+        capture: the images that it was trained on, with their cameras in the world frame;
+            `capture.normalisation` leads from there to the scene frame, in which all fields of the model
+            live.
         facts: what the images decided before training, such as the unit of radiance and the background.
-        model: in evaluation mode, with the weights of step `step`. `model.materials(x)`, `model.incident_light(x, wi)` and
-            `model.maps(rays)` answer for points and rays in the scene frame.
+        model: in evaluation mode, with the weights of step `step`. `model.materials(x)`,
+            `model.incident_light(x, wi)` and `model.maps(rays)` answer for points and rays in the scene
+            frame.
         step: how many steps of training the weights have seen.
 
     Example:
@@ -135,8 +142,8 @@ def check_free(path: Path) -> None:
     """That a new run may take this folder.
 
     Raises:
-        UserError: the folder is there already and holds more than the pixels of a training that never began, or cannot be
-            made.
+        UserError: the folder is there already and holds more than the pixels of a training that never began,
+            or cannot be made.
     """
     if path.exists() and (not path.is_dir() or any(inner.name != PIXELS for inner in path.iterdir())):
         raise UserError(f"{path}: exists already", "choose another --out, or continue it with --resume")
@@ -151,7 +158,9 @@ def check_writable(path: Path) -> None:
     """
     above = next(folder for folder in path.absolute().parents if folder.exists())
     if not above.is_dir() or not os.access(above, os.W_OK):
-        raise UserError(f"{path}: cannot be written, for nothing can be made in {above}", "choose another --out")
+        raise UserError(
+            f"{path}: cannot be written, for nothing can be made in {above}", "choose another --out"
+        )
 
 
 def create_run(path: Path, config: NeilfConfig, source: CaptureSource, facts: SceneFacts) -> None:
@@ -212,11 +221,14 @@ def read_description(path: Path) -> Description:
         UserError: no run there, or one of another version.
     """
     if not (path / "config.json").is_file():
-        raise UserError(f"{path}: no run here (config.json is missing)", "give the folder that `neilfpp train` wrote")
+        raise UserError(
+            f"{path}: no run here (config.json is missing)", "give the folder that `neilfpp train` wrote"
+        )
     stored = read_json(path / "config.json")
     if stored.get("format") != FORMAT:
         raise UserError(
-            f"{path / 'config.json'}: written in run format {stored.get('format')}, this version reads {FORMAT}",
+            f"{path / 'config.json'}: written in run format {stored.get('format')}, this version reads "
+            f"{FORMAT}",
             "use the version of neilfpp that wrote it, or train again",
         )
     return Description(
@@ -233,14 +245,20 @@ def _described(kind: type[Part], values: Any, where: str) -> Part:
     try:
         return from_dict(kind, values, where)
     except (TypeError, AttributeError) as error:  # Something that must be there is missing, or is no object.
-        raise UserError(f"{where}: not a complete description ({error})", "restore the file or train again") from error
+        raise UserError(
+            f"{where}: not a complete description ({error})", "restore the file or train again"
+        ) from error
 
 
-# ---------------------------------------------------------------------------------------------------------- checkpoints
+# ------------------------------------------------------------------------------------------------ checkpoints
 
 
-def save_checkpoint(path: Path, model: nn.Module, light_solver: nn.Module, optimizer: torch.optim.Optimizer, step: int) -> None:
-    """Weights, what the light solver remembers, and the optimiser after `step` steps, in one step: never half a file."""
+def save_checkpoint(
+    path: Path, model: nn.Module, light_solver: nn.Module, optimizer: torch.optim.Optimizer, step: int
+) -> None:
+    """Weights, what the light solver remembers, and the optimiser after `step` steps, in one step: never half
+    a file.
+    """
     parts = {"model": model, "light_solver": light_solver, "optimizer": optimizer}
     contents = {"format": FORMAT, "step": step, **{name: part.state_dict() for name, part in parts.items()}}
     with replacing(path) as temporary, temporary.open("wb") as file:
@@ -266,7 +284,9 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         remedy = "copy a stage's checkpoint over it, or train again"
         raise UserError(f"{path}: not a readable checkpoint", remedy) from error
     if not isinstance(contents, dict) or contents.get("format") != FORMAT or CHECKPOINT_KEYS - set(contents):
-        raise UserError(f"{path}: a checkpoint of another version", "use the version of neilfpp that wrote it")
+        raise UserError(
+            f"{path}: a checkpoint of another version", "use the version of neilfpp that wrote it"
+        )
     return contents
 
 
@@ -285,7 +305,7 @@ def load_weights(module: nn.Module, weights: Mapping[str, Any], run: Path) -> No
         ) from error
 
 
-# ---------------------------------------------------------------------------------------------------------------- files
+# ------------------------------------------------------------------------------------------------------ files
 
 
 def environment() -> dict[str, Any]:

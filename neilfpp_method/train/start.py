@@ -1,7 +1,7 @@
 """What the distance field starts as: the sphere that it is made as, or the visual hull of the masks.
 
-Training finds a surface faster, and more often the right one, from a body that has the object's outline in every view:
-hollows are carved from there, while a sphere has to grow legs.
+Training finds a surface faster, and more often the right one, from a body that has the object's outline in
+every view: hollows are carved from there, while a sphere has to grow legs.
 """
 
 from __future__ import annotations
@@ -33,19 +33,24 @@ NEAR_SHARE = 0.5
 NEAR_SURFACE = 0.1
 """How far from the surface these lie, scene units, standard deviation."""
 RATE = 1e-2
-"""Adam's rate for grids and networks of the preset `fast`; it falls to a tenth. Networks with waves take a tenth of it."""
+"""Adam's rate for grids and networks of the preset `fast`; it falls to a tenth. Networks with waves take a
+tenth of it.
+"""
 DAMPING = 1e-3
-"""Adam's ε. An entry of a fine grid that one point alone asks for has a gradient far below this, and hardly moves. With the
-usual 1e-15 it leaps by the whole rate: normals at the surface were then 12.5° off those of the hull, in place of 6°, and second
-derivatives four times as large."""
+"""Adam's ε. An entry of a fine grid that one point alone asks for has a gradient far below this, and hardly
+moves. With the usual 1e-15 it leaps by the whole rate: normals at the surface were then 12.5° off those of
+the hull, in place of 6°, and second derivatives four times as large.
+"""
 POOL = 65_536
 """Points of the cube among which those near the surface are sought."""
 
 
 @dataclass(frozen=True)
 class GeometryStart:
-    """What the field starts as. `error` is the mean difference between field and hull at the hull's surface, scene units;
-    none: it starts as a sphere, for the `reason`. `warning`: masks are there, and no body comes of them."""
+    """What the field starts as. `error` is the mean difference between field and hull at the hull's surface,
+    scene units; none: it starts as a sphere, for the `reason`. `warning`: masks are there, and no body comes
+    of them.
+    """
 
     views: int = 0
     error: float | None = None
@@ -63,8 +68,9 @@ class GeometryStart:
 def start_geometry(model: NeilfModel, capture: Capture, config: NeilfConfig) -> GeometryStart | None:
     """Give a new model the geometry that `config.host.sdf.start` names, and say which it is.
 
-    None where there is nothing to start: geometry is given, or belongs to another trainer. Only views to train on are
-    asked. The outcome follows from `config.train.seed` and the masks alone, and no other random number is moved by it.
+    None where there is nothing to start: geometry is given, or belongs to another trainer. Only views to
+    train on are asked. The outcome follows from `config.train.seed` and the masks alone, and no other random
+    number is moved by it.
 
     Raises:
         UserError: a mask cannot be read.
@@ -83,11 +89,14 @@ def start_geometry(model: NeilfModel, capture: Capture, config: NeilfConfig) -> 
     return GeometryStart(len(outlines), error)
 
 
-def fit_distance(field: SdfField, target: DistanceCube, radius: float, seed: int, rate: float = RATE) -> float:
-    """Bring a distance field to a sampled distance within the ball of `radius`; returns the mean error at its surface.
+def fit_distance(
+    field: SdfField, target: DistanceCube, radius: float, seed: int, rate: float = RATE
+) -> float:
+    """Bring a distance field to a sampled distance within the ball of `radius`; returns the mean error at its
+    surface.
 
-    The L1 error of the distance is minimised at points that are half spread over the ball and half about the surface.
-    Features of the field, which R reads, are not asked for and move as they like.
+    The L1 error of the distance is minimised at points that are half spread over the ball and half about the
+    surface. Features of the field, which R reads, are not asked for and move as they like.
 
     Args:
         field: moves in place, on its own device.
@@ -97,7 +106,9 @@ def fit_distance(field: SdfField, target: DistanceCube, radius: float, seed: int
         rate: of Adam.
     """
     device = next(field.parameters()).device
-    points = torch.Generator().manual_seed(seed)  # its own: what training draws does not depend on how it started
+    points = torch.Generator().manual_seed(
+        seed
+    )  # its own: what training draws does not depend on how it started
     surface = _surface_points(target, points)
     optimizer = torch.optim.Adam(field.parameters(), lr=rate, eps=DAMPING, fused=True)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.1 ** (1 / STEPS))
@@ -121,7 +132,12 @@ def _surface_points(target: DistanceCube, generator: torch.Generator) -> Float[T
     x = target.radius * (2 * torch.rand(POOL, 3, generator=generator) - 1)
     nearest = target.at(x).abs()
     # A body of a few cells has few points near it: the nearest hundredth of the pool serves then.
-    return x[nearest <= torch.maximum(torch.tensor(4 * target.radius / len(target.distance)), nearest.kthvalue(POOL // 100)[0])]
+    return x[
+        nearest
+        <= torch.maximum(
+            torch.tensor(4 * target.radius / len(target.distance)), nearest.kthvalue(POOL // 100)[0]
+        )
+    ]
 
 
 def _in_ball(count: int, radius: float, generator: torch.Generator) -> Float[Tensor, "N 3"]:
@@ -131,7 +147,9 @@ def _in_ball(count: int, radius: float, generator: torch.Generator) -> Float[Ten
 
 
 def _in_scene(outline: Outline, capture: Capture) -> Outline:
-    return replace(outline, view=replace(outline.view, camera=capture.normalisation.camera(outline.view.camera)))
+    return replace(
+        outline, view=replace(outline.view, camera=capture.normalisation.camera(outline.view.camera))
+    )
 
 
 def _rate(config: NeilfConfig) -> float:

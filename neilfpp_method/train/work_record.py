@@ -34,7 +34,9 @@ def read_work(run: Path) -> dict[str, dict[str, float]]:
         return {}
     stored = read_json(path)
     if stored.get("format") != FORMAT:
-        raise UserError(f"{path}: a record of another version", "remove the file, or use the version that wrote it")
+        raise UserError(
+            f"{path}: a record of another version", "remove the file, or use the version that wrote it"
+        )
     stages = stored.get("seconds")
     if not isinstance(stages, dict) or not all(isinstance(parts, dict) for parts in stages.values()):
         raise UserError(f"{path}: not a complete record", "remove the file, or train again")
@@ -42,7 +44,9 @@ def read_work(run: Path) -> dict[str, dict[str, float]]:
         for work, seconds in parts.items():
             good = isinstance(seconds, int | float) and math.isfinite(seconds) and seconds >= 0
             if work not in WORK or not good:
-                raise UserError(f"{path}: {stage}.{work}: no time of a known kind", "remove the file, or train again")
+                raise UserError(
+                    f"{path}: {stage}.{work}: no time of a known kind", "remove the file, or train again"
+                )
     return stages
 
 

@@ -39,6 +39,8 @@ def check_free(host: str, port: int) -> None:
             probe.bind(found[0][4])
             probe.listen()
     except socket.gaierror as error:
-        raise UserError(f"--host {host}: no such address", "give an address of this machine, as 127.0.0.1") from error
+        raise UserError(
+            f"--host {host}: no such address", "give an address of this machine, as 127.0.0.1"
+        ) from error
     except OSError as error:
         raise UserError(f"port {port} of {host}: {error.strerror}", "choose another with --port") from error

@@ -1,4 +1,5 @@
-"""The page in the browser, by viser: what a person moves becomes wishes, and pictures become the page's background.
+"""The page in the browser, by viser: what a person moves becomes wishes, and pictures become the page's
+background.
 
 Every browser has a session of its own: camera, layer, light, lamps. Sessions take turns at the model.
 """
@@ -44,7 +45,9 @@ KEYS = {title: name for name, title in LAYERS.items()}
 
 
 class _Local(viser.ViserServer):
-    """Without viser's tunnel: a page in any browser could ask for one, and a capture is nobody else's affair."""
+    """Without viser's tunnel: a page in any browser could ask for one, and a capture is nobody else's
+    affair.
+    """
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         return None
@@ -98,7 +101,9 @@ class Page:
 class _Session:
     """What one browser looks at."""
 
-    def __init__(self, page: Page, subject: Subject, client: viser.ClientHandle, before: _Session | None) -> None:
+    def __init__(
+        self, page: Page, subject: Subject, client: viser.ClientHandle, before: _Session | None
+    ) -> None:
         self.page, self.subject, self.client = page, subject, client
         self.own = own_light(subject.run)
         self.lights = self._lights()
@@ -121,7 +126,7 @@ class _Session:
         self.client.gui.reset()
         self.client.camera._state.camera_cb.clear()
 
-    # ------------------------------------------------------------------------------------------------ the controls
+    # ------------------------------------------------------------------------------------------- the controls
 
     def _build(self, before: _Session | None) -> None:
         gui, run = self.client.gui, self.subject.run
@@ -135,9 +140,13 @@ class _Session:
         self.layer.on_update(lambda _: self._ask())
         self.exposure.on_update(lambda _: self._ask())
         with gui.add_folder("Light", visible="pbr" in self.subject.layers):
-            self.environment = gui.add_dropdown("Environment", list(self.lights), initial_value=next(iter(self.lights)))
+            self.environment = gui.add_dropdown(
+                "Environment", list(self.lights), initial_value=next(iter(self.lights))
+            )
             has_sky = self.own.sky is not None
-            self.turned = gui.add_slider("Turn", -180, 180, 5, 0, hint="Degrees, about the vertical", visible=has_sky)
+            self.turned = gui.add_slider(
+                "Turn", -180, 180, 5, 0, hint="Degrees, about the vertical", visible=has_sky
+            )
             self.behind = gui.add_checkbox("Show the environment", False, visible=has_sky)
             lamps = self.own.lamps is not None
             self.lamps_on = gui.add_checkbox("Lamps", True, visible=lamps)
@@ -147,9 +156,13 @@ class _Session:
         self.behind.on_update(lambda _: self._ask())
         self.lamps_on.on_update(lambda _: self._change_light())
         self.back.on_click(lambda _: self._put_back())
-        with gui.add_folder("Light at a point", visible=self.subject.surface is not None and "pbr" in self.subject.layers):
+        with gui.add_folder(
+            "Light at a point", visible=self.subject.surface is not None and "pbr" in self.subject.layers
+        ):
             self.told = gui.add_markdown("Click the surface.")
-            self.map = gui.add_image(NOTHING, label="What arrives there; up is on top, grey is below the surface")
+            self.map = gui.add_image(
+                NOTHING, label="What arrives there; up is on top, grey is below the surface"
+            )
         with gui.add_folder("Cameras"):
             names = [view.name for view in run.capture.views]
             self.shown = gui.add_checkbox("Show", False)
@@ -162,10 +175,12 @@ class _Session:
     def _lights(self) -> dict[str, Lighting]:
         lights = {OWN: self.own}
         if self.own.sky is not None:
-            lights |= {name: Lighting(sky, self.own.lamps, own=False) for name, sky in self.page.skies.items()}
+            lights |= {
+                name: Lighting(sky, self.own.lamps, own=False) for name, sky in self.page.skies.items()
+            }
         return lights
 
-    # --------------------------------------------------------------------------------------------------- wishes
+    # ------------------------------------------------------------------------------------------------- wishes
 
     @property
     def light(self) -> Lighting:
@@ -187,19 +202,30 @@ class _Session:
         camera = self.client.camera
         pose = Pose(camera.position, camera.wxyz, camera.fov, camera.aspect)
         window = pinhole(pose, camera.image_width, camera.image_height)
-        wish = Wish(self.subject, window, KEYS[self.layer.value], self.light, float(self.exposure.value), self.behind.value)
+        wish = Wish(
+            self.subject,
+            window,
+            KEYS[self.layer.value],
+            self.light,
+            float(self.exposure.value),
+            self.behind.value,
+        )
         self.painter.ask(wish)
 
     def _show(self, frame: Frame) -> None:
         self.client.scene.set_background_image(frame.image, format="jpeg", jpeg_quality=90, depth=frame.depth)
         sharp = "" if frame.share == 1 else f" · 1/{round(1 / frame.share)} of its size"
-        noise = f" · {frame.samples} samples a pixel" if KEYS[self.layer.value] == "pbr" and frame.share == 1 else ""
+        noise = (
+            f" · {frame.samples} samples a pixel"
+            if KEYS[self.layer.value] == "pbr" and frame.share == 1
+            else ""
+        )
         self.state.content = f"{frame.image.shape[1]}×{frame.image.shape[0]}{sharp}{noise}"
 
     def _failed(self, error: Exception) -> None:
         self.state.content = f"This picture failed: {error}"
 
-    # ---------------------------------------------------------------------------------------------------- light
+    # -------------------------------------------------------------------------------------------------- light
 
     def _change_environment(self) -> None:
         """A map of another unit would be black or white: exposure goes with its brightness."""
@@ -231,7 +257,9 @@ class _Session:
             )
             colour = lamps.radiance[k] / lamps.radiance[k].max().clamp_min(1e-9)
             shown = display_color(colour.cpu().numpy()[None, None])[0, 0]
-            self.client.scene.add_icosphere(f"/lamps/{k}/bulb", radius=lamps.radius, color=tuple(int(c) for c in shown))
+            self.client.scene.add_icosphere(
+                f"/lamps/{k}/bulb", radius=lamps.radius, color=tuple(int(c) for c in shown)
+            )
             gizmo.on_update(lambda event, k=k: self._drag(k, event.target.position))
             self.gizmos.append(gizmo)
 
@@ -255,15 +283,15 @@ class _Session:
         self.map.image = light_picture(radiance, normal)
         material = point.material
         colour = ", ".join(f"{value:.2f}" for value in material.base_color[0].tolist())
-        self.told.content = (
-            f"base colour {colour} · roughness {material.roughness.item():.2f} · metallic {material.metallic.item():.2f}"
-        )
+        self.told.content = f"base colour {colour} · roughness {material.roughness.item():.2f} · metallic {material.metallic.item():.2f}"
         place = point.position.cpu().numpy()
         segment = np.stack((place, place + 0.15 * normal))[None]
-        self.client.scene.add_line_segments("/picked/normal", segment, PICKED, thickness=3, thickness_units="screen")
+        self.client.scene.add_line_segments(
+            "/picked/normal", segment, PICKED, thickness=3, thickness_units="screen"
+        )
         self.client.scene.add_icosphere("/picked/point", radius=0.012, color=PICKED, position=place)
 
-    # -------------------------------------------------------------------------------------------------- cameras
+    # ------------------------------------------------------------------------------------------------ cameras
 
     def _add_cameras(self) -> None:
         capture, self.frustums = self.subject.run.capture, []
@@ -313,7 +341,9 @@ def open_page(subject: Subject | None, skies: Mapping[str, Sky], host: str, port
     """Serve the page; the port must be free (`address.check_free`)."""
     rich.get_console().quiet = True  # viser's box names its own address, not ours
     server = _Local(host=host, port=port, label=label, verbose=False)
-    server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=BRAND, control_width="medium")
+    server.gui.configure_theme(
+        show_logo=False, show_share_button=False, brand_color=BRAND, control_width="medium"
+    )
     return Page(server, subject, skies)
 
 

@@ -19,7 +19,9 @@ MOST_SIDE = 1600
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a camera stands, how it is turned to the scene (w x y z), and its vertical field of view in radians."""
+    """Where a camera stands, how it is turned to the scene (w x y z), and its vertical field of view in
+    radians.
+    """
 
     position: Float[np.ndarray, " 3"]
     wxyz: Float[np.ndarray, " 4"]
@@ -42,4 +44,6 @@ def pose_of(camera: Camera) -> Pose:
     """A camera's pose; its lens is taken for straight and its principal point for the middle."""
     pose = camera.c2w
     wxyz = np.roll(Rotation.from_matrix(pose[:, :3]).as_quat(), 1)
-    return Pose(pose[:, 3], wxyz, 2 * math.atan(camera.height / (2 * camera.fy)), camera.width / camera.height)
+    return Pose(
+        pose[:, 3], wxyz, 2 * math.atan(camera.height / (2 * camera.fy)), camera.width / camera.height
+    )

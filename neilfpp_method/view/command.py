@@ -62,11 +62,17 @@ def view(
     subject = None if request.follow and seen is None else _load(request)
     from neilfpp_method.view.browser import open_page
 
-    skies = {name: replace(sky, radiance=sky.radiance.to(pick_device(request.device))) for name, sky in skies.items()}
+    skies = {
+        name: replace(sky, radiance=sky.radiance.to(pick_device(request.device)))
+        for name, sky in skies.items()
+    }
     page = open_page(subject, skies, request.host, request.port, "neilfpp view")
     try:
         if not only_here(request.host):
-            say(f"warning: anybody who reaches port {request.port} of this machine sees the run and its photographs")
+            say(
+                f"warning: anybody who reaches port {request.port} of this machine sees the run and its "
+                "photographs"
+            )
         if subject is None:
             say(f"waiting for the first checkpoint of {request.run}")
         elif subject.note:

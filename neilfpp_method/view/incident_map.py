@@ -71,7 +71,9 @@ def _by_paths(
     rows = torch.arange(len(directions), device=subject.device)
     numbers, total = Sequence(BOUNCES * DIMENSIONS, seed=0), torch.zeros_like(directions)
     for _ in range(SAMPLES):
-        found = trace_paths(scene, RayBatch(origins, directions), numbers.next(1, len(rows), subject.device), BOUNCES)
+        found = trace_paths(
+            scene, RayBatch(origins, directions), numbers.next(1, len(rows), subject.device), BOUNCES
+        )
         total += found.radiance
     met = scene.surface.cross(origins, directions)
     nearest = torch.full_like(directions[:, 0], torch.inf).index_put((met.rows,), met.distance)
@@ -82,7 +84,9 @@ def _by_paths(
     return radiance
 
 
-def light_picture(radiance: Float[np.ndarray, "H W 3"], normal: Float[np.ndarray, " 3"]) -> UInt8[np.ndarray, "H W 3"]:
+def light_picture(
+    radiance: Float[np.ndarray, "H W 3"], normal: Float[np.ndarray, " 3"]
+) -> UInt8[np.ndarray, "H W 3"]:
     """The map as a display shows it; directions from below the surface are grey."""
     above = lat_long_directions(len(radiance)) @ normal > 0
     shown = display_color(radiance, auto_exposure(radiance[above]))

@@ -41,8 +41,8 @@ class Pace:
 
 
 def sizes(width: int, height: int, at_once: int) -> list[float]:
-    """Factors of ever larger pictures, up to 1; the first has no more pixels than `at_once`, about, and each that follows
-    has four times as many, or fewer.
+    """Factors of ever larger pictures, up to 1; the first has no more pixels than `at_once`, about, and each
+    that follows has four times as many, or fewer.
 
     >>> sizes(640, 480, 19_200)
     [0.25, 0.5, 1.0]

@@ -1,4 +1,6 @@
-"""A thread that makes the pictures of one browser: the newest wish counts, and what is no longer wanted is given up."""
+"""A thread that makes the pictures of one browser: the newest wish counts, and what is no longer wanted is
+given up.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ Made = TypeVar("Made")
 class Painter(Generic[Asked, Made]):
     """Shows ever finer pictures of the newest wish.
 
-    The first picture of a wish is always finished: while a camera moves there would be nothing to see otherwise.
+    The first picture of a wish is always finished: while a camera moves there would be nothing to see
+    otherwise.
 
     Args:
         frames: pictures of a wish; None where it can be given up.

@@ -55,7 +55,8 @@ class Wish:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A picture of a wish, perhaps smaller than the window: sRGB, and depths along the camera's axis, scene units.
+    """A picture of a wish, perhaps smaller than the window: sRGB, and depths along the camera's axis, scene
+    units.
 
     `share` is its size over that of the window, `samples` how many each pixel has.
     """
@@ -92,10 +93,14 @@ def frames(wish: Wish, pace: Pace) -> Iterator[Frame | None]:
 
 
 def _whole(wish: Wish, camera: Camera, part: Part, pace: Pace, jitter: int) -> Iterator[Tensor | None]:
-    """None after each part but the last, then all pixels; the first sample goes through the middle of a pixel."""
+    """None after each part but the last, then all pixels; the first sample goes through the middle of a
+    pixel.
+    """
     layer, device = wish.layer, wish.subject.device
     pixels = torch.arange(camera.width * camera.height, device=device)
-    inside = torch.rand(2, generator=torch.Generator().manual_seed(jitter)) if jitter else torch.full((2,), 0.5)
+    inside = (
+        torch.rand(2, generator=torch.Generator().manual_seed(jitter)) if jitter else torch.full((2,), 0.5)
+    )
     inside = inside.to(device)
     done, start = [], 0
     while start < len(pixels):
@@ -132,7 +137,9 @@ def _still(wish: Wish) -> Part:
     subject, layer = wish.subject, wish.layer
     model = subject.run.model
     if layer == "radiance":
-        return lambda rays, rows: _with_alpha(model.host.render(rays).color, torch.ones_like(rays.origins[:, :1]))
+        return lambda rays, rows: _with_alpha(
+            model.host.render(rays).color, torch.ones_like(rays.origins[:, :1])
+        )
 
     def part(rays: RayBatch, rows: Tensor) -> Tensor:
         met = subject.surface.cross(rays.origins, rays.directions)
@@ -146,7 +153,9 @@ def _still(wish: Wish) -> Part:
             material = model.materials(met.position)
             if layer == "pbr":
                 wo = -rays.directions[met.rows]
-                value = model.shade(met.position, met.normal, wo, material, model.config.shading.eval_samples).color
+                value = model.shade(
+                    met.position, met.normal, wo, material, model.config.shading.eval_samples
+                ).color
             else:
                 value = getattr(material, layer).expand(-1, 3)
         shown[met.rows] = _with_alpha(value, torch.ones_like(value[:, :1]))
@@ -183,4 +192,3 @@ def _depth(subject: Subject, camera: Camera) -> Float[np.ndarray, "H W"]:
         forward = torch.from_numpy(camera.w2c[2, :3].astype(np.float32)).to(subject.device)
         depth[met.rows] = met.distance * (rays.directions[met.rows] @ forward)
     return depth.view(camera.height, camera.width).cpu().numpy()
-

@@ -59,7 +59,9 @@ class Subject:
 
 @dataclass(frozen=True)
 class Lighting:
-    """The light that is chosen. `own`: the run's own, unchanged. No sky: light that is free at every point."""
+    """The light that is chosen. `own`: the run's own, unchanged. No sky: light that is free at every
+    point.
+    """
 
     sky: Sky | None
     lamps: Lamplight | None
@@ -81,7 +83,8 @@ def subject_of(run: Run, resolution: int) -> Subject:
 
     Args:
         run: as loaded.
-        resolution: cells along an edge of the scene's cube, where the surface is extracted from a distance field.
+        resolution: cells along an edge of the scene's cube, where the surface is extracted from a distance
+            field.
     """
     try:
         surface, note = surface_of_run(run, resolution), ""

@@ -1,1 +1,3 @@
-"""Volume rendering: where a ray meets the scene, how dense it is there, where to sample it, how to add it up."""
+"""Volume rendering: where a ray meets the scene, how dense it is there, where to sample it, how to add it
+up.
+"""

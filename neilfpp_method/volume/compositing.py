@@ -26,8 +26,8 @@ class Weights:
 def depth_weights(depth: Float[Tensor, "N K"]) -> Weights:
     """w_i = T_i (1 − exp(−τ_i)), T_i = exp(−Σ_{j<i} τ_j), for intervals of optical depth τ_i ≥ 0 (Max 1995).
 
-    Optical depths are added before any exponential is taken, and 1 − exp is `expm1`: thin media keep their precision,
-    opaque ones do not overflow. Half-precision inputs are added up in float32, and stay float32.
+    Optical depths are added before any exponential is taken, and 1 − exp is `expm1`: thin media keep their
+    precision, opaque ones do not overflow. Half-precision inputs are added up in float32, and stay float32.
     """
     depth = depth.to(torch.promote_types(depth.dtype, torch.float32))
     # Summed afresh from a leading 0, not as "inclusive minus own": that cancels behind an opaque interval.
@@ -48,17 +48,25 @@ def sample_weights(weights: Float[Tensor, "N K"]) -> Float[Tensor, "N K+1"]:
 
 
 def share_near(
-    distances: Float[Tensor, "N M"], weights: Float[Tensor, "N M-1"], depth: Float[Tensor, " N"], radius: float
+    distances: Float[Tensor, "N M"],
+    weights: Float[Tensor, "N M-1"],
+    depth: Float[Tensor, " N"],
+    radius: float,
 ) -> Float[Tensor, " N"]:
-    """The weight of intervals that lies within `radius` of a depth; an interval that reaches out of it counts by its part."""
+    """The weight of intervals that lies within `radius` of a depth; an interval that reaches out of it counts
+    by its part.
+    """
     start = torch.maximum(distances[:, :-1], depth[:, None] - radius)
     end = torch.minimum(distances[:, 1:], depth[:, None] + radius)
     width = distances.diff(dim=-1).clamp_min(torch.finfo(distances.dtype).tiny)
     return (weights * ((end - start) / width).clamp(0.0, 1.0)).sum(-1)
 
 
-def render_weights(density: Float[Tensor, "N M"], distances: Float[Tensor, "N M"], far: Float[Tensor, " N"]) -> Weights:
-    """`depth_weights` of a density that is constant from one sample to the next: τ_i = σ_i δ_i, δ_i = t_{i+1} − t_i.
+def render_weights(
+    density: Float[Tensor, "N M"], distances: Float[Tensor, "N M"], far: Float[Tensor, " N"]
+) -> Weights:
+    """`depth_weights` of a density that is constant from one sample to the next: τ_i = σ_i δ_i, δ_i = t_{i+1}
+    − t_i.
 
     Args:
         density: σ_i ≥ 0 between sample i and the next, 1 / scene unit.
@@ -67,7 +75,9 @@ def render_weights(density: Float[Tensor, "N M"], distances: Float[Tensor, "N M"
     """
     widths = torch.cat([distances, far[:, None]], dim=-1).diff(dim=-1)
     # Rounding in a sampler can swap neighbours by one unit in the last place; a negative width would emit.
-    return depth_weights(density.to(torch.promote_types(density.dtype, torch.float32)) * widths.clamp_min(0.0))
+    return depth_weights(
+        density.to(torch.promote_types(density.dtype, torch.float32)) * widths.clamp_min(0.0)
+    )
 
 
 def composite(weights: Float[Tensor, "N M"], values: Float[Tensor, "N M C"]) -> Float[Tensor, "N C"]:

@@ -11,18 +11,20 @@ from neilfpp_method.errors import UserError
 __all__ = ["LaplaceDensity", "laplace_density", "laplace_depth"]
 
 CLOSE = 0.03
-"""Ends of an interval that differ by less than this share of β: their divided difference loses digits, and Simpson's rule
-is exact to 1e-5 even across the kink of the density."""
+"""Ends of an interval that differ by less than this share of β: their divided difference loses digits, and
+Simpson's rule is exact to 1e-5 even across the kink of the density.
+"""
 
 BETA_FLOOR = 1e-4
 """The smallest β, scene units (VolSDF): below it a ray of 128 cuts cannot find the surface."""
 
 
 def laplace_density(sdf: Float[Tensor, "*shape"], beta: Float[Tensor, "*#shape"]) -> Float[Tensor, "*shape"]:
-    """σ = α Ψ_β(−sdf), α = 1/β, with Ψ_β the CDF of a zero-mean Laplace distribution of scale β (VolSDF eq. 2, 3).
+    """σ = α Ψ_β(−sdf), α = 1/β, with Ψ_β the CDF of a zero-mean Laplace distribution of scale β (VolSDF eq.
+    2, 3).
 
-    Half of 1/β on the surface, 1/β deep inside, 0 far outside. No exponential grows, so value and gradients are finite
-    for any distance; small densities outside keep their relative precision.
+    Half of 1/β on the surface, 1/β deep inside, 0 far outside. No exponential grows, so value and gradients
+    are finite for any distance; small densities outside keep their relative precision.
 
     Args:
         sdf: signed distance, negative inside, scene units.
@@ -32,7 +34,8 @@ def laplace_density(sdf: Float[Tensor, "*shape"], beta: Float[Tensor, "*#shape"]
         Density, 1 / scene unit.
     """
     scaled = sdf / beta
-    # Ψ(−x) = ½ (e^{−max(x, 0)} − expm1(min(x, 0))). The parts share the kink so that the slope at 0 is −½, not 0 or −1.
+    # Ψ(−x) = ½ (e^{−max(x, 0)} − expm1(min(x, 0))). The parts share the kink so that the slope at 0 is −½,
+    # not 0 or −1.
     outside = torch.relu(scaled)
     inside = scaled - outside
     return 0.5 * (torch.exp(-outside) - torch.expm1(inside)) / beta
@@ -41,13 +44,14 @@ def laplace_density(sdf: Float[Tensor, "*shape"], beta: Float[Tensor, "*#shape"]
 def laplace_depth(
     sdf: Float[Tensor, "*shape M"], distances: Float[Tensor, "*shape M"], beta: Float[Tensor, "*#shape"]
 ) -> Float[Tensor, "*shape M-1"]:
-    """Optical depth between neighbouring samples of a ray: the integral of the density, the SDF being linear between them.
+    """Optical depth between neighbouring samples of a ray: the integral of the density, the SDF being linear
+    between them.
 
     With u = sdf/β the antiderivative of Ψ(−u) is F(u) = min(u, 0) − ½ e^{−|u|}, so an interval of width δ has the depth
     (δ/β) (F(u₁) − F(u₀)) / (u₁ − u₀). An even cut of a homogeneous medium gives δ σ.
 
-    The rule of VolSDF, δ times the density of the first sample, takes the last sample before empty space for all of it:
-    rays that graze a surface come out too opaque.
+    The rule of VolSDF, δ times the density of the first sample, takes the last sample before empty space for
+    all of it: rays that graze a surface come out too opaque.
 
     Args:
         sdf: signed distance at the samples, scene units.
@@ -64,7 +68,8 @@ def laplace_depth(
     scaled = sdf.to(torch.promote_types(sdf.dtype, torch.float32)) / beta
     outside = torch.relu(scaled)
     inside = scaled - outside
-    # The two terms of F are subtracted apart: deep inside the first is large, and the second would drown in it.
+    # The two terms of F are subtracted apart: deep inside the first is large, and the second would drown in
+    # it.
     rise = inside.diff(dim=-1) - 0.5 * torch.exp(inside - outside).diff(dim=-1)
     step = scaled.diff(dim=-1)
     close = step.abs() < CLOSE
@@ -93,7 +98,8 @@ class LaplaceDensity(nn.Module):
         super().__init__()
         if not 0.0 < beta_floor < beta_init:
             raise UserError(
-                f"volume.beta_init = {beta_init}: β must start above its floor, {beta_floor}, which must be above 0",
+                f"volume.beta_init = {beta_init}: β must start above its floor, {beta_floor}, which must be "
+                "above 0",
                 f"choose a volume.beta_init above {BETA_FLOOR}",
             )
         self.beta_floor = beta_floor

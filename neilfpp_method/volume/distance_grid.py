@@ -1,6 +1,7 @@
 """A distance field sampled on a grid, and rays traced through it: visibility at the price of a look-up.
 
-The grid spans the cube [−radius, radius]³ with its vertices on the faces, and is stored z, y, x as `grid_sample` reads it.
+The grid spans the cube [−radius, radius]³ with its vertices on the faces, and is stored z, y, x as
+`grid_sample` reads it.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ CHUNK = 65_536
 STEPS = 40
 """Most steps of a ray; one that has not ended by then passes close to a surface without meeting it."""
 HIT_CELLS = 0.25
-"""A ray meets the surface where the distance is below this share of a cell: about the error of the interpolation."""
+"""A ray meets the surface where the distance is below this share of a cell: about the error of the
+interpolation.
+"""
 
 
 def cell_size(grid: Float[Tensor, "R R R"], radius: float) -> float:
@@ -39,18 +42,24 @@ def sample_grid(
     axis = torch.linspace(-radius, radius, resolution, device=like.device, dtype=like.dtype)
     z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     vertices = torch.stack((x, y, z), -1).reshape(-1, 3)
-    return torch.cat([sdf(part) for part in vertices.split(CHUNK)]).reshape(resolution, resolution, resolution)
+    return torch.cat([sdf(part) for part in vertices.split(CHUNK)]).reshape(
+        resolution, resolution, resolution
+    )
 
 
 def look_up(grid: Float[Tensor, "R R R"], radius: float, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-    """The distance at points, by trilinear interpolation; beyond the cube that of the nearest point of its faces."""
+    """The distance at points, by trilinear interpolation; beyond the cube that of the nearest point of its
+    faces.
+    """
     at = (x / radius).view(1, -1, 1, 1, 3)
     return functional.grid_sample(grid[None, None], at, padding_mode="border", align_corners=True).view(-1)
 
 
 @dataclass(frozen=True)
 class GridHits:
-    """Where rays meet the surface: the distance along the ray, and whether they do before they leave the cube."""
+    """Where rays meet the surface: the distance along the ray, and whether they do before they leave the
+    cube.
+    """
 
     distance: Float[Tensor, " P"]
     hit: Bool[Tensor, " P"]
@@ -58,18 +67,31 @@ class GridHits:
 
 @torch.no_grad()
 def trace_grid(
-    grid: Float[Tensor, "R R R"], radius: float, origins: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]
+    grid: Float[Tensor, "R R R"],
+    radius: float,
+    origins: Float[Tensor, "P 3"],
+    directions: Float[Tensor, "P 3"],
 ) -> GridHits:
     """Sphere tracing: each step goes as far as the distance allows, and at least a quarter of a cell.
 
-    On a CPU by compiled loops; elsewhere all rays take all steps together, and the host never waits for the device.
+    On a CPU by compiled loops; elsewhere all rays take all steps together, and the host never waits for the
+    device.
     """
     least = HIT_CELLS * cell_size(grid, radius)
     compiled = ray_tracer(origins.device.type)
     if compiled is None or grid.dtype.itemsize < 4:
         return _trace_together(grid, radius, origins, directions, least)
     found = GridHits(grid.new_empty(len(origins)), grid.new_empty(len(origins), dtype=torch.bool))
-    compiled(grid, radius, origins.to(grid.dtype), directions.to(grid.dtype), least, STEPS, found.distance, found.hit)
+    compiled(
+        grid,
+        radius,
+        origins.to(grid.dtype),
+        directions.to(grid.dtype),
+        least,
+        STEPS,
+        found.distance,
+        found.hit,
+    )
     return found
 
 

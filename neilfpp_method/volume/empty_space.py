@@ -1,9 +1,10 @@
 """Empty space that a ray may skip: a coarse grid of the distance field says where no surface can be.
 
-The grid knows the field at its vertices, and how fast it changes between them. Within L · r of a place where it is known
-to be v, a field whose slope is at most L lies in v ± L · r: what is clear by that measure is skipped, and a plate thinner
-than a cell is not. The field moves while it trains. So every use asks it once per ray in the part that would be skipped;
-where one answer breaks the promise no ray skips anything, and the grid is soon sampled anew.
+The grid knows the field at its vertices, and how fast it changes between them. Within L · r of a place where
+it is known to be v, a field whose slope is at most L lies in v ± L · r: what is clear by that measure is
+skipped, and a plate thinner than a cell is not. The field moves while it trains. So every use asks it once
+per ray in the part that would be skipped; where one answer breaks the promise no ray skips anything, and the
+grid is soon sampled anew.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ LEAST_LIFE, MOST_LIFE = 20, 100
 
 @dataclass(frozen=True)
 class Span:
-    """Which rays have a part that is taken, and from where to where it is; the whole ray where it has none."""
+    """Which rays have a part that is taken, and from where to where it is; the whole ray where it has
+    none.
+    """
 
     some: Bool[Tensor, " N"]
     interval: Interval
@@ -75,8 +78,9 @@ class EmptySpace(nn.Module):
     ) -> Interval:
         """The part of each ray outside which the density of scale `beta` neither absorbs nor can be seen.
 
-        Costs one query of the field per ray. A ray that is empty all along keeps its whole interval. On a CPU a broken
-        promise is noticed at once; elsewhere nobody waits for the answer, and the age of the grid alone decides.
+        Costs one query of the field per ray. A ray that is empty all along keeps its whole interval. On a CPU
+        a broken promise is noticed at once; elsewhere nobody waits for the answer, and the age of the grid
+        alone decides.
         """
         self._renew(sdf)
         edges, clearance = self._edges(interval), self._clearance(beta, MISSED)
@@ -95,10 +99,11 @@ class EmptySpace(nn.Module):
         interval: Interval,
         beta: Float[Tensor, ""],
     ) -> Span:
-        """Which rays may show anything, and the part of each within which they do, for a field that stands still.
+        """Which rays may show anything, and the part of each within which they do, for a field that stands
+        still.
 
-        The grid must be that of the field as it is: it is sampled by the first who asks, and no promise is tested. What is
-        left out has an opacity of at most `HARDLY_MISSED`.
+        The grid must be that of the field as it is: it is sampled by the first who asks, and no promise is
+        tested. What is left out has an opacity of at most `HARDLY_MISSED`.
         """
         self._renew(sdf)
         edges = self._edges(interval)
@@ -113,11 +118,13 @@ class EmptySpace(nn.Module):
         interval: Interval,
         beta: Float[Tensor, ""],
     ) -> Bool[Tensor, " N"]:
-        """Which rays may come down on a surface: for rays that leave one, where nearly all of a ray's start is never clear.
+        """Which rays may come down on a surface: for rays that leave one, where nearly all of a ray's start
+        is never clear.
 
-        A ray that enters a surface does so where the distance falls. So a ray may meet one if somewhere the grid's distance
-        falls along it in a part that is not empty for sure. Between vertices the grid knows a falling distance less well than a
-        small one: a surface within a cell or two of the start may be overlooked. Costs look-ups alone.
+        A ray that enters a surface does so where the distance falls. So a ray may meet one if somewhere the
+        grid's distance falls along it in a part that is not empty for sure. Between vertices the grid knows a
+        falling distance less well than a small one: a surface within a cell or two of the start may be
+        overlooked. Costs look-ups alone.
         """
         self._renew(sdf)
         edges = self._edges(interval)
@@ -136,7 +143,11 @@ class EmptySpace(nn.Module):
         self.age = 0
 
     def _known(
-        self, rays: RayBatch, edges: Float[Tensor, "N E"], clearance: Float[Tensor, ""], beta: Float[Tensor, ""]
+        self,
+        rays: RayBatch,
+        edges: Float[Tensor, "N E"],
+        clearance: Float[Tensor, ""],
+        beta: Float[Tensor, ""],
     ) -> tuple[Bool[Tensor, "N K"], Bool[Tensor, "N K"]]:
         """Which parts of the rays are empty for sure, and which lie for sure behind what is opaque."""
         width, distance, doubt = edges.diff(dim=-1), self._read(rays, edges), self._doubt(edges)
@@ -157,12 +168,15 @@ class EmptySpace(nn.Module):
 
     def _doubt(self, edges: Float[Tensor, "N E"]) -> Float[Tensor, "N K"]:
         """How far the field in a part may be from what the grid says in its middle."""
-        # A weighted mean of the vertices of a cell is off by no more than the slope times half of its diagonal.
+        # A weighted mean of the vertices of a cell is off by no more than the slope times half of its
+        # diagonal.
         reach = 0.5 * math.sqrt(3.0) * cell_size(self.distance, self.radius)
         return self.slope * (0.5 * edges.diff(dim=-1) + reach)
 
     def _clearance(self, beta: Float[Tensor, ""], missed: float) -> Float[Tensor, ""]:
-        """The distance from which on a density of scale β adds up to no more than `missed` along a whole ray."""
+        """The distance from which on a density of scale β adds up to no more than `missed` along a whole
+        ray.
+        """
         return beta * math.log(self.radius / missed) - beta * beta.log()  # e^(−G/β) · 2 radius / 2β ≤ missed
 
     def _holds(

@@ -1,8 +1,9 @@
 """Free space before cameras: where a camera stands, and some way around it, there is nothing.
 
-A view alone is explained as well by a veil before its own lens as by the surface that it shows, and where cameras stand
-within the space that may hold density, training finds veils first. So a ball about every camera is cut out of the
-scene, whoever's ray runs through it: new views, which stand among the others, see no veil either.
+A view alone is explained as well by a veil before its own lens as by the surface that it shows, and where
+cameras stand within the space that may hold density, training finds veils first. So a ball about every camera
+is cut out of the scene, whoever's ray runs through it: new views, which stand among the others, see no veil
+either.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ from torch import Tensor, nn
 __all__ = ["FREE_SHARE", "OBJECT_RADIUS", "FreeSpace", "FreeSpaceSample", "cameras_within", "free_radius"]
 
 FREE_SHARE = 0.25
-"""Radius of the ball about a camera, in its distance from the scene's centre: 0.45 scene units for a camera that is 1.8 away,
-as half of them are where the box is about what they look at."""
+"""Radius of the ball about a camera, in its distance from the scene's centre: 0.45 scene units for a camera
+that is 1.8 away, as half of them are where the box is about what they look at.
+"""
 OBJECT_RADIUS = 1.0
 """No ball reaches into the ball of this radius, scene units, which holds the object."""
 RESOLUTION = 64
@@ -26,14 +28,17 @@ RESOLUTION = 64
 
 @dataclass(frozen=True)
 class FreeSpaceSample:
-    """How deep N points lie within free space, scene units, negative outside, and the gradient of that: a unit vector."""
+    """How deep N points lie within free space, scene units, negative outside, and the gradient of that: a
+    unit vector.
+    """
 
     depth: Float[Tensor, " N"]
     gradient: Float[Tensor, "N 3"]
 
 
 def free_radius(distance: Float[Tensor, " V"]) -> Float[Tensor, " V"]:
-    """Radius of the free ball about cameras at a distance from the scene's centre; 0 for those among the objects.
+    """Radius of the free ball about cameras at a distance from the scene's centre; 0 for those among the
+    objects.
 
     The lesser of `FREE_SHARE` · distance and distance − `OBJECT_RADIUS`, and never negative.
 
@@ -58,8 +63,8 @@ def cameras_within(position: Float[Tensor, "V 3"], radius: float) -> Float[Tenso
 class FreeSpace(nn.Module):
     """The union of the free balls, as a signed depth: max over cameras c of free_radius(‖c‖) − ‖x − c‖.
 
-    Which camera the maximum comes from is looked up, at the nearest vertex of a grid; the depth is that of this camera,
-    exactly. Where two balls meet it is too small by at most a cell and a half.
+    Which camera the maximum comes from is looked up, at the nearest vertex of a grid; the depth is that of
+    this camera, exactly. Where two balls meet it is too small by at most a cell and a half.
 
     Args:
         cameras: positions, scene frame; at least one.
@@ -74,7 +79,9 @@ class FreeSpace(nn.Module):
         self.register_buffer("free", free_radius(cameras.norm(dim=-1)), persistent=False)
         axis = torch.linspace(-radius, radius, RESOLUTION, dtype=cameras.dtype, device=cameras.device)
         planes = [self._deepest(torch.cartesian_prod(x[None], axis, axis)) for x in axis]
-        self.register_buffer("deepest", torch.stack(planes).view(RESOLUTION, RESOLUTION, RESOLUTION), persistent=False)
+        self.register_buffer(
+            "deepest", torch.stack(planes).view(RESOLUTION, RESOLUTION, RESOLUTION), persistent=False
+        )
 
     def forward(self, x: Float[Tensor, "N 3"]) -> FreeSpaceSample:
         """Depth and gradient at points; beyond the grid by its nearest vertex."""

@@ -1,8 +1,9 @@
 """Oriented points fused into a sampled distance field: what has been seen of a surface, made traceable.
 
-Near the points the distance is the weighted mean of the distances from their tangent planes (an implicit moving least-squares
-surface, Kolluri 2008; as a volume, Curless and Levoy 1996). Further away it is a lower bound of the distance from any vertex
-that is close to the surface, so that sphere tracing is safe and what nobody has seen is empty.
+Near the points the distance is the weighted mean of the distances from their tangent planes (an implicit
+moving least-squares surface, Kolluri 2008; as a volume, Curless and Levoy 1996). Further away it is a lower
+bound of the distance from any vertex that is close to the surface, so that sphere tracing is safe and what
+nobody has seen is empty.
 """
 
 from __future__ import annotations
@@ -20,12 +21,17 @@ from neilfpp_method.volume.distance_grid import cell_size, look_up
 __all__ = ["FusedSurface", "fuse", "grid_normal", "mean_at"]
 
 WIDTH = 0.75
-"""Standard deviation of a point's influence, in cells: the next vertices, and little beyond. It flattens a surface of curvature
-κ by about WIDTH² κ / 2 cells squared."""
+"""Standard deviation of a point's influence, in cells: the next vertices, and little beyond. It flattens a
+surface of curvature κ by about WIDTH² κ / 2 cells squared.
+"""
 BEHIND = 1.25
-"""How far behind its plane a point speaks, in cells: less than to the other side of what is thicker than that."""
+"""How far behind its plane a point speaks, in cells: less than to the other side of what is thicker than
+that.
+"""
 KNOWN = 0.15
-"""Least sum of the weights of a vertex whose distance is known: a point at the distance of one and a half cells has 0.14."""
+"""Least sum of the weights of a vertex whose distance is known: a point at the distance of one and a half
+cells has 0.14.
+"""
 HALF_DIAGONAL = 0.87
 """In cells: a vertex of the cell that holds a surface is no further from it."""
 AT_ONCE = 8192
@@ -34,7 +40,9 @@ AT_ONCE = 8192
 
 @dataclass(frozen=True)
 class FusedSurface:
-    """Distances at the vertices of the cube, z, y, x; and for means the sum of weights and of weighted values there."""
+    """Distances at the vertices of the cube, z, y, x; and for means the sum of weights and of weighted values
+    there.
+    """
 
     distance: Float[Tensor, "R R R"]
     weight: Float[Tensor, "R R R"]
@@ -74,7 +82,11 @@ def fuse(
     sums = sums.view(-1, resolution, resolution, resolution)
     weight, height = sums[0], sums[1] / sums[0].clamp_min(1e-6)
     known = weight >= KNOWN
-    return FusedSurface(torch.where(known, height, _far(known & (height.abs() < HALF_DIAGONAL * edge), edge)), weight, sums[2:])
+    return FusedSurface(
+        torch.where(known, height, _far(known & (height.abs() < HALF_DIAGONAL * edge), edge)),
+        weight,
+        sums[2:],
+    )
 
 
 def mean_at(surface: FusedSurface, radius: float, x: Float[Tensor, "P 3"]) -> Float[Tensor, "P C"]:
@@ -93,7 +105,9 @@ def grid_normal(grid: Float[Tensor, "R R R"], radius: float, x: Float[Tensor, "P
 
 
 def _far(near: Tensor, edge: float) -> Float[Tensor, "R R R"]:
-    """A lower bound of the distance from the surface: that from the nearest vertex beside it, less half a cell's diagonal."""
+    """A lower bound of the distance from the surface: that from the nearest vertex beside it, less half a
+    cell's diagonal.
+    """
     if not near.any():
         return torch.full(near.shape, near.shape[0] * edge, device=near.device)
     cells = torch.from_numpy(distance_transform_edt((~near).cpu().numpy())).to(near.device, torch.float32)

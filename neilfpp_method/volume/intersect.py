@@ -20,13 +20,15 @@ class Interval:
 
 
 @torch.no_grad()
-def sphere_interval(origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"], radius: float) -> Interval:
+def sphere_interval(
+    origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"], radius: float
+) -> Interval:
     """The part of each ray inside the sphere of `radius` about the scene's origin.
 
-    near = max(m − h, 0) and far = max(m + h, 0), with m = −o·d the distance of closest approach and
-    h² = max(radius² − ‖o + m d‖², 0). A ray that starts inside has near = 0. A ray that misses the sphere, or has left
-    it behind, has near = far: an interval of no length. The ends are constants: no gradient flows through where
-    sampling starts and stops.
+    near = max(m − h, 0) and far = max(m + h, 0), with m = −o·d the distance of closest approach and h² =
+    max(radius² − ‖o + m d‖², 0). A ray that starts inside has near = 0. A ray that misses the sphere, or has
+    left it behind, has near = far: an interval of no length. The ends are constants: no gradient flows
+    through where sampling starts and stops.
 
     Args:
         origins: ray origins, scene frame.
@@ -34,7 +36,8 @@ def sphere_interval(origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 
         radius: scene units.
     """
     closest = -(origins * directions).sum(dim=-1)
-    # From the perpendicular, not from ‖o‖² − m²: the difference of two large squares blurs the edge for far cameras.
+    # From the perpendicular, not from ‖o‖² − m²: the difference of two large squares blurs the edge for far
+    # cameras.
     perpendicular = origins + closest[:, None] * directions
     half = (radius**2 - perpendicular.square().sum(dim=-1)).clamp_min(0.0).sqrt()
     return Interval((closest - half).clamp_min(0.0), (closest + half).clamp_min(0.0))

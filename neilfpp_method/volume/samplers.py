@@ -1,11 +1,12 @@
-"""Where to sample a ray: evenly, by a given distribution, or with a bound on the error of the opacity (VolSDF §3).
+"""Where to sample a ray: evenly, by a given distribution, or with a bound on the error of the opacity (VolSDF
+§3).
 
-The error-bounded sampler cuts a ray into intervals, bounds how wrong the opacity can be when the density is taken as
-constant on each, and cuts again where that bound comes from. Nothing here is differentiated.
+The error-bounded sampler cuts a ray into intervals, bounds how wrong the opacity can be when the density is
+taken as constant on each, and cuts again where that bound comes from. Nothing here is differentiated.
 
-The samples that are rendered are of two kinds (published code): most lie where a ray is stopped, and the rest, with both
-ends of the ray, between them, so that the density is known where it is low as well. Without the latter a ray that
-grazes a surface comes out too opaque.
+The samples that are rendered are of two kinds (published code): most lie where a ray is stopped, and the
+rest, with both ends of the ray, between them, so that the density is known where it is low as well. Without
+the latter a ray that grazes a surface comes out too opaque.
 """
 
 from __future__ import annotations
@@ -23,7 +24,13 @@ from neilfpp_method.structures import Indexable, RayBatch
 from neilfpp_method.volume.compositing import render_weights
 from neilfpp_method.volume.density import laplace_density
 
-__all__ = ["OPACITY_ERROR", "ErrorBoundedSamples", "error_bounded_samples", "inverse_cdf_samples", "uniform_samples"]
+__all__ = [
+    "OPACITY_ERROR",
+    "ErrorBoundedSamples",
+    "error_bounded_samples",
+    "inverse_cdf_samples",
+    "uniform_samples",
+]
 
 OPACITY_ERROR = 0.1
 """ε, the bound on the opacity's error (VolSDF)."""
@@ -37,7 +44,7 @@ SPREAD = 1 / 3
 SignedDistance = Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]
 
 
-# ------------------------------------------------------------------------------------------------------ simple samplers
+# -------------------------------------------------------------------------------------------- simple samplers
 
 
 def strata(like: Float[Tensor, "N _"], count: int, stochastic: bool) -> Float[Tensor, "N {count}"]:
@@ -51,7 +58,9 @@ def strata(like: Float[Tensor, "N _"], count: int, stochastic: bool) -> Float[Te
 def uniform_samples(
     near: Float[Tensor, " N"], far: Float[Tensor, " N"], count: int, stochastic: bool
 ) -> Float[Tensor, "N {count}"]:
-    """`count` distances, ascending: both ends of [near, far], and one in each of equal parts, at random or at its middle."""
+    """`count` distances, ascending: both ends of [near, far], and one in each of equal parts, at random or at
+    its middle.
+    """
     within = torch.lerp(near[:, None], far[:, None], strata(near[:, None], count - 2, stochastic))
     return torch.cat([near[:, None], within, far[:, None]], dim=-1)
 
@@ -60,9 +69,11 @@ def uniform_samples(
 def inverse_cdf_samples(
     edges: Float[Tensor, "N E"], mass: Float[Tensor, "N E-1"], count: int, stochastic: bool
 ) -> Float[Tensor, "N {count}"]:
-    """Distances distributed as `mass`, evenly within each bin, ascending: one for each of `count` equal shares of it.
+    """Distances distributed as `mass`, evenly within each bin, ascending: one for each of `count` equal
+    shares of it.
 
-    A bin without mass gets no sample. Where no bin has mass the samples are even from the first edge to the last.
+    A bin without mass gets no sample. Where no bin has mass the samples are even from the first edge to the
+    last.
 
     Args:
         edges: bounds of the bins, ascending; a bin may have no width.
@@ -86,12 +97,14 @@ def inverse_cdf_samples(
     return torch.lerp(edges.gather(-1, end - 1), edges.gather(-1, end), fraction)
 
 
-# ------------------------------------------------------------------------------------------------------ the error bound
+# -------------------------------------------------------------------------------------------- the error bound
 
 
 @dataclass(frozen=True)
 class Partition(Indexable):
-    """Rays cut into intervals: the E cuts from near to far, the SDF there, and the width and d* of each interval."""
+    """Rays cut into intervals: the E cuts from near to far, the SDF there, and the width and d* of each
+    interval.
+    """
 
     distances: Float[Tensor, "N E"]
     sdf: Float[Tensor, "N E"]
@@ -124,7 +137,8 @@ def optical_depth(partition: Partition, beta: Float[Tensor, "#N 1"]) -> Float[Te
 
 
 def depth_error(partition: Partition, beta: Float[Tensor, "#N 1"]) -> Float[Tensor, "N K"]:
-    """Ê, the bound on the error of R̂, up to the end of each interval: Σ δ² exp(−d*/β) / (4 β²) (VolSDF §3.3).
+    """Ê, the bound on the error of R̂, up to the end of each interval: Σ δ² exp(−d*/β) / (4 β²) (VolSDF
+    §3.3).
 
     The slope of the density is at most exp(−d*/β) / (2 β²) on an interval where |∇ sdf| ≤ 1 (Theorem 1).
     """
@@ -145,10 +159,12 @@ def log_error_bound(partition: Partition, beta: Float[Tensor, "#N 1"]) -> Float[
 def bound_shares(partition: Partition, beta: Float[Tensor, "N 1"]) -> Float[Tensor, "N K"]:
     """What each interval adds to the bound, exp(Ê − R̂) · ΔÊ, up to a factor: where new cuts help.
 
-    The paper cuts in proportion to the bound itself. That piles up along the ray: behind a grazed surface it stays high
-    where nothing is to be gained. The shares reach the same bound with fewer queries.
+    The paper cuts in proportion to the bound itself. That piles up along the ray: behind a grazed surface it
+    stays high where nothing is to be gained. The shares reach the same bound with fewer queries.
     """
-    log_share = 2.0 * partition.width.clamp_min(torch.finfo(beta.dtype).tiny).log() - partition.least_distance / beta
+    log_share = (
+        2.0 * partition.width.clamp_min(torch.finfo(beta.dtype).tiny).log() - partition.least_distance / beta
+    )
     return torch.softmax(log_share + depth_error(partition, beta) - optical_depth(partition, beta), dim=-1)
 
 
@@ -167,12 +183,13 @@ def bounded_beta(
     return high
 
 
-# -------------------------------------------------------------------------------------------- the error-bounded sampler
+# ---------------------------------------------------------------------------------- the error-bounded sampler
 
 
 @dataclass(frozen=True)
 class ErrorBoundedSamples:
-    """Samples of each ray, what they cost, and how far the opacity they were drawn from can be from the truth.
+    """Samples of each ray, what they cost, and how far the opacity they were drawn from can be from the
+    truth.
 
     `distances` ascend. `error_bound` is that of `log_error_bound` at the true β, at most 1: above `OPACITY_ERROR` the
     rounds were used up, and the samples follow a wider density. It holds where |∇ sdf| ≤ 1. `sdf_queries` is the number
@@ -195,14 +212,15 @@ def error_bounded_samples(
     config: VolumeConfig,
     stochastic: bool,
 ) -> ErrorBoundedSamples:
-    """Distances where the Laplace density stops a ray, known up to `config.epsilon`, and some between (VolSDF Algorithm 1).
+    """Distances where the Laplace density stops a ray, known up to `config.epsilon`, and some between (VolSDF
+    Algorithm 1).
 
-    A ray is cut evenly, then up to `config.rounds` times where the bound on the error of its opacity comes from
-    (`bound_shares`), until the bound at β is ≤ ε. Each round asks for the SDF at the new cuts only. A ray whose rounds
-    are used up is sampled with the smallest wider scale β₊ that is bounded.
+    A ray is cut evenly, then up to `config.rounds` times where the bound on the error of its opacity comes
+    from (`bound_shares`), until the bound at β is ≤ ε. Each round asks for the SDF at the new cuts only. A
+    ray whose rounds are used up is sampled with the smallest wider scale β₊ that is bounded.
 
-    A ray leaves the loop in the round in which it converges, where that is free (`can_leave_early`). Elsewhere all rays
-    take all rounds, and a converged ray keeps β.
+    A ray leaves the loop in the round in which it converges, where that is free (`can_leave_early`).
+    Elsewhere all rays take all rounds, and a converged ray keeps β.
 
     Args:
         sdf: signed distance of points, negative inside, scene frame.
@@ -231,7 +249,9 @@ def error_bounded_samples(
         beta_plus = torch.where(converged, beta, beta_plus)
         if can_leave_early(near.device):
             done, left = converged[:, 0], ~converged[:, 0]
-            samples[rows[done]] = opacity_samples(partition[done], beta_plus[done], config.samples, stochastic)
+            samples[rows[done]] = opacity_samples(
+                partition[done], beta_plus[done], config.samples, stochastic
+            )
             rows, rays, partition, beta_plus = rows[left], rays[left], partition[left], beta_plus[left]
         beta_plus = bounded_beta(partition, beta, beta_plus, config)
         if rounds_left == 0 or len(rows) == 0:
@@ -245,7 +265,9 @@ def error_bounded_samples(
 
 
 def can_leave_early(device: torch.device) -> bool:
-    """Whether the host may ask which rays have converged: on a CPU it knows; elsewhere it would wait for the device."""
+    """Whether the host may ask which rays have converged: on a CPU it knows; elsewhere it would wait for the
+    device.
+    """
     return device.type == "cpu"
 
 
@@ -285,7 +307,8 @@ def query(sdf: SignedDistance, rays: RayBatch, distances: Float[Tensor, "N M"]) 
 def opacity_samples(
     partition: Partition, beta: Float[Tensor, "N 1"], count: int, stochastic: bool
 ) -> Float[Tensor, "N {count}"]:
-    """Both ends of each ray, and between them two thirds of the samples by opacity, and one third alike for every cut.
+    """Both ends of each ray, and between them two thirds of the samples by opacity, and one third alike for
+    every cut.
 
     By opacity: the inverse of the partition's Ô, normalised to 1 at far (VolSDF Algorithm 1, last step).
     """

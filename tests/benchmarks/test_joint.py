@@ -1,4 +1,6 @@
-"""What whole steps are timed on: rays that meet the table, a distance field that is it, and queries that are all counted."""
+"""What whole steps are timed on: rays that meet the table, a distance field that is it, and queries that are
+all counted.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ def test_all_rays_meet_the_table():
 
 def test_the_fit_brings_a_field_to_the_table_and_another_host_takes_it_over(monkeypatch):
     monkeypatch.setattr(joint, "FIT_STEPS", 60)
-    config = dataclasses.replace(tiny_config(), loss=dataclasses.replace(tiny_config().loss, hessian_joint=0.0))
+    config = dataclasses.replace(
+        tiny_config(), loss=dataclasses.replace(tiny_config().loss, hessian_joint=0.0)
+    )
     x = torch.rand(500, 3) * 1.6 - 0.8
     fitted = fitted_model(config)
     off = (fitted.host.sdf(x) - table(x)).abs().mean()
@@ -50,6 +54,8 @@ def test_every_query_of_the_sampler_is_counted(monkeypatch):
 
 def test_steps_take_turns_and_each_comes_after_one_like_it():
     calls = []
-    taken = seconds_of({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, {"a": False, "b": True})
+    taken = seconds_of(
+        {"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, {"a": False, "b": True}
+    )
     assert calls == ["a", "a", "b", "b"] * joint.REPETITIONS
     assert [len(taken[name]) for name in "ab"] == [joint.REPETITIONS] * 2

@@ -36,4 +36,6 @@ def test_all_but_what_nobody_can_see_is_found(found):
 
 def test_the_table_of_the_docs_is_this_one(found):
     rows = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \| [^|]*\|$", TABLE.read_text(), re.MULTILINE))
-    assert {name: rows.get(name) for name in found} == {name: check or "**nothing**" for name, check in found.items()}
+    assert {name: rows.get(name) for name in found} == {
+        name: check or "**nothing**" for name, check in found.items()
+    }

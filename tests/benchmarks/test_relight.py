@@ -24,7 +24,9 @@ def test_a_picture_of_the_corner_is_mitsubas(tmp_path):
     camera = relight.corner_camera(12)
     scene = relight.scene_of(relight.corner_parts(), Sky(radiance, rows_at_poles=True, start=0.0))
     ours = take_picture(scene, camera, Budget(256), bounces=3).radiance.numpy()
-    theirs = render(mi, relight.corner_parts(), radiance.numpy(), camera, tmp_path, samples=64, bounces=3, seed=1)
+    theirs = render(
+        mi, relight.corner_parts(), radiance.numpy(), camera, tmp_path, samples=64, bounces=3, seed=1
+    )
     mean = theirs.mean()
     assert ours.mean() == pytest.approx(mean, rel=0.015)
     assert np.abs(ours - theirs).mean() < 0.1 * mean

@@ -1,4 +1,6 @@
-"""The steps that are timed are steps: in every stage what should move gets a gradient, so no stage is timed empty."""
+"""The steps that are timed are steps: in every stage what should move gets a gradient, so no stage is timed
+empty.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,15 @@ def test_a_step_reaches_what_its_stage_moves(stage):
     before = {name: value.clone() for name, value in model.state_dict().items() if name.startswith("brdf.")}
     step_of(model, stage, rays=64)()
     groups = model.parameter_groups()
-    moved = {name for name, parameters in groups.items() if any(p.grad is not None and p.grad.any() for p in parameters)}
-    expected = {Stage.SDF_INIT: {"geometry", "radiance"}, Stage.MATERIAL_INIT: {"brdf"}, Stage.JOINT: {"geometry", "brdf"}}
+    moved = {
+        name
+        for name, parameters in groups.items()
+        if any(p.grad is not None and p.grad.any() for p in parameters)
+    }
+    expected = {
+        Stage.SDF_INIT: {"geometry", "radiance"},
+        Stage.MATERIAL_INIT: {"brdf"},
+        Stage.JOINT: {"geometry", "brdf"},
+    }
     assert expected[stage] <= moved
     assert all(value.equal(model.state_dict()[name]) for name, value in before.items())  # the rates are 0

@@ -1,4 +1,6 @@
-"""The yardstick computes what the package computes: losses and gradients of one step agree, on the same directions."""
+"""The yardstick computes what the package computes: losses and gradients of one step agree, on the same
+directions.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,9 @@ def test_losses_and_gradients_agree():
         terms = computed.losses(double(sphere_batch(spread=0.3)), Stage.JOINT)
         sum(terms[name].mean() for name in names).backward()
         # Wrapped fields have names of their own; the order of the parameters is the same.
-        gradients = [p.grad for group in computed.parameter_groups().values() for p in group if p.grad is not None]
+        gradients = [
+            p.grad for group in computed.parameter_groups().values() for p in group if p.grad is not None
+        ]
         found.append(([terms[name].mean().item() for name in names], gradients))
     (ours, our_gradients), (plain, plain_gradients) = found
     assert min(map(abs, ours)) > 0
@@ -68,5 +72,6 @@ def test_hessians_and_traced_light_agree():
     torch.manual_seed(0)
     theirs = trace_light(plain.host, 1.5 * out, -out, settings, hit_share=0.8)
     assert ours.hit.equal(theirs.hit)
-    # A ray that has converged takes no more cuts in the package: both know its opacity up to ε, not to the last digit.
+    # A ray that has converged takes no more cuts in the package: both know its opacity up to ε, not to the
+    # last digit.
     torch.testing.assert_close(ours.radiance, theirs.radiance, rtol=0.0, atol=1e-3)

@@ -9,8 +9,12 @@ import pytest
 from benchmarks.tables import COLUMNS, DOCUMENTS, Result, Row, filled, markdown, read_results, write_result
 from neilfpp_method.errors import UserError
 
-BALL = Result("t", "abc1234", "make ball", "a CPU", (Row("one", {"seconds": 12.34, "volume_psnr": 20.126}, "env"),))
-CUBE = Result("t", "abc1235", "make ball", "a GPU", (Row("two", {"seconds": 1234.0}, "env"), Row("three", {}, "mix")))
+BALL = Result(
+    "t", "abc1234", "make ball", "a CPU", (Row("one", {"seconds": 12.34, "volume_psnr": 20.126}, "env"),)
+)
+CUBE = Result(
+    "t", "abc1235", "make ball", "a GPU", (Row("two", {"seconds": 1234.0}, "env"), Row("three", {}, "mix"))
+)
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)

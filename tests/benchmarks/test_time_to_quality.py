@@ -15,7 +15,9 @@ from tests.scenes import tiny_config
 
 @pytest.fixture(scope="module")
 def measured() -> Curve:
-    return curve(demo_scene(), tiny_config(), cap=float("inf"), first=1e-3, views=1, device=torch.device("cpu"))
+    return curve(
+        demo_scene(), tiny_config(), cap=float("inf"), first=1e-3, views=1, device=torch.device("cpu")
+    )
 
 
 def test_marks_come_until_the_end_and_the_material_when_it_has_begun(measured):
@@ -35,7 +37,9 @@ def test_a_cap_ends_a_curve_and_says_so():
 
 
 def test_holding_for_a_mark_changes_nothing(measured):
-    again = curve(demo_scene(), tiny_config(), cap=float("inf"), first=1e9, views=1, device=torch.device("cpu"))
+    again = curve(
+        demo_scene(), tiny_config(), cap=float("inf"), first=1e9, views=1, device=torch.device("cpu")
+    )
     assert again.marks[-1].figures == pytest.approx(measured.marks[-1].figures)
 
 

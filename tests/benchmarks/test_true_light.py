@@ -1,4 +1,6 @@
-"""The true light as a function: it holds at the known directions, and integrals of it are those of what is known."""
+"""The true light as a function: it holds at the known directions, and integrals of it are those of what is
+known.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ def test_known_directions_keep_their_radiance():
     light = true_light(field.wi, field.incident)
     assert (light.radiance(field.wi) - field.incident).abs().mean() < 0.02
     inner = field.wi[:, :3000]  # well above the horizon
-    assert (light.radiance(inner) - smooth(inner)).abs().max() < 0.25  # at the poles, where cells are 14° wide
+    assert (
+        light.radiance(inner) - smooth(inner)
+    ).abs().max() < 0.25  # at the poles, where cells are 14° wide
     second = light[torch.tensor([1])].radiance(inner[1:2])
     torch.testing.assert_close(second, light.radiance(inner)[1:2])
 
@@ -44,7 +48,9 @@ def test_the_mean_over_the_hemisphere_is_that_of_the_truth():
 
 @pytest.mark.parametrize("name", list(techniques()))
 def test_every_sampler_comes_near_the_reference(name):
-    """Smooth light on a rough surface: 256 directions are right to some per cent, and more are better than few."""
+    """Smooth light on a rough surface: 256 directions are right to some per cent, and more are better than
+    few.
+    """
     scene = scene_of(sky())
     few, many = error_curves(scene, 1.0, {name: techniques()[name]}, counts=(8, 256))[name].y
     assert many < (0.6 if name == "lobe" else 0.1)  # a lobe alone seldom looks where the diffuse part does

@@ -23,7 +23,14 @@ def make_large_capture(root: Path, views: int, size: tuple[int, int]) -> Path:
     listed = []
     for i in range(views):
         os.link(root / "picture.png", root / "images" / f"{i:03d}.png")
-        camera = {"fx": 1.4 * height, "fy": 1.4 * height, "cx": width / 2, "cy": height / 2, "width": width, "height": height}
+        camera = {
+            "fx": 1.4 * height,
+            "fy": 1.4 * height,
+            "cx": width / 2,
+            "cy": height / 2,
+            "width": width,
+            "height": height,
+        }
         camera["w2c"] = camera_pose(i, views).tolist()
         listed.append({"name": f"{i:03d}", "image": f"images/{i:03d}.png", "camera": camera})
     capture = {"format": "neilfpp-capture", "version": 1, "response": "srgb", "views": listed}

@@ -1,7 +1,8 @@
-"""A tiny capture with everything known: a sphere, traced analytically, written in the layout of the NeILF datasets.
+"""A tiny capture with everything known: a sphere, traced analytically, written in the layout of the NeILF
+datasets.
 
-Written in NumPy and apart from the package's cameras, so that it is an oracle for them. The scene frame has the sphere
-at the origin with radius RADIUS / SCALE = 0.8.
+Written in NumPy and apart from the package's cameras, so that it is an oracle for them. The scene frame has
+the sphere at the origin with radius RADIUS / SCALE = 0.8.
 """
 
 from __future__ import annotations
@@ -39,9 +40,13 @@ def srgb(linear: np.ndarray) -> np.ndarray:
 
 
 def camera_pose(i: int, views: int) -> np.ndarray:
-    """World to camera of view i: on a ring about the sphere, by turns above and below it, looking at its centre."""
+    """World to camera of view i: on a ring about the sphere, by turns above and below it, looking at its
+    centre.
+    """
     azimuth, elevation = 2 * np.pi * i / views, np.radians(35 if i % 2 else -10)
-    outward = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+    outward = np.array(
+        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+    )
     forward = -outward
     right = np.cross(forward, [0, 0, 1])
     right /= np.linalg.norm(right)
@@ -106,7 +111,10 @@ def make_capture(
                 values = values * hit.reshape(hit.shape + (1,) * (values.ndim - 2))
                 path = root / "ground_truths" / "materials" / name / f"{i:03d}.png"
                 write_png(path, np.rint(255 * values).astype(np.uint8))
-        camera = {"intrinsic": {"focal": list(focal), "ppt": list(center)}, "extrinsic": w2c.reshape(-1).tolist()}
+        camera = {
+            "intrinsic": {"focal": list(focal), "ppt": list(center)},
+            "extrinsic": w2c.reshape(-1).tolist(),
+        }
         tracks[str(i)] = {"flg": 2, "size": [width, height], "camera": camera}
         files[str(i)] = f"images/{i:03d}{suffix}"
     box = np.diag([2 * SCALE, 2 * SCALE, 2 * RADIUS, 1.0])

@@ -27,7 +27,9 @@ def radiance(turn: tuple[float, ...], view: int = 2) -> np.ndarray:
 
 
 def bracket(turns: tuple[tuple[float, ...], ...], curve: str = "srgb", view: int = 2) -> Bracket:
-    images = [photographs(radiance(turn, view), curve, (time,))[0] for turn, time in zip(turns, TIMES, strict=True)]
+    images = [
+        photographs(radiance(turn, view), curve, (time,))[0] for turn, time in zip(turns, TIMES, strict=True)
+    ]
     return Bracket(tuple(images), TIMES)
 
 
@@ -87,7 +89,9 @@ def test_what_a_moved_image_does_not_show_is_told_by_the_others() -> None:
 def test_what_shows_nothing_is_left_as_it_is() -> None:
     grey = tuple(np.full((40, 60, 3), level, np.float32) for level in (0.1, 0.3, 0.8))
     assert align(Bracket(grey, TIMES)).moved == 0
-    noise = tuple(np.random.default_rng(i).uniform(0.1, 0.9, (90, 120, 3)).astype(np.float32) for i in range(3))
+    noise = tuple(
+        np.random.default_rng(i).uniform(0.1, 0.9, (90, 120, 3)).astype(np.float32) for i in range(3)
+    )
     assert align(Bracket(noise, TIMES)).moved == 0
     black = tuple(np.zeros((40, 60, 3), np.float32) for _ in range(2))
     assert align(Bracket(black, TIMES[:2])).moved == 0

@@ -43,7 +43,9 @@ def test_a_folder_of_photographs_becomes_radiance(tmp_path: Path, layout: str, r
         (photos / "brackets.json").write_text(json.dumps(listed))
     seen: list[tuple[str, float | None]] = []
     brackets = find_brackets(photos)
-    merge_brackets(brackets, tmp_path / "images", tmp_path / "valid", response, on_merged=lambda *done: seen.append(done))
+    merge_brackets(
+        brackets, tmp_path / "images", tmp_path / "valid", response, on_merged=lambda *done: seen.append(done)
+    )
     names = tuple(brackets)
     assert seen == [(name, 0.0) for name in names]  # a tripod's
     assert names == (("IMG_0000", "IMG_0005") if layout == "sequence" else ("left", "right"))
@@ -65,7 +67,11 @@ def bad_folder(root: Path, kind: str) -> None:
         exposure = None if kind == "no exif" and i else 0.1 if same else time
         if kind != "one image" or i == 0:
             write_photograph(root / f"a_{i}.png", np.full((*size, 3), 0.5), exposure)
-    lists = {"leaves the folder": '{"a": ["../x.png", "a_0.png"]}', "missing": '{"a": ["b.png"]}', "no list": "[1]"}
+    lists = {
+        "leaves the folder": '{"a": ["../x.png", "a_0.png"]}',
+        "missing": '{"a": ["b.png"]}',
+        "no list": "[1]",
+    }
     lists["bad name"] = '{"../a": ["a_0.png", "a_1.png"]}'
     if kind in lists:
         write_photograph(root.parent / "x.png", grey)

@@ -15,7 +15,9 @@ TIMES = (1 / 256, 1 / 64, 1 / 16, 1 / 4, 1.0)
 
 
 def scene(seed: int = 0, size: tuple[int, int] = (48, 64)) -> np.ndarray:
-    """Radiance over 13 stops, smooth and coloured: 0.016 to 128 in the unit in which the 1 s image clips at 1."""
+    """Radiance over 13 stops, smooth and coloured: 0.016 to 128 in the unit in which the 1 s image clips at
+    1.
+    """
     height, width = size
     v, u = np.mgrid[:height, :width] / np.array([height, width]).reshape(2, 1, 1)
     stops = -6.0 + 13.0 * (0.5 + 0.3 * np.sin(9 * u + seed) * np.cos(7 * v) + 0.2 * (u - v))
@@ -32,8 +34,12 @@ def film(light: np.ndarray) -> np.ndarray:
 CURVES = {"srgb": srgb, "film": film, "linear": lambda light: light.clip(0, 1)}
 
 
-def photographs(radiance: np.ndarray, curve: str, times: tuple[float, ...] = TIMES, levels: int = 255) -> list[np.ndarray]:
-    return [np.rint(levels * CURVES[curve](radiance * t)).astype(np.float32) / np.float32(levels) for t in times]
+def photographs(
+    radiance: np.ndarray, curve: str, times: tuple[float, ...] = TIMES, levels: int = 255
+) -> list[np.ndarray]:
+    return [
+        np.rint(levels * CURVES[curve](radiance * t)).astype(np.float32) / np.float32(levels) for t in times
+    ]
 
 
 def relative_error(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -41,7 +47,7 @@ def relative_error(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.abs(found / np.median(found / truth) / truth - 1)
 
 
-# ---------------------------------------------------------------------------------------------------------------- merge
+# ------------------------------------------------------------------------------------------------------ merge
 
 
 @pytest.mark.parametrize(("curve", "levels"), [("srgb", 255), ("linear", 65_535)])
@@ -88,7 +94,9 @@ def test_dark_at_every_exposure_is_almost_black_and_valid() -> None:
 
 def test_between_exposures_too_far_apart_the_unclipped_one_counts() -> None:
     truth = np.full((1, 1, 3), 2.0, np.float32)
-    merged = merge(Bracket(tuple(photographs(truth, "linear", (1.0, 1 / 256))), (1.0, 1 / 256)), linear_response)
+    merged = merge(
+        Bracket(tuple(photographs(truth, "linear", (1.0, 1 / 256))), (1.0, 1 / 256)), linear_response
+    )
     assert np.allclose(merged.radiance, 2.0, atol=256 * 0.5 / 255)
     assert merged.valid.all()
 

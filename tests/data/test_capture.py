@@ -24,7 +24,7 @@ def edit_scene(root: Path, change) -> None:
     path.write_text(json.dumps(scene))
 
 
-# -------------------------------------------------------------------------------------------------------------- cameras
+# ---------------------------------------------------------------------------------------------------- cameras
 
 
 def test_projection_is_k_times_w2c(tmp_path: Path) -> None:
@@ -60,12 +60,15 @@ def test_scene_frame(tmp_path: Path) -> None:
     points = torch.randn(2, 7, 3, dtype=torch.float64)
     assert torch.allclose(to_world(to_scene(points)), points)
     camera = capture.views[3].camera
-    world, scene = project(camera, points[0]), project(capture.normalisation.camera(camera), to_scene(points[0]))
+    world, scene = (
+        project(camera, points[0]),
+        project(capture.normalisation.camera(camera), to_scene(points[0])),
+    )
     assert torch.allclose(world.pixel, scene.pixel)
     assert torch.allclose(world.depth / SCALE, scene.depth)
 
 
-# ----------------------------------------------------------------------------------------------------- published layout
+# ------------------------------------------------------------------------------------------- published layout
 
 
 def test_views_are_read_in_order_and_invalid_ones_left_out(tmp_path: Path) -> None:
@@ -113,7 +116,7 @@ def test_without_a_box_the_point_cloud_says_where_the_scene_is(tmp_path: Path) -
     assert normalisation.centre == pytest.approx(CENTRE, abs=0.02)
 
 
-# --------------------------------------------------------------------------------------------------- split and response
+# ----------------------------------------------------------------------------------------- split and response
 
 
 def test_split(tmp_path: Path) -> None:
@@ -154,10 +157,12 @@ def test_summary(tmp_path: Path) -> None:
     assert summary[2] == "scene: centre (0.3, -0.2, 0.5), 1 scene unit = 1.5 world units, as the capture says"
 
 
-# ------------------------------------------------------------------------------------------------------------ real data
+# -------------------------------------------------------------------------------------------------- real data
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="the shared captures are not here; NEILFPP_DATA says where they are")
+@pytest.mark.skipif(
+    not DATA.is_dir(), reason="the shared captures are not here; NEILFPP_DATA says where they are"
+)
 @pytest.mark.parametrize("name", ["tabletop_env", "tabletop_mix"])
 def test_shared_captures(name: str) -> None:
     capture = load_capture(DATA / name)

@@ -28,7 +28,9 @@ def folder(root: Path, **changes) -> Path:
     (root / "inputs" / "sfm_scene.json").unlink()
     (root / "split.json").unlink()
     first, *rest = made.views
-    write_capture(root, replace(made, views=(replace(first, **changes), *rest)), response="linear", test=["002"])
+    write_capture(
+        root, replace(made, views=(replace(first, **changes), *rest)), response="linear", test=["002"]
+    )
     return root
 
 
@@ -55,7 +57,9 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
         )
         for view in made.views
     )
-    files = CaptureFiles(tmp_path, folder_views, Normalisation(0.1 + 0.2, (1 / 3, -2.0, 0.0)), made.point_cloud)
+    files = CaptureFiles(
+        tmp_path, folder_views, Normalisation(0.1 + 0.2, (1 / 3, -2.0, 0.0)), made.point_cloud
+    )
     write_capture(tmp_path, files, response="srgb", test=["view 4", "view 1"])
     (tmp_path / "split.json").unlink()
     back = load_capture(tmp_path)
@@ -102,7 +106,15 @@ def test_the_example_in_the_documentation_is_a_capture(tmp_path: Path) -> None:
 
 def test_a_folder_by_hand_needs_little(tmp_path: Path) -> None:
     write_exr(tmp_path / "a.exr", {"RGB": np.ones((18, 24, 3), np.float32)})
-    camera = {"fx": 20, "fy": 20, "cx": 12, "cy": 9, "width": 24, "height": 18, "w2c": camera_pose(0, 6).tolist()}
+    camera = {
+        "fx": 20,
+        "fy": 20,
+        "cx": 12,
+        "cy": 9,
+        "width": 24,
+        "height": 18,
+        "w2c": camera_pose(0, 6).tolist(),
+    }
     content = {
         "format": "neilfpp-capture",
         "version": 1,
@@ -143,12 +155,21 @@ def view(content: dict) -> dict:
         (lambda c: view(c).update(name=""), "'' cannot name a file"),
         (lambda c: view(c).update(name="000"), "have the same name"),
         (lambda c: view(c).update(exposure=0), "exposure and white balance are not all positive"),
-        (lambda c: view(c).update(white_balance=[1, -1, 1]), "exposure and white balance are not all positive"),
+        (
+            lambda c: view(c).update(white_balance=[1, -1, 1]),
+            "exposure and white balance are not all positive",
+        ),
         (lambda c: view(c)["camera"].update(w2c=[1] * 16), "no rotation and translation"),
         (lambda c: view(c)["camera"].update(width=0), "width: not a positive whole number"),
         (lambda c: view(c)["camera"].update(fx=0), "focal length is not positive"),
-        (lambda c: view(c)["camera"].update(lens={"model": "OPENCV", "coefficients": [1]}), "OPENCV has 4 finite"),
-        (lambda c: view(c)["camera"].update(lens={"model": "OPENCV", "coefficients": "x"}), "not a list of finite"),
+        (
+            lambda c: view(c)["camera"].update(lens={"model": "OPENCV", "coefficients": [1]}),
+            "OPENCV has 4 finite",
+        ),
+        (
+            lambda c: view(c)["camera"].update(lens={"model": "OPENCV", "coefficients": "x"}),
+            "not a list of finite",
+        ),
     ],
 )
 def test_bad_entries_are_refused(tmp_path: Path, change: Callable[[dict], object], words: str) -> None:

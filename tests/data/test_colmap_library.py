@@ -45,9 +45,19 @@ def test_one_module_loads_pycolmap():
 def test_another_version_of_pycolmap_is_refused_in_one_line(tmp_path, version, command):
     (tmp_path / "pycolmap.py").write_text(f"__version__ = '{version}'\n")
     program = "import sys; from neilfpp_method.cli import main; sys.exit(main())"
-    line = [sys.executable, "-c", program, command, str(tmp_path), *(["--out", "x"] if command == "prepare" else [])]
+    line = [
+        sys.executable,
+        "-c",
+        program,
+        command,
+        str(tmp_path),
+        *(["--out", "x"] if command == "prepare" else []),
+    ]
     paths = os.pathsep.join([str(tmp_path), *sys.path])
     done = subprocess.run(line, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": paths})
     assert done.returncode == 2
     (error,) = done.stderr.splitlines()
-    assert error == f"error: pycolmap {version} is installed, of another interface; pip install 'pycolmap>=4.2,<5'"
+    assert (
+        error
+        == f"error: pycolmap {version} is installed, of another interface; pip install 'pycolmap>=4.2,<5'"
+    )

@@ -66,6 +66,10 @@ def test_the_size_is_refused_before_pixels_are_read(tmp_path, monkeypatch):
 def test_other_files_are_refused(tmp_path):
     write_png(tmp_path / "sky.png", np.ones((4, 8, 3), np.uint8))
     (tmp_path / "text.exr").write_text("light")
-    for name, complaint in (("sky.png", "EXR file"), ("text.exr", "cannot be read"), ("none.exr", "no such image")):
+    for name, complaint in (
+        ("sky.png", "EXR file"),
+        ("text.exr", "cannot be read"),
+        ("none.exr", "no such image"),
+    ):
         with pytest.raises(UserError, match=complaint):
             check_environment(tmp_path / name)

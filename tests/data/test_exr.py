@@ -41,9 +41,18 @@ def written(path: Path, *parts: dict[str, np.ndarray]) -> Path:
         [{"Z": OTHER[..., 0].copy()}, planes("", RGB), planes("", OTHER)],
         [DATA, BEAUTY],
     ],
-    ids=["one layer", "Combined", "unnamed layer", "colours before vectors", "first part with colours", "layer in a part"],
+    ids=[
+        "one layer",
+        "Combined",
+        "unnamed layer",
+        "colours before vectors",
+        "first part with colours",
+        "layer in a part",
+    ],
 )
-def test_the_picture_is_found_among_layers_and_parts(tmp_path: Path, parts: list[dict[str, np.ndarray]]) -> None:
+def test_the_picture_is_found_among_layers_and_parts(
+    tmp_path: Path, parts: list[dict[str, np.ndarray]]
+) -> None:
     path = written(tmp_path / "a.exr", *parts)
     assert (image_header(path).width, image_header(path).height) == (WIDTH, HEIGHT)
     image = read_image(path)
@@ -53,7 +62,9 @@ def test_the_picture_is_found_among_layers_and_parts(tmp_path: Path, parts: list
 
 def test_the_alpha_is_that_of_the_layer(tmp_path: Path) -> None:
     alpha = np.full((HEIGHT, WIDTH), 0.25, np.float32)
-    image = read_image(written(tmp_path / "a.exr", {**BEAUTY, "View.Combined.A": alpha, "View.Other.A": 0 * alpha}))
+    image = read_image(
+        written(tmp_path / "a.exr", {**BEAUTY, "View.Combined.A": alpha, "View.Other.A": 0 * alpha})
+    )
     assert np.array_equal(image.pixels, RGB)
     assert (image.alpha == 0.25).all()
 
@@ -61,7 +72,9 @@ def test_the_alpha_is_that_of_the_layer(tmp_path: Path) -> None:
 def test_layers_that_could_all_be_meant_are_refused(tmp_path: Path) -> None:
     path = written(tmp_path / "a.exr", {**DIFFUSE, **planes("View.GlossCol.", RGB)})
     for read in (image_header, read_image):
-        with pytest.raises(UserError, match=r"a\.exr: no RGB or single channel among View\.DiffCol\.B, .*GlossCol"):
+        with pytest.raises(
+            UserError, match=r"a\.exr: no RGB or single channel among View\.DiffCol\.B, .*GlossCol"
+        ):
             read(path)
 
 

@@ -31,7 +31,9 @@ def looking(image: Path, eye: np.ndarray, at: np.ndarray) -> View:
     return View("view", 0, Camera(40.0, 40.0, 20.0, 15.0, 40, 30, w2c), image)
 
 
-def around(image: Path, count: int = 24, distance: float = 4.0, arc: float = 2 * np.pi, aim: float = 0.0) -> list[View]:
+def around(
+    image: Path, count: int = 24, distance: float = 4.0, arc: float = 2 * np.pi, aim: float = 0.0
+) -> list[View]:
     """Cameras on a part of a ring about the place, a little above it; their aim is off by up to `aim`."""
     random = np.random.default_rng(0)
     views = []
@@ -63,7 +65,10 @@ def test_aim_is_averaged(image):
 
 def test_a_quarter_that_looks_elsewhere_moves_nothing(image):
     random = np.random.default_rng(2)
-    away = [looking(image, PLACE + 4 * d, PLACE + 4 * d + 10 * random.normal(size=3)) for d in random.normal(size=(8, 3))]
+    away = [
+        looking(image, PLACE + 4 * d, PLACE + 4 * d + 10 * random.normal(size=3))
+        for d in random.normal(size=(8, 3))
+    ]
     focus = find_focus([*around(image), *away])
     assert np.linalg.norm(focus.centre - PLACE) < 0.1
     assert focus.looking[:24].all()
@@ -106,7 +111,9 @@ def test_cameras_side_by_side_that_turn_towards_a_thing_have_a_focus(image):
 def test_two_cameras(image):
     apart, close = (around(image, count=2, arc=arc) for arc in (np.pi, 0.2))
     assert find_focus(apart).centre == pytest.approx(PLACE, abs=1e-6)
-    assert find_focus(close) is None, "twelve degrees between them, and any depth may be that of a careless aim"
+    assert find_focus(close) is None, (
+        "twelve degrees between them, and any depth may be that of a careless aim"
+    )
     assert box_of_focus(close) is None
 
 

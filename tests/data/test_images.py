@@ -47,7 +47,9 @@ def test_exr_channels(tmp_path: Path) -> None:
     assert np.allclose(image.pixels[..., 0], RGB[..., 0], rtol=1e-3)
     assert (image.alpha == 0.25).all()
     for name in ("Y", "Z", "depth"):
-        assert np.array_equal(read_image(openexr(tmp_path / "one.exr", {name: planes["R"]})).pixels, RGB[..., :1])
+        assert np.array_equal(
+            read_image(openexr(tmp_path / "one.exr", {name: planes["R"]})).pixels, RGB[..., :1]
+        )
     xyz = dict(zip("XYZ", planes.values(), strict=True))
     assert np.array_equal(read_image(openexr(tmp_path / "xyz.exr", xyz)).pixels, RGB)
     with pytest.raises(UserError, match=r"two\.exr.*u, v"):
@@ -118,14 +120,19 @@ def test_the_exposure_of_a_radiance_file_is_divided_out(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["NO", "ZIP", "PIZ", "RLE"])
 @pytest.mark.parametrize("layout", ["scanline", "tiled"])
 def test_exr_compressions_and_layouts(tmp_path: Path, kind: str, layout: str) -> None:
-    header = {"compression": getattr(OpenEXR, f"{kind}_COMPRESSION"), "type": getattr(OpenEXR, f"{layout}image")}
+    header = {
+        "compression": getattr(OpenEXR, f"{kind}_COMPRESSION"),
+        "type": getattr(OpenEXR, f"{layout}image"),
+    }
     if layout == "tiled":
         header["tiles"] = OpenEXR.TileDescription()
     assert np.array_equal(read_image(openexr(tmp_path / "a.exr", {"RGB": RGB}, **header)).pixels, RGB)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float16, np.float32, np.float64])
-@pytest.mark.parametrize("layout", [{}, {"tile": (16, 16)}, {"byteorder": ">"}, {"compression": "zlib"}, {"planarconfig": 2}])
+@pytest.mark.parametrize(
+    "layout", [{}, {"tile": (16, 16)}, {"byteorder": ">"}, {"compression": "zlib"}, {"planarconfig": 2}]
+)
 def test_tiff_of_another_writer(tmp_path: Path, dtype: type, layout: dict) -> None:
     full = np.iinfo(dtype).max if np.issubdtype(dtype, np.integer) else 1
     samples = (RGB if full == 1 else RGB / 4 * full).astype(dtype)
@@ -149,7 +156,9 @@ def test_radiance_hdr_by_the_definition_of_rgbe(tmp_path: Path) -> None:
 def test_png_kinds(tmp_path: Path, mode: str) -> None:
     Image.fromarray(BYTES).convert(mode).save(tmp_path / "kind.png")
     expected = np.asarray(Image.fromarray(BYTES).convert(mode).convert("RGB")) / 255
-    assert np.allclose(read_image(tmp_path / "kind.png").pixels, expected[..., : 1 if mode in "L1" else 3], atol=1e-6)
+    assert np.allclose(
+        read_image(tmp_path / "kind.png").pixels, expected[..., : 1 if mode in "L1" else 3], atol=1e-6
+    )
 
 
 def test_jpeg_keeps_the_stored_orientation(tmp_path: Path) -> None:
@@ -188,7 +197,7 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-# ------------------------------------------------------------------------------------------------- files from strangers
+# --------------------------------------------------------------------------------------- files from strangers
 
 
 @pytest.mark.parametrize("suffix", [".exr", ".png", ".tif", ".jpg", ".hdr"])
@@ -200,7 +209,11 @@ def test_damaged_files_are_named(tmp_path: Path, suffix: str, damage: str) -> No
         write_exr(path, {"RGB": noise})
     else:
         cv2.imwrite(str(path), noise if suffix == ".hdr" else (noise * 255).astype(np.uint8))
-    content = {"cut": path.read_bytes()[: path.stat().st_size // 2], "empty": b"", "garbage": b"no image at all " * 9}
+    content = {
+        "cut": path.read_bytes()[: path.stat().st_size // 2],
+        "empty": b"",
+        "garbage": b"no image at all " * 9,
+    }
     path.unlink() if damage == "missing" else path.write_bytes(content[damage])
     with pytest.raises(UserError, match=rf"bad\{suffix}: (cannot be read|no such image)"):
         read_image(path)
@@ -211,11 +224,15 @@ def test_a_forged_size_is_refused_before_anything_is_allocated(tmp_path: Path) -
     data = (tmp_path / "a.exr").read_bytes()
     for window in (b"dataWindow", b"displayWindow"):
         at = data.index(window + b"\0box2i\0") + len(window) + 7 + 4
-        (tmp_path / "a.exr").write_bytes(data[:at] + struct.pack("<4i", 0, 0, 199_999, 199_999) + data[at + 16 :])
+        (tmp_path / "a.exr").write_bytes(
+            data[:at] + struct.pack("<4i", 0, 0, 199_999, 199_999) + data[at + 16 :]
+        )
         with pytest.raises(UserError, match=r"a\.exr: the header says 200000×200000"):
             read_image(tmp_path / "a.exr")
     cv2.imwrite(str(tmp_path / "a.hdr"), RGB)
-    (tmp_path / "a.hdr").write_bytes((tmp_path / "a.hdr").read_bytes().replace(b"-Y 5 +X 7", b"-Y 40000 +X 40000"))
+    (tmp_path / "a.hdr").write_bytes(
+        (tmp_path / "a.hdr").read_bytes().replace(b"-Y 5 +X 7", b"-Y 40000 +X 40000")
+    )
     with pytest.raises(UserError, match="40000×40000"):
         image_header(tmp_path / "a.hdr")
     write_png(tmp_path / "a.png", BYTES)
@@ -236,7 +253,9 @@ def test_a_header_of_100_000_columns_costs_no_memory(tmp_path: Path) -> None:
     for read in (image_header, read_image):
         with pytest.raises(UserError, match="the header says 100000×100000"):
             read(tmp_path / "wide.exr")
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB; the pixels would be 120 GB
+    assert (
+        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000
+    )  # kB; the pixels would be 120 GB
 
 
 def test_unknown_formats_are_refused(tmp_path: Path) -> None:

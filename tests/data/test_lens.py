@@ -24,7 +24,20 @@ COEFFICIENTS = {
     "RADIAL_FISHEYE": [0.03, -0.005],
     "OPENCV_FISHEYE": [0.03, -0.005, 0.002, -0.001],
     "THIN_PRISM_FISHEYE": [0.03, -0.005, 0.001, -0.001, 0.001, 0.0, 0.001, -0.001],
-    "RAD_TAN_THIN_PRISM_FISHEYE": [0.03, -0.005, 0.001, 0.0, 0.0, 0.0, 0.001, -0.001, 0.001, 0.0, -0.001, 0.0],
+    "RAD_TAN_THIN_PRISM_FISHEYE": [
+        0.03,
+        -0.005,
+        0.001,
+        0.0,
+        0.0,
+        0.0,
+        0.001,
+        -0.001,
+        0.001,
+        0.0,
+        -0.001,
+        0.0,
+    ],
     "FOV": [0.6],
     "SIMPLE_DIVISION": [-0.1],
     "DIVISION": [-0.1],
@@ -57,7 +70,9 @@ def test_every_model_of_the_library_is_known() -> None:
 def test_projection_is_that_of_pycolmap(model: str) -> None:
     names = pycolmap.Camera.create_from_model_name(0, model, 1.0, 1, 1).params_info.split(", ")
     focal = [FOCAL[0]] if names[0] == "f" else list(FOCAL)
-    oracle = pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=[*focal, *CENTRE_PIXEL, *COEFFICIENTS[model]])
+    oracle = pycolmap.Camera(
+        model=model, width=SIZE[0], height=SIZE[1], params=[*focal, *CENTRE_PIXEL, *COEFFICIENTS[model]]
+    )
     points = seen_points()
     seen = project(camera(model), torch.from_numpy(points))
     assert np.abs(seen.pixel.numpy() - oracle.img_from_cam(local(points))).max() < 1e-6
@@ -141,7 +156,9 @@ def test_pixels_at_which_a_lens_shows_nothing_are_told_and_look_away() -> None:
     assert rays.shown(0).shape == (600,)
     assert rays.shown(0).all()
     rows, columns = np.mgrid[: SIZE[1], : SIZE[0]]
-    radius = np.hypot(columns.ravel() + 0.5 - CENTRE_PIXEL[0], rows.ravel() + 0.5 - CENTRE_PIXEL[1]) / FOCAL[0]
+    radius = (
+        np.hypot(columns.ravel() + 0.5 - CENTRE_PIXEL[0], rows.ravel() + 0.5 - CENTRE_PIXEL[1]) / FOCAL[0]
+    )
     edge = 2 / 3 / np.sqrt(3 * 0.3)
     shown = rays.shown(1).numpy()
     assert shown[radius < edge - 0.01].all()

@@ -40,7 +40,9 @@ def test_exposures_from_a_file(tmp_path: Path) -> None:
         exposures_of(tmp_path, [tmp_path / "c.jpg"])
 
 
-@pytest.mark.parametrize("text", ["a.jpg 0", "a.jpg -1", "a.jpg nan", "a.jpg 1/0", "a.jpg", "a.jpg fast", "a.jpg 1e999"])
+@pytest.mark.parametrize(
+    "text", ["a.jpg 0", "a.jpg -1", "a.jpg nan", "a.jpg 1/0", "a.jpg", "a.jpg fast", "a.jpg 1e999"]
+)
 def test_a_bad_list_of_exposures_is_named(tmp_path: Path, text: str) -> None:
     (tmp_path / "exposures.txt").write_text(text)
     with pytest.raises(UserError, match=r"exposures\.txt"):

@@ -1,4 +1,6 @@
-"""The store of pixels: exact as its bits allow, found again when nothing has changed, and made anew when something has."""
+"""The store of pixels: exact as its bits allow, found again when nothing has changed, and made anew when
+something has.
+"""
 
 from __future__ import annotations
 
@@ -30,14 +32,16 @@ def opened(capture: Capture, folder: Path) -> tuple[PixelDataset, list[str]]:
 
 def batches(pixels: PixelDataset) -> list[torch.Tensor]:
     views = [pixels.view(i) for i in range(len(pixels.views))]
-    return [getattr(view, name) for view in views for name in ("color", "mask", "mask_known", "image_gradient")]
+    return [
+        getattr(view, name) for view in views for name in ("color", "mask", "mask_known", "image_gradient")
+    ]
 
 
 def same(one: PixelDataset, other: PixelDataset) -> bool:
     return all(torch.equal(a, b) for a, b in zip(batches(one), batches(other), strict=True))
 
 
-# ------------------------------------------------------------------------------------------------------- what it holds
+# ---------------------------------------------------------------------------------------------- what it holds
 
 
 def test_images_of_8_bits_come_back_to_the_bit(tmp_path: Path) -> None:
@@ -77,7 +81,9 @@ def test_a_range_beyond_half_precision_is_kept_in_single(tmp_path: Path) -> None
     write_exr(capture.views[2].image, {"RGB": color})
     pixels, names = opened(capture, tmp_path / "pixels")
     assert np.array_equal(pixels.view(2).color.numpy(), color.reshape(-1, 3))
-    assert names == [view.name for view in capture.views], "each view is reported once, though some were read twice"
+    assert names == [view.name for view in capture.views], (
+        "each view is reported once, though some were read twice"
+    )
 
 
 def test_in_memory_and_in_a_folder_are_the_same(tmp_path: Path) -> None:
@@ -100,7 +106,7 @@ def test_single_pixels_are_those_of_their_views(tmp_path: Path) -> None:
     assert edges.any(), "gradients at the border are compared, too"
 
 
-# ---------------------------------------------------------------------------------------------- found again, made anew
+# ------------------------------------------------------------------------------------- found again, made anew
 
 
 def test_a_store_is_found_again(tmp_path: Path) -> None:
@@ -173,7 +179,9 @@ def negative_scale(folder: Path) -> None:
     (folder / "store.json").write_text(json.dumps(known | {"scales": [-1.0] * 6}))
 
 
-@pytest.mark.parametrize("damage", [cut_off, of_other_shape, pickled, without_description, foreign_description, negative_scale])
+@pytest.mark.parametrize(
+    "damage", [cut_off, of_other_shape, pickled, without_description, foreign_description, negative_scale]
+)
 def test_a_damaged_or_foreign_store_is_made_anew(tmp_path: Path, damage) -> None:
     capture = load_capture(make_capture(tmp_path / "c"))
     opened(capture, tmp_path / "pixels")
@@ -196,7 +204,9 @@ def test_a_failure_leaves_no_half_store(tmp_path: Path) -> None:
 def test_a_full_disk_is_told_before_anything_is_read(tmp_path: Path, monkeypatch) -> None:
     capture = load_capture(make_capture(tmp_path / "c"))
     monkeypatch.setattr(pixel_store.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 10**6}))
-    with pytest.raises(UserError, match=r"pixels: the pixels of the training views take 0\.0 GB, and 0\.0 GB are free"):
+    with pytest.raises(
+        UserError, match=r"pixels: the pixels of the training views take 0\.0 GB, and 0\.0 GB are free"
+    ):
         opened(capture, tmp_path / "pixels")
     assert not (tmp_path / "pixels").exists()
 
@@ -214,7 +224,7 @@ def test_pages_that_were_drawn_are_given_back(tmp_path: Path, monkeypatch) -> No
     assert torch.equal(before, pixels.view(3).color)
 
 
-# --------------------------------------------------------------------------------------------------------- near or far
+# ------------------------------------------------------------------------------------------------ near or far
 
 
 def test_near_the_object_is_a_disc_about_it() -> None:

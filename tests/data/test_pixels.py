@@ -55,7 +55,12 @@ def test_rays_see_what_the_pixels_show(tmp_path: Path, hdr: bool) -> None:
     for batch in (*(pixels.view(i) for i in range(6)), pixels.sample(500)):
         hit, normal = sphere_normals(batch)
         expected = radiance(normal) if hdr else srgb(radiance(normal))
-        assert np.allclose(batch.color.numpy()[hit], expected[hit], atol=2e-4 if hdr else 0.6 / 255, rtol=2**-11 if hdr else 0)
+        assert np.allclose(
+            batch.color.numpy()[hit],
+            expected[hit],
+            atol=2e-4 if hdr else 0.6 / 255,
+            rtol=2**-11 if hdr else 0,
+        )
         assert (batch.mask.numpy()[hit] == 1).all()
         assert hit.mean() > 0.2
     background = pixels.view(0).mask == 0
@@ -94,7 +99,9 @@ def test_samples_are_uniform_and_follow_the_global_seed(tmp_path: Path) -> None:
     assert stats.chisquare(np.bincount(first.view, minlength=6)).pvalue > 1e-3
     local = torch.from_numpy(np.stack([view.camera.w2c[:3, :3] for view in pixels.views])).float()[first.view]
     plane = torch.einsum("nij,nj->ni", local, first.directions)
-    left = int((plane[:, 0] < -plane[:, 2] * 0.5 / 25.2).sum())  # the principal point lies half a pixel right of the middle
+    left = int(
+        (plane[:, 0] < -plane[:, 2] * 0.5 / 25.2).sum()
+    )  # the principal point lies half a pixel right of the middle
     assert stats.binomtest(left, 12_000, 0.5).pvalue > 1e-3
 
 
@@ -110,7 +117,9 @@ def test_masks(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("exposure", [1.0, 1000.0])
-def test_image_gradient_of_a_ramp_is_that_of_the_picture_whatever_its_exposure(tmp_path: Path, exposure: float) -> None:
+def test_image_gradient_of_a_ramp_is_that_of_the_picture_whatever_its_exposure(
+    tmp_path: Path, exposure: float
+) -> None:
     root = make_capture(tmp_path)
     x, y = np.meshgrid(np.arange(WIDTH) - (WIDTH - 1) / 2, np.arange(HEIGHT) - (HEIGHT - 1) / 2)
     display = 1.055 * 0.18 ** (1 / 2.4) - 0.055 + 0.02 * x + 0.01 * y  # about middle grey
@@ -118,15 +127,18 @@ def test_image_gradient_of_a_ramp_is_that_of_the_picture_whatever_its_exposure(t
     write_exr(root / "inputs" / "images" / "000.exr", {"RGB": np.repeat(linear[..., None], 3, axis=2)})
     capture = load_capture(root)
     gradient = PixelDataset(capture, [capture.views[0]]).view(0).image_gradient.reshape(HEIGHT, WIDTH)
-    # The median is next to middle grey. Scharr's weights 3, 10, 3 and the two pixels between make 32 (published code).
+    # The median is next to middle grey. Scharr's weights 3, 10, 3 and the two pixels between make 32
+    # (published code).
     assert np.allclose(gradient[1:-1, 1:-1], 32 * np.hypot(0.02, 0.01), rtol=0.02)
-    assert np.allclose(gradient[1:-1, 0], 32 * np.hypot(0.01, 0.01), rtol=0.02)  # half a difference at the border
+    assert np.allclose(
+        gradient[1:-1, 0], 32 * np.hypot(0.01, 0.01), rtol=0.02
+    )  # half a difference at the border
     shown = tone_map(torch.from_numpy(linear / np.median(linear) * 0.18)).numpy().astype(np.float32)
     right, down = (cv2.Sobel(shown, cv2.CV_32F, *axis, ksize=cv2.FILTER_SCHARR) for axis in ((1, 0), (0, 1)))
     assert np.allclose(gradient[1:-1, 1:-1], np.hypot(right, down)[1:-1, 1:-1], rtol=0.02)
 
 
-# ------------------------------------------------------------------------------------- invalid pixels, exposure, balance
+# -------------------------------------------------------------------------- invalid pixels, exposure, balance
 
 
 def with_views(capture: Capture, **changes) -> Capture:
@@ -181,9 +193,13 @@ def test_statistics_leave_invalid_pixels_out(tmp_path: Path) -> None:
     capture = marked(tmp_path / "a", slice(0, 12), background=0.25)
     pixels = PixelDataset(capture, capture.views)
     whole = dataset(tmp_path / "b", background=0.25)
-    right = torch.cat([whole.view(i).color.reshape(HEIGHT, WIDTH, 3)[:, 12:].reshape(-1, 3) for i in range(6)])
+    right = torch.cat(
+        [whole.view(i).color.reshape(HEIGHT, WIDTH, 3)[:, 12:].reshape(-1, 3) for i in range(6)]
+    )
     object_ = right[(right != 0.25).any(-1)]
-    assert pixels.median_radiance() == pytest.approx(float((object_ @ torch.tensor([0.2126, 0.7152, 0.0722])).median()))
+    assert pixels.median_radiance() == pytest.approx(
+        float((object_ @ torch.tensor([0.2126, 0.7152, 0.0722])).median())
+    )
     assert pixels.radiance_quantile(1.0) == float(object_.max())
     assert torch.equal(pixels.border_color(), torch.tensor([0.25, 0.25, 0.25]))
 
@@ -197,7 +213,10 @@ def test_nothing_valid_is_refused(tmp_path: Path) -> None:
 def test_pixels_at_which_a_lens_shows_nothing_are_never_drawn(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path, masks=True))
     whole = PixelDataset(capture, capture.views)
-    bent = [replace(view, camera=replace(view.camera, lens=Lens("RADIAL", (-0.6, 0.0)))) for view in capture.views[:3]]
+    bent = [
+        replace(view, camera=replace(view.camera, lens=Lens("RADIAL", (-0.6, 0.0))))
+        for view in capture.views[:3]
+    ]
     pixels = PixelDataset(replace(capture, views=(*bent, *capture.views[3:])), (*bent, *capture.views[3:]))
     assert 0.5 < pixels.valid(1).float().mean() < 0.98
     assert pixels.valid(4).all()
@@ -243,7 +262,7 @@ def test_display_values_have_no_exposure(tmp_path: Path) -> None:
         PixelDataset(capture, capture.views)
 
 
-# ----------------------------------------------------------------------------------------------------------- statistics
+# ------------------------------------------------------------------------------------------------- statistics
 
 
 @pytest.mark.parametrize("hdr", [True, False])
@@ -329,7 +348,9 @@ def test_exact_pixels_are_those_of_the_files(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path))
     color = np.random.default_rng(0).uniform(0, 3, (HEIGHT, WIDTH, 3)).astype(np.float32)
     write_exr(tmp_path / "inputs" / "images" / "001.exr", {"RGB": color})
-    kept = [PixelDataset(capture, capture.views, exact=exact).view(1).color.numpy() for exact in (False, True)]
+    kept = [
+        PixelDataset(capture, capture.views, exact=exact).view(1).color.numpy() for exact in (False, True)
+    ]
     assert np.array_equal(kept[1], color.reshape(-1, 3))
     assert not np.array_equal(kept[0], kept[1]), "a training keeps fewer bits"
     with pytest.raises(ValueError, match="in memory"):

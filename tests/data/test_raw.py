@@ -17,13 +17,17 @@ from neilfpp_method.errors import UserError
 
 BLACK, WHITE = 512, 16_383
 HEIGHT, WIDTH = 64, 96
-XYZ_TO_SRGB = np.array([[3.24045, -1.53714, -0.49853], [-0.96927, 1.87601, 0.04156], [0.05564, -0.20403, 1.05723]])
+XYZ_TO_SRGB = np.array(
+    [[3.24045, -1.53714, -0.49853], [-0.96927, 1.87601, 0.04156], [0.05564, -0.20403, 1.05723]]
+)
 NEUTRAL = (0.5, 1.0, 0.8)
 """What the sensor answers to white light: red at half of green."""
 
 
 def write_dng(path: Path, light: np.ndarray, as_shot: tuple[float, float, float] = NEUTRAL) -> None:
-    """A Bayer sensor (RGGB) behind sRGB filters of the transmittance NEUTRAL; light 1 in green is its white level."""
+    """A Bayer sensor (RGGB) behind sRGB filters of the transmittance NEUTRAL; light 1 in green is its white
+    level.
+    """
     channel = np.array([[0, 1], [1, 2]])[np.mgrid[:HEIGHT, :WIDTH][0] % 2, np.mgrid[:HEIGHT, :WIDTH][1] % 2]
     answer = np.take_along_axis(light * NEUTRAL, channel[..., None], axis=2)[..., 0]
     sensor = np.rint(BLACK + answer.clip(0, 1) * (WHITE - BLACK)).astype(np.uint16)
@@ -110,5 +114,7 @@ def test_a_damaged_file_is_named(tmp_path: Path, rawpy, content: bytes) -> None:
 
 def test_without_rawpy_the_extra_is_named(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "rawpy", None)
-    with pytest.raises(UserError, match=r"a\.nef: camera RAW needs rawpy; pip install 'neilfpp-method\[raw\]'"):
+    with pytest.raises(
+        UserError, match=r"a\.nef: camera RAW needs rawpy; pip install 'neilfpp-method\[raw\]'"
+    ):
         develop(tmp_path / "a.nef")

@@ -48,7 +48,9 @@ def test_the_ray_of_a_pixel_leads_through_the_middle_of_its_area(tmp_path: Path)
     view = load_capture(make_capture(tmp_path)).views[1]
     small = scaled_view(view, 1 / 3)
     rays = CameraRays([view.camera, small.camera], dtype=torch.float64)
-    middle = torch.tensor([4 * 24 + 7])  # of the 3×3 pixels about row 4, column 7, which are one of the small image
+    middle = torch.tensor(
+        [4 * 24 + 7]
+    )  # of the 3×3 pixels about row 4, column 7, which are one of the small image
     one = rays(torch.tensor([0]), middle)
     other = rays(torch.tensor([1]), torch.tensor([1 * 8 + 2]))
     assert torch.allclose(one.directions, other.directions, atol=1e-12)
@@ -68,7 +70,7 @@ def test_a_scale_that_is_none(tmp_path: Path, scale: float) -> None:
         at_scale(load_capture(make_capture(tmp_path)), scale)
 
 
-# ------------------------------------------------------------------------------------------------------------- averages
+# --------------------------------------------------------------------------------------------------- averages
 
 
 def test_means_over_parts_of_pixels() -> None:
@@ -131,7 +133,7 @@ def test_truth_at_a_smaller_size(tmp_path: Path) -> None:
     assert torch.allclose(truth.material(view).base_color.reshape(18, 24, 3), color, atol=1e-6)
 
 
-# ---------------------------------------------------------------------------------------------------------- which scale
+# ------------------------------------------------------------------------------------------------ which scale
 
 
 def photographs(tmp_path: Path, count: int, width: int, height: int) -> list:

@@ -1,4 +1,6 @@
-"""The ground truth of the sphere: depth, normals and materials against closed forms; everything is optional."""
+"""The ground truth of the sphere: depth, normals and materials against closed forms; everything is
+optional.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ def test_depth_normal_and_mask_of_a_view(truth: Truth) -> None:
         hit = truth.mask(views[i])
         assert torch.equal(hit, batch.mask == 1)
         axis = torch.from_numpy(views[i].camera.w2c[2, :3]).float()
-        position = batch.origins + batch.directions * (truth.depth(views[i]) / (batch.directions @ axis))[:, None]
+        position = (
+            batch.origins + batch.directions * (truth.depth(views[i]) / (batch.directions @ axis))[:, None]
+        )
         assert torch.allclose(position[hit].norm(dim=-1), torch.tensor(SPHERE), atol=1e-5)
         assert torch.allclose(truth.normal(views[i])[hit], position[hit] / SPHERE, atol=1e-5)
         assert (truth.normal(views[i])[~hit] == 0).all()
@@ -81,11 +85,15 @@ def test_light_field(truth: Truth) -> None:
     points = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
     np.savez(path, **light_field(points))
     field = truth.light_field()
-    assert torch.allclose(truth.capture.normalisation.to_world(field.position), torch.from_numpy(points), atol=1e-6)
+    assert torch.allclose(
+        truth.capture.normalisation.to_world(field.position), torch.from_numpy(points), atol=1e-6
+    )
     assert field.incident.shape == (4, 5, 3)
     assert field.material.roughness.shape == (4, 1)
     np.savez(path, **(light_field(points) | {"incident": np.zeros((4, 6, 3))}))
-    with pytest.raises(UserError, match=r"light_field_gt\.npz: not a light field \(incident has the shape \(4, 6, 3\)"):
+    with pytest.raises(
+        UserError, match=r"light_field_gt\.npz: not a light field \(incident has the shape \(4, 6, 3\)"
+    ):
         truth.light_field()
     np.savez(path, **(light_field(points) | {"wo": np.array([{"code": "runs"}])}))
     with pytest.raises(UserError, match="allow_pickle=False"):

@@ -33,9 +33,13 @@ def camera_at(eye: Sequence[float], focal: float = 1.5 * SIZE, size: int = SIZE)
 
 
 def disc(camera: Camera, centre: Sequence[float] = (0.0, 0.0, 0.0), radius: float = BALL) -> np.ndarray:
-    """The silhouette of a ball, from the angle between rays and its centre; apart from the package's projection."""
+    """The silhouette of a ball, from the angle between rays and its centre; apart from the package's
+    projection.
+    """
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
-    local = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=-1)
+    local = np.stack(
+        [(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=-1
+    )
     rays = local @ camera.w2c[:3, :3] / np.linalg.norm(local, axis=-1, keepdims=True)
     to = np.asarray(centre) - camera.c2w[:, 3]
     distance = np.linalg.norm(to)
@@ -46,7 +50,9 @@ def ring(count: int, distance: float = 4.0, **camera) -> list[Outline]:
     """Silhouettes of the ball from directions that are spread evenly over the sphere."""
     k = np.arange(count) + 0.5
     z, azimuth = 1 - 2 * k / count, k * np.pi * (3 - np.sqrt(5))
-    eyes = distance * np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], axis=1)
+    eyes = distance * np.stack(
+        [np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], axis=1
+    )
     cameras = [camera_at(eye, **camera) for eye in eyes]
     return [Outline(View(f"{i}", i, c, Path()), disc(c)) for i, c in enumerate(cameras)]
 
@@ -83,9 +89,14 @@ def test_a_few_wrong_masks_do_not_matter_and_many_do():
     broken = [replace(outline, inside=np.roll(outline.inside, SIZE // 2, axis=1)) for outline in outlines]
     whole = visual_hull(outlines, 1.3, 32)
     two = visual_hull([*broken[:2], *outlines[2:]], 1.3, 32)
-    assert (two & whole).sum() > 0.95 * whole.sum(), "two of forty may err; at the rim a third is off by a pixel"
+    assert (two & whole).sum() > 0.95 * whole.sum(), (
+        "two of forty may err; at the rim a third is off by a pixel"
+    )
     assert (two & ~whole).sum() == 0
-    assert find_hull([*broken[:20], *outlines[20:]], resolution=32) == "the masks have next to no place in common"
+    assert (
+        find_hull([*broken[:20], *outlines[20:]], resolution=32)
+        == "the masks have next to no place in common"
+    )
 
 
 def test_views_that_do_not_see_a_place_have_no_say_about_it():
@@ -99,7 +110,10 @@ def test_views_that_do_not_see_a_place_have_no_say_about_it():
     # And with close-ups alone nobody sees where the ball ends, nor what is beside the pictures.
     alone = visual_hull(close, 1.3, 32)
     centre = (np.arange(32) + 0.5) * 2.6 / 32 - 1.3
-    assert np.linalg.norm(np.stack(np.meshgrid(centre, centre, centre, indexing="ij"), -1)[alone], axis=-1).max() < 1.3
+    assert (
+        np.linalg.norm(np.stack(np.meshgrid(centre, centre, centre, indexing="ij"), -1)[alone], axis=-1).max()
+        < 1.3
+    )
 
 
 def test_a_hole_that_views_look_through_is_open():
@@ -144,4 +158,6 @@ def test_large_masks_are_read_small_with_cameras_to_match(tmp_path):
     (outline,) = read_outlines([view], longest=100)
     assert outline.inside.shape == (100, 100)
     assert outline.inside.mean() == pytest.approx(mask.mean(), rel=0.02)
-    assert sightings([outline], np.array([[0.2, 0.1, 0.0], [0.2, 0.1 + BALL + 0.1, 0.0]])).inside.tolist() == [1, 0]
+    assert sightings(
+        [outline], np.array([[0.2, 0.1, 0.0], [0.2, 0.1 + BALL + 0.1, 0.0]])
+    ).inside.tolist() == [1, 0]

@@ -39,7 +39,9 @@ def ball(metallic: float) -> Places:
     dark = Observed(normal, normal, wo, torch.zeros_like(normal))
     count = len(normal)
     material = Material(
-        torch.tensor([0.6, 0.5, 0.4]).expand(count, 3), torch.full((count, 1), 0.28), torch.full((count, 1), metallic)
+        torch.tensor([0.6, 0.5, 0.4]).expand(count, 3),
+        torch.full((count, 1), 0.28),
+        torch.full((count, 1), metallic),
     )
     environment = sky()
     carried = from_texels(environment, dark, material.roughness, LOBE, None)
@@ -48,13 +50,20 @@ def ball(metallic: float) -> Places:
 
 
 def gain_of_metals(places: Places) -> tuple[float, float]:
-    """Mean error that metals save in views that are kept back, and the share of places that are then of metal."""
+    """Mean error that metals save in views that are kept back, and the share of places that are then of
+    metal.
+    """
     transport = place_transport(places, LOBE, None)
     typical = places.observed.pixel.median().item()
     back = places.view % 3 == 0
     known, kept = torch.nonzero(~back)[:, 0], torch.nonzero(back)[:, 0]
-    paint, metal = (fit_places(places.where(known), transport[known], typical, metals) for metals in (False, True))
-    errors = [place_errors(fit, places.where(kept), transport[kept], typical).mean().item() for fit in (paint, metal)]
+    paint, metal = (
+        fit_places(places.where(known), transport[known], typical, metals) for metals in (False, True)
+    )
+    errors = [
+        place_errors(fit, places.where(kept), transport[kept], typical).mean().item()
+        for fit in (paint, metal)
+    ]
     assert paint.metallic.max() == 0
     return errors[0] - errors[1], (metal.metallic > len(METALLICS) // 2).float().mean().item()
 

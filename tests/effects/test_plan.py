@@ -25,7 +25,9 @@ from tests.train.small_runs import solved_light
 
 
 def half_walls(share: float):
-    """A scene in which a `share` of all directions by the cosine, those nearest to the normal z, meet a wall."""
+    """A scene in which a `share` of all directions by the cosine, those nearest to the normal z, meet a
+    wall.
+    """
 
     def scene_light(x, wi):
         # By the cosine cos² θ is uniform, so a share has cos² θ > 1 − share.
@@ -114,12 +116,18 @@ def test_the_standard_error_is_that_of_the_mean():
 def test_names_switch_settings():
     config = preset("fast")
     none = Plan.begin(read_asked("none"), config).config
-    assert (none.inter_reflection.mode, none.light.kind, none.background.kind) == ("off", "distant", "constant")
+    assert (none.inter_reflection.mode, none.light.kind, none.background.kind) == (
+        "off",
+        "distant",
+        "constant",
+    )
     everything = Plan.begin(read_asked("all,-lamps"), config).config
     assert (everything.inter_reflection.mode, everything.light.kind) == ("hard", "distant")
     assert Plan.begin(read_asked("as-set"), config).config == config
     free = tiny_config()
-    assert Plan.begin(read_asked("as-set"), free).config == Plan.begin(read_asked("auto"), free).config == free
+    assert (
+        Plan.begin(read_asked("as-set"), free).config == Plan.begin(read_asked("auto"), free).config == free
+    )
     assert Plan.begin(read_asked("none,+inter-reflection"), none).config.inter_reflection.mode == "hard"
 
 
@@ -147,4 +155,3 @@ def test_a_free_light_has_no_lamps_to_switch():
 def test_a_bad_name_ends_the_command(tmp_path, capsys):
     assert main(["train", "--data", str(tmp_path), "--effects", "auto,-lamp"]) == 2
     assert "did you mean 'lamps'" in capsys.readouterr().err
-

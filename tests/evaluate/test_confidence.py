@@ -1,4 +1,6 @@
-"""What a run says of its own errors: which views it asks, what they see, and that the sum does not depend on how it is cut."""
+"""What a run says of its own errors: which views it asks, what they see, and that the sum does not depend on
+how it is cut.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,11 @@ def make_run(capture: Capture, mode: str = "soft") -> Run:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Run:
-    return make_run(load_capture(make_capture(tmp_path_factory.mktemp("captures") / "ball", size=(96, 72), views=6, test=(0,))))
+    return make_run(
+        load_capture(
+            make_capture(tmp_path_factory.mktemp("captures") / "ball", size=(96, 72), views=6, test=(0,))
+        )
+    )
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +77,7 @@ def on_sphere(count: int) -> torch.Tensor:
     return torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
 
 
-# ---------------------------------------------------------------------------------------------------------------- views
+# ------------------------------------------------------------------------------------------------------ views
 
 
 @pytest.mark.parametrize("mode", ["soft", "hard"])
@@ -99,7 +105,7 @@ def test_the_first_views_are_far_from_one_another(run: Run):
     assert gap == (views.centres - views.centres[views.order[0]]).norm(dim=-1).max()
 
 
-# ---------------------------------------------------------------------------------------------------------------- light
+# ------------------------------------------------------------------------------------------------------ light
 
 
 def test_patches_add_up_to_all_light(run: Run):
@@ -111,7 +117,7 @@ def test_patches_add_up_to_all_light(run: Run):
     assert ((parts > 0).any(1).sum(-1) > 5).all()
 
 
-# ------------------------------------------------------------------------------------------------------------ deviation
+# -------------------------------------------------------------------------------------------------- deviation
 
 
 def test_it_does_not_depend_on_how_points_are_divided(run: Run, evidence, monkeypatch):
@@ -155,7 +161,9 @@ def test_points_whose_pixels_are_not_explained_are_less_sure(run: Run, evidence)
     normal = on_sphere(60)
     looks = evidence.views.sightings(run.model, SPHERE * normal, normal, 5).seen.sum(1)
     usual, off = (
-        material_deviation(run.model, replace(evidence, misfit=misfit), SPHERE * normal, normal).metallic[:, 0]
+        material_deviation(run.model, replace(evidence, misfit=misfit), SPHERE * normal, normal).metallic[
+            :, 0
+        ]
         for misfit in (100 * evidence.misfit, 10 * evidence.misfit)
     )
     assert torch.equal(usual[looks == 0], off[looks == 0])
@@ -194,7 +202,7 @@ def test_no_points_have_no_deviation(run: Run, evidence):
     assert len(material_deviation(run.model, evidence, torch.zeros(0, 3), torch.zeros(0, 3))) == 0
 
 
-# ----------------------------------------------------------------------------------------------------- maps and figures
+# ------------------------------------------------------------------------------------------- maps and figures
 
 
 def test_maps_lie_on_the_surface_and_a_step_repeats_pixels(run: Run, evidence):
@@ -213,7 +221,9 @@ def test_the_surface_at_pixels_is_where_the_sphere_is(run: Run):
     view = render_test_views(run)[0]
     pixels = np.flatnonzero(view.maps["opacity"][..., 0] > 0.99)
     points = shown_surface(run, view, pixels)
-    torch.testing.assert_close(points.position.norm(dim=-1), torch.full((len(pixels),), SPHERE), rtol=1e-4, atol=0.0)
+    torch.testing.assert_close(
+        points.position.norm(dim=-1), torch.full((len(pixels),), SPHERE), rtol=1e-4, atol=0.0
+    )
 
 
 def test_the_figures_are_of_the_maps_that_have_a_truth(run: Run):

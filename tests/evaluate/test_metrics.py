@@ -19,12 +19,14 @@ def image(*pixels: float) -> np.ndarray:
     return np.array(pixels, dtype=np.float32).reshape(1, -1, 1)
 
 
-# ----------------------------------------------------------------------------------------------------------------- PSNR
+# ------------------------------------------------------------------------------------------------------- PSNR
 
 
 def test_psnr_counts_masked_pixels_alone():
     estimate, truth = image(0.5, 9.0), image(0.4, 0.0)
-    assert metrics.psnr(estimate, truth, LEFT) == pytest.approx(10 * math.log10(1 / 0.1**2), abs=1e-4)  # 20 dB
+    assert metrics.psnr(estimate, truth, LEFT) == pytest.approx(
+        10 * math.log10(1 / 0.1**2), abs=1e-4
+    )  # 20 dB
 
 
 def test_psnr_averages_the_squared_error_over_pixels_and_channels():
@@ -49,13 +51,15 @@ def test_a_perfect_estimate_scores_100_db(measure):
     assert measure(image(0.3, 0.7), image(0.3, 0.7), ALL) == pytest.approx(100.0)
 
 
-# ----------------------------------------------------------------------------------------------------------------- SSIM
+# ------------------------------------------------------------------------------------------------------- SSIM
 
 
 def test_ssim_of_constant_images():
     a, b, stabiliser = 0.3, 0.6, 0.01**2
     estimate, truth = np.full((16, 16, 3), a), np.full((16, 16, 3), b)
-    expected = (2 * a * b + stabiliser) / (a * a + b * b + stabiliser)  # without variance only the means are compared
+    expected = (2 * a * b + stabiliser) / (
+        a * a + b * b + stabiliser
+    )  # without variance only the means are compared
     assert metrics.ssim(estimate, truth, np.ones((16, 16), bool)) == pytest.approx(expected, abs=1e-6)
 
 
@@ -73,10 +77,12 @@ def test_ssim_needs_an_image_as_large_as_its_window():
     side = metrics.SSIM_WINDOW
     metrics.ssim(np.zeros((side, side, 1)), np.zeros((side, side, 1)), np.ones((side, side), bool))
     with pytest.raises(ValueError, match="win_size"):
-        metrics.ssim(np.zeros((side, side - 1, 1)), np.zeros((side, side - 1, 1)), np.ones((side, side - 1), bool))
+        metrics.ssim(
+            np.zeros((side, side - 1, 1)), np.zeros((side, side - 1, 1)), np.ones((side, side - 1), bool)
+        )
 
 
-# -------------------------------------------------------------------------------------------------------------- normals
+# ---------------------------------------------------------------------------------------------------- normals
 
 
 def test_angular_error_averages_where_both_have_a_normal():
@@ -97,7 +103,7 @@ def test_angular_error_of_nothing_is_not_a_number():
     assert math.isnan(metrics.angular_error(np.zeros((1, 2, 3)), np.zeros((1, 2, 3)), ALL))
 
 
-# ------------------------------------------------------------------------------------------------------------ alignment
+# -------------------------------------------------------------------------------------------------- alignment
 
 
 def test_gamma_makes_the_medians_agree():
@@ -121,7 +127,7 @@ def test_scale_is_the_least_squares_factor_of_each_channel():
     assert metrics.align_scale(estimate, truth) == pytest.approx(expected)
 
 
-# ------------------------------------------------------------------------------------------------------------- geometry
+# --------------------------------------------------------------------------------------------------- geometry
 
 
 def test_chamfer_by_hand():
@@ -137,7 +143,9 @@ def test_chamfer_of_parallel_planes_is_their_distance():
     points = metrics.sample_surface(square, 60_000)
     assert metrics.chamfer(points + np.array([0, 0, 0.1]), points).mean == pytest.approx(0.1)
     other = metrics.sample_surface(square, 60_000, seed=1)
-    assert metrics.chamfer(points, other).mean == pytest.approx(0.5 * math.sqrt(1 / 60_000), rel=0.05)  # sampling alone
+    assert metrics.chamfer(points, other).mean == pytest.approx(
+        0.5 * math.sqrt(1 / 60_000), rel=0.05
+    )  # sampling alone
 
 
 def test_samples_are_spread_by_area_and_repeat():
@@ -148,7 +156,7 @@ def test_samples_are_spread_by_area_and_repeat():
     assert np.array_equal(points, metrics.sample_surface(mesh, 10_000, seed=3))
 
 
-# ---------------------------------------------------------------------------------------------------------------- light
+# ------------------------------------------------------------------------------------------------------ light
 
 
 def test_log_error_of_a_factor():

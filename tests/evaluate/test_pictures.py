@@ -52,7 +52,9 @@ def test_depth_is_white_near_and_black_far():
 
 
 def test_exposure_scales_before_clipping():
-    np.testing.assert_array_equal(display_color(flat(1.0, 2.0, 4.0), 0.25)[0, 0], display_color(flat(0.25, 0.5, 1.0))[0, 0])
+    np.testing.assert_array_equal(
+        display_color(flat(1.0, 2.0, 4.0), 0.25)[0, 0], display_color(flat(0.25, 0.5, 1.0))[0, 0]
+    )
 
 
 def test_auto_exposure_ignores_lamps():
@@ -75,7 +77,7 @@ def test_cut_out_shows_the_sheet_outside_the_mask():
     assert tuple(shown[0, 0]) == PAPER
 
 
-# ------------------------------------------------------------------------------------------------------- incident light
+# --------------------------------------------------------------------------------------------- incident light
 
 
 def test_lat_long_covers_the_sphere():
@@ -90,7 +92,8 @@ def test_lat_long_covers_the_sphere():
 
 @pytest.mark.parametrize(("row", "column"), [(10, 5), (32, 100), (50, 64)])
 def test_directional_light_has_its_peak_in_its_pixel(row: int, column: int):
-    # Row j is at θ = π (j + ½)/64, column i at φ = 2π (i + ½)/128, as an environment map's direction is written.
+    # Row j is at θ = π (j + ½)/64, column i at φ = 2π (i + ½)/128, as an environment map's direction is
+    # written.
     theta, phi = np.pi * (row + 0.5) / 64, 2.0 * np.pi * (column + 0.5) / 128
     light = np.array([np.sin(phi) * np.sin(theta), np.cos(phi) * np.sin(theta), np.cos(theta)])
     directions = lat_long_directions(64)
@@ -106,13 +109,15 @@ def test_directional_light_has_its_peak_in_its_pixel(row: int, column: int):
     assert directions[peak] @ light > np.cos(np.radians(3.0))
 
 
-# -------------------------------------------------------------------------------------------------------- contact sheet
+# ---------------------------------------------------------------------------------------------- contact sheet
 
 
 def sheet(value: int, rows: int = 2) -> np.ndarray:
     picture = np.full((30, 40, 3), value, dtype=np.uint8)
     row = Row("base colour", (picture, picture[..., :1], None), "as estimated", "0.2")
-    return contact_sheet("a run", "fast", [Section((Group("view 004", ("truth", "estimate", "error")),), rows * (row,))], 160)
+    return contact_sheet(
+        "a run", "fast", [Section((Group("view 004", ("truth", "estimate", "error")),), rows * (row,))], 160
+    )
 
 
 def test_contact_sheet_has_the_size_of_its_cells():

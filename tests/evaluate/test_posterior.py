@@ -8,14 +8,23 @@ from dataclasses import replace
 import pytest
 import torch
 
-from neilfpp_method.evaluate.posterior import ROUGHNESS_NODES, Deviation, Looks, Sights, expected_error, guessed_error
+from neilfpp_method.evaluate.posterior import (
+    ROUGHNESS_NODES,
+    Deviation,
+    Looks,
+    Sights,
+    expected_error,
+    guessed_error,
+)
 from neilfpp_method.structures import Material
 
 R = len(ROUGHNESS_NODES)
 
 
 def material(base_color: float = 0.5, roughness: float = 0.5, metallic: float = 0.0) -> Material:
-    return Material(torch.full((1, 3), base_color), torch.full((1, 1), roughness), torch.full((1, 1), metallic))
+    return Material(
+        torch.full((1, 3), base_color), torch.full((1, 1), roughness), torch.full((1, 1), metallic)
+    )
 
 
 def lambertian(views: int, diffuse: float = 1.0) -> Looks:
@@ -30,7 +39,10 @@ def sights(radiance: torch.Tensor, noise: float, shared: torch.Tensor | None = N
     value = radiance[None, :, None].expand(1, views, 3)
     shared = torch.zeros(views, 1) if shared is None else shared
     return Sights(
-        torch.ones(1, views, dtype=torch.bool), value, torch.full_like(value, noise), shared[None, :, None].expand(1, -1, 3, -1)
+        torch.ones(1, views, dtype=torch.bool),
+        value,
+        torch.full_like(value, noise),
+        shared[None, :, None].expand(1, -1, 3, -1),
     )
 
 
@@ -38,7 +50,7 @@ def numbers(deviation: Deviation) -> tuple[float, float, float]:
     return deviation.base_color.item(), deviation.roughness.item(), deviation.metallic.item()
 
 
-# --------------------------------------------------------------------------------------------------------- closed forms
+# ----------------------------------------------------------------------------------------------- closed forms
 
 
 @pytest.mark.parametrize("views", [1, 4, 16])
@@ -58,13 +70,17 @@ def test_an_estimate_that_the_views_speak_against_is_off_by_as_much():
 def test_more_views_do_not_help_against_an_error_that_they_share():
     for views in (1, 16, 64):
         seen = sights(torch.full((views,), 0.5), 1e-3, torch.full((views, 1), 0.1))
-        assert numbers(expected_error(lambertian(views), seen, material(), specular=False))[0] == pytest.approx(0.1, rel=2e-2)
+        assert numbers(expected_error(lambertian(views), seen, material(), specular=False))[
+            0
+        ] == pytest.approx(0.1, rel=2e-2)
 
 
 def test_an_error_that_is_shared_is_taken_out_of_what_does_not_follow_it():
     # The second view does not feel the shared error: it alone says what the base colour is.
     seen = sights(torch.tensor([0.5, 0.5]), 0.01, torch.tensor([[0.3], [0.0]]))
-    assert numbers(expected_error(lambertian(2), seen, material(), specular=False))[0] == pytest.approx(0.01, rel=1e-2)
+    assert numbers(expected_error(lambertian(2), seen, material(), specular=False))[0] == pytest.approx(
+        0.01, rel=1e-2
+    )
 
 
 @pytest.mark.parametrize("estimate", [(0.5, 0.5, 0.5), (0.9, 0.1, 0.0)])
@@ -74,29 +90,39 @@ def test_what_nobody_sees_has_the_deviation_from_the_prior(estimate):
     base_color, roughness, metallic = numbers(expected_error(looks, seen, material(*estimate)))
     assert base_color == pytest.approx(math.sqrt(1 / 12 + (estimate[0] - 0.5) ** 2), rel=1e-2)
     assert roughness == pytest.approx(math.sqrt(1 / 12 + (estimate[1] - 0.5) ** 2), rel=1e-2)
-    # The variance of the arcsine distribution is 1/8; on a grid that holds 0 and 1 themselves it is a little more.
+    # The variance of the arcsine distribution is 1/8; on a grid that holds 0 and 1 themselves it is a little
+    # more.
     assert 1 / 8 < metallic**2 - (estimate[2] - 0.5) ** 2 < 0.15
     guess = numbers(guessed_error(material(*estimate)))
-    assert guess == pytest.approx((base_color, roughness, math.hypot(math.sqrt(1 / 8), estimate[2] - 0.5)), rel=1e-2)
+    assert guess == pytest.approx(
+        (base_color, roughness, math.hypot(math.sqrt(1 / 8), estimate[2] - 0.5)), rel=1e-2
+    )
 
 
 def test_base_color_stays_between_black_and_white():
     # Twice as bright as white can be, and seen without doubt: the base colour is 1, and known to be.
     seen = sights(torch.full((4,), 2.0), 1e-3)
     assert numbers(expected_error(lambertian(4), seen, material(1.0), specular=False))[0] < 1e-3
-    assert numbers(expected_error(lambertian(4), seen, material(0.0), specular=False))[0] == pytest.approx(1.0, abs=1e-3)
+    assert numbers(expected_error(lambertian(4), seen, material(0.0), specular=False))[0] == pytest.approx(
+        1.0, abs=1e-3
+    )
 
 
-# --------------------------------------------------------------------------------------------------------- brute force
+# ------------------------------------------------------------------------------------------------ brute force
 
 
 def random_point(views: int = 5) -> tuple[Looks, Sights]:
     torch.manual_seed(3)
     falling = torch.linspace(2.0, 0.1, R)[:, None] * (0.3 + torch.rand(1, views, 1, 1))
-    looks = Looks(0.6 + 0.2 * torch.rand(1, 3), falling * torch.ones(3), 0.2 * falling.square() * torch.ones(3))
+    looks = Looks(
+        0.6 + 0.2 * torch.rand(1, 3), falling * torch.ones(3), 0.2 * falling.square() * torch.ones(3)
+    )
     shared = 0.05 * torch.rand(1, views, 3, 2)
     return looks, Sights(
-        torch.ones(1, views, dtype=torch.bool), 0.3 + 0.3 * torch.rand(1, views, 3), torch.full((1, views, 3), 0.1), shared
+        torch.ones(1, views, dtype=torch.bool),
+        0.3 + 0.3 * torch.rand(1, views, 3),
+        torch.full((1, views, 3), 0.1),
+        shared,
     )
 
 
@@ -125,18 +151,26 @@ def test_it_is_what_trying_every_material_finds():
         second = second + (likelihood * (b - 0.4) ** 2).mean(-1) / likelihood.mean(-1) / 3
     weight = density * prior
     weight = weight / weight.sum()
-    expected = ((weight * second).sum(), (weight.sum(1) * (r - 0.3) ** 2).sum(), (weight.sum(0) * (m - 0.2) ** 2).sum())
+    expected = (
+        (weight * second).sum(),
+        (weight.sum(1) * (r - 0.3) ** 2).sum(),
+        (weight.sum(0) * (m - 0.2) ** 2).sum(),
+    )
     assert got == pytest.approx([math.sqrt(e) for e in expected], rel=5e-3)
 
 
 def test_a_mirror_that_might_be_bright_paint_is_in_doubt():
-    """Where the specular part looks like the diffuse one from all sides, nothing says which of the two is seen."""
+    """Where the specular part looks like the diffuse one from all sides, nothing says which of the two is
+    seen.
+    """
     views = 8
     same = Looks(torch.ones(1, 3), torch.ones(1, views, R, 3), torch.zeros(1, views, R, 3))
     highlight = torch.linspace(0.2, 4.0, views)[None, :, None, None].expand(1, views, R, 3)
     telling = replace(same, facing=highlight)
     alike = numbers(expected_error(same, sights(torch.full((views,), 0.5), 0.01), material(0.5, 0.5, 0.0)))
-    told = numbers(expected_error(telling, sights(0.48 + 0.04 * highlight[0, :, 0, 0], 0.01), material(0.48, 0.5, 0.0)))
+    told = numbers(
+        expected_error(telling, sights(0.48 + 0.04 * highlight[0, :, 0, 0], 0.01), material(0.48, 0.5, 0.0))
+    )
     assert alike[2] > 0.3
     assert told[2] < 0.05
 
@@ -146,7 +180,9 @@ def test_roughness_is_known_from_views_that_the_lobe_moves_across_and_not_where_
     views = 6
     angle = torch.linspace(0, 1.2, views)[:, None]
     lobe = torch.exp(-angle.square() / (0.05 + nodes.square())) / (0.05 + nodes.square())
-    looks = Looks(torch.zeros(1, 3), lobe[None, ..., None].expand(1, views, R, 3), torch.zeros(1, views, R, 3))
+    looks = Looks(
+        torch.zeros(1, 3), lobe[None, ..., None].expand(1, views, R, 3), torch.zeros(1, views, R, 3)
+    )
     metal = material(0.8, 0.5, 1.0)
     flat = replace(looks, facing=torch.ones_like(looks.facing))
     moving = numbers(expected_error(looks, sights(0.8 * lobe[:, 4], 0.05), metal))[1]
@@ -159,6 +195,10 @@ def test_nothing_overflows_at_the_ends():
     looks, seen = random_point()
     for noise in (1e-6, 1e6):
         for radiance in (0.0, 1e4):
-            extreme = replace(seen, noise=torch.full_like(seen.noise, noise), radiance=torch.full_like(seen.radiance, radiance))
+            extreme = replace(
+                seen,
+                noise=torch.full_like(seen.noise, noise),
+                radiance=torch.full_like(seen.radiance, radiance),
+            )
             values = numbers(expected_error(looks, extreme, material()))
             assert all(0 <= v <= 1 + 1e-6 for v in values), (noise, radiance, values)

@@ -1,4 +1,6 @@
-"""The protocols on a capture whose every number is known: a sphere that a stand-in model knows analytically."""
+"""The protocols on a capture whose every number is known: a sphere that a stand-in model knows
+analytically.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,9 @@ class KnownSphere(NeilfModel):
         normal = torch.where(hit, (rays.origins + depth * rays.directions) / SPHERE, 0.0)
         n = normal.numpy().astype(np.float64)
         color = torch.where(hit, torch.from_numpy(scene.radiance(n)).float(), 0.0)
-        base_color = torch.where(hit, self.base_color_factor * torch.from_numpy(scene.base_color(n)).float(), 0.0)
+        base_color = torch.where(
+            hit, self.base_color_factor * torch.from_numpy(scene.base_color(n)).float(), 0.0
+        )
         ones = hit.float()
         material = (base_color, scene.ROUGHNESS * ones, scene.METALLIC * ones)
         if not with_material:
@@ -91,7 +95,8 @@ def captures(tmp_path_factory):
     root = tmp_path_factory.mktemp("captures")
     options = {"size": (160, 120), "views": 8, "test": (0, 5), "masks": True}
     return SimpleNamespace(
-        hdr=scene.make_capture(root / "hdr", **options), ldr=scene.make_capture(root / "ldr", hdr=False, **options)
+        hdr=scene.make_capture(root / "hdr", **options),
+        ldr=scene.make_capture(root / "ldr", hdr=False, **options),
     )
 
 
@@ -103,7 +108,7 @@ def _few_points(monkeypatch):
     monkeypatch.setattr(protocols, "confidence_metrics", lambda run, pairs: {})
 
 
-# --------------------------------------------------------------------------------------------------- a perfect estimate
+# ----------------------------------------------------------------------------------------- a perfect estimate
 
 
 def test_pixels_that_are_marked_as_invalid_do_not_count(captures, tmp_path):
@@ -127,7 +132,9 @@ def test_pixels_that_are_marked_as_invalid_do_not_count(captures, tmp_path):
 
 def test_a_perfect_estimate_scores_perfectly(captures):
     figures = evaluate(make_run(load_capture(captures.hdr)))
-    eight_bit = 10 * math.log10(12 * 255**2) - 0.5  # a rounded truth differs from the exact one by 1/(255 √12)
+    eight_bit = (
+        10 * math.log10(12 * 255**2) - 0.5
+    )  # a rounded truth differs from the exact one by 1/(255 √12)
     assert {"chamfer", "chamfer_accuracy", "chamfer_completeness", "normal_mae_deg"} <= figures.keys()
     for name in ("volume_psnr", "pbr_psnr", "volume_psnr_linear", "pbr_psnr_linear"):
         assert figures[name] > 90, name
@@ -138,7 +145,8 @@ def test_a_perfect_estimate_scores_perfectly(captures):
         assert figures[f"{name}_frame"] >= figures[name], name
     assert figures["base_color_psnr_gamma"] > 45
     assert figures["normal_mae_deg"] < 0.01
-    # The true mesh has the chords of a sphere; 20,000 points on an area of 8 leave ½ √(8/20000) = 0.01 by themselves.
+    # The true mesh has the chords of a sphere; 20,000 points on an area of 8 leave ½ √(8/20000) = 0.01 by
+    # themselves.
     assert figures["chamfer"] < 0.013
     assert not any(name.startswith("incident_light") for name in figures)
 
@@ -147,7 +155,9 @@ def test_base_color_is_reported_with_and_without_alignment(captures):
     factor = 0.5
     figures = evaluate(make_run(load_capture(captures.hdr), KnownSphere(base_color_factor=factor)))
     capture = load_capture(captures.hdr)
-    true = [Truth(capture).material(view).base_color[Truth(capture).mask(view)] for view in capture.test_views]
+    true = [
+        Truth(capture).material(view).base_color[Truth(capture).mask(view)] for view in capture.test_views
+    ]
     expected = np.mean([-10 * math.log10(((1 - factor) * t).square().mean()) for t in true])
     assert figures["base_color_psnr"] == pytest.approx(expected, abs=0.05)
     assert figures["base_color_psnr_scaled"] > 55
@@ -162,7 +172,7 @@ def test_frame_figures_differ_by_the_share_of_background(captures):
     assert figures["base_color_psnr_frame"] - figures["base_color_psnr"] == pytest.approx(gain, abs=1e-4)
 
 
-# ------------------------------------------------------------------------------------------------- only what is at hand
+# --------------------------------------------------------------------------------------- only what is at hand
 
 
 def test_an_ldr_capture_is_compared_in_display_values(captures):
@@ -217,14 +227,18 @@ def test_images_smaller_than_the_window_have_no_ssim(tmp_path):
     assert "volume_ssim" not in figures
 
 
-# ------------------------------------------------------------------------------------------------------------ rendering
+# -------------------------------------------------------------------------------------------------- rendering
 
 
 def test_views_are_rendered_whole_in_chunks(captures):
     capture = load_capture(captures.hdr)
     run = make_run(capture)
     view = render_view(run, 5)
-    assert (view.name, view.maps["rgb"].shape, view.maps["depth"].shape) == ("005", (120, 160, 3), (120, 160, 1))
+    assert (view.name, view.maps["rgb"].shape, view.maps["depth"].shape) == (
+        "005",
+        (120, 160, 3),
+        (120, 160, 1),
+    )
     assert max(run.model.sizes) <= 1000
     assert sum(run.model.sizes) == 160 * 120
     # depth: the lengths of rays in scene units; the image's brightest pixel is where it should be
@@ -246,7 +260,7 @@ def test_progress_ends_at_one_and_views_can_be_shared(captures):
     assert shares[1:] == sorted(shares[1:])
 
 
-# ------------------------------------------------------------------------------------------------------------- baseline
+# --------------------------------------------------------------------------------------------------- baseline
 
 
 def test_surface_points_lie_on_the_sphere(captures):
@@ -270,7 +284,8 @@ def test_the_observed_color_is_what_the_point_sends(captures, kind):
     cosines = (to_eyes * normal[:, None]).sum(-1) / np.linalg.norm(to_eyes, axis=-1)
     plain = cosines.max(-1) > 0.4  # the others are seen at grazing angles or not at all
     assert plain.mean() > 0.7
-    # Pixels are 0.04 radii apart. A view from behind, taken for one that sees the point, would err by up to 1.6.
+    # Pixels are 0.04 radii apart. A view from behind, taken for one that sees the point, would err by up to
+    # 1.6.
     assert error[plain].max() < 0.05
 
 
@@ -285,16 +300,21 @@ def test_baselines_on_the_same_pixels(captures):
     capture = load_capture(captures.hdr)
     run = make_run(capture)
     figures = evaluate(run)
-    # The light is not white noise: colour seen is base colour times shading, so the baseline is far from perfect.
+    # The light is not white noise: colour seen is base colour times shading, so the baseline is far from
+    # perfect.
     normals = [known.normal[known.mask].astype(np.float64) for known in known_test_views(run, ()).views]
     seen, true = [np.concatenate([f(n) for n in normals]) for f in (scene.radiance, scene.base_color)]
     scale = (seen * true).sum(0) / (seen * seen).sum(0)
-    expected = np.mean([-10 * np.log10(np.square(scene.radiance(n) * scale - scene.base_color(n)).mean()) for n in normals])
+    expected = np.mean(
+        [-10 * np.log10(np.square(scene.radiance(n) * scale - scene.base_color(n)).mean()) for n in normals]
+    )
     assert figures["baseline_base_color_psnr_scaled"] == pytest.approx(expected, abs=0.3)
-    assert figures["baseline_roughness_psnr"] == pytest.approx(100.0)  # the sphere's roughness is one constant
+    assert figures["baseline_roughness_psnr"] == pytest.approx(
+        100.0
+    )  # the sphere's roughness is one constant
 
 
-# ---------------------------------------------------------------------------------------------------------------- light
+# ------------------------------------------------------------------------------------------------------ light
 
 
 def light_field(directions: list[list[float]], points: int = 2) -> LightField:
@@ -302,7 +322,9 @@ def light_field(directions: list[list[float]], points: int = 2) -> LightField:
     unit = torch.nn.functional.normalize(torch.tensor(directions, dtype=torch.float32), dim=-1)
     wi, up = unit.repeat(points, 1, 1), torch.tensor([[0.0, 0.0, 1.0]]).repeat(points, 1)
     half = torch.full((points, 1), 0.5)
-    return LightField(torch.zeros(points, 3), up, Material(half.expand(-1, 3), half, half), wi, sky(wi), wi, sky(wi))
+    return LightField(
+        torch.zeros(points, 3), up, Material(half.expand(-1, 3), half, half), wi, sky(wi), wi, sky(wi)
+    )
 
 
 def test_light_that_is_too_bright_by_a_factor(captures):
@@ -315,10 +337,14 @@ def test_light_that_is_too_bright_by_a_factor(captures):
 
 def test_occluded_directions_are_those_that_meet_the_scene(captures):
     # A roof one unit above the points, on the side of +x alone.
-    roof = Mesh(torch.tensor([[0.1, -5, 1], [9, -5, 1], [9, 5, 1], [0.1, 5, 1]]), torch.tensor([[0, 1, 2], [0, 2, 3]]))
+    roof = Mesh(
+        torch.tensor([[0.1, -5, 1], [9, -5, 1], [9, 5, 1], [0.1, 5, 1]]), torch.tensor([[0, 1, 2], [0, 2, 3]])
+    )
     directions = [[1.0, 0, 1], [1, 1, 1], [-1, 0, 1], [-1, 1, 1], [-1, -1, 1]]
     field = light_field(directions)
-    field.incident[:, :2] *= math.e  # true light is brighter than the estimate where the roof is, and only there
+    field.incident[:, :2] *= (
+        math.e
+    )  # true light is brighter than the estimate where the roof is, and only there
     figures = light_metrics(make_run(load_capture(captures.hdr)), field, roof)
     assert figures["incident_light_log_mae_occluded"] == pytest.approx(1.0, abs=2e-3)
     assert figures["incident_light_log_mae_occluded_scaled"] == pytest.approx(1.0, abs=2e-3)
@@ -328,14 +354,19 @@ def test_occluded_directions_are_those_that_meet_the_scene(captures):
 def test_a_ray_does_not_meet_the_surface_that_it_leaves(captures):
     floor = Mesh(torch.tensor([[-5.0, -5, 0], [5, -5, 0], [0, 5, 0]]), torch.tensor([[0, 1, 2]]))
     run = make_run(load_capture(captures.hdr))
-    assert "incident_light_log_mae_occluded" not in light_metrics(run, light_field([[0, 0, 1], [9, 0, 1]]), floor)
+    assert "incident_light_log_mae_occluded" not in light_metrics(
+        run, light_field([[0, 0, 1], [9, 0, 1]]), floor
+    )
 
 
 def test_the_light_field_of_a_capture_is_read_and_asked_in_chunks(captures, tmp_path):
     root = shutil.copytree(captures.hdr, tmp_path / "lit")
     field = light_field(torch.nn.functional.normalize(torch.randn(50_000, 3), dim=-1).tolist(), points=7)
     (root / "light").mkdir()
-    arrays = {"points": field.position * scene.SCALE + torch.tensor(scene.CENTRE).float(), "normals": field.normal}
+    arrays = {
+        "points": field.position * scene.SCALE + torch.tensor(scene.CENTRE).float(),
+        "normals": field.normal,
+    }
     arrays |= {"base_color": field.material.base_color, "roughness": torch.ones(7), "metallic": torch.ones(7)}
     arrays |= {"wi": field.wi, "incident": field.incident, "wo": field.wo, "outgoing": field.outgoing}
     np.savez(root / "light" / "light_field_gt.npz", **{name: array.numpy() for name, array in arrays.items()})
@@ -346,7 +377,7 @@ def test_the_light_field_of_a_capture_is_read_and_asked_in_chunks(captures, tmp_
     assert run.model.sizes == [2, 2, 2, 1]  # 1000 rays × 128 directions in flight
 
 
-# ----------------------------------------------------------------------------------------------------------------- file
+# ------------------------------------------------------------------------------------------------------- file
 
 
 def test_metrics_are_flat_and_their_protocol_lies_beside_them(captures, tmp_path):

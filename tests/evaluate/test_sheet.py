@@ -1,4 +1,6 @@
-"""The contact sheet and the renders of a small run: a sphere, untrained, before a capture whose truth is known."""
+"""The contact sheet and the renders of a small run: a sphere, untrained, before a capture whose truth is
+known.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,7 @@ def sections_of(run: Run):
     return view_sections(run, rendered, known, albedo_scale(rendered, known))
 
 
-# --------------------------------------------------------------------------------------------------------------- report
+# ----------------------------------------------------------------------------------------------------- report
 
 
 def test_contact_sheet_shows_views_and_light(root: Path, tmp_path: Path):
@@ -95,11 +97,14 @@ def test_albedo_scale_undoes_a_factor_per_channel(root: Path):
     run = make_run(root)
     known = known_test_views(run, render_test_views(run)).views
     factors = np.array([0.5, 0.8, 1.25])
-    halved = [RenderedView(k.view.name, {"base_color": (k.material["base_color"] * factors).astype(np.float32)}) for k in known]
+    halved = [
+        RenderedView(k.view.name, {"base_color": (k.material["base_color"] * factors).astype(np.float32)})
+        for k in known
+    ]
     np.testing.assert_allclose(albedo_scale(halved, known), 1.0 / factors, rtol=1e-5)
 
 
-# ---------------------------------------------------------------------------------------------------------------- light
+# ------------------------------------------------------------------------------------------------------ light
 
 
 def write_light_field(root: Path, sky: Callable[[np.ndarray], np.ndarray]) -> None:
@@ -121,7 +126,9 @@ def write_light_field(root: Path, sky: Callable[[np.ndarray], np.ndarray]) -> No
         "outgoing": np.ones((3, 2, 3)),
     }
     (root / "light").mkdir()
-    np.savez(root / "light" / "light_field_gt.npz", **{name: a.astype(np.float32) for name, a in arrays.items()})
+    np.savez(
+        root / "light" / "light_field_gt.npz", **{name: a.astype(np.float32) for name, a in arrays.items()}
+    )
 
 
 def test_known_light_stands_beside_the_estimate_of_it(root: Path, tmp_path: Path, monkeypatch):
@@ -145,7 +152,11 @@ def test_known_light_stands_beside_the_estimate_of_it(root: Path, tmp_path: Path
 
 def test_without_known_light_points_of_the_surface_are_shown(root: Path):
     run = make_run(root)
-    groups = [group for section in light_sections(run, render_test_views(run), scale=None) for group in section.groups]
+    groups = [
+        group
+        for section in light_sections(run, render_test_views(run), scale=None)
+        for group in section.groups
+    ]
     assert [group.columns for group in groups] == 4 * [("estimate",)]
     for group in groups:
         position = np.array(eval(group.title.removeprefix("Light at ")))
@@ -160,7 +171,9 @@ def test_rings_are_about_the_lamps_above_the_surface(root: Path, tmp_path: Path)
     origin = run.capture.normalisation.to_scene(torch.zeros(3))
     run.model.lamps = Lamps(4, 0.06)
     run.model.lamps.place(origin + torch.tensor([[2.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), torch.ones(2, 3))
-    pictures = [p for s in light_sections(run, render_test_views(run), scale=None) for p in s.rows[0].pictures]
+    pictures = [
+        p for s in light_sections(run, render_test_views(run), scale=None) for p in s.rows[0].pictures
+    ]
     red = [(estimate[..., 0] > 200) & (estimate[..., 1:] < 110).all(-1) for estimate in pictures[1::2]]
     facing_x = [found for found in red if found.any()]
     assert len(facing_x) == 1  # the other lamp is below or level with all three
@@ -179,7 +192,7 @@ def test_the_light_is_drawn_alone(root: Path, tmp_path: Path):
     assert not path.exists()
 
 
-# -------------------------------------------------------------------------------------------------------------- renders
+# ---------------------------------------------------------------------------------------------------- renders
 
 
 def test_renders_hold_the_values_and_go_on_where_they_stopped(root: Path, tmp_path: Path):

@@ -42,7 +42,9 @@ def test_views_are_no_larger_than_it_takes_unless_asked_for(tmp_path: Path) -> N
 
 
 def test_a_run_that_was_trained_small_is_shown_as_it_was_trained(tmp_path: Path) -> None:
-    capture = at_scale(load_capture(make_large_capture(tmp_path, views=2, size=(800, 600)), test_every=2), 0.25)
+    capture = at_scale(
+        load_capture(make_large_capture(tmp_path, views=2, size=(800, 600)), test_every=2), 0.25
+    )
     run = make_run(capture)
     assert sizes(at_size(run)) == {(200, 150)}
     assert sizes(at_size(run, scale=0.5)) == {(400, 300)}
@@ -66,7 +68,9 @@ def test_a_true_estimate_is_true_at_half_the_size(tmp_path: Path) -> None:
 
 def test_the_first_part_tells_how_long_all_takes(monkeypatch, capsys) -> None:
     times = iter([100.0, 102.0])
-    monkeypatch.setattr(command, "time", SimpleNamespace(monotonic=lambda: next(times)))  # rich's threads read the clock, too
+    monkeypatch.setattr(
+        command, "time", SimpleNamespace(monotonic=lambda: next(times))
+    )  # rich's threads read the clock, too
     monkeypatch.setattr(rich, "_console", None)  # the console that others share may write elsewhere
     with progress_bar("evaluating") as advance:
         advance(0.0)

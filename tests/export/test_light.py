@@ -44,7 +44,9 @@ class Ball(torch.nn.Module):
         distance = -along - square.clamp_min(0).sqrt()
         position = torch.where(hit[:, None], rays.origins + distance[:, None] * rays.directions, rays.origins)
         share = hit.float()
-        return SurfaceHits(torch.zeros_like(position), position, position / RADIUS * share[:, None], share, share)
+        return SurfaceHits(
+            torch.zeros_like(position), position, position / RADIUS * share[:, None], share, share
+        )
 
 
 def make_run(folder: Path, kind: str, step: int = 12, radius: float = RADIUS) -> Run:
@@ -73,7 +75,11 @@ def test_the_map_is_written_as_it_is(tmp_path):
     assert written == light_module.ExportedLight(tmp_path / "light" / "environment.exr", 0, 0)
     expected = run.model.light.log_radiance.exp().permute(1, 2, 0).numpy()
     np.testing.assert_array_equal(pixels(tmp_path / "light" / "environment.exr"), expected)
-    assert json.loads((tmp_path / "light" / "lamps.json").read_text()) == {"format": 1, "frame": "world", "lamps": []}
+    assert json.loads((tmp_path / "light" / "lamps.json").read_text()) == {
+        "format": 1,
+        "frame": "world",
+        "lamps": [],
+    }
     assert not (tmp_path / "light" / "probes.json").exists()
 
 
@@ -84,14 +90,18 @@ def test_lamps_light_the_world_as_they_light_the_scene(tmp_path):
     assert described["format"] == 1
     assert [lamp["axis"] for lamp in described["lamps"]] == [None, [0.0, -1.0, 0.0]]
     at = np.array([0.1, -0.2, 0.6])  # a point of the scene, which is CENTRE + SCALE · at in the world
-    for lamp, position, intensity in zip(described["lamps"], POSITION.numpy(), INTENSITY.numpy(), strict=True):
+    for lamp, position, intensity in zip(
+        described["lamps"], POSITION.numpy(), INTENSITY.numpy(), strict=True
+    ):
         np.testing.assert_allclose(lamp["position"], CENTRE + SCALE * position, atol=1e-6)
         assert lamp["radius"] == pytest.approx(0.06 * SCALE)
         # Irradiance, intensity over squared distance, is the same in both frames.
         distance = np.linalg.norm(np.array(lamp["position"]) - (CENTRE + SCALE * at))
         expected = intensity / np.square(position - at).sum()
         np.testing.assert_allclose(np.array(lamp["intensity"]) / distance**2, expected, rtol=1e-5)
-        np.testing.assert_allclose(np.array(lamp["radiance"]) * np.pi * lamp["radius"] ** 2, lamp["intensity"], rtol=1e-5)
+        np.testing.assert_allclose(
+            np.array(lamp["radiance"]) * np.pi * lamp["radius"] ** 2, lamp["intensity"], rtol=1e-5
+        )
 
 
 def test_probes_show_what_arrives_above_the_surface(tmp_path, monkeypatch):

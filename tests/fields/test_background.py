@@ -14,7 +14,9 @@ CONFIG = BackgroundConfig(layers=2, width=16, samples=8)
 def rays(radius: float, count: int = 20) -> tuple[torch.Tensor, torch.Tensor]:
     """Origins everywhere within the sphere."""
     generator = torch.Generator().manual_seed(1)
-    outwards, directions = torch.nn.functional.normalize(torch.randn(2, count, 3, generator=generator).double(), dim=-1)
+    outwards, directions = torch.nn.functional.normalize(
+        torch.randn(2, count, 3, generator=generator).double(), dim=-1
+    )
     origins = 0.99 * radius * outwards * torch.rand(count, 1, generator=generator)
     return origins, directions
 
@@ -65,7 +67,9 @@ def test_a_colour_that_it_cannot_reach_leaves_it_able_to_learn(start):
 
 
 def test_two_samples_by_hand():
-    """An optical depth of ln 2 over the whole chart: half of the light would pass all of it, √½ each half of it."""
+    """An optical depth of ln 2 over the whole chart: half of the light would pass all of it, √½ each half of
+    it.
+    """
     torch.manual_seed(0)
     field = InvertedSphere(BackgroundConfig(layers=2, width=16, samples=2), radius=4.0, scale=1.0)
     with torch.no_grad():
@@ -76,6 +80,6 @@ def test_two_samples_by_hand():
     field.head.register_forward_hook(lambda _, __, out: colors.append(torch.sigmoid(out)))
     got = field(*(t.float() for t in rays(4.0)))
     near, far = colors[0].unbind(1)
-    # samples at 1/4 and 3/4 of the chart: the near one covers half of it, exp(−ln 2 / 2) = 0.7071 passes; the far one
-    # covers the rest, and what passes it has its colour too
+    # samples at 1/4 and 3/4 of the chart: the near one covers half of it, exp(−ln 2 / 2) = 0.7071 passes; the
+    # far one covers the rest, and what passes it has its colour too
     torch.testing.assert_close(got, (1 - 0.5**0.5) * near + 0.5**0.5 * far)

@@ -16,7 +16,9 @@ SMALL = {
 
 
 def positions(count: int = 8) -> torch.Tensor:
-    return torch.empty(count, 3, dtype=torch.float64).uniform_(-1, 1, generator=torch.Generator().manual_seed(1))
+    return torch.empty(count, 3, dtype=torch.float64).uniform_(
+        -1, 1, generator=torch.Generator().manual_seed(1)
+    )
 
 
 @pytest.mark.parametrize("name", ["paper-mlp", "paper-ngp", "fast"])

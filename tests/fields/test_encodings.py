@@ -15,7 +15,9 @@ GRID = grid_spec(levels=3, log2_entries=8, max_resolution=16, base_resolution=2)
 
 
 def positions(count: int = 6) -> torch.Tensor:
-    return torch.empty(count, 3, dtype=torch.float64).uniform_(-1, 1, generator=torch.Generator().manual_seed(2))
+    return torch.empty(count, 3, dtype=torch.float64).uniform_(
+        -1, 1, generator=torch.Generator().manual_seed(2)
+    )
 
 
 def sphere_quadrature() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -26,7 +28,9 @@ def sphere_quadrature() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def directions(theta: np.ndarray, phi: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(np.stack((np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)), -1))
+    return torch.from_numpy(
+        np.stack((np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)), -1)
+    )
 
 
 def test_spherical_harmonics_are_orthonormal():
@@ -40,9 +44,13 @@ def test_spherical_harmonics_agree_with_scipy():
     expected = []
     for band in range(5):
         for m in range(-band, band + 1):
-            value = (-1.0) ** m * sph_harm_y(band, abs(m), theta, phi)  # (−1)^m takes the Condon–Shortley phase away
+            value = (-1.0) ** m * sph_harm_y(
+                band, abs(m), theta, phi
+            )  # (−1)^m takes the Condon–Shortley phase away
             expected.append(value.real if m == 0 else np.sqrt(2) * (value.real if m > 0 else value.imag))
-    np.testing.assert_allclose(SphericalHarmonics(5)(directions(theta, phi)).numpy(), np.stack(expected, -1), atol=1e-12)
+    np.testing.assert_allclose(
+        SphericalHarmonics(5)(directions(theta, phi)).numpy(), np.stack(expected, -1), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3, 4, 5])

@@ -18,7 +18,9 @@ def directions(count: int) -> torch.Tensor:
 
 def test_it_starts_at_one_radiance_everywhere():
     light = EnvironmentLight(8, 0.25)
-    torch.testing.assert_close(light.radiance(torch.zeros(1, 3), directions(50)), torch.full((1, 50, 3), 0.25))
+    torch.testing.assert_close(
+        light.radiance(torch.zeros(1, 3), directions(50)), torch.full((1, 50, 3), 0.25)
+    )
 
 
 def test_texel_centres_show_their_texel():
@@ -27,7 +29,9 @@ def test_texel_centres_show_their_texel():
         light.log_radiance.normal_()
     for row, column in ((4, 0), (4, 17), (2, 5), (7, 11)):
         theta, phi = math.pi * row / 8, 2 * math.pi * (column + 0.5) / 18
-        wi = torch.tensor([[[math.sin(phi) * math.sin(theta), math.cos(phi) * math.sin(theta), math.cos(theta)]]])
+        wi = torch.tensor(
+            [[[math.sin(phi) * math.sin(theta), math.cos(phi) * math.sin(theta), math.cos(theta)]]]
+        )
         expected = light.log_radiance[:, row, column].exp()
         torch.testing.assert_close(light.radiance(torch.zeros(1, 3), wi)[0, 0], expected, rtol=1e-4, atol=0.0)
 
@@ -51,17 +55,26 @@ def test_the_density_integrates_to_one_and_follows_the_light():
     phi = 2 * math.pi * (torch.arange(800) + 0.5) / 800
     sine = (1 - z**2).sqrt()
     grid = torch.stack(
-        ((sine[:, None] * phi.sin()).flatten(), (sine[:, None] * phi.cos()).flatten(), z.repeat_interleave(800)), -1
+        (
+            (sine[:, None] * phi.sin()).flatten(),
+            (sine[:, None] * phi.cos()).flatten(),
+            z.repeat_interleave(800),
+        ),
+        -1,
     )[None]
     pdf = light.pdf(grid)
-    assert (pdf.mean() * 4 * math.pi).item() == pytest.approx(1.0, abs=0.03)  # the quadrature cuts through texels
+    assert (pdf.mean() * 4 * math.pi).item() == pytest.approx(
+        1.0, abs=0.03
+    )  # the quadrature cuts through texels
     brightest = light.radiance(torch.zeros(1, 3), grid).mean(-1).argmax()
     assert pdf[0, brightest] > 100 * pdf.median()
 
 
 @pytest.mark.parametrize("bright", [0.0, 5.0])
 def test_samples_follow_the_density(bright):
-    """The mean of f/pdf is the integral of f over the sphere: 4π for 1, 4π/3 for each squared coordinate, 0 for z."""
+    """The mean of f/pdf is the integral of f over the sphere: 4π for 1, 4π/3 for each squared coordinate, 0
+    for z.
+    """
     light = EnvironmentLight(12, 1.0)
     with torch.no_grad():
         light.log_radiance[:, 3:5, 7:10] = bright
@@ -88,22 +101,31 @@ def test_there_is_one_direction_in_every_texel_and_the_texels_cover_the_sphere()
     drawn = light.texel_directions(torch.zeros(5, 3))
     assert drawn.wi.shape == (5, 128, 3)
     assert drawn.solid_angle.sum().item() == pytest.approx(4 * math.pi)
-    # The density is constant on a texel and inverse to its solid angle, so it says which texel a direction lies in.
+    # The density is constant on a texel and inverse to its solid angle, so it says which texel a direction
+    # lies in.
     shares = light.pdf(drawn.wi) * drawn.solid_angle
     torch.testing.assert_close(shares, shares[:1].expand(5, -1))
     assert shares[0].sum().item() == pytest.approx(1.0, rel=1e-4)
 
 
-# ------------------------------------------------------------------------------------------------- maps that are known
+# ---------------------------------------------------------------------------------------- maps that are known
 
 
 def test_a_bright_texel_shows_where_the_layout_puts_it():
-    """Row j ↔ θ = πj/(h − 1) from +z, column i ↔ φ = 2π(i + ½)/w, direction (sin φ sin θ, cos φ sin θ, cos θ)."""
+    """Row j ↔ θ = πj/(h − 1) from +z, column i ↔ φ = 2π(i + ½)/w, direction (sin φ sin θ, cos φ sin θ, cos
+    θ).
+    """
     known = torch.full((3, 9, 12), 0.5)
     known[:, 4, 2] = torch.tensor([40.0, 20.0, 10.0])  # θ = 90°, φ = 75°: mostly +x, and a little +y
     light = EnvironmentLight(16, 1.0)
     light.show(known)
-    along = [(math.sin(math.radians(75)), math.cos(math.radians(75)), 0.0), (-1, 0, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
+    along = [
+        (math.sin(math.radians(75)), math.cos(math.radians(75)), 0.0),
+        (-1, 0, 0),
+        (0, -1, 0),
+        (0, 0, 1),
+        (0, 0, -1),
+    ]
     radiance = light.radiance(torch.zeros(1, 3), torch.tensor([along], dtype=torch.float32))[0]
     torch.testing.assert_close(radiance[0], torch.tensor([40.0, 20.0, 10.0]), rtol=1e-3, atol=0.0)
     torch.testing.assert_close(radiance[1:], torch.full((4, 3), 0.5))
@@ -111,7 +133,9 @@ def test_a_bright_texel_shows_where_the_layout_puts_it():
 
 
 def test_a_known_map_brings_what_its_texels_hold():
-    """Bilinear between its texels: a lamp of one texel brings its radiance times its solid angle, π/12 · 2π/24."""
+    """Bilinear between its texels: a lamp of one texel brings its radiance times its solid angle, π/12 ·
+    2π/24.
+    """
     known = torch.zeros(3, 13, 24)
     known[:, 6, 10] = 1000.0
     light = EnvironmentLight(8, 1.0)
@@ -127,7 +151,9 @@ def test_a_map_comes_back_from_a_checkpoint_in_its_own_size():
     light.show(torch.rand(3, 11, 30) + 0.1)
     other.load_state_dict(light.state_dict())
     wi = directions(40)
-    torch.testing.assert_close(other.radiance(torch.zeros(1, 3), wi), light.radiance(torch.zeros(1, 3), wi), rtol=0, atol=0)
+    torch.testing.assert_close(
+        other.radiance(torch.zeros(1, 3), wi), light.radiance(torch.zeros(1, 3), wi), rtol=0, atol=0
+    )
     torch.testing.assert_close(other.pdf(wi), light.pdf(wi), rtol=0, atol=0)
     with pytest.raises(RuntimeError):
         other.load_state_dict({"log_radiance": torch.zeros(2, 11, 30)})
@@ -143,7 +169,8 @@ def test_a_coarser_map_is_the_mean_of_what_lies_in_each_texel(size):
     coarse = light.at_most(16)
     assert coarse.log_radiance.shape == (3, 16, 32)
     assert coarse.log_radiance.isfinite().all()
-    # 2 + y + z changes by at most √2 a radian, and what lies in a texel is up to half of one off each way: 0.1 · √2.
+    # 2 + y + z changes by at most √2 a radian, and what lies in a texel is up to half of one off each way:
+    # 0.1 · √2.
     wi = directions(200)
     shown = coarse.radiance(torch.zeros(1, 3), wi)[0, :, 0]
     torch.testing.assert_close(shown, 2 + wi[0, :, 1] + wi[0, :, 2], rtol=0, atol=0.2)

@@ -15,14 +15,18 @@ WAVES = FrequencyConfig()
 
 def rays(points: int = 5, directions: int = 7) -> tuple[torch.Tensor, torch.Tensor]:
     torch.manual_seed(1)
-    return torch.rand(points, 3) - 0.5, torch.nn.functional.normalize(torch.randn(points, directions, 3), dim=-1)
+    return torch.rand(points, 3) - 0.5, torch.nn.functional.normalize(
+        torch.randn(points, directions, 3), dim=-1
+    )
 
 
 @pytest.mark.parametrize("name", ["paper-mlp", "paper-ngp", "fast"])
 @pytest.mark.parametrize("base", [2.718281828, 10.0])
 def test_starts_near_the_initial_radiance(name, base):
     torch.manual_seed(0)
-    light = IncidentLightField(CONFIGS[name].light, CONFIGS[name].encoding, base, initial_radiance=0.7).radiance(*rays(50, 20))
+    light = IncidentLightField(
+        CONFIGS[name].light, CONFIGS[name].encoding, base, initial_radiance=0.7
+    ).radiance(*rays(50, 20))
     assert light.shape == (50, 20, 3)
     assert light.min() > 0
     assert light.mean().item() == pytest.approx(0.7, rel=0.25)
@@ -32,7 +36,9 @@ def test_starts_near_the_initial_radiance(name, base):
 def test_position_and_direction_enter_where_the_paper_says():
     """The network, written again as one chain of layers over concatenated inputs."""
     torch.manual_seed(0)
-    field = IncidentLightField(FreeLightConfig(layers=6, width=16), WAVES, base=10.0, initial_radiance=2.0).double()
+    field = IncidentLightField(
+        FreeLightConfig(layers=6, width=16), WAVES, base=10.0, initial_radiance=2.0
+    ).double()
     x, wi = (t.double() for t in rays())
     direction = field.direction(wi)
     hidden = direction
@@ -55,7 +61,9 @@ def test_directions_can_be_shared_between_points():
     x, wi = rays()
     every = wi[:1].expand_as(wi)
     seen = []
-    field.direction_part.register_forward_hook(lambda module, inputs, output: seen.append(output[..., 0].numel()))
+    field.direction_part.register_forward_hook(
+        lambda module, inputs, output: seen.append(output[..., 0].numel())
+    )
     torch.testing.assert_close(field.radiance(x, wi[:1]), field.radiance(x, every))
     assert seen == [7, 35]
 

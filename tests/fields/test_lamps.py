@@ -15,13 +15,17 @@ from neilfpp_method.structures import Incident, Material
 
 def lamps() -> Lamps:
     both = Lamps(3, radius=0.05)
-    both.place(torch.tensor([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]]), torch.tensor([[0.2, 0.2, 0.2], [0.3, 0.6, 0.9]]))
+    both.place(
+        torch.tensor([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]]), torch.tensor([[0.2, 0.2, 0.2], [0.3, 0.6, 0.9]])
+    )
     return both
 
 
 def test_only_as_many_are_lit_as_there_is_room_for():
     few = Lamps(1, radius=0.05)
-    few.place(torch.tensor([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]]), torch.tensor([[0.2, 0.2, 0.2], [0.3, 0.6, 0.9]]))
+    few.place(
+        torch.tensor([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]]), torch.tensor([[0.2, 0.2, 0.2], [0.3, 0.6, 0.9]])
+    )
     assert few.lit == 1
     torch.testing.assert_close(few.position, torch.tensor([[0.0, 0.0, 1.0]]))
 

@@ -67,7 +67,9 @@ def test_forward_of_two_units_by_hand():
 
 
 def test_sines_keep_their_distribution():
-    """SIREN's theorem: at any depth the units are spread like a sine of a uniform phase, whose variance is ½."""
+    """SIREN's theorem: at any depth the units are spread like a sine of a uniform phase, whose variance is
+    ½.
+    """
     torch.manual_seed(0)
     mlp = Mlp(8, 3, layers=6, width=256, activation="sine")
     assert 0.9 / 8 < mlp.layers[0].weight.abs().max() <= 1 / 8

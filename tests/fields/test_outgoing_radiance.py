@@ -24,7 +24,9 @@ def test_starts_near_what_is_asked_and_below_its_scale(name, scale, asked, start
     torch.manual_seed(0)
     config = preset(name)
     width = config.host.sdf.feature_width
-    color = OutgoingRadianceField(config.radiance, config.encoding, width, config.volume.radius, scale, asked)(*inputs(width))
+    color = OutgoingRadianceField(
+        config.radiance, config.encoding, width, config.volume.radius, scale, asked
+    )(*inputs(width))
     assert color.shape == (50, 3)
     assert color.min() > 0
     assert color.max() < scale
@@ -54,7 +56,9 @@ def test_what_a_mirror_sends_moves_as_the_directions_that_it_mirrors():
     field(x, wo, normal, feature)
     half = torch.nn.functional.normalize(wo + seen["direction"], dim=-1)
     torch.testing.assert_close(seen["direction"].norm(dim=-1), torch.ones(50).double())
-    torch.testing.assert_close((half * normal).sum(-1).abs(), torch.ones(50).double())  # the normal halves the angle
+    torch.testing.assert_close(
+        (half * normal).sum(-1).abs(), torch.ones(50).double()
+    )  # the normal halves the angle
 
 
 def test_derivatives_of_a_mirrored_direction():

@@ -24,7 +24,8 @@ MLP = preset("paper-mlp")
 WAVES_6 = 3 + 2 * 3 * 6
 WAVES_4 = 3 + 2 * 3 * 4
 GRID = 3 + 16 * 2
-# 16 → 4096 in 16 levels, each 256^(1/15) = 1.4473 finer; those of 16, 23, 34, 49, 70 cells fit into 2¹⁹ entries
+# 16 → 4096 in 16 levels, each 256^(1/15) = 1.4473 finer; those of 16, 23, 34, 49, 70 cells fit into 2¹⁹
+# entries
 TABLE = 2 * (17**3 + 24**3 + 35**3 + 50**3 + 71**3 + 11 * 2**19)
 
 
@@ -40,14 +41,18 @@ def test_outgoing_radiance_of_the_mlp_setting():
 
 
 def test_brdf_of_the_mlp_setting():
-    expected = linear(WAVES_6, 512) + 6 * linear(512, 512) + linear(512 + WAVES_6, 512) + linear(512, 3 + 1 + 1)
+    expected = (
+        linear(WAVES_6, 512) + 6 * linear(512, 512) + linear(512 + WAVES_6, 512) + linear(512, 3 + 1 + 1)
+    )
     assert count(BrdfField(MLP.brdf, MLP.encoding, 3.0)) == expected
 
 
 @pytest.mark.parametrize(("name", "direction"), [("paper-mlp", WAVES_6), ("paper-ngp", 25)])
 def test_incident_light_of_both_settings(name, direction):
     middle = linear(128 + direction + 3, 128)
-    expected = linear(direction, 128) + 3 * linear(128, 128) + middle + 3 * linear(128, 128) + linear(128, 1)  # one channel
+    expected = (
+        linear(direction, 128) + 3 * linear(128, 128) + middle + 3 * linear(128, 128) + linear(128, 1)
+    )  # one channel
     assert count(IncidentLightField(preset(name).light, preset(name).encoding, 10.0, 1.0)) == expected
 
 

@@ -25,7 +25,9 @@ def load_pixels(root: Path, **options) -> PixelDataset:
 
 
 def refused(root: Path, *words: str, **options) -> None:
-    """Loading the capture and its pixels raises a one-line `UserError` with a remedy that has all these words."""
+    """Loading the capture and its pixels raises a one-line `UserError` with a remedy that has all these
+    words.
+    """
     with pytest.raises(UserError) as caught:
         load_pixels(root, **options)
     message = str(caught.value)
@@ -35,7 +37,7 @@ def refused(root: Path, *words: str, **options) -> None:
         assert word in message
 
 
-# -------------------------------------------------------------------------------------------------------------- folders
+# ---------------------------------------------------------------------------------------------------- folders
 
 
 def test_folder_is_missing(tmp_path: Path) -> None:
@@ -48,7 +50,7 @@ def test_folder_is_not_a_capture(tmp_path: Path) -> None:
     refused(tmp_path, "not a capture of the format sfm_scene", format="sfm_scene")
 
 
-# ----------------------------------------------------------------------------------------------------------- scene file
+# ------------------------------------------------------------------------------------------------- scene file
 
 
 def tracks(scene: dict) -> dict:
@@ -142,7 +144,9 @@ def test_no_box_and_no_point_cloud(tmp_path: Path) -> None:
     refused(root, "sfm_scene.json", "no bbox and no model/oriented_pcd.ply")
 
 
-@pytest.mark.parametrize("what", ["images/003.exr", "masks/003.png", "model/oriented_pcd.ply", "sfm_scene.json"])
+@pytest.mark.parametrize(
+    "what", ["images/003.exr", "masks/003.png", "model/oriented_pcd.ply", "sfm_scene.json"]
+)
 def test_links_do_not_lead_out_of_the_capture(tmp_path: Path, what: str) -> None:
     root = make_capture(tmp_path / "capture", masks=True)
     inside, outside = root / "inputs" / what, tmp_path / "outside"
@@ -174,7 +178,7 @@ def test_an_image_that_the_scene_file_does_not_know(tmp_path: Path) -> None:
     refused(root, "007.exr: an image without a camera")
 
 
-# ---------------------------------------------------------------------------------------------------------------- split
+# ------------------------------------------------------------------------------------------------------ split
 
 
 @pytest.mark.parametrize(
@@ -193,7 +197,7 @@ def test_nothing_is_left_to_train_on(tmp_path: Path) -> None:
     refused(root, "there is no view 'seven'", test=["seven"])
 
 
-# --------------------------------------------------------------------------------------------------------------- pixels
+# ----------------------------------------------------------------------------------------------------- pixels
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, -0.25])

@@ -71,7 +71,11 @@ def test_brdf(name, dtype):
     field = BrdfField(preset(name).brdf, preset(name).encoding, 1.75).to(dtype)
     x = POSITIONS[:6].to(dtype).requires_grad_()
     sample = field.with_gradients(x)
-    loss = sample.material.base_color.sum() + sample.roughness_gradient.square().sum() + sample.metallic_gradient.sum()
+    loss = (
+        sample.material.base_color.sum()
+        + sample.roughness_gradient.square().sum()
+        + sample.metallic_gradient.sum()
+    )
     assert_bounded(sample.material.roughness, sample.roughness_gradient, *gradients(loss, field, x))
 
 
@@ -104,7 +108,9 @@ def test_background_from_the_centre_and_from_the_rim(dtype):
     torch.manual_seed(0)
     field = InvertedSphere(BackgroundConfig(layers=4, width=32), radius=3.0, scale=3.0).to(dtype)
     origins = torch.tensor([[0.0, 0.0, 0.0], [2.9, 0.0, 0.0], [3.0, 0.0, 0.0], [3.01, 0.0, 0.0]], dtype=dtype)
-    directions = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 0.0]], dtype=dtype)
+    directions = torch.tensor(
+        [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 0.0]], dtype=dtype
+    )
     origins.requires_grad_()
     color = field(origins, directions)
     assert_bounded(color, *gradients(color.sum(), field, origins))

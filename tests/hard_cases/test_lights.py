@@ -1,4 +1,6 @@
-"""Lights, and points beside them, on which light models tend to break: value and every gradient finite and bounded."""
+"""Lights, and points beside them, on which light models tend to break: value and every gradient finite and
+bounded.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,15 @@ RADIUS = 0.06
 UP = torch.tensor([0.0, 0.0, 1.0])
 # In the lamp, on it, under it, behind its axis, level with it, and from far away.
 BESIDE = torch.tensor(
-    [[0.0, 0.0, 0.5], [0.0, 0.0, 0.44], [0.0, 0.0, 0.0], [0.0, 0.0, 0.9], [0.7, 0.0, 0.5], [300.0, 0.0, 0.0], [1e-20, 0.0, 0.5]]
+    [
+        [0.0, 0.0, 0.5],
+        [0.0, 0.0, 0.44],
+        [0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.9],
+        [0.7, 0.0, 0.5],
+        [300.0, 0.0, 0.0],
+        [1e-20, 0.0, 0.5],
+    ]
 )
 LAMPS = LampPlaces(torch.tensor([[0.0, 0.0, 0.5]]).expand(3, 3), torch.stack((-UP, UP, torch.zeros(3))))
 
@@ -67,10 +77,14 @@ def test_what_lamps_show_of_themselves(dtype, intensity):
 def test_a_map_at_its_poles_and_at_its_seam(dtype, radiance):
     torch.manual_seed(0)
     sky = EnvironmentLight(8, radiance).to(dtype)
-    wi = torch.cat((torch.eye(3), -torch.eye(3), torch.tensor([[-1e-8, 1.0, 0.0], [1e-8, 1.0, 0.0]])))[None].to(dtype)
+    wi = torch.cat((torch.eye(3), -torch.eye(3), torch.tensor([[-1e-8, 1.0, 0.0], [1e-8, 1.0, 0.0]])))[
+        None
+    ].to(dtype)
     found = sky.radiance(torch.zeros(1, 3, dtype=dtype), wi)
     assert found.dtype == dtype
-    torch.testing.assert_close(found, torch.full_like(found, radiance), rtol=0.1 if dtype == torch.bfloat16 else 1e-3, atol=0)
+    torch.testing.assert_close(
+        found, torch.full_like(found, radiance), rtol=0.1 if dtype == torch.bfloat16 else 1e-3, atol=0
+    )
     drawn = sky.sample(torch.zeros(2, 3, dtype=dtype), 16, stochastic=True)
     assert drawn.wi.dtype == dtype
     assert drawn.pdf.min() > 0
@@ -80,13 +94,17 @@ def test_a_map_at_its_poles_and_at_its_seam(dtype, radiance):
 @pytest.mark.parametrize("pixel", [0.0, 1e6])
 @pytest.mark.parametrize(("base_color", "metallic"), [(0.0, 0.0), (1.0, 1.0)])
 def test_a_fit_to_what_cannot_be(pixel, base_color, metallic):
-    """Black surfaces that shine, mirrors that show nothing, beside and within lamps: the light is odd, but it is a light."""
+    """Black surfaces that shine, mirrors that show nothing, beside and within lamps: the light is odd, but it
+    is a light.
+    """
     torch.manual_seed(0)
     seen, rough = beside_lamps(torch.float32, 0.05)
     count = len(rough)
     material = Material(torch.full((count, 3), base_color), rough, torch.full((count, 1), metallic))
     sky = EnvironmentLight(4, 1.0)
-    carried = from_texels(sky, seen, rough, GGX, None).beside(from_lamps(LAMPS, RADIUS, seen, rough, GGX, None))
+    carried = from_texels(sky, seen, rough, GGX, None).beside(
+        from_lamps(LAMPS, RADIUS, seen, rough, GGX, None)
+    )
     start = Light(sky.log_radiance, torch.zeros(3, 3))
     target = Target(seen.position, material, torch.full((count, 3), pixel))
     found = fit_light(start, carried, target, Objective("linear", max(pixel, 1.0), LightFitConfig(steps=50)))

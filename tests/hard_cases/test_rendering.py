@@ -21,7 +21,9 @@ def from_inside():
 def grazing():
     """Rays that touch the sphere, from a camera on the rim of the scene."""
     batch = sphere_batch()
-    targets = 0.6 * normalize(torch.cat([batch.directions[:, :2], torch.zeros(len(batch), 1)], dim=-1), dim=-1)
+    targets = 0.6 * normalize(
+        torch.cat([batch.directions[:, :2], torch.zeros(len(batch), 1)], dim=-1), dim=-1
+    )
     return dataclasses.replace(batch, directions=normalize(targets - batch.origins, dim=-1))
 
 

@@ -1,4 +1,6 @@
-"""Where shading could break: mirrors, horizons, lamps, half precision. Values and gradients stay finite and bounded."""
+"""Where shading could break: mirrors, horizons, lamps, half precision. Values and gradients stay finite and
+bounded.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ DIRECTIONS = (
     (0.0, -0.6, -0.8),
     (0.0, 0.0, -1.0),
 )
-# Adam squares gradients: in float32 its state stays finite up to 1e19. In float64 a lobe may be sharper and higher.
+# Adam squares gradients: in float32 its state stays finite up to 1e19. In float64 a lobe may be sharper and
+# higher.
 BOUND = {torch.float64: 1e36, torch.float32: 1e19, torch.bfloat16: 1e19}
 
 dtypes = pytest.mark.parametrize("dtype", DTYPES, ids=str)
@@ -103,13 +106,19 @@ def test_samplers(kind, lobe, dtype):
     assert samples.pdf.ge(0).all()
     assert (samples.wi.norm(dim=-1) - 1).abs().max() < (0.02 if dtype == torch.bfloat16 else 1e-5)
     leaf["radiance"] = torch.full_like(samples.wi, 1e6).requires_grad_()
-    assert_tame(shade(material, leaf["n"], wo, Incident.of(samples, leaf["radiance"]), LOBES[lobe]).color, leaf, BOUND[dtype])
+    assert_tame(
+        shade(material, leaf["n"], wo, Incident.of(samples, leaf["radiance"]), LOBES[lobe]).color,
+        leaf,
+        BOUND[dtype],
+    )
 
 
 @lobes
 @pytest.mark.parametrize("kind", ["lobe", "mis"])
 def test_importance_samples_of_a_mirror_do_not_sparkle(kind, lobe):
-    """The density cancels D, so that even at the floor of the roughness no float32 sample outshines the light."""
+    """The density cancels D, so that even at the floor of the roughness no float32 sample outshines the
+    light.
+    """
     torch.manual_seed(1)
     r = torch.tensor([[1e-4], [0.05], [0.1]])
     n, wo = torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3), torch.tensor([[0.6, 0.0, 0.8]]).expand(3, 3)
@@ -119,7 +128,11 @@ def test_importance_samples_of_a_mirror_do_not_sparkle(kind, lobe):
     many = Material(*(t.repeat_interleave(4096, 0) for t in (material.base_color, r, material.metallic)))
     light = torch.ones_like(single.wi)
     color = shade(
-        many, n[:1].expand(len(light), 3), wo[:1].expand(len(light), 3), Incident.of(single, light), LOBES[lobe]
+        many,
+        n[:1].expand(len(light), 3),
+        wo[:1].expand(len(light), 3),
+        Incident.of(single, light),
+        LOBES[lobe],
     ).color
     assert color.max() < 2.5
     # The mirror under unit light sends out 1, whatever its roughness.

@@ -1,5 +1,6 @@
-"""Scenes that strain the method: a hundred steps of each stage (a dozen for captures that are merely odd) end finite, and none
-is skipped."""
+"""Scenes that strain the method: a hundred steps of each stage (a dozen for captures that are merely odd) end
+finite, and none is skipped.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +39,9 @@ def repaint(root: Path, look: Look) -> Path:
         under_root = b**2 - (o**2).sum(-1) + radius**2
         hit = under_root > 0
         normal = (o + (-b - np.sqrt(under_root.clip(0)))[:, None] * d) / radius
-        painted = np.where(hit[:, None], look(normal, d), 0.0).reshape(view.camera.height, view.camera.width, 3)
+        painted = np.where(hit[:, None], look(normal, d), 0.0).reshape(
+            view.camera.height, view.camera.width, 3
+        )
         hit = hit.reshape((*painted.shape[:2], 1))
         pixels = read_image(view.image).pixels
         if capture.hdr:
@@ -48,12 +51,16 @@ def repaint(root: Path, look: Look) -> Path:
     return root
 
 
-def trains(root: Path, out: Path, may_rest: frozenset[str] = frozenset(), steps: int = 100, solved: bool = False) -> None:
+def trains(
+    root: Path, out: Path, may_rest: frozenset[str] = frozenset(), steps: int = 100, solved: bool = False
+) -> None:
     """Train so many steps a stage, and shade nearly every ray that the object might stop.
 
     Every field must move, but those that `may_rest`. The light is free, or `solved` for.
     """
-    config = small_config(sdf_steps=steps, material_steps=steps, joint_steps=steps, checkpoint_every=1000, rays=16)
+    config = small_config(
+        sdf_steps=steps, material_steps=steps, joint_steps=steps, checkpoint_every=1000, rays=16
+    )
     config = solved_light(config) if solved else config
     config = dataclasses.replace(config, shading=dataclasses.replace(config.shading, hit_share=0.01))
     training = small_training(root, out, config)
@@ -101,7 +108,9 @@ def test_a_body_that_is_black_is_refused(tmp_path, hdr):
 
 def test_an_overexposed_capture(tmp_path):
     root = make_capture(tmp_path / "burnt", hdr=False)
-    repaint(root, lambda n, d: 0.5 + 40.0 * (n @ np.array([0.0, 0.6, 0.8]) + 0.7).clip(0.0)[:, None] * np.ones(3))
+    repaint(
+        root, lambda n, d: 0.5 + 40.0 * (n @ np.array([0.0, 0.6, 0.8]) + 0.7).clip(0.0)[:, None] * np.ones(3)
+    )
     pixels = small_training(root, tmp_path / "unused", small_config()).pixels
     batch = pixels.view(1)
     assert (batch.color[batch.mask > 0.5] == 1.0).float().mean() > 0.5
@@ -115,7 +124,7 @@ def test_a_scene_without_an_object(tmp_path):
     trains(root, tmp_path / "run", may_rest=frozenset({"brdf", "light"}))
 
 
-# ------------------------------------------------------------------------------ captures that no setting was chosen for
+# -------------------------------------------------------------------- captures that no setting was chosen for
 
 # A map that is solved for is no parameter, so nothing of the light trains by steps.
 odd = {"steps": 12, "solved": True, "may_rest": frozenset({"light"})}

@@ -1,4 +1,5 @@
-"""Units that nobody tuned for: what a capture calls a length or a radiance of 1 changes neither surface nor material.
+"""Units that nobody tuned for: what a capture calls a length or a radiance of 1 changes neither surface nor
+material.
 
 Factors are powers of two, which no rounding touches, so two trainings can be compared bit for bit.
 """
@@ -57,7 +58,9 @@ def usual(request, without_shape_checks, tmp_path_factory: pytest.TempPathFactor
 
 @pytest.mark.parametrize(("radiance", "length"), [(2.0**13, 2.0**-10), (2.0**-13, 2.0**10)])
 def test_other_units_show_the_same_scene(tmp_path, usual, radiance, length):
-    """Surface and material are the same; the light, and what the surface sends, have the unit of the images."""
+    """Surface and material are the same; the light, and what the surface sends, have the unit of the
+    images.
+    """
     light, reference = usual
     other = trained(tmp_path, light, radiance, length)
     # The logarithm of a map's texels is shifted by the unit, and rounded.
@@ -72,4 +75,6 @@ def test_other_units_show_the_same_scene(tmp_path, usual, radiance, length):
     with torch.no_grad():
         for shown in (lambda model: model.light.radiance(x, wi), lambda model: model.host.render(rays).color):
             expected = radiance * shown(reference.model)
-            torch.testing.assert_close(shown(other.model), expected, rtol=1e-3, atol=1e-4 * float(expected.mean()))
+            torch.testing.assert_close(
+                shown(other.model), expected, rtol=1e-3, atol=1e-4 * float(expected.mean())
+            )

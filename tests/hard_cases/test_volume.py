@@ -54,7 +54,9 @@ def test_sampler(beta, stochastic, dtype):
     directions = torch.tensor([[1.0, 0.0, 0.0]], dtype=dtype).expand(5, 3)
     interval = sphere_interval(origins, directions, 3.0)
     scale = torch.tensor(beta, dtype=dtype)
-    found = error_bounded_samples(sphere, origins, directions, interval.near, interval.far, scale, CONFIG, stochastic)
+    found = error_bounded_samples(
+        sphere, origins, directions, interval.near, interval.far, scale, CONFIG, stochastic
+    )
     assert found.distances.dtype == dtype
     assert found.distances.isfinite().all()
     assert (found.distances >= interval.near[:, None]).all()
@@ -110,6 +112,8 @@ def test_inverse_cdf_of_an_even_mass_is_even(mass, span):
 
 def test_no_rays():
     empty = torch.zeros(0)
-    found = error_bounded_samples(sphere, torch.zeros(0, 3), torch.zeros(0, 3), empty, empty, torch.tensor(0.1), CONFIG, True)
+    found = error_bounded_samples(
+        sphere, torch.zeros(0, 3), torch.zeros(0, 3), empty, empty, torch.tensor(0.1), CONFIG, True
+    )
     assert found.distances.shape == (0, 8)
     assert found.sdf_queries == 0

@@ -21,7 +21,13 @@ def cases(findings) -> list[str]:
 
 @pytest.mark.parametrize(
     ("opaque", "sharp", "found"),
-    [(0.9, 0.95, []), (0.9, 0.1, ["fog"]), (0.01, 0.0, ["no_surface"]), (0.01, 1.0, ["no_surface"]), (0.3, 0.6, [])],
+    [
+        (0.9, 0.95, []),
+        (0.9, 0.1, ["fog"]),
+        (0.01, 0.0, ["no_surface"]),
+        (0.01, 1.0, ["no_surface"]),
+        (0.3, 0.6, []),
+    ],
 )
 def test_a_surface_is_there_and_sharp_or_it_is_said(opaque, sharp, found):
     assert cases(surface_findings(Look(100, opaque, sharp, None), 7)) == found

@@ -35,7 +35,9 @@ def showing(opacity: float, concentration: float):
     return model
 
 
-@pytest.mark.parametrize(("opacity", "concentration", "case"), [(1.0, 1.0, None), (1.0, 0.1, "fog"), (0.0, 0.0, "no_surface")])
+@pytest.mark.parametrize(
+    ("opacity", "concentration", "case"), [(1.0, 1.0, None), (1.0, 0.1, "fog"), (0.0, 0.0, "no_surface")]
+)
 def test_a_look_tells_surface_from_fog_and_from_nothing(opacity, concentration, case):
     said: list[str] = []
     watch = Watch(PIXELS, said.append)
@@ -91,7 +93,17 @@ def test_a_strict_command_ends_with_status_1_and_keeps_the_run(tmp_path, monkeyp
     monkeypatch.setitem(PRESETS, "tiny", tiny_config)
     capture, out = make_capture(tmp_path / "sphere"), tmp_path / "run"
     steps = [f"--config.train.{stage}-steps=1" for stage in ("sdf", "material", "joint")]
-    arguments = ["train", "--data", str(capture), "--out", str(out), "--device", "cpu", "--preset=tiny", *steps]
+    arguments = [
+        "train",
+        "--data",
+        str(capture),
+        "--out",
+        str(out),
+        "--device",
+        "cpu",
+        "--preset=tiny",
+        *steps,
+    ]
     monkeypatch.setattr("neilfpp_method.health.cases.MIN_SHARP", 1.1)
     assert main([*arguments, "--strict"]) == 1
     said = capfd.readouterr()

@@ -33,11 +33,17 @@ class Ball(nn.Module):
         half_chord = self.radius**2 + middle**2 - origins.square().sum(-1, keepdim=True)
         hit = (half_chord > 1e-4) & (middle > 0.0)
         position = origins + (middle - half_chord.clamp_min(1e-4).sqrt()) * directions
-        return torch.where(hit, self.paint(position), 0.0), position, torch.where(hit, normalize(position, dim=-1), 0.0)
+        return (
+            torch.where(hit, self.paint(position), 0.0),
+            position,
+            torch.where(hit, normalize(position, dim=-1), 0.0),
+        )
 
 
 class BallHost(Ball):
-    """The ball behind the host contract; `spoil` tells which outputs to replace before they are handed out."""
+    """The ball behind the host contract; `spoil` tells which outputs to replace before they are handed
+    out.
+    """
 
     def __init__(self, spoil: Callable[[RayBatch, dict], dict] = lambda rays, outputs: {}) -> None:
         super().__init__()
@@ -46,7 +52,13 @@ class BallHost(Ball):
     def render(self, rays: RayBatch) -> SurfaceHits | SimpleNamespace:
         color, position, normal = self(rays.origins, rays.directions)
         hit = normal.detach().norm(dim=-1)
-        outputs = {"color": color, "position": position, "normal": normal, "opacity": hit, "concentration": hit}
+        outputs = {
+            "color": color,
+            "position": position,
+            "normal": normal,
+            "opacity": hit,
+            "concentration": hit,
+        }
         outputs |= self.spoil(rays, outputs)
         try:
             return SurfaceHits(**outputs)

@@ -42,7 +42,9 @@ class TableTop:
         position = origins + torch.where(hit, distance, 0.0)[:, None] * directions
         centre = torch.tensor(CENTRE) + torch.tensor([0.0, 0.0, self.lift])
         on_ball = (position - centre).norm(dim=-1) < RADIUS + 1e-3
-        normal = torch.where(on_ball[:, None], normalize(position - centre, dim=-1), torch.tensor([0.0, 0.0, 1.0]))
+        normal = torch.where(
+            on_ball[:, None], normalize(position - centre, dim=-1), torch.tensor([0.0, 0.0, 1.0])
+        )
         color = torch.where(on_ball[:, None], torch.tensor([0.6, 0.1, 0.1]), torch.tensor([0.2, 0.3, 0.4]))
         return color * hit[:, None], position, normal * hit[:, None]
 

@@ -35,10 +35,19 @@ def first_nan(rays: RayBatch, outputs: dict, name: str) -> dict:
 
 
 ERRORS = [
-    (lambda r, o: first_nan(r, o, "position"), "BallHost: its position is not finite for 1 of 64 rays; return zeros"),
+    (
+        lambda r, o: first_nan(r, o, "position"),
+        "BallHost: its position is not finite for 1 of 64 rays; return zeros",
+    ),
     (lambda r, o: first_nan(r, o, "color"), "BallHost: its color is not finite for 1 of 64 rays"),
-    (lambda r, o: {"normal": -o["normal"]}, "BallHost: 100% of its normals point away from the viewer; turn them outwards"),
-    (beside, "BallHost: 100% of its hits do not lie on their rays; return positions in the frame of the rays"),
+    (
+        lambda r, o: {"normal": -o["normal"]},
+        "BallHost: 100% of its normals point away from the viewer; turn them outwards",
+    ),
+    (
+        beside,
+        "BallHost: 100% of its hits do not lie on their rays; return positions in the frame of the rays",
+    ),
 ]
 
 
@@ -65,7 +74,9 @@ def test_no_hit_in_a_batch_is_said_once(caplog):
         for _ in range(3):
             neilf.losses(batch(away), "material_init")
     (record,) = (record for record in caplog.records if record.name == SAYS)
-    assert "Ball: none of 64 rays meets a surface, so nothing is learned of them; is the frame" in record.message
+    assert (
+        "Ball: none of 64 rays meets a surface, so nothing is learned of them; is the frame" in record.message
+    )
 
 
 def test_a_scene_far_outside_the_unit_sphere_is_said_once(caplog):
@@ -87,19 +98,25 @@ def test_a_scene_far_outside_the_unit_sphere_is_said_once(caplog):
 def test_directions_that_are_not_unit_are_an_error():
     rays = ball_rays(8)
     neilf = attach_neilf(Ball(), tiny_config())
-    with pytest.raises(UserError, match=r"directions of rays are no unit vectors: the lengths go from 2 to 2; divide them"):
+    with pytest.raises(
+        UserError, match=r"directions of rays are no unit vectors: the lengths go from 2 to 2; divide them"
+    ):
         neilf.losses(batch(RayBatch(rays.origins, 2.0 * rays.directions)), "joint")
 
 
 def test_pixels_that_are_not_finite_are_an_error():
     spoiled = batch(ball_rays(8))
-    spoiled = dataclasses.replace(spoiled, color=torch.where(torch.arange(8)[:, None] < 2, torch.inf, spoiled.color))
+    spoiled = dataclasses.replace(
+        spoiled, color=torch.where(torch.arange(8)[:, None] < 2, torch.inf, spoiled.color)
+    )
     with pytest.raises(UserError, match="color of 2 of 8 pixels are not finite; leave those pixels out"):
         attach_neilf(Ball(), tiny_config()).losses(spoiled, "joint")
 
 
 def test_display_values_above_one_are_an_error_and_a_wrong_median_a_warning(caplog):
-    with pytest.raises(UserError, match=r"pixels reach 128, and display values end at 1; divide 8-bit pixels by 255"):
+    with pytest.raises(
+        UserError, match=r"pixels reach 128, and display values end at 1; divide 8-bit pixels by 255"
+    ):
         attach_neilf(Ball(), tiny_config(), response="srgb").losses(batch(ball_rays(8), 128.0), "joint")
     neilf = attach_neilf(Ball(), tiny_config())
     with caplog.at_level(logging.WARNING, SAYS):
@@ -112,21 +129,37 @@ def test_display_values_above_one_are_an_error_and_a_wrong_median_a_warning(capl
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"color": torch.zeros(4, 3, dtype=torch.uint8)}, "color of the batch is torch.uint8; divide 8-bit pixels by 255"),
-        ({"mask": torch.ones(4, 1)}, r"mask of the batch has the shape \(4, 1\); give \(4,\): a number per pixel"),
+        (
+            {"color": torch.zeros(4, 3, dtype=torch.uint8)},
+            "color of the batch is torch.uint8; divide 8-bit pixels by 255",
+        ),
+        (
+            {"mask": torch.ones(4, 1)},
+            r"mask of the batch has the shape \(4, 1\); give \(4,\): a number per pixel",
+        ),
         ({"color": torch.zeros(4)}, r"color of the batch has the shape \(4,\); give \(4, 3\)"),
-        ({"directions": torch.zeros(2, 2, 3)}, r"the shape \(2, 2, 3\); give \(4, 3\): a row per pixel, reshape\(-1, 3\)"),
+        (
+            {"directions": torch.zeros(2, 2, 3)},
+            r"the shape \(2, 2, 3\); give \(4, 3\): a row per pixel, reshape\(-1, 3\)",
+        ),
     ],
 )
 def test_pixels_of_another_form_are_named(change, message):
     rays = ball_rays(4)
-    parts = {"origins": rays.origins, "directions": rays.directions, "color": torch.rand(4, 3), "mask": torch.ones(4)}
+    parts = {
+        "origins": rays.origins,
+        "directions": rays.directions,
+        "color": torch.rand(4, 3),
+        "mask": torch.ones(4),
+    }
     with pytest.raises(UserError, match=message):
         pixel_batch(**(parts | change))
 
 
 def test_points_of_an_image_are_named():
-    with pytest.raises(UserError, match=r"x has the shape \(2, 2, 3\), not \(N, 3\); give x.reshape\(-1, 3\)"):
+    with pytest.raises(
+        UserError, match=r"x has the shape \(2, 2, 3\), not \(N, 3\); give x.reshape\(-1, 3\)"
+    ):
         check_points("x", torch.zeros(2, 2, 3))
     with pytest.raises(UserError, match=r"wi has the shape \(4, 3\), not \(N, S, 3\)"):
         check_points("wi", torch.zeros(4, 3), axes=3)

@@ -1,4 +1,6 @@
-"""A mesh as the host: which triangle a ray meets, what it shows, and what light goes from one surface to another."""
+"""A mesh as the host: which triangle a ray meets, what it shows, and what light goes from one surface to
+another.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +65,7 @@ def tracer(request, monkeypatch) -> str:
     return request.param
 
 
-# ------------------------------------------------------------------------------------------------------------- geometry
+# --------------------------------------------------------------------------------------------------- geometry
 
 
 def test_hits_on_a_sphere_are_those_of_the_sphere(tracer):
@@ -160,7 +162,9 @@ def test_the_inside_of_a_face_stops_a_ray_but_is_no_surface_point(tracer):
 
 def test_the_tree_finds_what_embree_finds(monkeypatch):
     knot = trimesh.creation.torus(0.5, 0.2, major_sections=90, minor_sections=40)
-    floor = trimesh.creation.box(extents=(2.0, 2.0, 0.0))  # large triangles beside small ones, and two of them flat
+    floor = trimesh.creation.box(
+        extents=(2.0, 2.0, 0.0)
+    )  # large triangles beside small ones, and two of them flat
     shape = trimesh.util.concatenate([knot, floor, trimesh.creation.icosphere(subdivisions=4, radius=0.2)])
     triangles = torch.as_tensor(np.array(shape.triangles), dtype=torch.float32)
     monkeypatch.setattr(mesh_tracing, "RAYS_AT_ONCE", 1000)
@@ -168,9 +172,12 @@ def test_the_tree_finds_what_embree_finds(monkeypatch):
     rays = rays_at(2500, 0.9)
     found, expected = (t(rays.origins, rays.directions) for t in (tree, embree))
     assert 0.3 < (expected >= 0).float().mean() < 1.0
-    # Two triangles share an edge, and the floor is two sheets in one place: then the distance decides nothing.
+    # Two triangles share an edge, and the floor is two sheets in one place: then the distance decides
+    # nothing.
     same = found == expected
-    depths = [mesh_tracing.meet(rays.origins, rays.directions, triangles[t]).distance for t in (found, expected)]
+    depths = [
+        mesh_tracing.meet(rays.origins, rays.directions, triangles[t]).distance for t in (found, expected)
+    ]
     assert ((depths[0] - depths[1]).abs()[~same] < 1e-5).all()
     assert torch.equal(found >= 0, expected >= 0)
     assert same.float().mean() > 0.7
@@ -194,7 +201,7 @@ def test_a_ray_between_two_triangles_meets_the_one_ahead():
     assert tracer(torch.tensor([[0.2, 0.2, 0.4]]).expand(2, 3), up).tolist() == [1, 0]
 
 
-# --------------------------------------------------------------------------------------------------------- light between
+# ---------------------------------------------------------------------------------------------- light between
 
 
 def test_noise_of_a_mesh_is_smoothed_on_demand():
@@ -217,9 +224,13 @@ def two_planes() -> trimesh.Trimesh:
 
 
 def test_light_between_two_planes_is_what_they_emit():
-    """The ceiling sends 1 + its x, the floor 3 + its y; light from the floor's middle meets the ceiling at 0.5 tan θ."""
+    """The ceiling sends 1 + its x, the floor 3 + its y; light from the floor's middle meets the ceiling at
+    0.5 tan θ.
+    """
     host = mesh_host(two_planes())
-    host.radiance_field.forward = lambda x, wo, n, f: torch.where(n[:, 2:] < 0, 1.0 + x[:, :1], 3.0 + x[:, 1:2]).expand(-1, 3)
+    host.radiance_field.forward = lambda x, wo, n, f: torch.where(
+        n[:, 2:] < 0, 1.0 + x[:, :1], 3.0 + x[:, 1:2]
+    ).expand(-1, 3)
     floor, up = torch.zeros(4000, 3), torch.tensor([[0.0, 0.0, 1.0]]).expand(4000, 3)
     settings = dataclasses.replace(mesh_config().inter_reflection, rays_per_point=1.0)
     torch.manual_seed(0)
@@ -230,7 +241,9 @@ def test_light_between_two_planes_is_what_they_emit():
     torch.testing.assert_close(traced.radiance[traced.hit], expected, atol=1e-5, rtol=0.0)
 
     # L_ref, in closed form: a light of 1 everywhere differs from the ceiling by |x|, and from the floor by 2 + y.
-    model = NeilfModel(host, mesh_config(loss=dataclasses.replace(mesh_config().loss, unit="activation")), FACTS)
+    model = NeilfModel(
+        host, mesh_config(loss=dataclasses.replace(mesh_config().loss, unit="activation")), FACTS
+    )
     model.light.radiance = lambda x, wi: torch.ones_like(wi)
     model.config = dataclasses.replace(model.config, inter_reflection=settings)
     torch.manual_seed(0)
@@ -242,7 +255,9 @@ def test_light_between_two_planes_is_what_they_emit():
 
 
 def test_the_scene_sends_light_from_its_outsides_alone_and_says_from_how_far():
-    """From the middle between floor and ceiling; and from below the floor, whose back is dark and in the way."""
+    """From the middle between floor and ceiling; and from below the floor, whose back is dark and in the
+    way.
+    """
     host = mesh_host(two_planes())
     host.radiance_field.forward = lambda x, wo, n, f: torch.where(n[:, 2:] < 0, 1.0, 3.0).expand(-1, 3)
     x = torch.tensor([[0.1, 0.0, 0.25], [0.1, 0.0, -0.25]])
@@ -267,13 +282,15 @@ def test_rays_leave_a_surface_at_every_angle_without_meeting_it():
     assert not trace_light(mesh_host(SPHERE), hits.position, hits.normal, settings, 0.8).hit.any()
 
 
-# ------------------------------------------------------------------------------------------------------------- training
+# --------------------------------------------------------------------------------------------------- training
 
 
 def test_r_material_and_light_move_together_and_the_mesh_does_not():
     assert mesh_config().inter_reflection.radiance_gradient == 0.7  # METHOD §2, for fixed geometry
     host = mesh_host(SPHERE)
-    model = NeilfModel(host, mesh_config(loss=dataclasses.replace(mesh_config().loss, lambertian=1e-3)), FACTS)
+    model = NeilfModel(
+        host, mesh_config(loss=dataclasses.replace(mesh_config().loss, lambertian=1e-3)), FACTS
+    )
     assert set(model.parameter_groups()) == {"radiance", "brdf", "light"}
     terms = model.losses(sphere_batch(), Stage.MATERIAL_INIT)
     weights = active_losses(Stage.MATERIAL_INIT, model.config, model.stages)
@@ -287,7 +304,19 @@ def test_r_material_and_light_move_together_and_the_mesh_does_not():
 def test_a_mesh_run_from_the_command_line(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.setitem(PRESETS, "tiny", small_config)
     capture, out = make_capture(tmp_path / "sphere", masks=True), tmp_path / "run"
-    command = ["train", "--data", str(capture), "--preset", "tiny", "--host", "mesh", "--out", str(out), "--device", "cpu"]
+    command = [
+        "train",
+        "--data",
+        str(capture),
+        "--preset",
+        "tiny",
+        "--host",
+        "mesh",
+        "--out",
+        str(out),
+        "--device",
+        "cpu",
+    ]
     assert main(command) == 0
     assert set(json.loads((out / "timing.json").read_text())) == {"material_init"}
     assert (out / "previews" / "material_init.png").is_file()
@@ -333,7 +362,9 @@ def test_another_mesh_is_taken_by_its_path_and_found_again(tmp_path: Path, monke
 
     out = tmp_path / "run"
     assert main([*common, str(out), "--host", "mesh", "--mesh", str(tmp_path / "scan.ply")]) == 0
-    assert json.loads((out / "config.json").read_text())["config"]["host"]["path"] == str(tmp_path / "scan.ply")
+    assert json.loads((out / "config.json").read_text())["config"]["host"]["path"] == str(
+        tmp_path / "scan.ply"
+    )
     (tmp_path / "scan.ply").unlink()
     assert main(["eval", str(out), "--device", "cpu"]) == 2
     assert "scan.ply: there is no such mesh" in capsys.readouterr().err

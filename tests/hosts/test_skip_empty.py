@@ -17,7 +17,11 @@ from tests.scenes import sphere_batch, tiny_config
 def host(skip: bool = True) -> VolSdfHost:
     torch.manual_seed(0)
     config = tiny_config()
-    return VolSdfHost(dataclasses.replace(config, volume=dataclasses.replace(config.volume, skip_empty=skip)), 3.0, "constant")
+    return VolSdfHost(
+        dataclasses.replace(config, volume=dataclasses.replace(config.volume, skip_empty=skip)),
+        3.0,
+        "constant",
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -98,7 +102,9 @@ def test_hits_stay_where_they_are():
 
 
 def test_traced_rays_that_meet_nothing_are_not_rendered(monkeypatch):
-    """On a sphere no ray meets anything: none is rendered. Where the start lies before it, all are, and hit as they did."""
+    """On a sphere no ray meets anything: none is rendered. Where the start lies before it, all are, and hit
+    as they did.
+    """
     skipping, plain = host().train(), host(skip=False).train()
     plain.load_state_dict(skipping.state_dict(), strict=False)
     skipping.density.above_floor.data.fill_(2e-3)
@@ -118,7 +124,9 @@ def test_traced_rays_that_meet_nothing_are_not_rendered(monkeypatch):
 
 
 def test_no_ray_to_render_is_no_error():
-    none = trace_light(host().train(), torch.zeros(0, 3), torch.zeros(0, 3), tiny_config().inter_reflection, hit_share=0.8)
+    none = trace_light(
+        host().train(), torch.zeros(0, 3), torch.zeros(0, 3), tiny_config().inter_reflection, hit_share=0.8
+    )
     assert none.hit.shape == (0,)
 
 

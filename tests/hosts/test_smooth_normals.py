@@ -30,7 +30,9 @@ def test_ripples_go():
     waves, slope = 2 * math.pi / 0.03, math.tan(math.radians(5.0))
 
     def gradient(x: torch.Tensor) -> torch.Tensor:
-        return torch.stack((slope * (waves * x[:, 0]).sin(), slope * (waves * x[:, 1]).cos(), torch.ones(len(x))), -1)
+        return torch.stack(
+            (slope * (waves * x[:, 0]).sin(), slope * (waves * x[:, 1]).cos(), torch.ones(len(x))), -1
+        )
 
     torch.manual_seed(0)
     position = torch.rand(500, 3) * torch.tensor([1.0, 1.0, 0.0])
@@ -68,18 +70,24 @@ def test_no_points_have_no_normals():
 def test_a_radius_of_zero_asks_nothing_and_others_ask_for_the_neighbours():
     config = tiny_config()
     for radius, expected in ((0.0, 0), (RADIUS, NEIGHBOURS)):
-        model = sphere_model(dataclasses.replace(config, volume=dataclasses.replace(config.volume, normal_radius=radius)))
+        model = sphere_model(
+            dataclasses.replace(config, volume=dataclasses.replace(config.volume, normal_radius=radius))
+        )
         hits = model.host.render(sphere_batch(spread=0.3).rays).detach()
         asked = []
         original = model.host.sdf_field.with_gradient
-        model.host.sdf_field.with_gradient = lambda x, original=original, asked=asked: asked.append(len(x)) or original(x)
+        model.host.sdf_field.with_gradient = lambda x, original=original, asked=asked: (
+            asked.append(len(x)) or original(x)
+        )
         model.shading_normals(hits.position, hits.normal)
         assert sum(asked) == expected * len(hits)
 
 
 def test_the_gradient_is_that_of_the_hits_normals():
     config = tiny_config()
-    model = sphere_model(dataclasses.replace(config, volume=dataclasses.replace(config.volume, normal_radius=RADIUS)))
+    model = sphere_model(
+        dataclasses.replace(config, volume=dataclasses.replace(config.volume, normal_radius=RADIUS))
+    )
     hits = model.host.render(sphere_batch(spread=0.3).rays).detach()
     normal = hits.normal.clone().requires_grad_()
     weight = torch.randn_like(normal)

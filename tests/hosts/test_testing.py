@@ -60,24 +60,45 @@ BROKEN = [
     (lambda r, o: {"color": o["color"][:, :2]}, r"its color has the shape \(200, 2\); return \(200, 3\)"),
     (lambda r, o: {"opacity": None}, r"its opacity is a NoneType"),
     (lambda r, o: {"opacity": o["opacity"] > 0}, r"its opacity is a torch.bool"),
-    (lambda r, o: {"normal": o["normal"].double()}, r"its normal is torch.float64, the rays are torch.float32"),
+    (
+        lambda r, o: {"normal": o["normal"].double()},
+        r"its normal is torch.float64, the rays are torch.float32",
+    ),
     (lambda r, o: {"concentration": 0.1 * o["concentration"]}, r"200 rays hit nothing"),
     (lambda r, o: {"opacity": 2.0 * o["opacity"]}, r"its opacity leaves \[0, 1\]"),
-    (lambda r, o: {"normal": 0.5 * o["normal"]}, r"its normal is no unit vector: that of a hit has the length 0.5"),
+    (
+        lambda r, o: {"normal": 0.5 * o["normal"]},
+        r"its normal is no unit vector: that of a hit has the length 0.5",
+    ),
     (lambda r, o: {"normal": o["normal"] / 0.0 * 0.0}, r"its normal is not finite for 200 of 200 rays"),
     (lambda r, o: {"normal": -o["normal"]}, r"100% of its normals point away from the viewer"),
     (lambda r, o: {"position": o["position"] + sideways(r)}, r"hits do not lie on their ray"),
     (lambda r, o: {"position": 2.0 * r.origins - o["position"]}, r"hits lie behind the origin"),
     (lambda r, o: {"color": o["color"] - 9.0}, r"its colour is negative"),
     (lambda r, o: {"color": o["color"] / 0.0}, r"its colour is not finite"),
-    (lambda r, o: {"color": (o["color"] / o["color"].median()).clamp_max(1.0)}, r"50% of its colours are exactly 1"),
-    (lambda r, o: {"position": torch.where(missed(o), torch.nan, o["position"])}, r"its position is not finite where"),
-    (lambda r, o: {"concentration": torch.ones_like(o["opacity"])}, r"hits something with rays that lead away"),
-    (lambda r, o: {"color": o["color"] * (1.0 + np.random.rand())}, r"renders differently after the same seed"),  # noqa: NPY002
+    (
+        lambda r, o: {"color": (o["color"] / o["color"].median()).clamp_max(1.0)},
+        r"50% of its colours are exactly 1",
+    ),
+    (
+        lambda r, o: {"position": torch.where(missed(o), torch.nan, o["position"])},
+        r"its position is not finite where",
+    ),
+    (
+        lambda r, o: {"concentration": torch.ones_like(o["opacity"])},
+        r"hits something with rays that lead away",
+    ),
+    (
+        lambda r, o: {"color": o["color"] * (1.0 + np.random.rand())},
+        r"renders differently after the same seed",
+    ),
     (shift_origins, r"changes its input"),
     (lambda r, o: {"color": o["color"].detach()}, r"no gradient leads from its colour to its parameters"),
     (lambda r, o: {n: o[n].detach() for n in ("position", "normal")}, r"no gradient leads from its hits"),
-    (lambda r, o: {"color": (o["color"] - o["color"].detach()).sqrt()}, r"a gradient of its parameters is not finite"),
+    (
+        lambda r, o: {"color": (o["color"] - o["color"].detach()).sqrt()},
+        r"a gradient of its parameters is not finite",
+    ),
     (recomputed, r"its normal carries a gradient under torch.no_grad"),
 ]
 

@@ -24,7 +24,8 @@ def thin_surface(background: str = "constant") -> VolSdfHost:
     """The sphere with a thin surface layer."""
     config = tiny_config()
     config = dataclasses.replace(
-        config, volume=dataclasses.replace(config.volume, beta_init=2e-3, initial_samples=64, rounds=4, samples=64)
+        config,
+        volume=dataclasses.replace(config.volume, beta_init=2e-3, initial_samples=64, rounds=4, samples=64),
     )
     return sphere_model(config, background=background).eval().host
 
@@ -67,7 +68,9 @@ def test_without_a_background_the_sphere_of_the_scene_closes_it(skip_empty):
     config = tiny_config()
     config = dataclasses.replace(config, volume=dataclasses.replace(config.volume, skip_empty=skip_empty))
     host = sphere_model(config, background="none").train().host
-    host.radiance_field.forward = lambda x, wo, normal, feature: x.norm(dim=-1, keepdim=True).expand(-1, 3)  # how far out
+    host.radiance_field.forward = lambda x, wo, normal, feature: x.norm(dim=-1, keepdim=True).expand(
+        -1, 3
+    )  # how far out
     rays = RayBatch(torch.tensor([[0.0, 1.2, -1.0], [0.0, 0.0, -3.0]]), torch.tensor([[0.0, 0.0, 1.0]] * 2))
     past, onto = host.render(rays).color[:, 0]
     assert past.item() == pytest.approx(config.volume.radius, abs=1e-3)
@@ -75,11 +78,13 @@ def test_without_a_background_the_sphere_of_the_scene_closes_it(skip_empty):
     assert host.render(rays).opacity[0] < 1e-3  # painted by R, but no surface of the object
 
 
-# ------------------------------------------------------------------------------------------------------- silhouettes
+# ------------------------------------------------------------------------------------------------ silhouettes
 
 
 def true_opacity(gap: Tensor, beta: float) -> Tensor:
-    """Opacity of rays that pass the middle of the sphere at a distance `gap`: the density summed over 40,000 steps, float64."""
+    """Opacity of rays that pass the middle of the sphere at a distance `gap`: the density summed over 40,000
+    steps, float64.
+    """
     along = torch.linspace(-1.7, 1.7, 40_001, dtype=torch.float64)
     distance = (gap.double()[:, None].square() + along.square()).sqrt() - RADIUS
     density = laplace_density(distance, torch.tensor(beta, dtype=torch.float64))
@@ -92,7 +97,9 @@ def true_opacity(gap: Tensor, beta: float) -> Tensor:
 )
 @pytest.mark.parametrize("training", [True, False])
 def test_the_opacity_of_rays_that_graze_a_sphere_is_true(name, beta, error, training):
-    """What is rendered, not what the sampler knows: rays that a thin layer covers in part, of a sphere that is exact."""
+    """What is rendered, not what the sampler knows: rays that a thin layer covers in part, of a sphere that
+    is exact.
+    """
     volume = dataclasses.replace(preset(name).volume, beta_init=beta)
     host = sphere_model(tiny_config(volume=volume)).train(training).host
     exact = lambda x: x.norm(dim=-1) - RADIUS  # noqa: E731
@@ -107,7 +114,9 @@ def test_the_opacity_of_rays_that_graze_a_sphere_is_true(name, beta, error, trai
     off = hits.opacity[partly] - expected[partly]
     assert off.square().mean().sqrt() < error
     depth = hits.position[partly, 2]
-    assert depth.abs().max() < 3.0 * (2.0 * RADIUS * beta) ** 0.5  # as far as the layer reaches along such a ray
+    assert (
+        depth.abs().max() < 3.0 * (2.0 * RADIUS * beta) ** 0.5
+    )  # as far as the layer reaches along such a ray
 
 
 def test_only_the_named_losses_are_computed(sharp):
@@ -117,12 +126,16 @@ def test_only_the_named_losses_are_computed(sharp):
 
 
 def test_regularisers_look_all_over_the_scene():
-    """On G = c · x the losses are known at any place, so what is averaged, and how often, shows where they look."""
+    """On G = c · x the losses are known at any place, so what is averaged, and how often, shows where they
+    look.
+    """
     config = tiny_config()
     config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, points="scene"))
     host, batch, asked = sphere_model(config).train().host, sphere_batch(16), []
     slope = torch.tensor([0.0, 0.0, 2.0])
-    host.sdf_field.with_gradient = lambda x: asked.append(x) or SdfSample(x @ slope, slope.expand_as(x), torch.zeros(len(x), 4))
+    host.sdf_field.with_gradient = lambda x: (
+        asked.append(x) or SdfSample(x @ slope, slope.expand_as(x), torch.zeros(len(x), 4))
+    )
     host.sdf_field.hessian = lambda x: asked.append(x) or torch.zeros(len(x), 3, 3)
     terms = host.render_regularised(batch, ["eikonal", "surface", "hessian"]).terms
     _, points, curved = asked
@@ -137,7 +150,9 @@ def test_regularisers_look_all_over_the_scene():
 
 @pytest.mark.parametrize("background", ["constant", "none"])
 def test_a_mask_removes_a_solid_that_stands_in_empty_space(background):
-    """No ray comes through, so opacity has no slope; the surface must give way all the same, and not by getting foggy."""
+    """No ray comes through, so opacity has no slope; the surface must give way all the same, and not by
+    getting foggy.
+    """
     host = thin_surface(background)
     batch = sphere_batch(32, spread=0.2)
     inside = 0.5 * batch.origins  # of the sphere that closes a scene without background
@@ -160,7 +175,9 @@ def test_a_mask_removes_a_solid_that_stands_in_empty_space(background):
 def test_a_cloud_on_the_surface_costs_little_and_one_off_it_its_distance():
     direction = normalize(torch.randn(64, 3), dim=-1)
     for radius, expected in ((RADIUS, 0.0), (RADIUS + 0.3, 0.3)):
-        host = VolSdfHost(tiny_config(), 3.0, "constant", points=OrientedPoints(radius * direction, direction))
+        host = VolSdfHost(
+            tiny_config(), 3.0, "constant", points=OrientedPoints(radius * direction, direction)
+        )
         term = host.render_regularised(sphere_batch(8), ["point_cloud"]).terms["point_cloud"]
         assert term.mean().item() == pytest.approx(expected, abs=0.15)  # the field starts as a rough sphere
 

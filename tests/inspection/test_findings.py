@@ -1,4 +1,6 @@
-"""Inspection: a good capture has no findings, and each thing that is broken on purpose is found, and nothing else."""
+"""Inspection: a good capture has no findings, and each thing that is broken on purpose is found, and nothing
+else.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ def change(path: Path, how: Callable[[np.ndarray], np.ndarray]) -> None:
 @pytest.fixture
 def capture(tmp_path: Path) -> Capture:
     """A copy of the scene of the demo, to break."""
-    shutil.copytree(SCENE, tmp_path / "scene", ignore=shutil.ignore_patterns("light", "ground_truths", "*_maps"))
+    shutil.copytree(
+        SCENE, tmp_path / "scene", ignore=shutil.ignore_patterns("light", "ground_truths", "*_maps")
+    )
     return load_capture(tmp_path / "scene")
 
 
@@ -70,7 +74,9 @@ def test_an_exposure_jump(capture: Capture, stops: float) -> None:
 @pytest.mark.parametrize("kind", ["motion", "focus"])
 def test_a_blurred_view(capture: Capture, kind: str) -> None:
     view = capture.views[VICTIM]
-    kernel = np.full((1, 7), 1 / 7) if kind == "motion" else np.outer(*2 * (cv2.getGaussianKernel(9, 1.5)[:, 0],))
+    kernel = (
+        np.full((1, 7), 1 / 7) if kind == "motion" else np.outer(*2 * (cv2.getGaussianKernel(9, 1.5)[:, 0],))
+    )
     change(view.image, lambda pixels: cv2.filter2D(pixels, -1, kernel, borderType=cv2.BORDER_REPLICATE))
     assert found(capture) == {"blurred": (view.name,)}
 
@@ -78,7 +84,10 @@ def test_a_blurred_view(capture: Capture, kind: str) -> None:
 def test_a_duplicate(capture: Capture) -> None:
     first, second = capture.views[3], capture.views[9]
     noise = np.random.default_rng(0)
-    change(second.image, lambda _: radiance(first.image) * noise.normal(1, 0.01, radiance(first.image).shape).clip(0))
+    change(
+        second.image,
+        lambda _: radiance(first.image) * noise.normal(1, 0.01, radiance(first.image).shape).clip(0),
+    )
     assert found(capture) == {"duplicate": (second.name,)}
 
 
@@ -125,7 +134,10 @@ def test_display_values_in_linear_files(capture: Capture) -> None:
 
 def test_broken_pixels_need_a_mark(capture: Capture) -> None:
     view = capture.views[VICTIM]
-    change(view.image, lambda pixels: np.where(np.indices(pixels.shape[:2]).sum(0)[..., None] < 5, np.nan, pixels))
+    change(
+        view.image,
+        lambda pixels: np.where(np.indices(pixels.shape[:2]).sum(0)[..., None] < 5, np.nan, pixels),
+    )
     assert found(capture) == {"broken_pixels": (view.name,)}
 
 
@@ -142,7 +154,10 @@ def test_black_views(capture: Capture) -> None:
 
 def test_too_few_views_from_one_side(capture: Capture) -> None:
     assert set(found(replace(capture, views=capture.views[:2]))) == {"few_views"}
-    near = sorted(capture.views, key=lambda view: np.linalg.norm(view.camera.c2w[:, 3] - capture.views[0].camera.c2w[:, 3]))
+    near = sorted(
+        capture.views,
+        key=lambda view: np.linalg.norm(view.camera.c2w[:, 3] - capture.views[0].camera.c2w[:, 3]),
+    )
     kinds = set(found(replace(capture, views=tuple(near[:4]))))
     assert {"few_views", "coverage"} <= kinds
 
@@ -151,7 +166,9 @@ def test_scale(capture: Capture) -> None:
     rng = np.random.default_rng(0)
     normal = rng.normal(size=(500, 3))
     for size, severity in ((2.0, "problem"), (0.05, "warning")):
-        points = np.array(capture.normalisation.centre) + capture.normalisation.scale * size * rng.uniform(-1, 1, (500, 3))
+        points = np.array(capture.normalisation.centre) + capture.normalisation.scale * size * rng.uniform(
+            -1, 1, (500, 3)
+        )
         write_ply(capture.root / "cloud.ply", points, normal)
         findings = inspect_capture(replace(capture, point_cloud=capture.root / "cloud.ply")).findings
         assert [(finding.kind, finding.severity) for finding in findings] == [("scale", severity)]
@@ -170,7 +187,7 @@ def test_display_values(tmp_path: Path) -> None:
         assert figures.clipped == pytest.approx((pixels[mask] == 255).any(-1).mean())
 
 
-# ----------------------------------------------------------------------------------------------------------- the command
+# ------------------------------------------------------------------------------------------------ the command
 
 
 def test_the_command_says_it_and_writes_it(capture: Capture, tmp_path: Path, capfd) -> None:
@@ -178,7 +195,9 @@ def test_the_command_says_it_and_writes_it(capture: Capture, tmp_path: Path, cap
     change(view.image, lambda pixels: 4 * pixels)
     assert main(["inspect", str(capture.root), "--out", str(tmp_path / "out")]) == 0
     said = capfd.readouterr().out
-    assert re.search(rf"problem: brighter or darker than the views around them: {view.name} ×(3\.[5-9]|4)", said)
+    assert re.search(
+        rf"problem: brighter or darker than the views around them: {view.name} ×(3\.[5-9]|4)", said
+    )
     assert "radiance: poor" in said
     written = json.loads((tmp_path / "out" / "inspect.json").read_text())
     assert [(f["kind"], f["views"]) for f in written["findings"]] == [("exposure_jump", [view.name])]

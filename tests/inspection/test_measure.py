@@ -16,7 +16,9 @@ from neilfpp_method.inspection.measure import ViewFigures, measure
 from tests.data.make_capture import make_capture
 
 HEIGHT, WIDTH = 60, 80
-NOISE = cv2.GaussianBlur(np.random.default_rng(0).uniform(0.05, 1, (HEIGHT, WIDTH, 3)), (0, 0), 1.0).astype(np.float32)
+NOISE = cv2.GaussianBlur(np.random.default_rng(0).uniform(0.05, 1, (HEIGHT, WIDTH, 3)), (0, 0), 1.0).astype(
+    np.float32
+)
 
 
 @pytest.fixture
@@ -53,7 +55,8 @@ def test_luminance_moves_with_the_exposure_and_hardly_with_what_is_in_view(view:
         pixels[:bright_rows] *= 4.0
         return figures(view, pixels).luminance
 
-    # A little more than half of it sky, or a little less: what a step to the side does to a view without a mask.
+    # A little more than half of it sky, or a little less: what a step to the side does to a view without a
+    # mask.
     assert seen(32) / seen(28) == pytest.approx(1.0, abs=0.15)
     assert seen(32, exposure=2.0) / seen(32) == pytest.approx(2.0, rel=1e-3)
 

@@ -43,7 +43,9 @@ def test_duplicates_survive_compression_size_and_brightness() -> None:
     flat = [cv2.GaussianBlur(rng.uniform(0, 1, (90, 120, 3)).astype(np.float32), (0, 0), 6) for _ in range(4)]
     pictures = [cv2.normalize(picture, None, 0, 1, cv2.NORM_MINMAX) for picture in flat]
     small = cv2.resize(pictures[2], (60, 45), interpolation=cv2.INTER_AREA)
-    rough = (np.rint(pictures[1] * 255 + rng.normal(0, 2, pictures[1].shape)) / 255).clip(0).astype(np.float32)
+    rough = (
+        (np.rint(pictures[1] * 255 + rng.normal(0, 2, pictures[1].shape)) / 255).clip(0).astype(np.float32)
+    )
     shifted = np.roll(pictures[0], 6, axis=1)
     black = np.zeros_like(small)
     assert duplicates([*pictures, 0.5 * small, rough, shifted, black, black]) == ((1, 5), (2, 4))
@@ -55,7 +57,9 @@ def test_where_cameras_stand(tmp_path: Path) -> None:
     assert not where.away.any()
     assert not where.within.any()
     assert np.allclose(np.linalg.norm(where.centres, axis=1), DISTANCE / SCALE)
-    assert np.allclose(where.axes, -where.centres / np.linalg.norm(where.centres, axis=1, keepdims=True), atol=1e-9)
+    assert np.allclose(
+        where.axes, -where.centres / np.linalg.norm(where.centres, axis=1, keepdims=True), atol=1e-9
+    )
     one = stand(replace(capture, views=capture.views[:1]))
     cap = (1 - np.cos(np.radians(30))) / 2  # the share of the sphere within 30° of a direction
     assert one.coverage == pytest.approx(cap, abs=2e-3)

@@ -1,4 +1,6 @@
-"""Backends against the reference where the transcription does not reach: gradients, odd inputs, threads, and the choice."""
+"""Backends against the reference where the transcription does not reach: gradients, odd inputs, threads, and
+the choice.
+"""
 
 from __future__ import annotations
 
@@ -34,10 +36,14 @@ def table(seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:
 
 def scattered(count: int, seed: int = 1) -> torch.Tensor:
     """Points in the cube and a little around it."""
-    return 1.2 * torch.rand(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) - 0.1
+    return (
+        1.2 * torch.rand(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) - 0.1
+    )
 
 
-def everything(x: torch.Tensor, table: torch.Tensor, backend: str, jacobian: bool = True) -> list[torch.Tensor]:
+def everything(
+    x: torch.Tensor, table: torch.Tensor, backend: str, jacobian: bool = True
+) -> list[torch.Tensor]:
     """Features, Jacobian, and the gradients of a loss that weighs both at random."""
     x, table = x.clone().requires_grad_(), table.clone().requires_grad_()
     encoded = encode(x, table, dataclasses.replace(SPEC, backend=backend), jacobian)
@@ -55,7 +61,7 @@ def assert_agree(x: torch.Tensor, jacobian: bool = True) -> None:
         torch.testing.assert_close(got, expected, rtol=1e-10, atol=1e-10)
 
 
-# -------------------------------------------------------------------------------------------------- equal to the reference
+# ------------------------------------------------------------------------------------- equal to the reference
 
 
 @pytest.mark.parametrize("count", [0, 1, 128, 130])
@@ -70,7 +76,9 @@ def test_points_on_faces_edges_corners_and_vertices():
 
 
 def test_points_far_outside():
-    far = torch.tensor([[1e30, 0.5, 0.5], [-1e30, 2.0, -7.0], [torch.inf, 0.2, -torch.inf]], dtype=torch.float64)
+    far = torch.tensor(
+        [[1e30, 0.5, 0.5], [-1e30, 2.0, -7.0], [torch.inf, 0.2, -torch.inf]], dtype=torch.float64
+    )
     got, expected = everything(far, table(), BACKEND), everything(far, table(), "reference")
     torch.testing.assert_close(got, expected, equal_nan=True)
 
@@ -92,7 +100,9 @@ def test_any_grid(levels, features, log2_entries, base, growth, seed):
     spec = grid_spec(levels, log2_entries, base * growth, base, features, BACKEND)
     x, generator = scattered(40, seed), torch.Generator().manual_seed(seed)
     rows = torch.randn(spec.entries, features, dtype=torch.float64, generator=generator)
-    got, expected = (encode(x, rows, dataclasses.replace(spec, backend=name), True) for name in (BACKEND, "reference"))
+    got, expected = (
+        encode(x, rows, dataclasses.replace(spec, backend=name), True) for name in (BACKEND, "reference")
+    )
     torch.testing.assert_close(got.features, expected.features, atol=1e-10, rtol=1e-10)
     torch.testing.assert_close(got.jacobian, expected.jacobian, atol=1e-8, rtol=1e-8)
 
@@ -100,7 +110,9 @@ def test_any_grid(levels, features, log2_entries, base, growth, seed):
 def test_float32_gradients():
     x = scattered(200).float()
     for got, expected in zip(
-        everything(x, table(dtype=torch.float32), BACKEND), everything(x, table(dtype=torch.float32), "reference"), strict=True
+        everything(x, table(dtype=torch.float32), BACKEND),
+        everything(x, table(dtype=torch.float32), "reference"),
+        strict=True,
     ):
         torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-3 * expected.abs().max().item())
 
@@ -127,12 +139,14 @@ def test_only_what_is_asked_for_gets_a_gradient():
     x, rows = scattered(5), table().requires_grad_()
     encode(x, rows, SPEC, True).jacobian.square().sum().backward()  # the features take no part in the loss
     expected = table().requires_grad_()
-    encode(x, expected, dataclasses.replace(SPEC, backend="reference"), True).jacobian.square().sum().backward()
+    encode(
+        x, expected, dataclasses.replace(SPEC, backend="reference"), True
+    ).jacobian.square().sum().backward()
     torch.testing.assert_close(rows.grad, expected.grad, rtol=1e-9, atol=1e-9)
     assert x.grad is None
 
 
-# ------------------------------------------------------------------------------------------------------- higher orders
+# ---------------------------------------------------------------------------------------------- higher orders
 
 
 def test_the_second_derivative_of_a_second_derivative():
@@ -149,7 +163,7 @@ def test_the_second_derivative_of_a_second_derivative():
         torch.testing.assert_close(got, expected, rtol=1e-8, atol=1e-8 * expected.abs().max().item())
 
 
-# ------------------------------------------------------------------------------------------------------------- threads
+# ---------------------------------------------------------------------------------------------------- threads
 
 
 @pytest.fixture
@@ -174,7 +188,9 @@ def test_threads_that_call_at_once(threads):
     threads(2)
     x, rows, found = scattered(5000), table(), {}
     expected = everything(x, rows, BACKEND)
-    callers = [threading.Thread(target=lambda n=n: found.update({n: everything(x, rows, BACKEND)})) for n in range(3)]
+    callers = [
+        threading.Thread(target=lambda n=n: found.update({n: everything(x, rows, BACKEND)})) for n in range(3)
+    ]
     for caller in callers:
         caller.start()
     for caller in callers:
@@ -213,13 +229,15 @@ def test_threads_after_a_fork():
     queue = context.Queue()
     child = context.Process(target=mark, args=(queue,))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # later Pythons advise against what this test is about
+        warnings.simplefilter(
+            "ignore", DeprecationWarning
+        )  # later Pythons advise against what this test is about
         child.start()
     assert queue.get(timeout=30) == [0, 1, 2]
     child.join()
 
 
-# ------------------------------------------------------------------------------------------------------------ the choice
+# ------------------------------------------------------------------------------------------------- the choice
 
 
 @pytest.fixture(autouse=True)
@@ -280,4 +298,6 @@ from neilfpp_method.kernels import compiled
 assert compiled._corners.stats.cache_path is None
 """
     root = Path(__file__).parents[2]
-    subprocess.run([sys.executable, "-c", script], check=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(root)})
+    subprocess.run(
+        [sys.executable, "-c", script], check=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(root)}
+    )

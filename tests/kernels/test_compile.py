@@ -1,6 +1,7 @@
 """A compiler of whole steps goes around the loops that are compiled already.
 
-In a process of its own: the checkers of types that tests run with are themselves more than torch.compile looks into.
+In a process of its own: the checkers of types that tests run with are themselves more than torch.compile
+looks into.
 """
 
 from __future__ import annotations

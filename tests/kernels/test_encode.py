@@ -1,6 +1,7 @@
 """Every backend of the hash grid, against a transcription that visits one vertex at a time.
 
-Triton's interpreter has to be chosen before Triton is imported: `test_triton.py` runs this file once more, with it.
+Triton's interpreter has to be chosen before Triton is imported: `test_triton.py` runs this file once more,
+with it.
 """
 
 from __future__ import annotations
@@ -71,25 +72,36 @@ def test_layout_of_the_levels():
 
 
 def test_features_agree_with_the_transcription(small):
-    x = torch.cat((points(20), torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.5, 1.0, 0.0]], dtype=torch.float64)))
+    x = torch.cat(
+        (points(20), torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.5, 1.0, 0.0]], dtype=torch.float64))
+    )
     expected = np.stack([one_by_one(p, small_table().numpy()) for p in x.numpy()])
     for jacobian in (False, True):
-        np.testing.assert_allclose(encode(x, small_table(), small, jacobian).features.numpy(), expected, atol=1e-12)
+        np.testing.assert_allclose(
+            encode(x, small_table(), small, jacobian).features.numpy(), expected, atol=1e-12
+        )
 
 
 def test_jacobian_agrees_with_differences_of_the_transcription(small):
     x, table, h = points(10), small_table().numpy(), 1e-6
     steps = h * np.eye(3)
     expected = np.stack(
-        [np.stack([(one_by_one(p + s, table) - one_by_one(p - s, table)) / (2 * h) for s in steps], -1) for p in x.numpy()]
+        [
+            np.stack([(one_by_one(p + s, table) - one_by_one(p - s, table)) / (2 * h) for s in steps], -1)
+            for p in x.numpy()
+        ]
     )
     jacobian = encode(x, small_table(), small, jacobian=True).jacobian
     np.testing.assert_allclose(jacobian.numpy(), expected, atol=1e-7)
 
 
 def test_hash_of_a_fine_level_does_not_overflow(backend):
-    """Vertex numbers of 4096 times the primes leave int32; only their low bits count, and those must be right."""
-    spec = grid_spec(levels=1, features=1, log2_entries=10, base_resolution=4096, max_resolution=4096, backend=backend)
+    """Vertex numbers of 4096 times the primes leave int32; only their low bits count, and those must be
+    right.
+    """
+    spec = grid_spec(
+        levels=1, features=1, log2_entries=10, base_resolution=4096, max_resolution=4096, backend=backend
+    )
     table = torch.arange(1024, dtype=torch.float64)[:, None]
     vertices = torch.tensor([[4000, 3999, 3998], [17, 4096, 1]])
     expected = [(i ^ (j * PRIMES[1]) ^ (k * PRIMES[2])) % 1024 for i, j, k in vertices.tolist()]
@@ -143,7 +155,9 @@ def test_float32_and_bfloat16_follow_float64(small):
         assert (got.jacobian.double() - exact.jacobian).abs().max() < 9 * tolerance
 
 
-@pytest.mark.parametrize("wrong", [{"levels": 0}, {"base_resolution": 64, "max_resolution": 32}, {"log2_entries": 31}])
+@pytest.mark.parametrize(
+    "wrong", [{"levels": 0}, {"base_resolution": 64, "max_resolution": 32}, {"log2_entries": 31}]
+)
 def test_a_grid_that_cannot_be_is_refused(wrong):
     with pytest.raises(UserError, match="no hash grid has"):
         grid_spec(**({"levels": 4, "log2_entries": 10, "max_resolution": 64} | wrong))

@@ -46,13 +46,17 @@ def test_gradients_of_first_and_second_order_agree_with_float64(sharpness):
 
     z = 0.5 * torch.randn(999, generator=torch.Generator().manual_seed(0)) / sharpness
     for ours, expected in zip(orders(z.clone()), orders(z.double()), strict=True):
-        torch.testing.assert_close(ours.double(), expected, rtol=1e-4, atol=2e-6 * expected.abs().max().item())
+        torch.testing.assert_close(
+            ours.double(), expected, rtol=1e-4, atol=2e-6 * expected.abs().max().item()
+        )
 
 
 def test_the_gradient_of_the_value_alone():
     z = numbers().requires_grad_()
     softplus(z, 100.0).sum().backward()
-    torch.testing.assert_close(z.grad.double(), torch.sigmoid(100.0 * z.detach().double()), rtol=0.0, atol=1.5e-7)
+    torch.testing.assert_close(
+        z.grad.double(), torch.sigmoid(100.0 * z.detach().double()), rtol=0.0, atol=1.5e-7
+    )
 
 
 def test_what_is_no_number_stays_none():
@@ -75,7 +79,9 @@ def test_any_shape(shape):
 
 def test_any_order_in_memory():
     z = torch.randn(6, 4).t()
-    torch.testing.assert_close(softplus_and_slope(z, 10.0).value.double(), exact(z, 10.0), rtol=1e-6, atol=1e-7)
+    torch.testing.assert_close(
+        softplus_and_slope(z, 10.0).value.double(), exact(z, 10.0), rtol=1e-6, atol=1e-7
+    )
 
 
 def test_several_threads_compute_the_same():

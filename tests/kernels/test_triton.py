@@ -28,7 +28,12 @@ for number in ("fp32", "fp64"):
 
 def python(*arguments: str, **environment: str) -> str:
     done = subprocess.run(
-        [sys.executable, *arguments], cwd=ROOT, env={**os.environ, **environment}, capture_output=True, text=True, check=False
+        [sys.executable, *arguments],
+        cwd=ROOT,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -37,12 +42,16 @@ def python(*arguments: str, **environment: str) -> str:
 @pytest.mark.skipif(os.environ.get("TRITON_INTERPRET") == "1", reason="this is the inner run")
 def test_the_tests_of_every_backend_hold_in_the_interpreter():
     here = Path(__file__).parent.relative_to(ROOT)
-    told = python("-m", "pytest", "-x", "-p", "no:cacheprovider", str(here), TRITON_INTERPRET="1", OMP_NUM_THREADS="1")
+    told = python(
+        "-m", "pytest", "-x", "-p", "no:cacheprovider", str(here), TRITON_INTERPRET="1", OMP_NUM_THREADS="1"
+    )
     assert "passed" in told
     assert "failed" not in told
 
 
-@pytest.mark.skipif(sys.platform != "linux" or os.environ.get("TRITON_INTERPRET") == "1", reason="needs Triton's compiler")
+@pytest.mark.skipif(
+    sys.platform != "linux" or os.environ.get("TRITON_INTERPRET") == "1", reason="needs Triton's compiler"
+)
 def test_the_kernels_compile_for_a_gpu(tmp_path):
     sizes = python("-c", COMPILE, TRITON_CACHE_DIR=str(tmp_path), TRITON_INTERPRET="0").split()
     assert len(sizes) == 6

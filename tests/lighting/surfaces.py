@@ -9,7 +9,9 @@ from neilfpp_method.structures import Material, Observed, SceneLight
 
 
 def half_room(x: torch.Tensor, wi: torch.Tensor) -> SceneLight:
-    """A scene: wherever one looks down there is a wall 2 away that sends out radiance 0.7; above there is nothing."""
+    """A scene: wherever one looks down there is a wall 2 away that sends out radiance 0.7; above there is
+    nothing.
+    """
     below = wi[..., 2] < 0
     distance = torch.where(below, 2.0, torch.inf)
     return SceneLight(below, below[..., None] * torch.full_like(wi, 0.7), distance)
@@ -33,7 +35,9 @@ def material(count: int, seed: int = 1) -> Material:
 
 
 def patches(position: torch.Tensor) -> Material:
-    """Roughness and metallic as of `material`, and a base colour for each octant about the middle of the points."""
+    """Roughness and metallic as of `material`, and a base colour for each octant about the middle of the
+    points.
+    """
     speckled = material(len(position))
     octant = ((position > position.mean(0)) * torch.tensor([1, 2, 4])).sum(-1)
     return Material(speckled.base_color[octant], speckled.roughness, speckled.metallic)

@@ -1,4 +1,6 @@
-"""Solving for the environment map, against closed forms, the Monte-Carlo estimator and maps that are known."""
+"""Solving for the environment map, against closed forms, the Monte-Carlo estimator and maps that are
+known.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,9 @@ def test_transport_agrees_with_the_estimator_under_a_map_and_a_wall():
 def test_transport_knows_its_slopes_in_sources_and_strength():
     torch.manual_seed(0)
     of = Material(*(value.double() for value in (torch.rand(4, 3), torch.rand(4, 1), torch.rand(4, 1))))
-    sources, scene, strength = (torch.rand(*shape, dtype=torch.float64) for shape in ((3, 4, 5), (3, 4, 3), (5, 3)))
+    sources, scene, strength = (
+        torch.rand(*shape, dtype=torch.float64) for shape in ((3, 4, 5), (3, 4, 3), (5, 3))
+    )
     unknowns = (sources.requires_grad_(), strength.requires_grad_())
     torch.autograd.gradcheck(lambda a, b: Transport(a, scene).outgoing(of, b), unknowns)
 
@@ -86,8 +90,9 @@ def lamp(height: int) -> EnvironmentLight:
     ids=["known", "even", "uneven"],
 )
 def test_a_lamp_is_found_where_it_is_and_as_bright_beside_the_sky_as_it_is(tint, made_of, evenness, steps):
-    """All the same where the base colour is wrong by one factor, which light and base colour share; and, as fits follow
-    each other, where every point has a colour of its own."""
+    """All the same where the base colour is wrong by one factor, which light and base colour share; and, as
+    fits follow each other, where every point has a colour of its own.
+    """
     torch.manual_seed(0)
     seen = points(600)
     of = material(600) if made_of == "speckles" else patches(seen.position)
@@ -105,7 +110,8 @@ def test_a_lamp_is_found_where_it_is_and_as_bright_beside_the_sky_as_it_is(tint,
     row, column = divmod(int(green.argmax()), 48)
     assert abs(row - 8) <= 1
     assert abs(column - 20) <= 1
-    # The power around the lamp, over which one texel may share with the next, in units of the sky far from it.
+    # The power around the lamp, over which one texel may share with the next, in units of the sky far from
+    # it.
     sky = green[:, 30:].median()
     power = (green[6:11, 18:23] - sky).exp().sum().item()
     assert power == pytest.approx((true.log_radiance[1, 6:11, 18:23].exp() / 0.3).sum().item(), rel=0.25)
@@ -127,7 +133,9 @@ def test_where_no_point_looks_the_map_takes_after_its_surroundings():
 
 
 def test_what_a_few_points_see_alone_is_no_sun():
-    """All is under an even sky, but twelve mirrors in three hundred points look down, one way, and are brighter than it."""
+    """All is under an even sky, but twelve mirrors in three hundred points look down, one way, and are
+    brighter than it.
+    """
     torch.manual_seed(0)
     seen = points(300)
     up = normalize(seen.normal * torch.tensor([0.2, 0.2, 0.0]) + torch.tensor([0.0, 0.0, 1.0]), dim=-1)
@@ -161,7 +169,9 @@ def test_what_is_chosen_stays_in_doubt_and_nothing_is_chosen_in_doubt(gain, devi
 
 
 def test_a_base_colour_is_as_uneven_as_its_steps_are_high():
-    """Points along a line, whose neighbours are the two on either side: one step of ln 2 is crossed by 6 of 40 pairs."""
+    """Points along a line, whose neighbours are the two on either side: one step of ln 2 is crossed by 6 of
+    40 pairs.
+    """
     position = torch.arange(10.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
     nearest = nearest_points(position)
     assert sorted(nearest[5].tolist()) == [3, 4, 6, 7]
@@ -175,7 +185,9 @@ def test_total_variation_counts_every_step_once_and_closes_the_map():
     """One column of 1 in a map of 0: it steps up and down in each of its four rows, of 32 texels."""
     values = torch.zeros(1, 4, 8)
     values[0, :, 7] = 1.0
-    assert total_variation(values).item() == pytest.approx(2 * 4 / 32, abs=0.02)  # the rounding near 0 adds 0.01 a step
+    assert total_variation(values).item() == pytest.approx(
+        2 * 4 / 32, abs=0.02
+    )  # the rounding near 0 adds 0.01 a step
 
 
 def test_a_map_without_a_finite_answer_stays_as_it_was():

@@ -30,7 +30,9 @@ def model(**changes) -> NeilfModel:
     off = dataclasses.replace(tiny_config().inter_reflection, mode="off")
     # A layer as soft as the sphere's at the start has little of its weight in one place.
     soft = dataclasses.replace(tiny_config().shading, hit_share=0.5)
-    return sphere_model(tiny_config(train=dataclasses.replace(QUARTER, **changes), inter_reflection=off, shading=soft))
+    return sphere_model(
+        tiny_config(train=dataclasses.replace(QUARTER, **changes), inter_reflection=off, shading=soft)
+    )
 
 
 def filled(**changes) -> NeilfModel:

@@ -23,7 +23,9 @@ RADIUS = 0.06
 EVENNESS = LightFitConfig().evenness
 """Where base colour is not known. With a weight of 0 it is known, up to a factor."""
 TRUE = FoundLamps(
-    LampPlaces(torch.tensor([[0.5, -0.3, 0.6], [-0.6, 0.4, 0.5]]), torch.tensor([[0.0, 0.0, 0.0], [0.6, 0.0, -0.8]])),
+    LampPlaces(
+        torch.tensor([[0.5, -0.3, 0.6], [-0.6, 0.4, 0.5]]), torch.tensor([[0.0, 0.0, 0.0], [0.6, 0.0, -0.8]])
+    ),
     torch.tensor([[1.0, 0.8, 0.5], [0.4, 0.5, 0.7]]),
 )
 WHITE = Material(torch.ones(600, 3), torch.ones(600, 1), torch.zeros(600, 1))
@@ -44,7 +46,9 @@ def photographed(lamps: FoundLamps, speckled: bool) -> tuple[Observed, Material,
 def settled(start: FoundLamps, true: FoundLamps, evenness: float) -> FoundLamps:
     seen, of, beside = photographed(true, speckled=evenness == 0)
     objective = Objective("linear", seen.pixel.median().item(), LightFitConfig(evenness=evenness))
-    return settle_lamps(start, RADIUS, beside, seen, Target(seen.position, of, seen.pixel), GGX, None, objective)
+    return settle_lamps(
+        start, RADIUS, beside, seen, Target(seen.position, of, seen.pixel), GGX, None, objective
+    )
 
 
 def test_derivatives_by_place_and_axis():
@@ -71,10 +75,14 @@ def test_a_wall_hides_a_lamp():
 
 @pytest.mark.parametrize(("evenness", "as_tinted"), [(0.0, 0.03), (EVENNESS, 0.06)])
 def test_a_lamp_in_pieces_becomes_one_where_it_is(evenness, as_tinted):
-    """Where base colour is not known, light near white is likelier: a little of the lamp's tint goes to the surfaces."""
+    """Where base colour is not known, light near white is likelier: a little of the lamp's tint goes to the
+    surfaces.
+    """
     true = FoundLamps(TRUE.places[:1], TRUE.intensity[:1])
     offsets = torch.tensor([[0.12, 0.0, 0.05], [-0.1, 0.15, 0.0], [0.0, -0.2, -0.15], [0.3, 0.3, 0.3]])
-    pieces = FoundLamps(LampPlaces(true.places.position + offsets, torch.zeros(4, 3)), 0.4 * true.intensity.expand(4, 3))
+    pieces = FoundLamps(
+        LampPlaces(true.places.position + offsets, torch.zeros(4, 3)), 0.4 * true.intensity.expand(4, 3)
+    )
     found = settled(pieces, true, evenness)
     assert len(found.intensity) == 1
     torch.testing.assert_close(found.places.position, true.places.position, rtol=0, atol=0.01)
@@ -98,21 +106,30 @@ def test_two_lamps_stay_two_and_come_to_where_they_are(evenness):
     torch.testing.assert_close(found.intensity, TRUE.intensity, rtol=0.1, atol=0)
 
 
-@pytest.mark.parametrize("start", [torch.zeros(3), torch.tensor([0.6, 0.0, -0.8])], ids=["from a bulb", "from a panel"])
+@pytest.mark.parametrize(
+    "start", [torch.zeros(3), torch.tensor([0.6, 0.0, -0.8])], ids=["from a bulb", "from a panel"]
+)
 @pytest.mark.parametrize("number", [0, 1], ids=["a bulb", "a panel"])
 def test_a_lamp_is_of_the_kind_that_explains_the_points(number, start):
     row = slice(number, number + 1)
     true = FoundLamps(TRUE.places[row], TRUE.intensity[row])
-    found = settled(FoundLamps(LampPlaces(true.places.position + 0.05, start[None]), true.intensity), true, EVENNESS)
+    found = settled(
+        FoundLamps(LampPlaces(true.places.position + 0.05, start[None]), true.intensity), true, EVENNESS
+    )
     assert found.places.axis.any() == true.places.axis.any()
     torch.testing.assert_close(found.places.axis, true.places.axis, rtol=0, atol=0.1)
 
 
 @pytest.mark.parametrize(("evenness", "within"), [(EVENNESS, 0.07), (0.0, math.inf)])
 def test_a_lamp_is_not_held_by_base_colours_that_were_learned_under_it_elsewhere(evenness, within):
-    """Nothing speaks against the lamp in the wrong place but that the surfaces then have its glow painted on them."""
+    """Nothing speaks against the lamp in the wrong place but that the surfaces then have its glow painted on
+    them.
+    """
     true = FoundLamps(TRUE.places[:1], TRUE.intensity[:1])
-    astray = FoundLamps(LampPlaces(true.places.position + torch.tensor([[0.15, 0.1, -0.1]]), torch.zeros(1, 3)), true.intensity)
+    astray = FoundLamps(
+        LampPlaces(true.places.position + torch.tensor([[0.15, 0.1, -0.1]]), torch.zeros(1, 3)),
+        true.intensity,
+    )
     seen = points(600)
     seen = dataclasses.replace(seen, position=4 * seen.position)
     of = patches(seen.position)
@@ -129,7 +146,9 @@ def test_a_lamp_is_not_held_by_base_colours_that_were_learned_under_it_elsewhere
     torch.testing.assert_close(under_astray.outgoing(learned, astray.intensity), pixel)
 
     objective = Objective("linear", pixel.median().item(), LightFitConfig(evenness=evenness))
-    found = settle_lamps(astray, RADIUS, even, seen, Target(seen.position, learned, pixel), None, None, objective)
+    found = settle_lamps(
+        astray, RADIUS, even, seen, Target(seen.position, learned, pixel), None, None, objective
+    )
     off = (found.places.position - true.places.position).norm(dim=-1).min()
     assert off < within
     assert evenness > 0 or off > 0.15

@@ -50,7 +50,9 @@ def photographed(lamp: LampPlaces | None, speckled: bool = False) -> tuple[Obser
     seen = table(800)
     of = material(800) if speckled else patches(seen.position)
     sky = EnvironmentLight(12, 0.5)
-    image = from_texels(sky, seen, of.roughness, GGX, None).outgoing(of, sky.log_radiance.exp().flatten(1).t())
+    image = from_texels(sky, seen, of.roughness, GGX, None).outgoing(
+        of, sky.log_radiance.exp().flatten(1).t()
+    )
     if lamp is not None:
         carried = from_lamps(lamp, 0.06, seen, of.roughness, GGX, None)
         image = image + carried.outgoing(of, torch.tensor([[0.9, 0.7, 0.4]]))
@@ -70,7 +72,9 @@ def solve(
     return solve_light(LightModel(environment, lamps), seen, of, GGX, None, objective, config, first)
 
 
-def solved(seen: Observed, of: Material, rounds: int, config: MapLightConfig = CONFIG) -> tuple[Lamps, object]:
+def solved(
+    seen: Observed, of: Material, rounds: int, config: MapLightConfig = CONFIG
+) -> tuple[Lamps, object]:
     torch.manual_seed(0)
     environment, lamps = EnvironmentLight(12, 0.7), Lamps(4, 0.06)
     for number in range(rounds):
@@ -82,7 +86,9 @@ def solved(seen: Observed, of: Material, rounds: int, config: MapLightConfig = C
 @pytest.mark.parametrize("true", [BULB, PANEL], ids=["bulb", "panel"])
 @pytest.mark.parametrize("known", [True, False])
 def test_a_lamp_is_found_where_it_is_as_strong_and_which_way_it_shines(true, known):
-    """Base colours that are known may be as uneven as they like; those that are not are even but for edges."""
+    """Base colours that are known may be as uneven as they like; those that are not are even but for
+    edges.
+    """
     lamps, _ = solved(*photographed(true, speckled=known), rounds=3, config=KNOWN if known else CONFIG)
     assert lamps.lit
     strongest = int(lamps.intensity.sum(-1).argmax())
@@ -170,7 +176,9 @@ def test_under_a_known_sky_alone_no_lamp_is_lit():
 
 @pytest.mark.parametrize("count", [1, 3, 5])
 def test_hardly_any_points_speak_for_no_lamp(count):
-    """Of a few points none or one is kept back: evidence that JSON can hold, and nothing that is not finite."""
+    """Of a few points none or one is kept back: evidence that JSON can hold, and nothing that is not
+    finite.
+    """
     seen, of = photographed(None)
     few = torch.arange(count)
     lamps, evidence = solved(seen[few], of[few], rounds=1)

@@ -62,5 +62,9 @@ def test_no_second_sqlite_touches_the_database():
     """Two SQLite libraries in one process do not see each other's locks; COLMAP then dies of a bus error."""
     for path in Path(prepare.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [getattr(node, "module", "")]
+            names = (
+                [alias.name for alias in node.names]
+                if isinstance(node, ast.Import)
+                else [getattr(node, "module", "")]
+            )
             assert "sqlite3" not in names, path

@@ -49,7 +49,7 @@ def own(photos: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(photos, tmp_path / "photos"))
 
 
-# --------------------------------------------------------------------------------------------------------- the good way
+# ----------------------------------------------------------------------------------------------- the good way
 
 
 def to_truth(capture, poses: dict[str, np.ndarray]):
@@ -57,7 +57,9 @@ def to_truth(capture, poses: dict[str, np.ndarray]):
     true = np.stack([-poses[view.name][:3, :3].T @ poses[view.name][:3, 3] for view in capture.views])
     scale, rotation, shift = alignment(found, true)
     centres = np.linalg.norm(scale * found @ rotation.T + shift - true, axis=1)
-    rotations = [angle(view.camera.w2c[:3, :3] @ rotation.T, poses[view.name][:3, :3]) for view in capture.views]
+    rotations = [
+        angle(view.camera.w2c[:3, :3] @ rotation.T, poses[view.name][:3, :3]) for view in capture.views
+    ]
     return scale, rotation, shift, centres.max(), max(rotations)
 
 
@@ -92,7 +94,9 @@ def test_the_points_lie_on_the_planes_with_their_normals(prepared):
     distance = np.abs(position)
     assert np.median(distance.min(axis=1)) < 0.005
     assert np.quantile(distance.min(axis=1), 0.9) < 0.01
-    facing = np.take_along_axis(normal, distance.argmin(axis=1)[:, None], axis=1)  # the planes' normals are +x, +y, +z
+    facing = np.take_along_axis(
+        normal, distance.argmin(axis=1)[:, None], axis=1
+    )  # the planes' normals are +x, +y, +z
     assert np.median(facing) > np.cos(np.radians(3))
     assert (facing > 0.8).mean() > 0.95
 
@@ -129,7 +133,10 @@ def test_a_stopped_command_says_how_it_continues_and_does(photos, tmp_path, monk
     with monkeypatch.context() as patch:
         patch.setattr(command, "map_scene", stop)
         assert prepare(photos, out, "--undistort", "--test-every", "3") == 130
-    assert f"neilfpp prepare {photos} --out {out} --undistort --test-every 3" in capfd.readouterr().err.replace("\n", "")
+    assert (
+        f"neilfpp prepare {photos} --out {out} --undistort --test-every 3"
+        in capfd.readouterr().err.replace("\n", "")
+    )
     assert not (out / "capture.json").exists()
     for done in ("write_copies", "extract_features", "match_features"):
         monkeypatch.setattr(command, done, stop)
@@ -188,7 +195,9 @@ def test_sub_folders_two_sizes_and_display_values(tmp_path):
     assert prepare(tmp_path / "photos", tmp_path / "out", "--matching", "sequential") == 0
     capture = load_capture(tmp_path / "out")
     assert not capture.hdr
-    assert {view.name for view in capture.views} == {f"{side}-{i:03}" for side in ("left", "right") for i in range(6)}
+    assert {view.name for view in capture.views} == {
+        f"{side}-{i:03}" for side in ("left", "right") for i in range(6)
+    }
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert sorted(camera["size"] for camera in summary["cameras"]) == [[200, 150], [WIDTH, 180]]
     focal = {camera["size"][0]: camera["parameters"]["f"] for camera in summary["cameras"]}
@@ -256,7 +265,7 @@ def test_a_colmap_project_keeps_its_poses_and_points(prepared, tmp_path):
     assert len(read_oriented_ply(capture.point_cloud).position) > 500
 
 
-# ------------------------------------------------------------------------------------------------------------ bad input
+# -------------------------------------------------------------------------------------------------- bad input
 
 
 def refused(capfd, images: Path, out: Path, *options: str, says: str) -> str:
@@ -305,7 +314,10 @@ def test_less_than_sixty_per_cent_placed(own, tmp_path, capfd):
         (own / f"{i:03}.exr").unlink()
     for i in range(5):
         rng = np.random.default_rng(i)
-        write_exr(own / f"other{i}.exr", {"RGB": np.kron(rng.random((45, 60, 1)), np.ones((4, 4, 3))).astype(np.float32)})
+        write_exr(
+            own / f"other{i}.exr",
+            {"RGB": np.kron(rng.random((45, 60, 1)), np.ones((4, 4, 3))).astype(np.float32)},
+        )
     line = refused(capfd, own, tmp_path / "out", says="only 6 of 11 images")
     assert "other0" in line
     assert "--allow-partial" in line
@@ -358,7 +370,7 @@ def test_images_and_capture_within_one_another(own, tmp_path, capfd):
     refused(capfd, own, tmp_path, says="within one another")
 
 
-# --------------------------------------------------------------------------------------------------- a rendered capture
+# ----------------------------------------------------------------------------------------- a rendered capture
 
 
 @pytest.mark.slow
@@ -376,8 +388,27 @@ def test_the_ring_is_placed_exactly(tmp_path):
     assert centres < 0.005 * scale * capture.normalisation.scale
     assert rotations < 0.2
     assert (
-        main(["train", "--data", str(tmp_path / "ring"), "--out", str(tmp_path / "run"), "--device", "cpu", *FIVE_STEPS]) == 0
+        main(
+            [
+                "train",
+                "--data",
+                str(tmp_path / "ring"),
+                "--out",
+                str(tmp_path / "run"),
+                "--device",
+                "cpu",
+                *FIVE_STEPS,
+            ]
+        )
+        == 0
     )
 
 
-FIVE_STEPS = ("--config.train.sdf-steps", "3", "--config.train.material-steps", "1", "--config.train.joint-steps", "1")
+FIVE_STEPS = (
+    "--config.train.sdf-steps",
+    "3",
+    "--config.train.material-steps",
+    "1",
+    "--config.train.joint-steps",
+    "1",
+)

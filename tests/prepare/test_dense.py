@@ -102,6 +102,8 @@ def test_what_the_views_agree_on_is_fused_once_and_what_one_says_is_not():
     assert 20_000 < len(points.position) < sum(depth.size for depth in depths) / 2
     distance = np.abs(points.position)
     assert np.median(distance.min(axis=1)) < 1e-3
-    assert np.quantile(distance.min(axis=1), 0.99) < 0.01 * 1.6**2  # a grain at this depth: planes round the creases off
+    assert (
+        np.quantile(distance.min(axis=1), 0.99) < 0.01 * 1.6**2
+    )  # a grain at this depth: planes round the creases off
     facing = np.take_along_axis(points.normal, distance.argmin(axis=1)[:, None], axis=1)
     assert np.median(facing) > 0.999

@@ -1,4 +1,6 @@
-"""Exposure brackets among photographs: which folders are brackets, and a capture made from them end to end."""
+"""Exposure brackets among photographs: which folders are brackets, and a capture made from them end to
+end.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +57,7 @@ def among(root: Path, wanted="auto"):
     return brackets_among(survey(root, "auto"), wanted)
 
 
-# --------------------------------------------------------------------------------------------------------- the whole way
+# ---------------------------------------------------------------------------------------------- the whole way
 
 
 def test_brackets_become_a_linear_capture(tmp_path: Path, capsys) -> None:
@@ -152,7 +154,7 @@ def test_camera_and_focal_length_come_from_the_photographs(tmp_path: Path) -> No
         assert photo.valid.is_file()
 
 
-# --------------------------------------------------------------------------------------------------- what is a bracket
+# ------------------------------------------------------------------------------------------ what is a bracket
 
 
 @pytest.mark.parametrize("name", ["{p}_{i}.png", "{p}/{i}.png", "IMG_{n:04}.png"])
@@ -187,7 +189,9 @@ def test_photographs_beside_brackets_in_folders_are_not_lost(tmp_path: Path) -> 
     assert among(tmp_path) is None
 
 
-@pytest.mark.parametrize("name", ["{p}_{i}.png", "{p}/{i}.png", "IMG_{n:04}.png", "IMG{n:04}.png", "listed_{n:04}.png"])
+@pytest.mark.parametrize(
+    "name", ["{p}_{i}.png", "{p}/{i}.png", "IMG_{n:04}.png", "IMG{n:04}.png", "listed_{n:04}.png"]
+)
 @pytest.mark.parametrize("damaged", [0, 4, 11])
 def test_a_damaged_photograph_costs_its_own_bracket_alone(tmp_path: Path, name: str, damaged: int) -> None:
     root = plain(tmp_path / "photos", [TIMES] * 4, name)
@@ -219,7 +223,10 @@ def test_a_list_says_what_is_used(tmp_path: Path) -> None:
     [
         ({"brackets.json": '{"a": ["0_0.png", "0_1.png"]}'}, r"brackets\.json: 1 bracket; .*--brackets off"),
         ({"brackets.json": '{"a": ["0_0.png", "x.png"]}'}, r"there is no .*x\.png; .*--brackets off"),
-        ({"brackets.json": '{"a": ["0_0.png", "notes.txt"]}', "exposures.txt": "0_0.png 1\nnotes.txt 2"}, "is no photograph"),
+        (
+            {"brackets.json": '{"a": ["0_0.png", "notes.txt"]}', "exposures.txt": "0_0.png 1\nnotes.txt 2"},
+            "is no photograph",
+        ),
         ({"brackets.json": '{"a:b": ["0_0.png", "0_1.png"]}'}, "cannot name a file everywhere"),
         ({"exposures.txt": "0_0.png 1/60"}, r"0_1\.png: no exposure time; .*--brackets off"),
     ],

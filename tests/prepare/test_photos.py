@@ -86,7 +86,10 @@ def test_linear_copies_share_one_exposure(tmp_path):
     seen = []
     assert write_copies(photos, tmp_path / "work", lambda: seen.append(1)) == ()
     assert len(seen) == 3
-    copies = {photo.name: read_image(tmp_path / "work" / f"{photo.name}.png").pixels.mean() for photo in photos.items}
+    copies = {
+        photo.name: read_image(tmp_path / "work" / f"{photo.name}.png").pixels.mean()
+        for photo in photos.items
+    }
     linear = {name: ((value + 0.055) / 1.055) ** 2.4 for name, value in copies.items()}
     assert linear["middle"] == pytest.approx(0.7, rel=0.02)  # the common level of the bright end
     assert linear["dim"] == pytest.approx(0.35, rel=0.02)
@@ -97,13 +100,17 @@ def test_display_values_are_copied_as_they_are(tmp_path):
     for i in range(3):
         write_png(tmp_path / f"{i}.png", np.full((30, 40, 3), 50 * i, np.uint8))
     write_copies(survey(tmp_path, "auto"), tmp_path / "work", lambda: None)
-    assert [read_image(tmp_path / "work" / f"{i}.png").pixels.mean() * 255 for i in range(3)] == pytest.approx([0, 50, 100])
+    assert [
+        read_image(tmp_path / "work" / f"{i}.png").pixels.mean() * 255 for i in range(3)
+    ] == pytest.approx([0, 50, 100])
 
 
 def test_exposures_count_where_all_are_known_and_the_pixels_linear(tmp_path):
     for name, time in (("a", 1 / 100), ("b", 1 / 50), ("c", 1 / 25)):
         jpeg(tmp_path / f"{name}.jpg", time=time)
-    assert relative_exposures(survey(tmp_path, "linear")) == pytest.approx({"a": 0.5, "b": 1.0, "c": 2.0}, rel=1e-3)
+    assert relative_exposures(survey(tmp_path, "linear")) == pytest.approx(
+        {"a": 0.5, "b": 1.0, "c": 2.0}, rel=1e-3
+    )
     assert set(relative_exposures(survey(tmp_path, "srgb")).values()) == {1.0}
     jpeg(tmp_path / "d.jpg")
     assert set(relative_exposures(survey(tmp_path, "linear")).values()) == {1.0}

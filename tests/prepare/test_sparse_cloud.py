@@ -32,7 +32,9 @@ def test_normals_point_to_those_who_see_them():
     position = sphere(noise=0.002)
     for side in (1.0, -1.0):
         normal, flat = estimate_normals(position, side * position)
-        angle = np.degrees(np.arccos(np.clip((normal * side * position).sum(1) / np.linalg.norm(position, axis=1), -1, 1)))
+        angle = np.degrees(
+            np.arccos(np.clip((normal * side * position).sum(1) / np.linalg.norm(position, axis=1), -1, 1))
+        )
         assert flat.mean() > 0.9
         assert np.quantile(angle[flat], 0.95) < 12
 

@@ -33,14 +33,18 @@ def test_lines_have_the_figures():
     assert "2 of 3 images placed, reprojection error 1.15 pixels" in lines[0]
     assert "fx 500" in lines[1]
     assert "77 points" in lines[2]
-    assert lines[3] == "radius of the scene: 1.5, told by the cameras' focus, as the points reach far beyond it"
+    assert (
+        lines[3] == "radius of the scene: 1.5, told by the cameras' focus, as the points reach far beyond it"
+    )
     assert lines[4] == "note: careful"
     assert "with the poses" in Summary((), (), (), 5, 0, "none", 1.0, "box", ()).lines[0]
 
 
 def test_a_small_part_is_refused_with_what_to_do():
     refuse_partial(["x"] * 4, [6, 2])  # six of ten are enough
-    with pytest.raises(UserError, match=r"only 5 of 10 images.*models of 4; not placed: x, x, x, …; .*--allow-partial"):
+    with pytest.raises(
+        UserError, match=r"only 5 of 10 images.*models of 4; not placed: x, x, x, …; .*--allow-partial"
+    ):
         refuse_partial(["x"] * 5, [5, 4])
 
 
@@ -55,7 +59,10 @@ def has(picture: np.ndarray, color: tuple[int, int, int]) -> bool:
 
 
 def test_the_pictures_show_cameras_points_and_failures(tmp_path):
-    views = [View(f"{i}", i, Camera(200.0, 200.0, 80.0, 60.0, 160, 120, pose(i, 5)), tmp_path / f"{i}.png") for i in range(5)]
+    views = [
+        View(f"{i}", i, Camera(200.0, 200.0, 80.0, 60.0, 160, 120, pose(i, 5)), tmp_path / f"{i}.png")
+        for i in range(5)
+    ]
     up = np.tile([0.0, 0.0, 1.0], (500, 1))
     points = WorldPoints(np.random.default_rng(0).random((500, 3)), up)
     box = Normalisation(0.8, (0.5, 0.5, 0.5))

@@ -26,7 +26,9 @@ def test_level_cameras_tell_up(arc):
 
 
 def pixel_after(orientation: int) -> np.ndarray:
-    """Where the axes of a stored picture, x right and y down, point in the picture that Pillow shows for an orientation."""
+    """Where the axes of a stored picture, x right and y down, point in the picture that Pillow shows for an
+    orientation.
+    """
     axes = []
     for at in ((1, 0), (2, 0), (1, 1)):
         picture = Image.new("L", (5, 3))

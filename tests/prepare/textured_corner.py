@@ -1,7 +1,8 @@
-"""A corner of a room with noise on its floor and two walls, photographed along an arc: everything known, easy to match.
+"""A corner of a room with noise on its floor and two walls, photographed along an arc: everything known, easy
+to match.
 
-Rays are met with the planes in NumPy, apart from the package's cameras. World +z is up; all coordinates of what is seen lie
-between 0 and 1.
+Rays are met with the planes in NumPy, apart from the package's cameras. World +z is up; all coordinates of
+what is seen lie between 0 and 1.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ def noise(seed: int, size: int = 512) -> np.ndarray:
     """A texture with detail at all scales, linear values from 0.05 to 1."""
     rng = np.random.default_rng(seed)
     layers = [
-        cv2.resize(rng.random((size // s, size // s, 3)), (size, size), interpolation=cv2.INTER_CUBIC) for s in (4, 8, 16, 64)
+        cv2.resize(rng.random((size // s, size // s, 3)), (size, size), interpolation=cv2.INTER_CUBIC)
+        for s in (4, 8, 16, 64)
     ]
     texture = sum(layers) / len(layers)
     return np.clip((texture - 0.3) / 0.4, 0.05, 1.0).astype(np.float32)
@@ -35,7 +37,9 @@ TEXTURES = [noise(seed) for seed in range(3)]
 def pose(i: int, views: int, arc: float = 70.0) -> np.ndarray:
     """World to camera: on an arc about the corner, at two heights by turns."""
     azimuth, elevation = np.radians(45 + arc * (i / max(views - 1, 1) - 0.5)), np.radians(30 + 12 * (i % 2))
-    outward = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+    outward = np.array(
+        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+    )
     right = np.cross(-outward, [0, 0, 1])
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(-outward, right), -outward])
@@ -49,7 +53,8 @@ def photograph(w2c: np.ndarray, size: tuple[int, int], focal: float = FOCAL) -> 
     width, height = size
     rows, columns = np.mgrid[:height, :width] + 0.5
     rays = np.stack(
-        [(columns - width / 2) / (focal * width), (rows - height / 2) / (focal * width), np.ones_like(rows)], axis=-1
+        [(columns - width / 2) / (focal * width), (rows - height / 2) / (focal * width), np.ones_like(rows)],
+        axis=-1,
     )
     directions, eye = rays @ w2c[:3, :3], -w2c[:3, :3].T @ w2c[:3, 3]
     image, nearest = np.zeros((height, width, 3), np.float32), np.full((height, width), np.inf)
@@ -73,14 +78,18 @@ def make_photos(
     for i, w2c in enumerate(poses):
         pixels = photograph(w2c, size)
         if hdr:
-            write_exr(folder / f"{name.format(i)}.exr", {"RGB": 4.0 * pixels})  # an exposure that no display shows
+            write_exr(
+                folder / f"{name.format(i)}.exr", {"RGB": 4.0 * pixels}
+            )  # an exposure that no display shows
         else:
             write_png(folder / f"{name.format(i)}.png", np.rint(255 * pixels ** (1 / 2.2)).astype(np.uint8))
     return poses
 
 
 def alignment(found: np.ndarray, true: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """The similarity (scale, rotation, shift) that takes points `found` to `true` best, by Umeyama's closed form."""
+    """The similarity (scale, rotation, shift) that takes points `found` to `true` best, by Umeyama's closed
+    form.
+    """
     a, b = found - found.mean(0), true - true.mean(0)
     u, s, vt = np.linalg.svd(b.T @ a)
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])

@@ -59,7 +59,9 @@ def test_another_size_shows_the_same(capture):
 
 def test_views_keep_their_size_up_to_a_width(capture):
     shots = view_shots(capture, capture.test_views, None, None)
-    assert [(shot.name, shot.camera.width, shot.view is capture.views[0]) for shot in shots] == [("000", 24, True)]
+    assert [(shot.name, shot.camera.width, shot.view is capture.views[0]) for shot in shots] == [
+        ("000", 24, True)
+    ]
     assert view_shots(capture, capture.test_views, 0.5, None)[0].camera.height == 9
     assert view_shots(capture, capture.test_views, None, 48)[0].view is None
     large = dataclasses.replace(capture.views[0].camera, width=2400, height=1800)

@@ -106,7 +106,10 @@ def test_the_light_comes_from_where_the_map_has_it(given, sky, tmp_path):
     means = {}
     for turn in (0, 180):
         out = tmp_path / str(turn)
-        assert relit(given, "--env", sky, "--rotate", turn, "--views", "turntable", "--frames", 2, "--out", out) == 0
+        assert (
+            relit(given, "--env", sky, "--rotate", turn, "--views", "turntable", "--frames", 2, "--out", out)
+            == 0
+        )
         means[turn] = [read_image(out / "studio" / f"turn_000{k}.exr").pixels.mean() for k in (0, 1)]
     # The first camera is at +x, the second at −x.
     assert means[0][0] > 1.5 * means[0][1]

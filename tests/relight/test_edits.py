@@ -16,11 +16,15 @@ def grey(x: torch.Tensor) -> Material:
 
 
 def test_edits_replace_what_they_name():
-    changed = edited(grey, parse_edits(["roughness=0.2", "base_color=0.1,0.2,0.3", "roughness = 0.4"]))(torch.rand(4, 3))
+    changed = edited(grey, parse_edits(["roughness=0.2", "base_color=0.1,0.2,0.3", "roughness = 0.4"]))(
+        torch.rand(4, 3)
+    )
     assert torch.allclose(changed.roughness, torch.tensor(0.4))
     assert torch.allclose(changed.base_color, torch.tensor([0.1, 0.2, 0.3]))
     assert torch.allclose(changed.metallic, torch.tensor(0.1))
-    assert torch.allclose(edited(grey, parse_edits(["base_color=1"]))(torch.rand(2, 3)).base_color, torch.tensor(1.0))
+    assert torch.allclose(
+        edited(grey, parse_edits(["base_color=1"]))(torch.rand(2, 3)).base_color, torch.tensor(1.0)
+    )
 
 
 def test_a_box_of_the_world_bounds_an_edit():

@@ -53,7 +53,9 @@ def test_the_time_ends_a_picture(scene):
     ticks = iter(range(10_000))
     shares: list[float] = []
     budget = Budget(None, seconds=10.0)
-    picture = take_picture(scene, camera(64, 64), budget, 1, 0, shares.append, clock=lambda: float(next(ticks)))
+    picture = take_picture(
+        scene, camera(64, 64), budget, 1, 0, shares.append, clock=lambda: float(next(ticks))
+    )
     assert 1 <= picture.samples < 200
     assert shares == sorted(shares)
     assert shares[-1] == pytest.approx(1, abs=0.2)

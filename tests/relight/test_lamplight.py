@@ -14,7 +14,9 @@ from neilfpp_method.relight.lamplight import Lamplight, lamps_of_run
 def light(*positions, axes=None, radiance=None, radius=0.1) -> Lamplight:
     position = torch.tensor(positions)
     axis = torch.zeros_like(position) if axes is None else torch.tensor(axes)
-    return Lamplight(position, axis, torch.ones_like(position) if radiance is None else torch.tensor(radiance), radius)
+    return Lamplight(
+        position, axis, torch.ones_like(position) if radiance is None else torch.tensor(radiance), radius
+    )
 
 
 def irradiance(lamps: Lamplight, count: int = 200_000) -> torch.Tensor:
@@ -62,7 +64,9 @@ def test_density_of_directions_that_meet_a_lamp():
         assert torch.allclose(pair.pdf(x, lamp)[mine], drawn.pdf[mine], rtol=1e-4)
         assert (radiance[mine] == 1).all()
     # Their shares, each spread over the solid angle of its lamp, add up to 1.
-    total = sum(pair.pdf(x[:1], k).item() * 2 * math.pi * (1 - c) for k, c in ((0, 0.96**0.5), (1, 0.9975**0.5)))
+    total = sum(
+        pair.pdf(x[:1], k).item() * 2 * math.pi * (1 - c) for k, c in ((0, 0.96**0.5), (1, 0.9975**0.5))
+    )
     assert total == pytest.approx(1, rel=1e-3)
 
 
@@ -78,6 +82,8 @@ def test_the_lamps_of_a_run():
     assert lamps_of_run(lamps) is None
     lamps.place(torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[1.0, 2.0, 3.0]]))
     found = lamps_of_run(lamps)
-    assert found.radiance.numpy() == pytest.approx((torch.tensor([[1.0, 2.0, 3.0]]) / (math.pi * 0.02**2)).numpy())
+    assert found.radiance.numpy() == pytest.approx(
+        (torch.tensor([[1.0, 2.0, 3.0]]) / (math.pi * 0.02**2)).numpy()
+    )
     # Irradiance of a bulb is intensity · cos / distance².
     assert irradiance(found).numpy() == pytest.approx([1.0, 2.0, 3.0], rel=2e-3)

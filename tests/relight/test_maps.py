@@ -71,7 +71,9 @@ def test_the_first_row_is_above(tmp_path):
 
 def test_stops_make_it_brighter(tmp_path):
     write_exr(tmp_path / "sun.exr", {"RGB": with_spot(8, 8)})
-    plain, brighter = (read_map(tmp_path / "sun.exr", "ours", exposure=stops).sky.radiance for stops in (0.0, 2.0))
+    plain, brighter = (
+        read_map(tmp_path / "sun.exr", "ours", exposure=stops).sky.radiance for stops in (0.0, 2.0)
+    )
     assert torch.equal(brighter, 4 * plain)
 
 

@@ -24,7 +24,9 @@ EVEN = Sky(torch.ones(8, 16, 3), rows_at_poles=True, start=0.0)
 
 
 def made_of(base: float, roughness: float = 0.5, metallic: float = 0.0):
-    return lambda x: Material(*(torch.full_like(x[:, :k], v) for k, v in ((3, base), (1, roughness), (1, metallic))))
+    return lambda x: Material(
+        *(torch.full_like(x[:, :k], v) for k, v in ((3, base), (1, roughness), (1, metallic)))
+    )
 
 
 def ball(subdivisions: int = 3, inside_out: bool = False) -> Surface:
@@ -61,11 +63,15 @@ def looking_at(points, eye=(0.0, 0.0, 3.0)) -> RayBatch:
 
 def scattered_targets(count: int, radius: float = 0.5) -> torch.Tensor:
     generator = torch.Generator().manual_seed(4)
-    return torch.cat((radius * (2 * torch.rand(count, 2, generator=generator) - 1), torch.zeros(count, 1)), -1)
+    return torch.cat(
+        (radius * (2 * torch.rand(count, 2, generator=generator) - 1), torch.zeros(count, 1)), -1
+    )
 
 
 def test_a_white_ball_in_white_light_cannot_be_seen():
-    found = trace(Scene(ball(), made_of(1.0), None, EVEN), looking_at(scattered_targets(500, 0.35)), 256, bounces=1)
+    found = trace(
+        Scene(ball(), made_of(1.0), None, EVEN), looking_at(scattered_targets(500, 0.35)), 256, bounces=1
+    )
     assert found.mean().item() == pytest.approx(1, abs=1e-3)
 
 
@@ -74,7 +80,9 @@ def test_a_white_bowl_in_white_light_cannot_be_seen():
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.6)
     kept = mesh.triangles[mesh.triangles_center[:, 2] < 0.2]
     bowl = Surface(torch.tensor(np.array(kept), dtype=torch.float32).flip(1))
-    found = trace(Scene(bowl, made_of(1.0), None, EVEN), looking_at(scattered_targets(100, 0.2)), 512, bounces=64)
+    found = trace(
+        Scene(bowl, made_of(1.0), None, EVEN), looking_at(scattered_targets(100, 0.2)), 512, bounces=64
+    )
     assert found.mean().item() == pytest.approx(1, abs=4e-3)
 
 
@@ -117,7 +125,9 @@ def gradient() -> Sky:
     return Sky(radiance, rows_at_poles=True, start=0.3)
 
 
-def quadrature(sky: Sky, normal: np.ndarray, wo: np.ndarray, base: float, roughness: float, metallic: float) -> np.ndarray:
+def quadrature(
+    sky: Sky, normal: np.ndarray, wo: np.ndarray, base: float, roughness: float, metallic: float
+) -> np.ndarray:
     """What a convex surface sends: the rendering equation by an even spread of a quarter of a million
     directions."""
     count = 500_000

@@ -13,10 +13,14 @@ from neilfpp_method.shading.brdf import GGX, LOBES, SPHERICAL_GAUSSIAN
 from neilfpp_method.structures import Material
 from tests import oracles
 
-CASES = [(name, r, m) for name in ("ggx", "spherical_gaussian") for r, m in ((0.35, 0.0), (0.35, 1.0), (1.0, 0.3))]
+CASES = [
+    (name, r, m) for name in ("ggx", "spherical_gaussian") for r, m in ((0.35, 0.0), (0.35, 1.0), (1.0, 0.3))
+]
 
 
-def at(count: int, lobe, roughness: float, metallic: float, cosine: float = 0.6, base: float = 0.7) -> Vertices:
+def at(
+    count: int, lobe, roughness: float, metallic: float, cosine: float = 0.6, base: float = 0.7
+) -> Vertices:
     wo = torch.tensor([[math.sqrt(1 - cosine**2), 0.0, cosine]]).expand(count, 3)
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3)
     one = torch.ones(count, 1)
@@ -80,6 +84,8 @@ def test_a_lambertian_surface_has_the_weight_of_its_colour():
 def test_nothing_is_scattered_into_the_triangle(lobe):
     points = at(1, lobe, 0.5, 0.5)
     tilted = Vertices(**{**vars(points), "flat": torch.tensor([[0.6, 0.0, 0.8]])})
-    wi = torch.nn.functional.normalize(torch.tensor([[-1.0, 0.0, 0.5]]), dim=-1)  # above the normal, within the triangle
+    wi = torch.nn.functional.normalize(
+        torch.tensor([[-1.0, 0.0, 0.5]]), dim=-1
+    )  # above the normal, within the triangle
     assert scattered(points, wi, lobe).amin() > 0
     assert not scattered(tilted, wi, lobe).any()

@@ -1,6 +1,7 @@
 """A page in a real browser: Chromium without a window.
 
-Nothing is needed but the browser: it prints the page as it stands after a script of the test has clicked through it.
+Nothing is needed but the browser: it prints the page as it stands after a script of the test has clicked
+through it.
 """
 
 from __future__ import annotations

@@ -42,7 +42,9 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
         given = dict(attributes)
-        self.loaded += [v for n, v in attributes if n in ("src", "href") and v and not v.startswith(("data:", "#"))]
+        self.loaded += [
+            v for n, v in attributes if n in ("src", "href") and v and not v.startswith(("data:", "#"))
+        ]
         self.unnamed += tag == "img" and not given.get("alt")
         self._block = given.get("id") if tag == "script" else None
         self.scripts += tag == "script" and self._block is None
@@ -80,7 +82,7 @@ def page_of(run: Path) -> Page:
     return Page(write_report(run, run / "report.html", SMALL).read_text("utf-8"))
 
 
-# ----------------------------------------------------------------------------------------------------------- every page
+# ------------------------------------------------------------------------------------------------- every page
 
 
 def test_training_ends_with_a_page_that_loads_nothing(trained: Path):
@@ -114,13 +116,19 @@ def test_maps_stand_beside_their_truth(trained: Path):
         "Metallic",
         "Normal",
     ]
-    assert all(cell["truth"].startswith("data:image/webp;base64,UklGR") for layer in layers for cell in layer["cells"])
+    assert all(
+        cell["truth"].startswith("data:image/webp;base64,UklGR")
+        for layer in layers
+        for cell in layer["cells"]
+    )
     assert "Views that were not trained on" in page.text
 
 
 def test_the_surface_is_that_of_the_run(trained: Path):
     packed = page_of(trained).data["surface-data"]
-    raw = {name: base64.b64decode(packed[name]) for name in ("position", "normal", "color", "material", "index")}
+    raw = {
+        name: base64.b64decode(packed[name]) for name in ("position", "normal", "color", "material", "index")
+    }
     position = np.frombuffer(raw["position"], "<u2").reshape(-1, 3)
     index = np.frombuffer(raw["index"], "<u4").reshape(-1, 3)
     assert (len(position), len(index)) == (packed["vertices"], packed["faces"])
@@ -153,7 +161,14 @@ def test_figures_are_of_the_protocol_once_they_are_measured(run: Path):
 
 
 def test_a_finding_comes_with_its_cause_and_remedy(run: Path):
-    finding = {"case": "fog", "severe": True, "step": 8, "what": "all fog", "cause": "few <views>", "remedy": "give masks"}
+    finding = {
+        "case": "fog",
+        "severe": True,
+        "step": 8,
+        "what": "all fog",
+        "cause": "few <views>",
+        "remedy": "give masks",
+    }
     (run / "health.json").write_text(json.dumps({"format": 1, "verdict": "failed", "findings": [finding]}))
     page = page_of(run)
     for words in ("Failed", "all fog", "few <views>", "give masks"):
@@ -162,9 +177,20 @@ def test_a_finding_comes_with_its_cause_and_remedy(run: Path):
 
 
 def test_effects_and_times_are_shown_where_they_are_recorded(run: Path):
-    row = {"effect": "lamps", "title": "Lamps nearby", "decision": "off", "reason": "0.1 <% ", "cost": "8 %", "risk": "none"}
-    (run / "effects.json").write_text(json.dumps({"format": 1, "asked": "as-set", "decisions": [], "effects": [row]}))
-    (run / "work.json").write_text(json.dumps({"format": 1, "seconds": {"sdf_init": {"rendering": 61.0, "data": 20.0}}}))
+    row = {
+        "effect": "lamps",
+        "title": "Lamps nearby",
+        "decision": "off",
+        "reason": "0.1 <% ",
+        "cost": "8 %",
+        "risk": "none",
+    }
+    (run / "effects.json").write_text(
+        json.dumps({"format": 1, "asked": "as-set", "decisions": [], "effects": [row]})
+    )
+    (run / "work.json").write_text(
+        json.dumps({"format": 1, "seconds": {"sdf_init": {"rendering": 61.0, "data": 20.0}}})
+    )
     text = page_of(run).text
     assert "Lamps nearby" in text
     assert "1 min 21 s" in text
@@ -176,7 +202,7 @@ def test_a_damaged_side_file_is_named_and_left_out(run: Path):
     assert "timing.json: not readable as JSON" in page_of(run).text
 
 
-# --------------------------------------------------------------------------------------------------------- unusual runs
+# ----------------------------------------------------------------------------------------------- unusual runs
 
 
 def test_a_run_that_was_stopped_says_how_it_goes_on(run: Path):
@@ -231,7 +257,7 @@ def test_no_run_no_page(tmp_path: Path):
     assert not list(tmp_path.iterdir())
 
 
-# ---------------------------------------------------------------------------------------------------------------- parts
+# ------------------------------------------------------------------------------------------------------ parts
 
 
 def test_text_is_escaped_and_elements_are_not():

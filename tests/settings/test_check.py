@@ -1,4 +1,6 @@
-"""Settings that nothing can be built from are refused by whoever builds: the command, the plugin and `attach_neilf` alike."""
+"""Settings that nothing can be built from are refused by whoever builds: the command, the plugin and
+`attach_neilf` alike.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Settings from files: words stay words, numbers are numbers, and what is no file of settings is told in one line."""
+"""Settings from files: words stay words, numbers are numbers, and what is no file of settings is told in one
+line.
+"""
 
 from __future__ import annotations
 
@@ -34,15 +36,21 @@ def test_words_and_numbers_of_yaml(tmp_path):
     expected |= {"h": "1:30", "i": [1, 2.5], "j": "off", "k": 1000, "l": "2001-01-01", "m": None}
     found = read_settings(written(tmp_path, text))
     assert found == expected
-    assert {name: type(value) for name, value in found.items()} == {name: type(value) for name, value in expected.items()}
+    assert {name: type(value) for name, value in found.items()} == {
+        name: type(value) for name, value in expected.items()
+    }
 
 
 def test_a_file_changes_a_preset_and_options_win(tmp_path):
-    path = written(tmp_path, "preset: paper-ngp\ntrain:\n  rays: 64\ninter-reflection.mode: off\nloss.eikonal: 1e-2\n")
+    path = written(
+        tmp_path, "preset: paper-ngp\ntrain:\n  rays: 64\ninter-reflection.mode: off\nloss.eikonal: 1e-2\n"
+    )
     config = settings_of("--config", str(path))
     changes = {"train.rays": 64, "inter_reflection.mode": "off", "loss.eikonal": 0.01}
     assert config == changed(preset("paper-ngp"), changes)
-    assert settings_of(f"--config={path}", "--preset", "fast").train.sdf_steps == preset("fast").train.sdf_steps
+    assert (
+        settings_of(f"--config={path}", "--preset", "fast").train.sdf_steps == preset("fast").train.sdf_steps
+    )
 
 
 def test_without_a_preset_a_file_changes_the_usual_one(tmp_path):

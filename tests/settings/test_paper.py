@@ -34,9 +34,15 @@ def value(cell: str) -> object:
 
 
 def table(name: str) -> Mapping[str, Row]:
-    """The rows under the heading of a preset, by setting, on top of those of the preset that it is based on."""
+    """The rows under the heading of a preset, by setting, on top of those of the preset that it is based
+    on.
+    """
     section = PAGE.read_text(encoding="utf-8").split(f"## `{name}`\n")[1].split("\n## ")[0]
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in section.splitlines() if line.startswith("| `")]
+    rows = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in section.splitlines()
+        if line.startswith("| `")
+    ]
     assert rows
     assert len({row[0] for row in rows}) == len(rows)
     found = {path.strip("`"): Row(value(code), value(ours), why) for path, _, code, ours, why in rows}
@@ -67,13 +73,19 @@ def equal(one: object, other: object) -> bool:
 @pytest.mark.parametrize("name", PRESETS)
 def test_the_preset_is_what_the_table_says(name):
     config = settings(name)
-    wrong = {path: setting(config, path) for path, row in rows_of(name).items() if not equal(setting(config, path), row.ours)}
+    wrong = {
+        path: setting(config, path)
+        for path, row in rows_of(name).items()
+        if not equal(setting(config, path), row.ours)
+    }
     assert not wrong
 
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_difference_from_the_published_code_has_its_reason(name):
-    unexplained = [path for path, row in table(name).items() if not equal(row.published, row.ours) and len(row.why) < 9]
+    unexplained = [
+        path for path, row in table(name).items() if not equal(row.published, row.ours) and len(row.why) < 9
+    ]
     assert not unexplained
 
 

@@ -1,4 +1,6 @@
-"""Settings to and from plain values, and changed by them: what is wrong is told in one line that names the setting."""
+"""Settings to and from plain values, and changed by them: what is wrong is told in one line that names the
+setting.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +12,19 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.settings.count import leaves
 from neilfpp_method.settings.plain import changed, from_dict, to_dict
 from neilfpp_method.settings.presets import PRESETS, fixed_geometry, free_light, preset
-from neilfpp_method.settings.types import FreeLightConfig, HashGridConfig, MapLightConfig, MeshConfig, NeilfConfig
+from neilfpp_method.settings.types import (
+    FreeLightConfig,
+    HashGridConfig,
+    MapLightConfig,
+    MeshConfig,
+    NeilfConfig,
+)
 
-EVERY = [preset(name) for name in PRESETS] + [fixed_geometry(preset(name)) for name in PRESETS] + [free_light(preset("fast"))]
+EVERY = (
+    [preset(name) for name in PRESETS]
+    + [fixed_geometry(preset(name)) for name in PRESETS]
+    + [free_light(preset("fast"))]
+)
 
 
 def test_there_are_not_too_many_settings():
@@ -22,7 +34,14 @@ def test_there_are_not_too_many_settings():
 
 def test_settings_of_every_kind_count_once():
     names = set(leaves(NeilfConfig))
-    assert {"light.kind", "light.map", "light.width", "host.sdf.layers", "host.path", "encoding.levels"} <= names
+    assert {
+        "light.kind",
+        "light.map",
+        "light.width",
+        "host.sdf.layers",
+        "host.path",
+        "encoding.levels",
+    } <= names
 
 
 @pytest.mark.parametrize("config", EVERY, ids=lambda config: f"{config.preset}-{config.light.kind}")
@@ -32,7 +51,9 @@ def test_settings_survive_json(config):
 
 
 def test_a_change_leaves_all_else():
-    config = changed(preset("fast"), {"train.rays": 7, "light": {"fit": {"points": 3}}, "host": {"sdf.width": 9}})
+    config = changed(
+        preset("fast"), {"train.rays": 7, "light": {"fit": {"points": 3}}, "host": {"sdf.width": 9}}
+    )
     assert (config.train.rays, config.light.fit.points, config.host.sdf.width) == (7, 3, 9)
     back = {"train.rays": 512, "light.fit.points": 1024, "host.sdf.width": 64}
     assert changed(config, back) == preset("fast")
@@ -40,10 +61,14 @@ def test_a_change_leaves_all_else():
 
 def test_a_kind_brings_its_own_settings():
     fast = preset("fast")
-    assert changed(fast, {"light.kind": "distant"}).light == MapLightConfig("distant", 48, None, fast.light.fit)
+    assert changed(fast, {"light.kind": "distant"}).light == MapLightConfig(
+        "distant", 48, None, fast.light.fit
+    )
     assert changed(fast, {"light": {"kind": "free", "width": 8}}).light == FreeLightConfig(width=8)
     assert changed(fast, {"host.kind": "mesh", "host.path": "a.ply"}).host == MeshConfig(path="a.ply")
-    assert changed(NeilfConfig(), {"encoding.kind": "hash", "encoding.levels": 4}).encoding == HashGridConfig(levels=4)
+    assert changed(NeilfConfig(), {"encoding.kind": "hash", "encoding.levels": 4}).encoding == HashGridConfig(
+        levels=4
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,6 @@
-"""Directional albedo against SciPy's quadrature of the printed BRDF, at the corners of its tables, and by its gradient."""
+"""Directional albedo against SciPy's quadrature of the printed BRDF, at the corners of its tables, and by its
+gradient.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ def towards(cosine: float) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("lobe", list(LOBES))
-@pytest.mark.parametrize(("b", "r", "m", "cosine"), [(0.6, 0.5, 0.0, 0.9), (0.8, 0.3, 1.0, 0.5), (0.4, 0.8, 0.5, 0.3)])
+@pytest.mark.parametrize(
+    ("b", "r", "m", "cosine"), [(0.6, 0.5, 0.0, 0.9), (0.8, 0.3, 1.0, 0.5), (0.4, 0.8, 0.5, 0.3)]
+)
 def test_is_the_integral_of_the_brdf_and_the_cosine(lobe, b, r, m, cosine):
     n, wo = np.array([0.0, 0.0, 1.0]), towards(cosine)[0].double().numpy()
     one = lambda value: np.array([value])  # noqa: E731
@@ -56,7 +60,9 @@ def test_white_paint_under_varnish_sends_more_than_it_gets_and_a_white_metal_doe
 
 def test_the_gradient_goes_to_the_material_and_not_to_the_view():
     material = surface(0.5, 0.4, 0.5)
-    leaves = [value.requires_grad_() for value in (material.base_color, material.roughness, material.metallic)]
+    leaves = [
+        value.requires_grad_() for value in (material.base_color, material.roughness, material.metallic)
+    ]
     wo = towards(0.6).requires_grad_()
     directional_albedo(material, UP, wo, SPHERICAL_GAUSSIAN).sum().backward()
     assert all(leaf.grad.abs().max() > 0 for leaf in leaves)

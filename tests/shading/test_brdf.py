@@ -59,7 +59,9 @@ def test_reciprocity(lobe, scene):
 
 
 def test_schlick_keeps_f0_near_the_normal():
-    """At wo·h = 0.8, F0 = 0.04: 0.04 + 0.96 · 0.2⁵ = 0.0403; the misprint in the supplement would give 0.69."""
+    """At wo·h = 0.8, F0 = 0.04: 0.04 + 0.96 · 0.2⁵ = 0.0403; the misprint in the supplement would give
+    0.69.
+    """
     wo = torch.tensor([[0.6, 0.0, 0.8]], dtype=torch.float64)
     wi, n = wo.new_tensor([[[-0.6, 0.0, 0.8]]]), wo.new_tensor([[0.0, 0.0, 1.0]])
     material = Material(torch.zeros_like(n), n[:, 2:], n[:, :1])
@@ -69,7 +71,9 @@ def test_schlick_keeps_f0_near_the_normal():
 
 
 def test_normal_reflectance():
-    material = Material(torch.tensor([[0.9, 0.5, 0.1]]).expand(2, 3), torch.ones(2, 1), torch.tensor([[0.0], [1.0]]))
+    material = Material(
+        torch.tensor([[0.9, 0.5, 0.1]]).expand(2, 3), torch.ones(2, 1), torch.tensor([[0.0], [1.0]])
+    )
     assert normal_reflectance(material).allclose(torch.tensor([[0.04, 0.04, 0.04], [0.9, 0.5, 0.1]]))
 
 
@@ -84,7 +88,9 @@ def at(function, cos_h: float, r: float) -> float:
 )
 def test_projected_area_of_the_microfacets(lobe, closed_form, r):
     """∫ D (n·h) dh = 2π ∫ D c dc."""
-    area, _ = integrate.quad(lambda c: 2 * np.pi * c * at(LOBES[lobe].distribution, c, r), 0, 1, epsabs=1e-9, limit=200)
+    area, _ = integrate.quad(
+        lambda c: 2 * np.pi * c * at(LOBES[lobe].distribution, c, r), 0, 1, epsabs=1e-9, limit=200
+    )
     assert area == pytest.approx(closed_form(r), abs=1e-7)
 
 

@@ -1,6 +1,7 @@
 """On the rendered ground truth, true material and true incident light give the true outgoing radiance.
 
-The light field is that of a path tracer: 64 surface points, 4096 directions of equal weight 2π/4096, 16 views each.
+The light field is that of a path tracer: 64 surface points, 4096 directions of equal weight 2π/4096, 16 views
+each.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ DATA = Path(os.environ.get("NEILFPP_DATA", Path(__file__).parents[2].parent / "s
 def light_field(request):
     path = DATA / request.param / "light" / "light_field_gt.npz"
     if not path.is_file():
-        pytest.skip(f"the rendered light field {path} is not at hand; NEILFPP_DATA names the folder of the captures")
+        pytest.skip(
+            f"the rendered light field {path} is not at hand; NEILFPP_DATA names the folder of the captures"
+        )
     return {name: torch.from_numpy(values.astype(np.float32)) for name, values in np.load(path).items()}
 
 
@@ -31,9 +34,14 @@ def test_the_estimator_closes_the_rendering_equation(light_field):
     truth = light_field["outgoing"]
     wi, n = light_field["wi"], light_field["normals"]
     samples = IncidentSamples(wi, torch.full(wi.shape[:2], 1 / (2 * math.pi)))
-    material = Material(light_field["base_color"], light_field["roughness"][:, None], light_field["metallic"][:, None])
+    material = Material(
+        light_field["base_color"], light_field["roughness"][:, None], light_field["metallic"][:, None]
+    )
     views = light_field["wo"].unbind(1)
-    shaded = [shade(material, n, wo, Incident.of(samples, light_field["incident"]), SPHERICAL_GAUSSIAN).color for wo in views]
+    shaded = [
+        shade(material, n, wo, Incident.of(samples, light_field["incident"]), SPHERICAL_GAUSSIAN).color
+        for wo in views
+    ]
     outgoing = torch.stack(shaded, 1)
 
     assert outgoing.sum((0, 1)).allclose(truth.sum((0, 1)), rtol=0.02)

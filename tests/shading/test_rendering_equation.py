@@ -15,7 +15,8 @@ from tests import oracles
 KINDS = ("fibonacci", "cosine", "lobe", "mis")
 B, M = (0.7, 0.4, 0.1), 0.3
 WO = (0.6, 0.0, 0.8)
-# A smooth surface is a metal: lobe samples alone see next to nothing of what a narrow lobe leaves to the diffuse part.
+# A smooth surface is a metal: lobe samples alone see next to nothing of what a narrow lobe leaves to the
+# diffuse part.
 SURFACES = [(0.4, 1.0), (0.9, 0.3)]
 
 
@@ -33,8 +34,18 @@ def random_scene(count: int = 5, samples: int = 16):
     n, wo, wi = (torch.randn(*shape, 3).double() for shape in ((count,), (count,), (count, samples)))
     n, wo, wi = (v / v.norm(dim=-1, keepdim=True) for v in (n, wo, wi))
     wo = wo * (wo * n).sum(-1, keepdim=True).sign()
-    material = Material(torch.rand(count, 3).double(), 0.3 + 0.6 * torch.rand(count, 1).double(), torch.rand(count, 1).double())
-    return material, n, wo, IncidentSamples(wi, 0.1 + torch.rand(count, samples).double()), torch.rand_like(wi) * 3
+    material = Material(
+        torch.rand(count, 3).double(),
+        0.3 + 0.6 * torch.rand(count, 1).double(),
+        torch.rand(count, 1).double(),
+    )
+    return (
+        material,
+        n,
+        wo,
+        IncidentSamples(wi, 0.1 + torch.rand(count, samples).double()),
+        torch.rand_like(wi) * 3,
+    )
 
 
 @pytest.mark.parametrize("lobe", list(LOBES))
@@ -50,12 +61,16 @@ def test_is_the_mean_of_integrand_over_pdf(lobe):
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 32, 128, 256])
 def test_white_furnace_is_exact_at_every_count(count):
-    """The midpoint rule integrates the cosine exactly: under unit light a Lambertian surface sends out its colour."""
+    """The midpoint rule integrates the cosine exactly: under unit light a Lambertian surface sends out its
+    colour.
+    """
     n = torch.nn.functional.normalize(torch.randn(10, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
     material = Material(rows(B, 10, torch.float32), torch.ones(10, 1), torch.full((10, 1), M))
     samples = combine([(fibonacci(n), count)], stochastic=False)
     for specular, expected in ((True, (1 - M) * material.base_color), (False, material.base_color)):
-        shading = shade(material, n, n, Incident.of(samples, torch.ones_like(samples.wi)), GGX if specular else None)
+        shading = shade(
+            material, n, n, Incident.of(samples, torch.ones_like(samples.wi)), GGX if specular else None
+        )
         assert (shading.diffuse - expected).abs().max() < 1e-6
 
 
@@ -104,7 +119,9 @@ def test_midpoint_lattices_converge_too(lobe, truth):
 
 
 def test_specular_furnace_of_a_smooth_metal():
-    """D and V both lose little at r = 0.2: a white metal under unit light sends out nearly 1, by lobe samples alone."""
+    """D and V both lose little at r = 0.2: a white metal under unit light sends out nearly 1, by lobe samples
+    alone.
+    """
     count = 2000
     torch.manual_seed(3)
     material = Material(rows((1.0, 1.0, 1.0), count), rows([0.2], count), rows([1.0], count))
@@ -127,22 +144,28 @@ def test_gradcheck(lobe):
 
 
 def test_gradient_of_the_estimate_is_the_gradient_of_the_integral(truth):
-    """d/dr by lobe samples, whose density depends on r but carries no gradient, against differences of quadratures."""
+    """d/dr by lobe samples, whose density depends on r but carries no gradient, against differences of
+    quadratures.
+    """
     torch.manual_seed(4)
     count, r, step = 4000, 0.6, 1e-2
     n, wo = rows((0.0, 0.0, 1.0), count), rows(WO, count)
     roughness = rows([r], count).clone().requires_grad_()
     samples = sample_directions("lobe", n, wo, roughness, 32, GGX, stochastic=True)
     light = sky(samples.wi)[..., None].expand_as(samples.wi)
-    specular = shade(Material(rows(B, count), roughness, rows([M], count)), n, wo, Incident.of(samples, light), GGX).specular[
-        :, 0
-    ]
+    specular = shade(
+        Material(rows(B, count), roughness, rows([M], count)), n, wo, Incident.of(samples, light), GGX
+    ).specular[:, 0]
     (gradient,) = torch.autograd.grad(specular.sum(), roughness)
 
     def integral(r: float) -> float:
         def integrand(wi):
             vectors = np.array([0.0, 0.0, 1.0]), np.array(WO), wi
-            return oracles.brdf("ggx", np.array([B[0]]), np.array([r]), np.array([M]), *vectors)[1][0] * sky(wi) * wi[2]
+            return (
+                oracles.brdf("ggx", np.array([B[0]]), np.array([r]), np.array([M]), *vectors)[1][0]
+                * sky(wi)
+                * wi[2]
+            )
 
         return oracles.hemisphere_integral(integrand)
 

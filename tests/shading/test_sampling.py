@@ -17,7 +17,8 @@ KINDS = ("fibonacci", "cosine", "lobe", "mis")
 CASES = [(kind, "ggx", 0.5) for kind in ("fibonacci", "cosine")] + [
     (kind, lobe, r) for kind in ("lobe", "mis") for lobe in LOBES for r in (0.35, 0.6, 1.0)
 ]
-# The viewer is at +z and the surface turns: at −wo, a pole of the χ² cells, the density of the lobe is infinite.
+# The viewer is at +z and the surface turns: at −wo, a pole of the χ² cells, the density of the lobe is
+# infinite.
 NORMALS = {"frontal": (0.0, 0.0, 1.0), "oblique": (0.8, 0.0, 0.6), "grazing": (0.0, 0.9992, 0.04)}
 POINTS, PER_POINT = 20_000, 6
 
@@ -31,7 +32,9 @@ def density(kind, lobe, wi, n, wo, r):
         "fibonacci": lambda: sampling.pdf_fibonacci(wi, n),
         "cosine": lambda: sampling.pdf_cosine(wi, n),
         "lobe": lambda: sampling.pdf_specular_lobe(wi, n, wo, r, lobe),
-        "mis": lambda: 0.5 * sampling.pdf_cosine(wi, n) + 0.5 * sampling.pdf_specular_lobe(wi, n, wo, r, lobe),
+        "mis": lambda: (
+            0.5 * sampling.pdf_cosine(wi, n) + 0.5 * sampling.pdf_specular_lobe(wi, n, wo, r, lobe)
+        ),
     }[kind]()
 
 
@@ -42,7 +45,9 @@ def test_chi2(kind, lobe, r, view):
     many = points(NORMALS[view], (0.0, 0.0, 1.0), POINTS, r)
     one = tuple(t[:1] for t in many)
     result = oracles.chi2_test(
-        lambda: sample_directions(kind, *many, PER_POINT, LOBES[lobe], stochastic=True).wi.reshape(-1, 3).numpy(),
+        lambda: (
+            sample_directions(kind, *many, PER_POINT, LOBES[lobe], stochastic=True).wi.reshape(-1, 3).numpy()
+        ),
         lambda wi: density(kind, LOBES[lobe], torch.from_numpy(wi)[None], *one)[0].numpy(),
         tests=len(CASES) * len(NORMALS),
     )
@@ -104,11 +109,13 @@ def test_an_unknown_sampler_is_refused():
         sample_directions("uniform", *points((0, 0, 1.0), (0, 0, 1.0), 1), 4, GGX, False)
 
 
-# -------------------------------------------------------------------------------------------------- light that is known
+# ---------------------------------------------------------------------------------------- light that is known
 
 
 def light_of(n):
-    """Light from an eighth of the sphere, z > 0 and azimuths from 270° to 360°, whose edges are edges of the χ² cells."""
+    """Light from an eighth of the sphere, z > 0 and azimuths from 270° to 360°, whose edges are edges of the
+    χ² cells.
+    """
 
     def draw(count, stochastic):
         z, turn = torch.rand(2, len(n), count, dtype=n.dtype)
@@ -142,12 +149,14 @@ def test_the_density_of_mis_with_light_is_that_of_its_directions():
         parts = light.pdf(wi) / 2 + density("lobe", GGX, wi, *one) / 4 + density("cosine", GGX, wi, *one) / 4
         return parts[0].numpy()
 
-    result = oracles.chi2_test(lambda: sample_directions("mis", n, wo, r, 8, GGX, True, light).wi.reshape(-1, 3).numpy(), pdf)
+    result = oracles.chi2_test(
+        lambda: sample_directions("mis", n, wo, r, 8, GGX, True, light).wi.reshape(-1, 3).numpy(), pdf
+    )
     assert result.passed, result
     assert result.total == pytest.approx(1, abs=1e-4)
 
 
-# ----------------------------------------------------------------------------------------------------- the whole sphere
+# ------------------------------------------------------------------------------------------- the whole sphere
 
 
 def test_a_lattice_of_the_sphere_is_spread_evenly():

@@ -8,7 +8,9 @@ from neilfpp_method.timing.ledger import EVERY, FIRST, Ledger, doing, listening
 
 
 class Clock:
-    """A clock that stands still until it is told; waiting for the device takes `lag` seconds if work is under way there."""
+    """A clock that stands still until it is told; waiting for the device takes `lag` seconds if work is under
+    way there.
+    """
 
     def __init__(self) -> None:
         self.time = self.lag = 0.0
@@ -33,7 +35,10 @@ def test_work_within_work_is_told_apart():
                 clock.time += 4.0
             clock.time += 8.0
         clock.time += 16.0
-    assert ledger.seconds() == {"preparation": {"rest": 1.0}, "joint": {"shading": 10.0, "tracing": 4.0, "rest": 16.0}}
+    assert ledger.seconds() == {
+        "preparation": {"rest": 1.0},
+        "joint": {"shading": 10.0, "tracing": 4.0, "rest": 16.0},
+    }
     assert ledger.total == 31.0
 
 
@@ -78,7 +83,9 @@ def test_what_was_counted_before_is_added():
 
 
 def test_a_device_is_seldom_waited_for_and_its_time_is_shared_out():
-    """Work of a device shows up when it is waited for: 3 s of rendering and 1 s of shading in every step, 2 s in a fit."""
+    """Work of a device shows up when it is waited for: 3 s of rendering and 1 s of shading in every step, 2 s
+    in a fit.
+    """
     clock, steps = Clock(), EVERY + FIRST + 1
     with listening(Ledger(synchronise=clock.synchronise, now=clock)) as ledger:
         ledger.enter("joint")

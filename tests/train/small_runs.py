@@ -23,7 +23,9 @@ from tests.scenes import tiny_config
 
 
 def small_config(**train) -> NeilfConfig:
-    """The tiny settings, in which most rays that meet something are shaded; four steps a stage but for `train`."""
+    """The tiny settings, in which most rays that meet something are shaded; four steps a stage but for
+    `train`.
+    """
     config = tiny_config()
     return dataclasses.replace(
         config,
@@ -33,7 +35,9 @@ def small_config(**train) -> NeilfConfig:
 
 
 def solved_light(config: NeilfConfig) -> NeilfConfig:
-    """The settings with the light of `fast`: a small map and lamps, fitted every third step, and traced visibility."""
+    """The settings with the light of `fast`: a small map and lamps, fitted every third step, and traced
+    visibility.
+    """
     fast = preset("fast")
     fit = dataclasses.replace(fast.light.fit, points=32, every=3, steps=5)
     return dataclasses.replace(

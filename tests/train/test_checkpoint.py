@@ -1,4 +1,6 @@
-"""The run folder: whole files or none, nothing executed that a file says, and one line for what does not fit."""
+"""The run folder: whole files or none, nothing executed that a file says, and one line for what does not
+fit.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,7 @@ def refused(path: Path, complaint: str) -> None:
     assert caught.value.remedy
 
 
-# ---------------------------------------------------------------------------------------------------------- checkpoints
+# ------------------------------------------------------------------------------------------------ checkpoints
 
 
 def test_a_checkpoint_holds_what_was_saved(tmp_path):
@@ -73,7 +75,9 @@ def test_a_crash_while_writing_leaves_the_old_checkpoint(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(torch, "save", half_a_save)
-    with pytest.raises(UserError, match=r"last\.pt: cannot be written \(No space left on device\); make room"):
+    with pytest.raises(
+        UserError, match=r"last\.pt: cannot be written \(No space left on device\); make room"
+    ):
         save_checkpoint(path, *learner(), 8)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
@@ -145,7 +149,7 @@ def test_a_checkpoint_of_another_version(tmp_path, contents):
     refused(tmp_path / "last.pt", "a checkpoint of another version")
 
 
-# --------------------------------------------------------------------------------------------------------- descriptions
+# ----------------------------------------------------------------------------------------------- descriptions
 
 
 def described(path: Path) -> Path:
@@ -198,10 +202,22 @@ def change(path: Path, **values) -> None:
 @pytest.mark.parametrize(
     ("file", "values", "complaint"),
     [
-        ("config.json", {"format": FORMAT + 1}, f"written in run format {FORMAT + 1}, this version reads {FORMAT}"),
+        (
+            "config.json",
+            {"format": FORMAT + 1},
+            f"written in run format {FORMAT + 1}, this version reads {FORMAT}",
+        ),
         ("config.json", {"format": None}, "written in run format None"),
-        ("config.json", {"config": {"telepathy": True}}, r"config\.json: config: unknown setting 'telepathy'"),
-        ("config.json", {"config": {"encoding": {"kind": "hush"}}}, r"config\.encoding\.kind: 'hush' is not a choice"),
+        (
+            "config.json",
+            {"config": {"telepathy": True}},
+            r"config\.json: config: unknown setting 'telepathy'",
+        ),
+        (
+            "config.json",
+            {"config": {"encoding": {"kind": "hush"}}},
+            r"config\.encoding\.kind: 'hush' is not a choice",
+        ),
         ("config.json", {"config": None}, "not a complete description"),
         ("config.json", {"config": {"brdf": 3}}, "config.brdf: 3 where settings belong"),
         ("capture.json", {"drive": "B:"}, r"capture\.json: unknown setting 'drive'"),

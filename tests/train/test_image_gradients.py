@@ -1,4 +1,6 @@
-"""Image gradients take nine reads a pixel: they are computed in the steps whose losses need them, and in no others."""
+"""Image gradients take nine reads a pixel: they are computed in the steps whose losses need them, and in no
+others.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +15,12 @@ from tests.data.make_capture import make_capture
 from tests.train.small_runs import small_config, small_training
 
 
-@pytest.mark.parametrize(("smoothness", "drawn"), [(0.0, 0), (5e-4, 8 * 48)])  # eight steps of 48 rays move the material
-def test_gradients_are_computed_where_a_loss_needs_them(tmp_path: Path, monkeypatch, smoothness: float, drawn: int) -> None:
+@pytest.mark.parametrize(
+    ("smoothness", "drawn"), [(0.0, 0), (5e-4, 8 * 48)]
+)  # eight steps of 48 rays move the material
+def test_gradients_are_computed_where_a_loss_needs_them(
+    tmp_path: Path, monkeypatch, smoothness: float, drawn: int
+) -> None:
     counted: list[int] = []
     computed = pixels._scharr
     monkeypatch.setattr(pixels, "_scharr", lambda about: counted.append(about[0].numel()) or computed(about))

@@ -1,4 +1,6 @@
-"""Light in and out: what a run exports is what another trains under, and the record of why there are lamps."""
+"""Light in and out: what a run exports is what another trains under, and the record of why there are
+lamps.
+"""
 
 from __future__ import annotations
 
@@ -110,10 +112,15 @@ def test_a_stopped_run_goes_on_without_the_file(capture, tmp_path):
     [
         (["--light", "none.exr"], "none.exr: no such image"),
         (["--light", "none.png"], "none.png: an environment map is linear radiance in an EXR file"),
-        (["--light", "none.exr", "--config.light.kind", "free"], "a light that is free at every point takes no map"),
+        (
+            ["--light", "none.exr", "--config.light.kind", "free"],
+            "a light that is free at every point takes no map",
+        ),
     ],
 )
-def test_a_map_that_cannot_be_is_refused_and_leaves_nothing(capture, tmp_path, capfd, monkeypatch, options, complaint):
+def test_a_map_that_cannot_be_is_refused_and_leaves_nothing(
+    capture, tmp_path, capfd, monkeypatch, options, complaint
+):
     monkeypatch.chdir(tmp_path)
     assert train(capture, tmp_path / "run", *options) == 2
     said = capfd.readouterr().err
@@ -122,17 +129,25 @@ def test_a_map_that_cannot_be_is_refused_and_leaves_nothing(capture, tmp_path, c
     assert list(tmp_path.iterdir()) == []
 
 
-# --------------------------------------------------------------------------------------------------------------- record
+# ----------------------------------------------------------------------------------------------------- record
 
 FITS = [LightFit(0, 0.021, 0.004, 204, 3), LightFit(100, -0.001, 0.003, 204, 0)]
 
 
 def test_the_record_says_why():
     auto = MapLightConfig(kind="auto")
-    assert in_words(auto, FITS) == "an environment map; lamps were not needed (error +0.1 ± 0.3 % at 204 points kept back)"
-    assert in_words(auto, FITS[:1]) == "an environment map and 3 lamps before it (error −2.1 ± 0.4 % at 204 points kept back)"
+    assert (
+        in_words(auto, FITS)
+        == "an environment map; lamps were not needed (error +0.1 ± 0.3 % at 204 points kept back)"
+    )
+    assert (
+        in_words(auto, FITS[:1])
+        == "an environment map and 3 lamps before it (error −2.1 ± 0.4 % at 204 points kept back)"
+    )
     given = dataclasses.replace(auto, map="sky.exr")
-    assert in_words(given, [dataclasses.replace(FITS[0], lamps=1)]).startswith("the given environment map and 1 lamp before")
+    assert in_words(given, [dataclasses.replace(FITS[0], lamps=1)]).startswith(
+        "the given environment map and 1 lamp before"
+    )
     assert in_words(auto, []) == "an environment map"
     assert in_words(FreeLightConfig(), []) == "a field that is free at every point"
 

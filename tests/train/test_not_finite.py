@@ -1,4 +1,6 @@
-"""A step that is not finite moves nothing, is counted, and says what went wrong; ten in a row end the training."""
+"""A step that is not finite moves nothing, is counted, and says what went wrong; ten in a row end the
+training.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_capture(tmp_path_factory.mktemp("capture") / "sphere")
 
 
-def spoil_loss(training: Training, name: str, steps: range | tuple[int, ...], value: float = math.nan) -> None:
+def spoil_loss(
+    training: Training, name: str, steps: range | tuple[int, ...], value: float = math.nan
+) -> None:
     """Let a loss be `value` at these steps."""
     honest, calls = training.model.step, iter(range(1000))
 
@@ -66,14 +70,18 @@ def watch(training: Training, patch: pytest.MonkeyPatch) -> list[dict]:
 
     def look(loss, psnr):
         step(loss, psnr)
-        states.append(copy.deepcopy({"model": training.model.state_dict(), "optimizer": made[0].state_dict()["state"]}))
+        states.append(
+            copy.deepcopy({"model": training.model.state_dict(), "optimizer": made[0].state_dict()["state"]})
+        )
 
     patch.setattr(loop, "make_optimizer", remember)
     patch.setattr(training.reporter, "step", look)
     return states
 
 
-@pytest.mark.parametrize(("name", "step"), [("volume", 2), ("eikonal", 1), ("physical", 6), ("lambertian", 9)])
+@pytest.mark.parametrize(
+    ("name", "step"), [("volume", 2), ("eikonal", 1), ("physical", 6), ("lambertian", 9)]
+)
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_loss_that_is_not_finite(tmp_path, capture, monkeypatch, name, step, value):
     training = small_training(capture, tmp_path, small_config())
@@ -105,7 +113,9 @@ def test_what_is_not_finite_in_another_process(tmp_path, capture, monkeypatch):
     """The mean over all processes is not finite where one of them is not: all leave the step out."""
     training = small_training(capture, tmp_path, small_config())
     states, calls = watch(training, monkeypatch), iter(range(1000))
-    monkeypatch.setattr(training.fabric, "all_reduce", lambda known: known * (math.nan if next(calls) == 5 else 1.0))
+    monkeypatch.setattr(
+        training.fabric, "all_reduce", lambda known: known * (math.nan if next(calls) == 5 else 1.0)
+    )
     train(training)
     assert differences(states[4], states[5]) == []
     assert differences(states[5], states[6])
@@ -133,7 +143,9 @@ def test_ten_in_a_row_are_none(tmp_path, capture, monkeypatch):
     training = small_training(capture, tmp_path, small_config(sdf_steps=40))
     spoil_loss(training, "volume", range(7, 40))
     states = watch(training, monkeypatch)
-    with pytest.raises(Diverged, match="10 steps in a row were not finite, the last one in loss volume") as caught:
+    with pytest.raises(
+        Diverged, match="10 steps in a row were not finite, the last one in loss volume"
+    ) as caught:
         train(training)
     assert str(tmp_path / "checkpoints") in caught.value.remedy
     assert training.skipped == 10
@@ -148,7 +160,9 @@ def test_the_command_ends_with_status_1(tmp_path, capture, monkeypatch, capfd):
 
     def spoiled(*arguments):
         computed = honest(*arguments)
-        return computed._replace(terms={name: LossTerm(t.values * math.nan) for name, t in computed.terms.items()})
+        return computed._replace(
+            terms={name: LossTerm(t.values * math.nan) for name, t in computed.terms.items()}
+        )
 
     monkeypatch.setitem(PRESETS, "tiny", small_config)
     monkeypatch.setattr(NeilfModel, "step", spoiled)

@@ -21,7 +21,14 @@ from tests.data.make_capture import make_capture
 from tests.train.small_runs import differences, small_config, small_training
 
 REPOSITORY = Path(__file__).parents[2]
-STEPS = ["--config.train.sdf-steps", "2", "--config.train.material-steps", "2", "--config.train.joint-steps", "2"]
+STEPS = [
+    "--config.train.sdf-steps",
+    "2",
+    "--config.train.material-steps",
+    "2",
+    "--config.train.joint-steps",
+    "2",
+]
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +37,9 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @contextmanager
-def started(capture: Path, out: Path, *options: str, record: Path | None = None) -> Iterator[subprocess.Popen]:
+def started(
+    capture: Path, out: Path, *options: str, record: Path | None = None
+) -> Iterator[subprocess.Popen]:
     """A training in two processes; none is left when the block ends, however it ends."""
     command = [sys.executable, "-m", "tests.tiny_command", "train", "--data", str(capture), "--out", str(out)]
     command += ["--preset", "tiny", "--device", "cpu", "--devices", "2", *options]
@@ -78,8 +87,12 @@ def test_two_processes_end_with_one_model(tmp_path, capture):
     assert differences(*seen) == []
     assert seen[0].keys() == gradients[0].keys()
     for name, gradient in seen[0].items():
-        torch.testing.assert_close(gradient, (gradients[0][name] + gradients[1][name]) / 2.0, rtol=1e-4, atol=1e-7)
-    apart = [(gradients[0][name] - gradients[1][name]).norm() > 0.1 * seen[0][name].norm() for name in seen[0]]
+        torch.testing.assert_close(
+            gradient, (gradients[0][name] + gradients[1][name]) / 2.0, rtol=1e-4, atol=1e-7
+        )
+    apart = [
+        (gradients[0][name] - gradients[1][name]).norm() > 0.1 * seen[0][name].norm() for name in seen[0]
+    ]
     assert sum(apart) > 0.8 * len(apart)  # other rays
 
 
@@ -111,7 +124,9 @@ def test_bad_input_is_told_once(tmp_path, capture):
     with started(capture, capture) as process:
         _, complaint = process.communicate(timeout=30)
     assert process.returncode == 2
-    assert complaint == f"error: {capture}: exists already; choose another --out, or continue it with --resume\n"
+    assert (
+        complaint == f"error: {capture}: exists already; choose another --out, or continue it with --resume\n"
+    )
 
 
 def test_the_second_process_leaves_words_and_status_to_the_first(monkeypatch, capfd):

@@ -32,7 +32,9 @@ from tests.train.small_runs import differences, small_config, solved_light
 STEPS = 12
 
 
-def run(data: Path | None, out: Path, config: NeilfConfig | None = None, resume: bool = False, **options) -> str:
+def run(
+    data: Path | None, out: Path, config: NeilfConfig | None = None, resume: bool = False, **options
+) -> str:
     """Train or continue, and return what the person is told."""
     console = Console()
     options = {"test_every": None, "response": "auto", "device": "cpu", "devices": 1, **options}
@@ -59,7 +61,9 @@ def state(out: Path, name: str = "last") -> dict:
 
 def files(folder: Path) -> dict[Path, tuple[int, bytes]]:
     """Everything in a folder, with its time and contents."""
-    return {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in folder.rglob("*") if path.is_file()}
+    return {
+        path: (path.stat().st_mtime_ns, path.read_bytes()) for path in folder.rglob("*") if path.is_file()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +149,9 @@ def test_a_run_that_found_no_room_goes_on_once_there_is_some(tmp_path, capture, 
     write, out = torch.save, tmp_path / "run"
     with monkeypatch.context() as patch:
         patch.setattr(torch, "save", save)
-        with pytest.raises(UserError, match=r"last\.pt: cannot be written \(No space .*; make room, and continue with: "):
+        with pytest.raises(
+            UserError, match=r"last\.pt: cannot be written \(No space .*; make room, and continue with: "
+        ):
             run(capture, out, small_config())
     assert state(out)["step"] == 4
     assert not [path for path in (out / "checkpoints").iterdir() if path.name.startswith(".")]
@@ -172,7 +178,11 @@ def test_time_adds_up_over_stops(tmp_path, capture, monkeypatch):
             run(None, out, resume=True)
         assert json.loads((out / "timing.json").read_text()) == {"sdf_init": 4.0, "material_init": 2.0}
         run(None, out, resume=True)
-    assert json.loads((out / "timing.json").read_text()) == {"sdf_init": 4.0, "material_init": 4.0, "joint": 4.0}
+    assert json.loads((out / "timing.json").read_text()) == {
+        "sdf_init": 4.0,
+        "material_init": 4.0,
+        "joint": 4.0,
+    }
 
 
 def ticking() -> Callable[[], float]:
@@ -180,7 +190,7 @@ def ticking() -> Callable[[], float]:
     return lambda: float(next(count))
 
 
-# ---------------------------------------------------------------------------------------------------- what resume takes
+# ------------------------------------------------------------------------------------------ what resume takes
 
 
 def test_a_finished_run_is_left_as_it_is(whole):
@@ -234,13 +244,22 @@ def test_weights_that_do_not_fit_the_settings(tmp_path, capture, monkeypatch):
         run(None, out, resume=True)
 
 
-# -------------------------------------------------------------------------------------------------------- a real Ctrl-C
+# ---------------------------------------------------------------------------------------------- a real Ctrl-C
 
 
 def test_ctrl_c_in_a_real_terminal_session(tmp_path, capture):
     """The process says in one line how to go on, ends with 130, and that line, typed as it is, goes on."""
     out, rays = tmp_path / "a folder with spaces", 512
-    command = [sys.executable, "-m", "tests.tiny_command", "train", "--data", str(capture), "--preset", "tiny"]
+    command = [
+        sys.executable,
+        "-m",
+        "tests.tiny_command",
+        "train",
+        "--data",
+        str(capture),
+        "--preset",
+        "tiny",
+    ]
     command += ["--config.train.rays", str(rays), "--device", "cpu", "--out"]
     process = _start([*command, str(out)])
     while not (out / "checkpoints" / "last.pt").exists():
@@ -255,7 +274,8 @@ def test_ctrl_c_in_a_real_terminal_session(tmp_path, capture):
     assert complaint == told
 
     assert main(shlex.split(complaint.split("continue with: neilfpp ")[1])) == 0
-    # As a process of its own, too: commands compute without denormal numbers, which the moments of a table come to hold.
+    # As a process of its own, too: commands compute without denormal numbers, which the moments of a table
+    # come to hold.
     unstopped = _start([*command, str(tmp_path / "unstopped")])
     unstopped.communicate(timeout=60)
     assert unstopped.returncode == 0
@@ -267,11 +287,13 @@ def _start(command: list[str]) -> subprocess.Popen[str]:
     return subprocess.Popen(command, cwd=Path(__file__).parents[2], **pipes)
 
 
-# -------------------------------------------------------------------------------------------------------------- effects
+# ---------------------------------------------------------------------------------------------------- effects
 
 
 def test_what_evidence_decided_is_read_from_the_run(tmp_path, capture, monkeypatch):
-    """A ball sees nothing of itself: nothing is traced after SDF init, in a run that was stopped as in one that was not."""
+    """A ball sees nothing of itself: nothing is traced after SDF init, in a run that was stopped as in one
+    that was not.
+    """
     config = solved_light(small_config())
     asked = read_asked("auto")
     run(capture, tmp_path / "whole", config, effects=asked)
@@ -279,7 +301,13 @@ def test_what_evidence_decided_is_read_from_the_run(tmp_path, capture, monkeypat
         interrupt_at(patch, 2, 6)
         for resume in (False, True):
             with pytest.raises(Stopped):
-                run(None if resume else capture, tmp_path / "run", None if resume else config, resume=resume, effects=asked)
+                run(
+                    None if resume else capture,
+                    tmp_path / "run",
+                    None if resume else config,
+                    resume=resume,
+                    effects=asked,
+                )
     run(None, tmp_path / "run", resume=True)
     assert differences(state(tmp_path / "run"), state(tmp_path / "whole")) == []
     records = [json.loads((tmp_path / name / "effects.json").read_text()) for name in ("run", "whole")]

@@ -1,4 +1,6 @@
-"""What lies behind a scene must not swallow it: a ground and a sky are found to be two, and surfaces come first."""
+"""What lies behind a scene must not swallow it: a ground and a sky are found to be two, and surfaces come
+first.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,10 @@ def facts_of(root: Path):
 
 
 def test_what_lies_behind_is_told_from_the_images(tmp_path):
-    even, sky = facts_of(make_capture(tmp_path / "even", background=GROUND)), facts_of(make_sky_capture(tmp_path / "sky"))
+    even, sky = (
+        facts_of(make_capture(tmp_path / "even", background=GROUND)),
+        facts_of(make_sky_capture(tmp_path / "sky")),
+    )
     assert (even.background, sky.background) == ("constant", "inverted_sphere")
     assert even.background_color == sky.background_color == (GROUND, GROUND, GROUND)
 
@@ -75,13 +80,19 @@ def test_a_sphere_under_a_sky_gets_a_surface(tmp_path):
     """With the settings of `fast` for what lies behind, and small networks."""
     config = tiny_config()
     fast = preset("fast").optimizer
-    steps = dataclasses.replace(config.train, sdf_steps=300, material_steps=0, joint_steps=0, rays=256, checkpoint_every=1000)
+    steps = dataclasses.replace(
+        config.train, sdf_steps=300, material_steps=0, joint_steps=0, rays=256, checkpoint_every=1000
+    )
     config = dataclasses.replace(config, optimizer=fast, train=steps)
-    training = small_training(make_sky_capture(tmp_path / "sky", views=10, size=(48, 36)), tmp_path / "run", config)
+    training = small_training(
+        make_sky_capture(tmp_path / "sky", views=10, size=(48, 36)), tmp_path / "run", config
+    )
     train(training)
     model = training.model.eval()
     capture = training.pixels.capture
-    truth = PixelDataset(load_capture(make_capture(tmp_path / "truth", views=10, size=(48, 36), masks=True)), capture.views)
+    truth = PixelDataset(
+        load_capture(make_capture(tmp_path / "truth", views=10, size=(48, 36), masks=True)), capture.views
+    )
     with torch.no_grad():
         batch = truth.view(3)
         hits = model.host.render(batch.rays)

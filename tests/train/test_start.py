@@ -47,20 +47,26 @@ def masked(tmp_path: Path) -> Path:
 
 def settings(begin: str = "silhouettes") -> NeilfConfig:
     config = small_config()
-    return dataclasses.replace(config, host=VolSdfConfig(sdf=dataclasses.replace(config.host.sdf, start=begin)))
+    return dataclasses.replace(
+        config, host=VolSdfConfig(sdf=dataclasses.replace(config.host.sdf, start=begin))
+    )
 
 
 def started(root: Path, config: NeilfConfig) -> tuple[NeilfModel, GeometryStart]:
     """An untrained model of the capture after its start."""
     capture = load_capture(root)
     seed_step(config.train.seed, -1)
-    model = build_model(capture, scene_facts(capture, PixelDataset(capture, capture.train_views), config), config)
+    model = build_model(
+        capture, scene_facts(capture, PixelDataset(capture, capture.train_views), config), config
+    )
     return model, start_geometry(model, capture, config)
 
 
 def off_the_ball(model: NeilfModel) -> torch.Tensor:
     """G at points of the ball's surface: 0 where it is right."""
-    direction = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    direction = torch.nn.functional.normalize(
+        torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)), dim=-1
+    )
     with torch.no_grad():
         return model.host.sdf_field(BALL * direction)
 
@@ -79,7 +85,9 @@ def test_the_field_starts_as_the_hull_of_the_masks(masked):
     assert off_the_ball(sphere).abs().mean() > 0.1
     assert off_the_ball(hull).abs().mean() < 0.05
     with torch.no_grad():
-        inside, outside = (hull.host.sdf_field(torch.tensor([[0.0, 0.0, z], [z, 0.0, 0.0]])) for z in (0.2, 1.3))
+        inside, outside = (
+            hull.host.sdf_field(torch.tensor([[0.0, 0.0, z], [z, 0.0, 0.0]])) for z in (0.2, 1.3)
+        )
     assert (inside < -0.3).all()
     assert (outside > 0.2).all()
 
@@ -115,7 +123,9 @@ def test_masks_that_make_no_body_are_a_warning(masked):
         write_png(path, np.full(SIZE[::-1], 255, np.uint8))
     plain, _ = started(masked, settings("sphere"))
     model, told = started(masked, settings())
-    assert told.text == "warning: geometry starts as a sphere: what the masks show reaches beyond the scene box"
+    assert (
+        told.text == "warning: geometry starts as a sphere: what the masks show reaches beyond the scene box"
+    )
     assert all(torch.equal(a, b) for a, b in zip(weights(plain), weights(model), strict=True))
 
 
@@ -126,7 +136,9 @@ def test_training_says_how_it_starts_and_a_resumed_run_does_not_start_again(mask
         path = run.path / "checkpoints" / "last.pt"
         if not path.exists():
             path.parent.mkdir(exist_ok=True)
-            save_checkpoint(path, run.model, run.light_solver, make_optimizer(run.model, run.config.optimizer), 1)
+            save_checkpoint(
+                path, run.model, run.light_solver, make_optimizer(run.model, run.config.optimizer), 1
+            )
 
     monkeypatch.setattr(command, "train", first_step)
     said = []

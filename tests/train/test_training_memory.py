@@ -25,7 +25,18 @@ sys.exit(status)
 
 def peak(data: Path, out: Path) -> int:
     """Most memory, bytes, of a process that trains on images at their full size."""
-    command = [sys.executable, "-c", MEASURE, "train", "--data", str(data), "--preset", "tiny", "--device", "cpu"]
+    command = [
+        sys.executable,
+        "-c",
+        MEASURE,
+        "train",
+        "--data",
+        str(data),
+        "--preset",
+        "tiny",
+        "--device",
+        "cpu",
+    ]
     command += ["--scale", "1", "--test-every", "0", "--out", str(out)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

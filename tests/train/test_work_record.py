@@ -45,7 +45,9 @@ def test_the_seconds_of_a_run_that_was_stopped_add_up_to_the_clock(tmp_path, mon
 
 
 @pytest.mark.parametrize(
-    "damage", [{"format": 9}, {"format": 1}, {"format": 1, "seconds": {"joint": {"tea": 1.0}}}], ids=["format", "none", "kind"]
+    "damage",
+    [{"format": 9}, {"format": 1}, {"format": 1, "seconds": {"joint": {"tea": 1.0}}}],
+    ids=["format", "none", "kind"],
 )
 def test_a_damaged_record_is_named(tmp_path, damage):
     assert read_work(tmp_path) == {}

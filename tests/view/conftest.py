@@ -26,7 +26,9 @@ def found(tmp_path_factory, capture) -> Path:
 @pytest.fixture(scope="package")
 def given(tmp_path_factory, capture) -> Path:
     """A run with the capture's mesh, and a light that is free at every point."""
-    return _trained(tmp_path_factory.mktemp("runs") / "given", capture, lambda config: config, "--host", "mesh")
+    return _trained(
+        tmp_path_factory.mktemp("runs") / "given", capture, lambda config: config, "--host", "mesh"
+    )
 
 
 def _trained(folder: Path, capture: Path, change, *options: str) -> Path:

@@ -1,4 +1,6 @@
-"""The page in a real browser, where there is one: through the layers, the light, and a click on the surface."""
+"""The page in a real browser, where there is one: through the layers, the light, and a click on the
+surface.
+"""
 
 from __future__ import annotations
 

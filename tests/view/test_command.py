@@ -22,7 +22,14 @@ def port() -> int:
 
 
 def request(run: Path, port: int, **changes) -> command.Request:
-    usual = {"env": (), "env_layout": "ours", "follow": False, "host": "127.0.0.1", "resolution": 32, "checkpoint": "last"}
+    usual = {
+        "env": (),
+        "env_layout": "ours",
+        "follow": False,
+        "host": "127.0.0.1",
+        "resolution": 32,
+        "checkpoint": "last",
+    }
     return command.Request(run=run, port=port, device="cpu", **{**usual, **changes})
 
 

@@ -43,12 +43,16 @@ def cast(subject, camera):
     rays = camera_rays(camera)
     corners = subject.surface.triangles.reshape(-1, 3).numpy()
     mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
-    place, ray, _ = mesh.ray.intersects_location(rays.origins.numpy(), rays.directions.numpy(), multiple_hits=False)
+    place, ray, _ = mesh.ray.intersects_location(
+        rays.origins.numpy(), rays.directions.numpy(), multiple_hits=False
+    )
     return rays, place, ray
 
 
 def srgb(linear):
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055
+    )
 
 
 def test_pictures_become_finer_up_to_the_window(subject, camera):
@@ -121,13 +125,15 @@ def test_a_run_without_a_surface_shows_r_and_says_so(found, camera):
     assert point_under(empty, (3.0, 0.0, 0.0), (-1.0, 0.0, 0.0)) is None
 
 
-# ------------------------------------------------------------------------------------------------ light at a point
+# ------------------------------------------------------------------------------------------- light at a point
 
 
 def test_a_ray_picks_the_point_that_trimesh_finds(subject, camera):
     rays, place, ray = cast(subject, camera)
     k = len(ray) // 2
-    point = point_under(subject, tuple(rays.origins[ray[k]].tolist()), tuple((3 * rays.directions[ray[k]]).tolist()))
+    point = point_under(
+        subject, tuple(rays.origins[ray[k]].tolist()), tuple((3 * rays.directions[ray[k]]).tolist())
+    )
     assert point.position.tolist() == pytest.approx(place[k].tolist(), abs=1e-4)
     assert point.normal.norm().item() == pytest.approx(1, abs=1e-5)
 
@@ -135,13 +141,16 @@ def test_a_ray_picks_the_point_that_trimesh_finds(subject, camera):
 def test_even_light_arrives_evenly_and_not_from_below(subject, camera):
     rays, _, ray = cast(subject, camera)
     middle = ray[len(ray) // 2]
-    point = point_under(subject, tuple(rays.origins[middle].tolist()), tuple(rays.directions[middle].tolist()))
+    point = point_under(
+        subject, tuple(rays.origins[middle].tolist()), tuple(rays.directions[middle].tolist())
+    )
     even = Lighting(Sky(torch.full((8, 16, 3), 0.7), True, 0.0), None, own=False)
     radiance = light_at(subject, even, point)
     normal = point.normal.numpy()
     theta, phi = (np.arange(48) + 0.5) * np.pi / 48, (np.arange(96) + 0.5) * np.pi / 48
     cosine = (
-        np.sin(theta)[:, None] * (np.sin(phi) * normal[0] + np.cos(phi) * normal[1]) + np.cos(theta)[:, None] * normal[2]
+        np.sin(theta)[:, None] * (np.sin(phi) * normal[0] + np.cos(phi) * normal[1])
+        + np.cos(theta)[:, None] * normal[2]
     )
     assert np.median(np.abs(radiance[cosine > 0.5] - 0.7)) < 1e-5  # nothing stands before it
     assert radiance[cosine < -0.05].max() == 0
@@ -153,11 +162,15 @@ def test_even_light_arrives_evenly_and_not_from_below(subject, camera):
 def test_own_light_is_what_the_model_says(subject, camera):
     rays, _, ray = cast(subject, camera)
     middle = ray[len(ray) // 2]
-    point = point_under(subject, tuple(rays.origins[middle].tolist()), tuple(rays.directions[middle].tolist()))
+    point = point_under(
+        subject, tuple(rays.origins[middle].tolist()), tuple(rays.directions[middle].tolist())
+    )
     radiance = light_at(subject, own_light(subject.run), point)
     down, across = np.argwhere(radiance.any(-1))[77]
     theta, phi = np.pi * (down + 0.5) / 48, 2 * np.pi * (across + 0.5) / 96
-    wi = torch.tensor([np.sin(phi) * np.sin(theta), np.cos(phi) * np.sin(theta), np.cos(theta)], dtype=torch.float32)
+    wi = torch.tensor(
+        [np.sin(phi) * np.sin(theta), np.cos(phi) * np.sin(theta), np.cos(theta)], dtype=torch.float32
+    )
     with torch.no_grad():
         true = subject.run.model.incident_light(point.position[None], wi[None, None])[0, 0]
     assert radiance[down, across].tolist() == pytest.approx(true.tolist(), rel=1e-3)

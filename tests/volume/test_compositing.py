@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from neilfpp_method.volume.compositing import composite, depth_weights, render_weights, sample_weights, share_near
+from neilfpp_method.volume.compositing import (
+    composite,
+    depth_weights,
+    render_weights,
+    sample_weights,
+    share_near,
+)
 
 
 def product_formula(density, distances, far):
@@ -53,7 +59,9 @@ def test_a_homogeneous_slab_is_beer_lambert_however_it_is_cut(sigma):
 
 
 def test_half_of_an_interval_counts_at_either_end():
-    intervals = depth_weights(torch.tensor([[math.log(2.0), math.log(4.0)]]))  # let through one half, then one quarter
+    intervals = depth_weights(
+        torch.tensor([[math.log(2.0), math.log(4.0)]])
+    )  # let through one half, then one quarter
     torch.testing.assert_close(intervals.weights, torch.tensor([[0.5, 0.5 * 0.75]]))
     at_samples = sample_weights(intervals.weights)
     torch.testing.assert_close(at_samples, torch.tensor([[0.25, 0.25 + 0.1875, 0.1875]]))
@@ -68,7 +76,9 @@ def test_the_share_near_a_depth_takes_parts_of_intervals():
 
 
 def test_an_opaque_sample_hides_what_is_behind_it():
-    found = render_weights(torch.tensor([[0.0, 1e8, 3.0]]), torch.tensor([[0.0, 1.0, 2.0]]), torch.tensor([3.0]))
+    found = render_weights(
+        torch.tensor([[0.0, 1e8, 3.0]]), torch.tensor([[0.0, 1.0, 2.0]]), torch.tensor([3.0])
+    )
     assert found.weights.tolist() == [[0.0, 1.0, 0.0]]
     assert found.transmittance.item() == 0.0
 

@@ -22,7 +22,9 @@ def test_is_the_laplace_cdf_over_beta(beta):
 
 def test_thin_air_keeps_its_relative_precision_in_float32():
     density = laplace_density(torch.tensor([4.0]), torch.tensor(0.1))
-    assert density.item() == pytest.approx(0.5 * np.exp(-40.0) / 0.1, rel=1e-5)  # 2e-17, far below 1 − (1 − 2e-17)
+    assert density.item() == pytest.approx(
+        0.5 * np.exp(-40.0) / 0.1, rel=1e-5
+    )  # 2e-17, far below 1 − (1 − 2e-17)
 
 
 def test_gradients():
@@ -43,10 +45,17 @@ def test_slope_on_the_surface_is_that_of_the_laplace_density():
 )
 def test_depth_is_the_integral_of_the_density_of_a_linear_distance(ends, dtype):
     beta, width = 0.1, 0.7
-    inner = 0.5 if ends[0] == ends[1] else np.clip(ends[0] / (ends[0] - ends[1]), 0.0, 1.0)  # the kink of the density
+    inner = (
+        0.5 if ends[0] == ends[1] else np.clip(ends[0] / (ends[0] - ends[1]), 0.0, 1.0)
+    )  # the kink of the density
     slope = ends[1] - ends[0]
     expected, _ = quad(
-        lambda t: laplace.cdf(-(ends[0] + slope * t), scale=beta) / beta, 0.0, 1.0, points=[inner], epsabs=0.0, epsrel=1e-10
+        lambda t: laplace.cdf(-(ends[0] + slope * t), scale=beta) / beta,
+        0.0,
+        1.0,
+        points=[inner],
+        epsabs=0.0,
+        epsrel=1e-10,
     )
     found = laplace_depth(
         torch.tensor([ends], dtype=dtype), torch.tensor([[2.0, 2.0 + width]], dtype=dtype), torch.tensor(beta)
@@ -58,7 +67,9 @@ def test_depth_does_not_depend_on_the_cuts_of_a_linear_distance():
     cuts = torch.tensor([0.0, 0.1, 0.1, 0.33, 0.34, 0.9, 1.0], dtype=torch.float64)
     through = laplace_depth(0.4 - cuts, cuts, torch.tensor(0.05, dtype=torch.float64)).sum()
     ends = cuts[[0, -1]]
-    torch.testing.assert_close(through, laplace_depth(0.4 - ends, ends, torch.tensor(0.05, dtype=torch.float64))[0])
+    torch.testing.assert_close(
+        through, laplace_depth(0.4 - ends, ends, torch.tensor(0.05, dtype=torch.float64))[0]
+    )
 
 
 def test_depth_has_gradients_also_along_a_surface():

@@ -24,7 +24,9 @@ def plate(x: torch.Tensor) -> torch.Tensor:
 def test_look_up_is_exact_for_a_linear_field():
     grid = sample_grid(lambda x: x @ torch.tensor([0.3, -0.5, 0.7]) + 0.1, RADIUS, 7, torch.zeros(1))
     x = (torch.rand(200, 3) * 2 - 1) * RADIUS
-    torch.testing.assert_close(look_up(grid, RADIUS, x), x @ torch.tensor([0.3, -0.5, 0.7]) + 0.1, atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(
+        look_up(grid, RADIUS, x), x @ torch.tensor([0.3, -0.5, 0.7]) + 0.1, atol=1e-5, rtol=0.0
+    )
 
 
 def test_rays_meet_the_sphere_where_they_should():
@@ -35,7 +37,9 @@ def test_rays_meet_the_sphere_where_they_should():
     found = trace_grid(grid, RADIUS, origins, directions)
     along = (origins * directions).sum(-1)
     missed_by = (origins.square().sum(-1) - along**2).clamp_min(0).sqrt() - 0.6
-    clear = missed_by.abs() > 2 * cell_size(grid, RADIUS)  # within a cell or two of grazing either answer is right
+    clear = missed_by.abs() > 2 * cell_size(
+        grid, RADIUS
+    )  # within a cell or two of grazing either answer is right
     assert torch.equal(found.hit[clear], missed_by[clear] < 0)
     hit = found.hit & clear
     exact = -along[hit] - (0.36 - (origins[hit].square().sum(-1) - along[hit] ** 2)).sqrt()

@@ -55,7 +55,9 @@ def narrowed(sdf, rays, beta, grid=None):
 
 def true_weights(sdf, rays, beta, whole):
     """Places along each ray and their blending weight, by quadrature of the true density."""
-    edges = torch.lerp(whole.near[:, None].double(), whole.far[:, None].double(), torch.linspace(0, 1, 8001).double())
+    edges = torch.lerp(
+        whole.near[:, None].double(), whole.far[:, None].double(), torch.linspace(0, 1, 8001).double()
+    )
     middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
     points = rays.origins[:, None].double() + middle[..., None] * rays.directions[:, None].double()
     distance = sdf(points.float().reshape(-1, 3)).double().view(middle.shape)
@@ -77,7 +79,9 @@ def assert_nothing_lost(sdf, rays, beta):
 
 
 @pytest.mark.parametrize("beta", [0.1, 0.01, 0.001])
-@pytest.mark.parametrize("sdf", [sphere, hollow, plate(0.2), plate(1e-3)], ids=["sphere", "hollow", "plate", "foil"])
+@pytest.mark.parametrize(
+    "sdf", [sphere, hollow, plate(0.2), plate(1e-3)], ids=["sphere", "hollow", "plate", "foil"]
+)
 @pytest.mark.parametrize("inside", [False, True])
 def test_what_is_skipped_holds_no_weight(sdf, beta, inside):
     assert_nothing_lost(sdf, bundle(inside=inside), beta)
@@ -135,7 +139,9 @@ def test_fewer_queries_find_the_same_surface(sdf):
         reached = torch.nn.functional.pad(depth_weights(depth).weights, (1, 0)).cumsum(-1)
         first = torch.searchsorted(reached, torch.full_like(t[:, :1], 0.5)).clamp(1, t.shape[1] - 1)
         low, high = reached.gather(-1, first - 1), reached.gather(-1, first)
-        median = torch.lerp(t.gather(-1, first - 1), t.gather(-1, first), (0.5 - low) / (high - low).clamp_min(1e-9))
+        median = torch.lerp(
+            t.gather(-1, first - 1), t.gather(-1, first), (0.5 - low) / (high - low).clamp_min(1e-9)
+        )
         return (median[opaque, 0] - truth).abs(), found.sdf_queries
 
     (exact, more), (narrow, fewer) = run(whole), run(part)
@@ -144,7 +150,7 @@ def test_fewer_queries_find_the_same_surface(sdf):
     assert fewer < 0.85 * more
 
 
-# ------------------------------------------------------------------------------------------------ rays that leave a surface
+# ---------------------------------------------------------------------------------- rays that leave a surface
 
 
 def may_meet(sdf, rays, beta=0.01):
@@ -167,24 +173,37 @@ def test_rays_that_leave_a_round_thing_meet_nothing():
 
 
 @settings(max_examples=25, deadline=None)
-@given(share=st.floats(0.001, 2.0), seed=st.integers(0, 99), tilt=st.floats(-1.5, 1.5), log_beta=st.floats(-3.0, -1.5))
+@given(
+    share=st.floats(0.001, 2.0),
+    seed=st.integers(0, 99),
+    tilt=st.floats(-1.5, 1.5),
+    log_beta=st.floats(-3.0, -1.5),
+)
 def test_no_thin_plate_before_a_ray_is_overlooked(share, seed, tilt, log_beta):
-    """Rays from two cells or more before the plate, by no less than 10° towards it, from above a surface of their own."""
+    """Rays from two cells or more before the plate, by no less than 10° towards it, from above a surface of
+    their own.
+    """
     normal = torch.tensor([math.sin(tilt), 0.2, math.cos(tilt)]) / math.sqrt(1.04)
     foil, generator = plate(share * CELL, tilt, 0.3), torch.Generator().manual_seed(seed)
     origins = normalize(torch.randn(200, 3, generator=generator), dim=-1)
     directions = normalize(torch.randn(200, 3, generator=generator), dim=-1)
     along = (0.3 - origins @ normal) / (directions @ normal)
-    meets = (along > 0) & ((directions @ normal).abs() > math.sin(math.radians(10.0))) & (foil(origins) > 2 * CELL)
+    meets = (
+        (along > 0)
+        & ((directions @ normal).abs() > math.sin(math.radians(10.0)))
+        & (foil(origins) > 2 * CELL)
+    )
     meets &= (origins + along[:, None] * directions).norm(dim=-1) < RADIUS - CELL
 
     def scene(x):
-        return torch.minimum(foil(x), (x.norm(dim=-1) - 0.9).abs() + 0.03)  # a shell that all rays leave, or pass
+        return torch.minimum(
+            foil(x), (x.norm(dim=-1) - 0.9).abs() + 0.03
+        )  # a shell that all rays leave, or pass
 
     assert may_meet(scene, RayBatch(origins, directions)[meets], 10.0**log_beta).all()
 
 
-# ------------------------------------------------------------------------------------------------------- a field that moves
+# ----------------------------------------------------------------------------------------- a field that moves
 
 
 def test_a_surface_that_has_come_up_is_noticed_at_once():

@@ -1,4 +1,6 @@
-"""Free space about cameras: how far it reaches, its depth against the definition, and what it does to the reference host."""
+"""Free space about cameras: how far it reaches, its depth against the definition, and what it does to the
+reference host.
+"""
 
 from __future__ import annotations
 

@@ -23,7 +23,9 @@ X = [1.0, 0.0, 0.0]
     ],
 )
 def test_closed_forms(origin, direction, near, far):
-    interval = sphere_interval(torch.tensor([origin], dtype=torch.float64), torch.tensor([direction], dtype=torch.float64), 2.0)
+    interval = sphere_interval(
+        torch.tensor([origin], dtype=torch.float64), torch.tensor([direction], dtype=torch.float64), 2.0
+    )
     assert interval.near.item() == pytest.approx(near, abs=1e-12)
     assert interval.far.item() == pytest.approx(far, abs=1e-12)
 

@@ -1,4 +1,6 @@
-"""Ray samplers: the distributions they draw from, and the error bound against quadrature of the true density."""
+"""Ray samplers: the distributions they draw from, and the error bound against quadrature of the true
+density.
+"""
 
 from __future__ import annotations
 
@@ -46,17 +48,24 @@ SURFACES = [sphere, thin_plate, tilted_plane]
 def ray_bundle(count, dtype=F64):
     """Rays from a shell of radius 2.5 towards the object; some pass it."""
     generator = torch.Generator().manual_seed(3)
-    origins = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=F64), dim=-1) * 2.5
+    origins = (
+        torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=F64), dim=-1) * 2.5
+    )
     targets = 0.4 * torch.randn(count, 3, generator=generator, dtype=F64)
     directions = torch.nn.functional.normalize(targets - origins, dim=-1)
-    return origins.to(dtype), directions.to(dtype), torch.zeros(count, dtype=dtype), torch.full((count,), 5.0).to(dtype)
+    return (
+        origins.to(dtype),
+        directions.to(dtype),
+        torch.zeros(count, dtype=dtype),
+        torch.full((count,), 5.0).to(dtype),
+    )
 
 
 def sample(sdf, rays, beta, config=CONFIG, stochastic=False):
     return error_bounded_samples(sdf, *rays, torch.tensor(beta, dtype=rays[0].dtype), config, stochastic)
 
 
-# ------------------------------------------------------------------------------------------------------ simple samplers
+# -------------------------------------------------------------------------------------------- simple samplers
 
 
 def test_uniform_samples_are_both_ends_and_the_middles_of_equal_parts():
@@ -112,15 +121,19 @@ def test_inverse_cdf_at_its_ends_stays_where_the_mass_is(monkeypatch, u, mass, w
     assert samples.item() == pytest.approx(where, abs=1e-6)
 
 
-# ------------------------------------------------------------------------------------------------------ the error bound
+# -------------------------------------------------------------------------------------------- the error bound
 
 
 def distance_beyond_two_balls(width, a, b):
-    """Brute force: from the segment [0, width] on an axis to the nearest point outside the discs at its two ends."""
+    """Brute force: from the segment [0, width] on an axis to the nearest point outside the discs at its two
+    ends.
+    """
     angle = np.linspace(0.0, np.pi, 20_001)
     first = np.stack([a * np.cos(angle), a * np.sin(angle)], -1)
     second = np.stack([width + b * np.cos(angle), b * np.sin(angle)], -1)
-    outline = np.concatenate([first[np.hypot(first[:, 0] - width, first[:, 1]) >= b], second[np.hypot(*second.T) >= a]])
+    outline = np.concatenate(
+        [first[np.hypot(first[:, 0] - width, first[:, 1]) >= b], second[np.hypot(*second.T) >= a]]
+    )
     return np.hypot(outline[:, 0] - outline[:, 0].clip(0.0, width), outline[:, 1]).min()
 
 
@@ -199,7 +212,7 @@ def test_the_bound_says_when_the_rounds_were_too_few():
     assert found.distances.isfinite().all()
 
 
-# -------------------------------------------------------------------------------------------- the error-bounded sampler
+# ---------------------------------------------------------------------------------- the error-bounded sampler
 
 
 @pytest.mark.parametrize("stochastic", [False, True])
@@ -229,7 +242,9 @@ def test_a_thin_plate_is_not_missed():
     crosses = (crossing > 0.1) & (crossing < 4.9)
     found = sample(thin_plate, rays, 0.002)
     points = origins[:, None] + found.distances[..., None] * directions[:, None]
-    density = laplace_density(thin_plate(points.reshape(-1, 3)).reshape(points.shape[:2]), torch.tensor(0.002))
+    density = laplace_density(
+        thin_plate(points.reshape(-1, 3)).reshape(points.shape[:2]), torch.tensor(0.002)
+    )
     opacity = render_weights(density, found.distances, far).opacity
     # Along the normal the plate's optical depth is 0.02 / 0.002, so exp(−10) passes at most.
     assert crosses.sum() > 10
@@ -237,7 +252,9 @@ def test_a_thin_plate_is_not_missed():
 
 
 def test_samples_follow_the_true_opacity():
-    """In a soft plane that stops all light, the share of samples before t is the opacity up to t, within ε."""
+    """In a soft plane that stops all light, the share of samples before t is the opacity up to t, within
+    ε.
+    """
     origins, directions = torch.zeros(1, 3, dtype=F64), torch.tensor([[0.0, 0.0, 1.0]], dtype=F64)
     rays = (origins, directions, torch.zeros(1, dtype=F64), torch.full((1,), 4.0, dtype=F64))
     beta = 0.1
@@ -295,7 +312,9 @@ def test_new_cuts_pay_more_than_cuts_in_proportion_to_the_bound(monkeypatch):
     ours = sample(sphere, ray_bundle(200), 0.01)
     monkeypatch.setattr(samplers, "bound_shares", bound_itself)
     papers = sample(sphere, ray_bundle(200), 0.01)
-    assert (ours.error_bound <= OPACITY_ERROR).float().mean() >= (papers.error_bound <= OPACITY_ERROR).float().mean()
+    assert (ours.error_bound <= OPACITY_ERROR).float().mean() >= (
+        papers.error_bound <= OPACITY_ERROR
+    ).float().mean()
     assert ours.sdf_queries < papers.sdf_queries
 
 

@@ -1,10 +1,10 @@
 """Reader of COLMAP models, text or binary, with rigs or from before them; any camera model but panoramas.
 
-sparse/0, sparse, …, or the folder itself     cameras, images, points3D (.bin or .txt)
-images/                                       the images, or beside the model; EXR files may stand for the listed ones
-masks/<image>.png, masks/<stem>.png           optional
-fused.ply, dense/fused.ply                    optional: COLMAP's dense points with normals
-object_point_cloud.ply                        optional: points of the object alone, which tell where it is (NeRO's scenes)
+sparse/0, sparse, …, or the folder itself     cameras, images, points3D (.bin or .txt) images/
+the images, or beside the model; EXR files may stand for the listed ones masks/<image>.png, masks/<stem>.png
+optional fused.ply, dense/fused.ply                    optional: COLMAP's dense points with normals
+object_point_cloud.ply                        optional: points of the object alone, which tell where it is
+(NeRO's scenes)
 
 The images are used as they are: a lens keeps its distortion, and its rays are bent instead of the image.
 """
@@ -44,7 +44,8 @@ def read(root: Path) -> CaptureFiles:
     """The capture's files: one view for each registered image, in the order of their names.
 
     Raises:
-        UserError: the model is malformed or empty, has a panorama, or an image is missing or outside the folder.
+        UserError: the model is malformed or empty, has a panorama, or an image is missing or outside the
+            folder.
     """
     folder = model_folder(root)
     if folder is None:
@@ -59,7 +60,9 @@ def read(root: Path) -> CaptureFiles:
     first = names[0]
     inputs = next((root / place for place in IMAGE_FOLDERS if stored(root, root / place / first)), None)
     if inputs is None:
-        raise UserError(f"{root}: there is no images/{first}", "put the images of the model into the folder images")
+        raise UserError(
+            f"{root}: there is no images/{first}", "put the images of the model into the folder images"
+        )
     views = []
     for index, (image, listed, name) in enumerate(zip(registered, names, view_names(names), strict=True)):
         file = stored_image(root, inputs / listed, f"{folder}: {listed}")
@@ -67,7 +70,11 @@ def read(root: Path) -> CaptureFiles:
         camera = camera_of(image.camera, w2c, f"{folder}: {listed}")
         views.append(View(name, index, camera, file, _mask(root, listed)))
     known = (root / OBJECT).is_file()
-    points = read_positions(inside(root, root / OBJECT)) if known else np.array([p.xyz for p in model.points3D.values()])
+    points = (
+        read_positions(inside(root, root / OBJECT))
+        if known
+        else np.array([p.xyz for p in model.points3D.values()])
+    )
     points = points.reshape(-1, 3)
     cloud = next((inside(root, root / place) for place in POINT_CLOUDS if (root / place).is_file()), None)
     box = find_box(views, points[np.isfinite(points).all(axis=1)])
@@ -88,7 +95,9 @@ def open_model(folder: Path) -> pycolmap.Reconstruction:
         return model
     except (ValueError, IndexError, RuntimeError, MemoryError, OSError) as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise UserError(f"{folder}: not a COLMAP model that can be read ({reason})", "export the model again") from error
+        raise UserError(
+            f"{folder}: not a COLMAP model that can be read ({reason})", "export the model again"
+        ) from error
 
 
 def camera_of(camera: pycolmap.Camera, w2c: Float64[np.ndarray, "4 4"], where: str) -> Camera:
@@ -98,7 +107,9 @@ def camera_of(camera: pycolmap.Camera, w2c: Float64[np.ndarray, "4 4"], where: s
         UserError: a panorama, which has no image plane; names `where`.
     """
     if camera.model_name in PANORAMAS:
-        raise UserError(f"{where}: a camera of the model {camera.model_name}", "cut the panorama into perspective images")
+        raise UserError(
+            f"{where}: a camera of the model {camera.model_name}", "cut the panorama into perspective images"
+        )
     params = np.asarray(camera.params, dtype=np.float64)
     fx, fy = np.broadcast_to(params[list(camera.focal_length_idxs())], 2)
     cx, cy = params[list(camera.principal_point_idxs())]
@@ -118,4 +129,6 @@ def model_folder(root: Path) -> Path | None:
 def _mask(root: Path, image: str) -> Path | None:
     """COLMAP's own name for a mask adds .png to the image's; others put it in place of the suffix."""
     named = root / "masks" / f"{image}.png"
-    return named if inside(root, named).is_file() else stored(root, (root / "masks" / image).with_suffix(".png"))
+    return (
+        named if inside(root, named).is_file() else stored(root, (root / "masks" / image).with_suffix(".png"))
+    )

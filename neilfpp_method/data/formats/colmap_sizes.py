@@ -1,7 +1,7 @@
 """A walk through the binary files of a COLMAP model that only adds up lengths.
 
-pycolmap believes the counts in a file: one damaged number has it loop for minutes, or ask for more memory than there is.
-What the counts announce has to be there before pycolmap may read it.
+pycolmap believes the counts in a file: one damaged number has it loop for minutes, or ask for more memory
+than there is. What the counts announce has to be there before pycolmap may read it.
 """
 
 from __future__ import annotations

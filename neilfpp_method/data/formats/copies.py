@@ -32,16 +32,19 @@ def writing(out: Path) -> Iterator[None]:
         out.mkdir(parents=True, exist_ok=True)
         yield
     except OSError as error:
-        raise UserError(f"{out}: cannot be written ({error.strerror or error})", "choose another folder") from error
+        raise UserError(
+            f"{out}: cannot be written ({error.strerror or error})", "choose another folder"
+        ) from error
 
 
 def copy_view(view: View, out: Path, hdr: bool, straight: bool) -> View:
-    """Copy a view's files to `out`/images, masks and valid, under the view's name; returns the view that they make.
+    """Copy a view's files to `out`/images, masks and valid, under the view's name; returns the view that they
+    make.
 
-    The files are copied as they are where that says all. An exposure or white balance is divided out, as the layouts
-    know none: the image is then written as EXR. With `straight` a lens is undone: the image is resampled as linear
-    radiance and written as EXR, or as 16-bit PNG where it is not linear. A pixel is then valid where all that it is made
-    of is, and on the object where most of it is.
+    The files are copied as they are where that says all. An exposure or white balance is divided out, as the
+    layouts know none: the image is then written as EXR. With `straight` a lens is undone: the image is
+    resampled as linear radiance and written as EXR, or as 16-bit PNG where it is not linear. A pixel is then
+    valid where all that it is made of is, and on the object where most of it is.
 
     Raises:
         UserError: an image cannot be read.
@@ -71,7 +74,9 @@ def copy_file(source: Path, target: Path) -> Path:
     return target
 
 
-def _write_image(view: View, camera: Camera, factor: Float32[np.ndarray, " 3"], hdr: bool, target: Path) -> Path:
+def _write_image(
+    view: View, camera: Camera, factor: Float32[np.ndarray, " 3"], hdr: bool, target: Path
+) -> Path:
     image = read_image(view.image)
     linear = image.pixels if hdr else srgb_to_linear(torch.from_numpy(image.pixels)).numpy()
     color = np.broadcast_to(linear, (*linear.shape[:2], 3)) / factor
@@ -80,14 +85,21 @@ def _write_image(view: View, camera: Camera, factor: Float32[np.ndarray, " 3"], 
     if camera is not view.camera:
         layers = resample(layers, view.camera, camera)
     if hdr:
-        write_exr(path := target.with_name(f"{target.name}.exr"), {"RGB" if layers.shape[2] == 3 else "RGBA": layers})
+        write_exr(
+            path := target.with_name(f"{target.name}.exr"),
+            {"RGB" if layers.shape[2] == 3 else "RGBA": layers},
+        )
         return path
     layers[..., :3] = linear_to_srgb(torch.from_numpy(layers[..., :3])).numpy()
-    write_png(path := target.with_name(f"{target.name}.png"), np.rint(layers.clip(0, 1) * 65_535).astype(np.uint16))
+    write_png(
+        path := target.with_name(f"{target.name}.png"), np.rint(layers.clip(0, 1) * 65_535).astype(np.uint16)
+    )
     return path
 
 
-def _copy_mask(mask: Path | None, camera: Camera, straight: Camera, target: Path, least: float) -> Path | None:
+def _copy_mask(
+    mask: Path | None, camera: Camera, straight: Camera, target: Path, least: float
+) -> Path | None:
     """Copy a mask; a resampled pixel is white where more than `least` of it was."""
     if mask is None:
         return None

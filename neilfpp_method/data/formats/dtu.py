@@ -4,7 +4,8 @@ cameras_sphere.npz, or cameras.npz      world_mat_<i>: image ← world, 4×4 (th
                                         scale_mat_<i>: world ← unit sphere, a scale and a shift
 image/ or rgb/, mask/                   the i-th file belongs to camera i
 
-In these files a pixel's centre lies at whole numbers; here it lies at +½, so principal points move by half a pixel.
+In these files a pixel's centre lies at whole numbers; here it lies at +½, so principal points move by half a
+pixel.
 """
 
 from __future__ import annotations
@@ -55,7 +56,9 @@ def read(root: Path) -> CaptureFiles:
     views = []
     for i, image in enumerate(images):
         header = image_header(image)
-        camera = _camera(_matrix(matrices, f"world_mat_{i}", archive), header.width, header.height, archive, i)
+        camera = _camera(
+            _matrix(matrices, f"world_mat_{i}", archive), header.width, header.height, archive, i
+        )
         views.append(View(image.stem, i, camera, image, masks[i] if masks else None))
     return CaptureFiles(root, tuple(views), _normalisation(matrices, len(images), archive))
 
@@ -69,15 +72,25 @@ def _matrices(archive: Path) -> Mapping[str, np.ndarray]:
         with np.load(archive, allow_pickle=False) as stored:
             return {name: stored[name] for name in stored.files}
     except (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile, MemoryError) as error:
-        raise UserError(f"{archive}: not an archive of matrices ({error})", "export the cameras again") from error
+        raise UserError(
+            f"{archive}: not an archive of matrices ({error})", "export the cameras again"
+        ) from error
 
 
 def _matrix(matrices: Mapping[str, np.ndarray], name: str, archive: Path) -> Float64[np.ndarray, "4 4"]:
     matrix = matrices.get(name)
     if matrix is None:
-        raise UserError(f"{archive}: {name} is missing", "number the matrices from 0, in the order of the images' names")
-    if matrix.shape not in ((4, 4), (3, 4)) or matrix.dtype.kind not in "fiu" or not np.isfinite(matrix).all():
-        raise UserError(f"{archive}: {name} is not a 4×4 matrix of finite numbers", "export the cameras again")
+        raise UserError(
+            f"{archive}: {name} is missing", "number the matrices from 0, in the order of the images' names"
+        )
+    if (
+        matrix.shape not in ((4, 4), (3, 4))
+        or matrix.dtype.kind not in "fiu"
+        or not np.isfinite(matrix).all()
+    ):
+        raise UserError(
+            f"{archive}: {name} is not a 4×4 matrix of finite numbers", "export the cameras again"
+        )
     return np.concatenate([matrix[:3], [[0, 0, 0, 1]]]).astype(np.float64)
 
 
@@ -114,13 +127,20 @@ def _normalisation(matrices: Mapping[str, np.ndarray], count: int, archive: Path
 
 
 def _files(root: Path, folder: Path) -> tuple[Path, ...]:
-    """The images of a folder, in the order of their names, which must not contradict that of their numbers."""
-    shown = (file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith("."))
+    """The images of a folder, in the order of their names, which must not contradict that of their
+    numbers.
+    """
+    shown = (
+        file
+        for file in folder.iterdir()
+        if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
+    )
     files = sorted(shown)
     numbers = [int(file.stem) for file in files if file.stem.isdecimal()]
     if len(numbers) == len(files) and numbers != sorted(numbers):
         raise UserError(
-            f"{folder}: by name {files[0].name} comes first, by number {min(numbers)}: whose camera is whose is not certain",
+            f"{folder}: by name {files[0].name} comes first, by number {min(numbers)}: whose camera is whose "
+            "is not certain",
             "pad the numbers with zeros: 007, 010",
         )
     return tuple(inside(root, file) for file in files)

@@ -30,11 +30,14 @@ def lens_from_nerfstudio(model: str, coefficients: Mapping[str, float], where: s
         where: whose lens it is.
 
     Raises:
-        UserError: a perspective camera has a k4, which stands for r⁸ in nerfstudio and has no place in COLMAP's models.
+        UserError: a perspective camera has a k4, which stands for r⁸ in nerfstudio and has no place in
+            COLMAP's models.
     """
     known = {name: coefficients.get(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
     if model != FISHEYE and known["k4"]:
-        raise UserError(f"{where}: k4 has a meaning for {FISHEYE} only", "undistort the images, or calibrate without it")
+        raise UserError(
+            f"{where}: k4 has a meaning for {FISHEYE} only", "undistort the images, or calibrate without it"
+        )
     if model != FISHEYE:
         model = "FULL_OPENCV" if known["k3"] else "OPENCV"
     unnamed = (0.0,) * 3 if model == "FULL_OPENCV" else ()
@@ -42,7 +45,9 @@ def lens_from_nerfstudio(model: str, coefficients: Mapping[str, float], where: s
 
 
 def nerfstudio_coefficients(camera: Camera) -> Mapping[str, float] | None:
-    """The coefficients of a camera's lens by name: empty for a pinhole, none for a lens that nerfstudio has not."""
+    """The coefficients of a camera's lens by name: empty for a pinhole, none for a lens that nerfstudio has
+    not.
+    """
     if camera.lens is None:
         return {}
     names, coefficients = NAMES.get(camera.lens.model), camera.lens.coefficients

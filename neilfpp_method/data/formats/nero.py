@@ -1,9 +1,10 @@
 """Reader of NeRO's glossy synthetic scenes.
 
-<i>-camera.pkl      a pickled pair of arrays: world to camera, 3×4, OpenCV axes; and the intrinsics, 3×3, pixel centres at +½
-<i>.png             the image; 0, 1, …, without gaps
+<i>-camera.pkl      a pickled pair of arrays: world to camera, 3×4, OpenCV axes; and the intrinsics, 3×3,
+pixel centres at +½ <i>.png             the image; 0, 1, …, without gaps
 
-The object lies in the unit sphere. NeRO's real scenes, and others prepared for it, are COLMAP models in colmap/sparse/0.
+The object lies in the unit sphere. NeRO's real scenes, and others prepared for it, are COLMAP models in
+colmap/sparse/0.
 """
 
 from __future__ import annotations
@@ -37,14 +38,20 @@ def read(root: Path) -> CaptureFiles:
         UserError: a camera or an image is missing, or a camera is malformed.
     """
     count = sum(1 for path in root.glob(f"*{SUFFIX}") if path.name.removesuffix(SUFFIX).isdigit())
-    return CaptureFiles(root, tuple(_view(root, i) for i in range(count)), Normalisation(1.0, (0.0, 0.0, 0.0)))
+    return CaptureFiles(
+        root, tuple(_view(root, i) for i in range(count)), Normalisation(1.0, (0.0, 0.0, 0.0))
+    )
 
 
 def _view(root: Path, i: int) -> View:
     path = inside(root, root / f"{i}{SUFFIX}")
     arrays = read_pickled_arrays(path)
-    if [array.shape for array in arrays] != [(3, 4), (3, 3)] or not all(np.isfinite(array).all() for array in arrays):
-        raise UserError(f"{path}: not a pose of 3×4 and intrinsics of 3×3 finite numbers", "write the camera again")
+    if [array.shape for array in arrays] != [(3, 4), (3, 3)] or not all(
+        np.isfinite(array).all() for array in arrays
+    ):
+        raise UserError(
+            f"{path}: not a pose of 3×4 and intrinsics of 3×3 finite numbers", "write the camera again"
+        )
     pose, k = arrays
     if abs(k[0, 1]) > SKEW * abs(k[0, 0]) or not np.allclose(k[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
         raise UserError(f"{path}: the intrinsics are not those of a pinhole", "undistort the images")

@@ -1,8 +1,8 @@
 """Arrays of numbers from a pickle that a stranger may have written.
 
-A pickle is a program, and the usual reader runs it. This one knows the five names by which NumPy pickles an array, gives
-each a stand-in of its own that only notes down what it is handed, and refuses all other names: nothing that a file says is
-called, and NumPy itself sees no more than checked bytes in the end.
+A pickle is a program, and the usual reader runs it. This one knows the five names by which NumPy pickles an
+array, gives each a stand-in of its own that only notes down what it is handed, and refuses all other names:
+nothing that a file says is called, and NumPy itself sees no more than checked bytes in the end.
 """
 
 from __future__ import annotations
@@ -39,14 +39,18 @@ def read_pickled_arrays(path: Path) -> tuple[Float64[np.ndarray, " *shape"], ...
             raise ValueError("it is too large for a camera")
         for opcode, argument, _ in pickletools.genops(data):
             if opcode.name.endswith("PUT") and int(argument or 0) > len(data):
-                raise ValueError("damaged")  # the unpickler makes room for as many objects as such a number says
+                raise ValueError(
+                    "damaged"
+                )  # the unpickler makes room for as many objects as such a number says
         held = _Arrays(io.BytesIO(data)).load()
         if not isinstance(held, tuple | list):
             raise ValueError("it is no tuple of arrays")
         return tuple(_numbers(array) for array in held)
     except Exception as error:  # a forged file can fail anywhere in the unpickler
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise UserError(f"{path}: no pickled arrays of numbers ({reason})", "write the camera again, as two arrays") from error
+        raise UserError(
+            f"{path}: no pickled arrays of numbers ({reason})", "write the camera again, as two arrays"
+        ) from error
 
 
 class _Type:

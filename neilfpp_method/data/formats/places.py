@@ -13,7 +13,8 @@ __all__ = ["stored", "stored_image", "view_names"]
 
 
 def stored(root: Path, path: Path) -> Path | None:
-    """The file, or the one of its name with another image suffix: scenes list .png, or no suffix, where files are .exr.
+    """The file, or the one of its name with another image suffix: scenes list .png, or no suffix, where files
+    are .exr.
 
     Raises:
         UserError: the path leads out of `root`, or two files could be meant.
@@ -38,7 +39,9 @@ def stored_image(root: Path, path: Path, where: str) -> Path:
 
 
 def view_names(listed: Sequence[str]) -> tuple[str, ...]:
-    """Names for views: the stems of the listed files, or where two are the same, of all with their folders: "left-000"."""
+    """Names for views: the stems of the listed files, or where two are the same, of all with their folders:
+    "left-000".
+    """
     paths = [PurePosixPath(name.replace("\\", "/")) for name in listed]
     stems = tuple(path.stem for path in paths)
     return stems if len(set(stems)) == len(stems) else tuple(_with_folders(path) for path in paths)

@@ -1,13 +1,14 @@
-"""Reader of the layout in which the NeILF datasets are published: `inputs/sfm_scene.json` and the files around it.
+"""Reader of the layout in which the NeILF datasets are published: `inputs/sfm_scene.json` and the files
+around it.
 
 camera_track_map.images.<i>.flg                        2: the camera is valid; others are left out
 camera_track_map.images.<i>.size                       width, height
-camera_track_map.images.<i>.camera.intrinsic           focal (one number or two), ppt (principal point), in pixels
-camera_track_map.images.<i>.camera.extrinsic           world to camera, 4×4, row-major
-image_path.file_paths.<i>                              relative to the folder `inputs`
-bbox.transform                                         4×4: full extents on the diagonal, centre in the last column
-inputs/masks/<stem>.*, inputs/model/oriented_pcd.ply   optional
-inputs/valid/<stem>.*                                  optional; the project's own writer adds it
+camera_track_map.images.<i>.camera.intrinsic           focal (one number or two), ppt (principal point), in
+pixels camera_track_map.images.<i>.camera.extrinsic           world to camera, 4×4, row-major
+image_path.file_paths.<i>                              relative to the folder `inputs` bbox.transform
+4×4: full extents on the diagonal, centre in the last column inputs/masks/<stem>.*,
+inputs/model/oriented_pcd.ply   optional inputs/valid/<stem>.*                                  optional; the
+project's own writer adds it
 """
 
 from __future__ import annotations
@@ -41,18 +42,25 @@ def read(root: Path) -> CaptureFiles:
     """The capture's files.
 
     Raises:
-        UserError: the scene file is malformed, or images and cameras do not match; names the file and the entry.
+        UserError: the scene file is malformed, or images and cameras do not match; names the file and the
+            entry.
     """
     path = inside(root, next(root / place for place in PLACES if (root / place).is_file()))
     scene = Entry.load(path)
     tracks, files = scene["camera_track_map"]["images"], scene["image_path"]["file_paths"]
     for key in files.entries():
         if key not in tracks.entries():
-            raise UserError(f"{files.name(key)}: an image without a camera", "add its camera, or remove the entry")
-    valid = sorted((key for key in tracks.entries() if tracks[key]["flg"].value == VALID), key=_number_of(tracks))
+            raise UserError(
+                f"{files.name(key)}: an image without a camera", "add its camera, or remove the entry"
+            )
+    valid = sorted(
+        (key for key in tracks.entries() if tracks[key]["flg"].value == VALID), key=_number_of(tracks)
+    )
     for key in valid:
         if key not in files.entries():
-            raise UserError(f"{tracks.name(key)}: a camera without an image", f"add its image to {files.where}")
+            raise UserError(
+                f"{tracks.name(key)}: a camera without an image", f"add its image to {files.where}"
+            )
     if not valid:
         raise UserError(f"{path}: no images with a valid camera", f"give at least one entry the flg {VALID}")
     listed = {key: files[key].text() for key in files.entries()}
@@ -69,7 +77,9 @@ def _number_of(tracks: Entry) -> Callable[[str], int]:
         try:
             return int(key)
         except ValueError:
-            raise UserError(f"{tracks.name(key)}: an image's key is not a number", "number the images from 0") from None
+            raise UserError(
+                f"{tracks.name(key)}: an image's key is not a number", "number the images from 0"
+            ) from None
 
     return number
 
@@ -77,7 +87,9 @@ def _number_of(tracks: Entry) -> Callable[[str], int]:
 def _view(root: Path, inputs: Path, index: int, track: Entry, file: Entry) -> View:
     width, height = track["size"].numbers((2,))
     if (width, height) != (int(width), int(height)):
-        raise UserError(f"{track.name('size')}: the image size is not whole", "give width and height in pixels")
+        raise UserError(
+            f"{track.name('size')}: the image size is not whole", "give width and height in pixels"
+        )
     intrinsic, extrinsic = track["camera"]["intrinsic"], track["camera"]["extrinsic"]
     fx, fy = np.broadcast_to(intrinsic["focal"].numbers((), (1,), (2,)), 2)
     cx, cy = intrinsic["ppt"].numbers((2,))
@@ -89,18 +101,24 @@ def _view(root: Path, inputs: Path, index: int, track: Entry, file: Entry) -> Vi
 
 
 def _inputs_folder(root: Path, scene: Path, listed: str) -> Path:
-    """The folder that listed paths start from, told by the first image: the scene file may lie in other places."""
+    """The folder that listed paths start from, told by the first image: the scene file may lie in other
+    places.
+    """
     folders = (scene.parent, root / "inputs", root)
     return next((folder for folder in folders if stored(root, folder / listed) is not None), scene.parent)
 
 
 def _refuse_strays(views: tuple[View, ...], listed: set[str], scene: Path) -> None:
-    """Images beside the listed ones that the scene file does not know: somebody believes that they are used."""
+    """Images beside the listed ones that the scene file does not know: somebody believes that they are
+    used.
+    """
     for folder in sorted({view.image.parent for view in views}):
         for file in sorted(folder.iterdir()):
             shown = file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
             if shown and file.stem not in listed:
-                raise UserError(f"{file}: an image without a camera in {scene}", "add its camera, or move it away")
+                raise UserError(
+                    f"{file}: an image without a camera in {scene}", "add its camera, or move it away"
+                )
 
 
 def _normalisation(scene: Entry, point_cloud: Path | None) -> Normalisation:
@@ -114,7 +132,9 @@ def _normalisation(scene: Entry, point_cloud: Path | None) -> Normalisation:
         low, high = points.min(axis=0), points.max(axis=0)
         extents, centre, where = high - low, (low + high) / 2, str(point_cloud)
     else:
-        raise UserError(f"{scene.where}: no bbox and no {POINT_CLOUD}", "add one: it says where the object is")
+        raise UserError(
+            f"{scene.where}: no bbox and no {POINT_CLOUD}", "add one: it says where the object is"
+        )
     if extents.min() < 0 or extents.max() == 0:
         raise UserError(f"{where}: the box is empty or inside out", "give the full extents on the diagonal")
     return Normalisation(float(extents.max() / 2), tuple(map(float, centre)))

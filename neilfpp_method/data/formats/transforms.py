@@ -1,16 +1,16 @@
 """Reader of nerfstudio's transforms.json, and of what instant-ngp and others write under that name.
 
 camera_model                         OPENCV (also where missing), OPENCV_FISHEYE, or one of COLMAP's pinholes
-is_fisheye                           instant-ngp's word for OPENCV_FISHEYE, in the place of camera_model
-fl_x, fl_y, cx, cy, w, h, k1 … p2    for all frames, or in a frame for itself; camera_angle_x (radians) may stand for fl_x
-frames[].file_path, .mask_path       relative to the file; a mask is white on the object
+is_fisheye                           instant-ngp's word for OPENCV_FISHEYE, in the place of camera_model fl_x,
+fl_y, cx, cy, w, h, k1 … p2    for all frames, or in a frame for itself; camera_angle_x (radians) may stand
+for fl_x frames[].file_path, .mask_path       relative to the file; a mask is white on the object
 frames[].transform_matrix            camera to world, 4×4, OpenGL axes (x right, y up, z back)
 train_filenames, test_filenames, …   optional: the views held out are those that are not for training
 ply_file_path                        optional; used for its points, and where it has normals as oriented cloud
 scene, response, frames[].valid_path optional, as in capture.json: the project's own writer adds them
 
-The world frame is that of the file's poses, in which its point cloud lies too. `applied_transform`, which says how that
-frame came from an older one, stays applied.
+The world frame is that of the file's poses, in which its point cloud lies too. `applied_transform`, which
+says how that frame came from an older one, stays applied.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ __all__ = ["FLIP", "LAYOUT", "Frame", "read", "read_frames", "recognise"]
 
 LAYOUT = "transforms.json"
 FLIP = np.array([1.0, -1.0, -1.0, 1.0])
-"""OpenCV's axes (x right, y down, z forward) and OpenGL's (x right, y up, z back): one is the other times this."""
+"""OpenCV's axes (x right, y down, z forward) and OpenGL's (x right, y up, z back): one is the other times
+this.
+"""
 MODELS = ("OPENCV", FISHEYE, "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 
 
@@ -106,7 +108,9 @@ def read_frames(root: Path, entry: Entry) -> tuple[Frame, ...]:
 def _frame(root: Path, entry: Entry, frame: Entry) -> Frame:
     listed = frame["file_path"]
     image = _named(root, listed)
-    mask, valid = (_named(root, path) if (path := frame.get(name)) else None for name in ("mask_path", "valid_path"))
+    mask, valid = (
+        _named(root, path) if (path := frame.get(name)) else None for name in ("mask_path", "valid_path")
+    )
     return Frame(listed.text(), image, mask, valid, _camera(entry, frame, image))
 
 
@@ -127,9 +131,13 @@ def _camera(entry: Entry, frame: Entry, image: Path) -> Camera:
     fx = number("fl_x") or _focal(number("camera_angle_x"), width)
     fy = number("fl_y") or _focal(number("camera_angle_y"), height) or fx
     if fx is None or fy is None:
-        raise UserError(f"{frame.where}: no focal length", "add fl_x, in pixels, or camera_angle_x, in radians")
+        raise UserError(
+            f"{frame.where}: no focal length", "add fl_x, in pixels, or camera_angle_x, in radians"
+        )
     cx, cy = number("cx"), number("cy")
-    distortion = {name: value for name in ("k1", "k2", "k3", "k4", "p1", "p2") if (value := number(name)) is not None}
+    distortion = {
+        name: value for name in ("k1", "k2", "k3", "k4", "p1", "p2") if (value := number(name)) is not None
+    }
     model, fisheye = (frame.get(name) or entry.get(name) for name in ("camera_model", "is_fisheye"))
     unnamed = FISHEYE if fisheye and fisheye.value is True else "OPENCV"
     return Camera(
@@ -153,7 +161,9 @@ def _pose(entry: Entry) -> Float64[np.ndarray, "4 4"]:
     c2w = entry.numbers((4, 4), (3, 4))[:3]
     rotation = c2w[:, :3] * FLIP[:3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
-        raise UserError(f"{entry.where}: not a rotation and a translation", "give camera-to-world, 4×4, row-major")
+        raise UserError(
+            f"{entry.where}: not a rotation and a translation", "give camera-to-world, 4×4, row-major"
+        )
     w2c = np.eye(4)
     w2c[:3, :3], w2c[:3, 3] = rotation.T, -rotation.T @ c2w[:, 3]
     return w2c
@@ -162,14 +172,22 @@ def _pose(entry: Entry) -> Float64[np.ndarray, "4 4"]:
 def _held_out(root: Path, entry: Entry, views: Sequence[View]) -> frozenset[str] | None:
     """The views that the file holds out: `test_filenames`, or else all that are in no list for training."""
     lists = {split: entry.get(f"{split}_filenames") for split in ("train", "test")}
-    given = {split: {stored(root, root / name.text()) for name in names.items()} for split, names in lists.items() if names}
+    given = {
+        split: {stored(root, root / name.text()) for name in names.items()}
+        for split, names in lists.items()
+        if names
+    }
     if not given:
         return None
     for split, files in given.items():
         if not files <= {view.image for view in views}:
-            raise UserError(f"{entry.name(f'{split}_filenames')}: names a file that is no frame", "correct the list")
+            raise UserError(
+                f"{entry.name(f'{split}_filenames')}: names a file that is no frame", "correct the list"
+            )
     train, test = given.get("train"), given.get("test")
-    return frozenset(v.name for v in views if (v.image in test if test is not None else v.image not in (train or ())))
+    return frozenset(
+        v.name for v in views if (v.image in test if test is not None else v.image not in (train or ()))
+    )
 
 
 def _given_box(entry: Entry) -> SceneBox | None:

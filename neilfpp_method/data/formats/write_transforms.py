@@ -1,4 +1,6 @@
-"""Writer of nerfstudio's transforms.json; `transforms` reads it back, scene box, response and validity included."""
+"""Writer of nerfstudio's transforms.json; `transforms` reads it back, scene box, response and validity
+included.
+"""
 
 from __future__ import annotations
 
@@ -20,15 +22,21 @@ __all__ = ["write_transforms"]
 def write_transforms(capture: Capture, out: Path) -> Path:
     """Write a capture with copies of its images, masks and points; returns the folder.
 
-    The frame stays the capture's own. Lenses that nerfstudio knows are kept; images of others, and of fisheyes beside
-    other cameras, are resampled. `scene`, `response` and `valid_path` are entries that nerfstudio passes over.
+    The frame stays the capture's own. Lenses that nerfstudio knows are kept; images of others, and of
+    fisheyes beside other cameras, are resampled. `scene`, `response` and `valid_path` are entries that
+    nerfstudio passes over.
 
     Raises:
         UserError: an image cannot be read, or the folder cannot be written.
     """
-    fisheye = all(view.camera.lens is not None and view.camera.lens.model == FISHEYE for view in capture.views)
+    fisheye = all(
+        view.camera.lens is not None and view.camera.lens.model == FISHEYE for view in capture.views
+    )
     with writing(out):
-        views = [copy_view(view, out, capture.hdr, straight=not _known(view.camera, fisheye)) for view in capture.views]
+        views = [
+            copy_view(view, out, capture.hdr, straight=not _known(view.camera, fisheye))
+            for view in capture.views
+        ]
         description: dict[str, Any] = {
             "camera_model": FISHEYE if fisheye else "OPENCV",
             "response": "linear" if capture.hdr else "srgb",

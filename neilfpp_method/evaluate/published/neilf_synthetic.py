@@ -1,11 +1,15 @@
-"""The protocol of NeILF++ on its synthetic scenes: apple/ml-neilfpp, `code/evaluation/evaluate.py` and `code/utils/general.py`.
+"""The protocol of NeILF++ on its synthetic scenes: apple/ml-neilfpp, `code/evaluation/evaluate.py` and
+`code/utils/general.py`.
 
 What is particular about it:
 
-- The mask is that of the estimate, not of the truth: pixels of which less than 5 % shows what lies behind the surface.
-- Both images are multiplied by the mask, and the squared error is averaged over the whole frame. A small object scores higher.
-- Base colour is clipped to [0, 1] and raised to one power for all views and channels, ln(median truth) / ln(median estimate),
-  the medians over the masked pixels of all views. Roughness and metallic are compared as they are.
+- The mask is that of the estimate, not of the truth: pixels of which less than 5 % shows what lies behind the
+  surface.
+- Both images are multiplied by the mask, and the squared error is averaged over the whole frame. A small
+  object scores higher.
+- Base colour is clipped to [0, 1] and raised to one power for all views and channels, ln(median truth) /
+  ln(median estimate), the medians over the masked pixels of all views. Roughness and metallic are compared as
+  they are.
 - Linear images go through the ACES curve, unclipped; display values are compared as they are.
 - PSNR is taken per view and averaged over the views.
 
@@ -56,7 +60,8 @@ def median_gamma(estimate: Float[np.ndarray, "P 3"], truth: Float[np.ndarray, "P
     medians = float(np.median(truth)), float(np.median(estimate))
     if not all(0 < median < 1 for median in medians):
         raise UserError(
-            f"the protocol {NAME} has no gamma: the median base colour is {medians[0]:.3g}, of the estimate {medians[1]:.3g}",
+            f"the protocol {NAME} has no gamma: the median base colour is {medians[0]:.3g}, of the estimate "
+            f"{medians[1]:.3g}",
             "it needs both between 0 and 1; measure with --protocol neilfpp",
         )
     return float(np.log(medians[0]) / np.log(medians[1]))
@@ -68,7 +73,9 @@ def _check(run: Run) -> None:
     truth = Truth(run.capture)
     for view in run.capture.test_views:
         if truth.material(view) is None:
-            places = [f"ground_truths/materials/{name}/{view.name}.png" for name in ("kd", "roughness", "metallic")]
+            places = [
+                f"ground_truths/materials/{name}/{view.name}.png" for name in ("kd", "roughness", "metallic")
+            ]
             what = "true base colour, roughness and metallic"
             raise missing(NAME, run.capture, view, what, f"{places[0]}, {places[1]} and {places[2]}")
 
@@ -77,10 +84,14 @@ def _measure(run: Run, rendered: Sequence[RenderedView]) -> dict[str, float]:
     known = known_test_views(run, rendered).views
     masks = [view.maps["opacity"][..., 0] > 1 - BEHIND for view in rendered]
     if not any(mask.any() for mask in masks):
-        raise UserError(f"{run.path}: no test view shows a surface", "train longer, or look at the run's report")
+        raise UserError(
+            f"{run.path}: no test view shows a surface", "train longer, or look at the run's report"
+        )
     pairs = list(zip(rendered, known, masks, strict=True))
     estimate = np.concatenate([view.maps["base_color"][mask] for view, _, mask in pairs])
-    gamma = median_gamma(estimate, np.concatenate([known.material["base_color"][mask] for _, known, mask in pairs]))
+    gamma = median_gamma(
+        estimate, np.concatenate([known.material["base_color"][mask] for _, known, mask in pairs])
+    )
     names = ("render", "base_color", "roughness", "metallic")
     scores: dict[str, list[float]] = {f"{name}_psnr": [] for name in names}
     for view, truth, mask in pairs:

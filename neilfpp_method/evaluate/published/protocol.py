@@ -17,7 +17,9 @@ from neilfpp_method.train.run import Run, write_json
 __all__ = ["Protocol", "decibels", "missing", "write_figures"]
 
 PERFECT = 1e-10
-"""Least mean squared error: official code gives infinity for a perfect estimate, which JSON cannot hold; here it is 100 dB."""
+"""Least mean squared error: official code gives infinity for a perfect estimate, which JSON cannot hold; here
+it is 100 dB.
+"""
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,8 @@ class Protocol:
         name: as `neilfpp eval --protocol` has it.
         source: repository and file of the official code.
         left_out: what the official code reports and this does not, with the reason.
-        check: raises a `UserError` where the capture lacks what the protocol needs; called before views are rendered.
+        check: raises a `UserError` where the capture lacks what the protocol needs; called before views are
+            rendered.
         measure: figures by name, from the test views in order.
     """
 

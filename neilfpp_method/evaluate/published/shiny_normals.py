@@ -1,12 +1,14 @@
-"""Normals as Ref-NeRF measures them on Shiny Blender: google-research/multinerf, `eval.py` and `internal/ref_utils.py`.
+"""Normals as Ref-NeRF measures them on Shiny Blender: google-research/multinerf, `eval.py` and
+`internal/ref_utils.py`.
 
 What is particular about it:
 
 - A pixel weighs as much as the estimate's opacity times the alpha of the true image; there is no hard mask.
 - Cosines are clipped to ±(1 − 2⁻²³), so a perfect estimate has 0.028°, not 0.
 - The mean is taken per view and averaged over the views.
-- True normals are 8-bit pictures, 2 p / 255 − 1, in the world frame, beside the images as `<image>_normal.png`. A capture in
-  the layout of the NeILF datasets has float normals instead, and its depth maps tell the alpha.
+- True normals are 8-bit pictures, 2 p / 255 − 1, in the world frame, beside the images as
+  `<image>_normal.png`. A capture in the layout of the NeILF datasets has float normals instead, and its depth
+  maps tell the alpha.
 """
 
 from __future__ import annotations
@@ -36,7 +38,9 @@ LARGEST_COSINE = 1 - 2.0**-23
 def weighted_angle(
     estimate: Float[np.ndarray, "H W 3"], truth: Float[np.ndarray, "H W 3"], weight: Float[np.ndarray, "H W"]
 ) -> float:
-    """The weighted mean angle between normals, degrees (`compute_weighted_mae`); NaN where nothing has a weight."""
+    """The weighted mean angle between normals, degrees (`compute_weighted_mae`); NaN where nothing has a
+    weight.
+    """
     cosine = (_unit(estimate) * _unit(truth)).sum(-1).clip(-LARGEST_COSINE, LARGEST_COSINE)
     total = weight.sum(dtype=np.float64)
     return float(np.degrees((weight * np.arccos(cosine)).sum() / total)) if total > 0 else float("nan")
@@ -47,16 +51,23 @@ def _unit(normal: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
     return normal / np.sqrt(np.maximum(squared, 2.0**-23))
 
 
-def _true_normal(capture: Capture, view: View) -> tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W"]] | None:
+def _true_normal(
+    capture: Capture, view: View
+) -> tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W"]] | None:
     """The true normals of a view and the alpha of its image; none where there are no normals."""
     width, height = view.camera.width, view.camera.height
     path = view.image.with_name(f"{view.image.stem}_normal.png")
     if inside(capture.root, path).is_file():
         if (width, height) != file_size(view):
-            raise UserError(f"{path}: true normals in 8 bits cannot be scaled", "leave --scale and --width out")
+            raise UserError(
+                f"{path}: true normals in 8 bits cannot be scaled", "leave --scale and --width out"
+            )
         pixels, alpha = read_image(path).pixels, read_image(view.image).alpha
         if pixels.shape != (height, width, 3):
-            raise UserError(f"{path}: the shape {pixels.shape}, where the view needs {(height, width, 3)}", "render it again")
+            raise UserError(
+                f"{path}: the shape {pixels.shape}, where the view needs {(height, width, 3)}",
+                "render it again",
+            )
         return 2 * pixels - 1, np.ones((height, width)) if alpha is None else alpha
     truth = Truth(capture)
     normal, mask = truth.normal(view), truth.mask(view)
@@ -70,7 +81,9 @@ def _check(run: Run) -> None:
         if _true_normal(run.capture, view) is None:
             beside = view.image.with_name(f"{view.image.stem}_normal.png").relative_to(run.capture.root)
             neilf = f"inputs/normal_maps/{view.name}.exr and inputs/depth_maps/{view.name}.exr"
-            raise missing(NAME, run.capture, view, "true normals", f"{beside}, or in the NeILF layout at {neilf}")
+            raise missing(
+                NAME, run.capture, view, "true normals", f"{beside}, or in the NeILF layout at {neilf}"
+            )
 
 
 def _measure(run: Run, rendered: Sequence[RenderedView]) -> dict[str, float]:
@@ -80,7 +93,9 @@ def _measure(run: Run, rendered: Sequence[RenderedView]) -> dict[str, float]:
         angles.append(weighted_angle(shown.maps["normal"], normal, shown.maps["opacity"][..., 0] * alpha))
     angles = [angle for angle in angles if not np.isnan(angle)]
     if not angles:
-        raise UserError(f"{run.path}: no test view shows a surface", "train longer, or look at the run's report")
+        raise UserError(
+            f"{run.path}: no test view shows a surface", "train longer, or look at the run's report"
+        )
     return {"normal_mae_deg": float(np.mean(angles))}
 
 

@@ -46,7 +46,9 @@ def unwrap(surface: Surface, size: int) -> Unwrapped:
     vertices, normals = surface.vertices[wedges[:, 0].astype(np.int64)], wedges[:, 1:]
     packing, atlas = xatlas.PackOptions(), xatlas.Atlas()
     packing.resolution, packing.padding = size, GAP
-    atlas.add_mesh(vertices.astype(np.float32), wedge.reshape(-1, 3).astype(np.uint32), normals.astype(np.float32))
+    atlas.add_mesh(
+        vertices.astype(np.float32), wedge.reshape(-1, 3).astype(np.uint32), normals.astype(np.float32)
+    )
     atlas.generate(xatlas.ChartOptions(), packing)
     source, faces, uv = atlas.get_mesh(0)
     # The resolution is a wish; what came out is scaled to the texture.

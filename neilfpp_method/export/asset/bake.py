@@ -105,7 +105,9 @@ def bake(
         on_progress((texels.number[-1] + 1) / size**2 if len(texels.number) else 0.0)
     full = dilate(texture.reshape(size, size, -1), covered.reshape(size, size))
     textures = {name: full[..., channels] for name, channels in CHANNELS.items()}
-    return Textures(**textures, covered=float(covered.mean()), deviation=None if deviation is None else full[..., 8:])
+    return Textures(
+        **textures, covered=float(covered.mean()), deviation=None if deviation is None else full[..., 8:]
+    )
 
 
 def in_frame(

@@ -24,7 +24,9 @@ def clean(surface: Surface, seen: Bool[np.ndarray, " F"]) -> Surface:
         UserError: nothing was seen.
     """
     if not seen.any():
-        raise UserError("no training camera sees the surface", "train the run for longer, and look at its previews")
+        raise UserError(
+            "no training camera sees the surface", "train the run for longer, and look at its previews"
+        )
     return close_holes(without_crumbs(keep_seen(surface, seen)))
 
 

@@ -59,13 +59,19 @@ def check_asset(run: Run, options: AssetOptions) -> None:
         UserError: no surface, no material yet, or options out of range.
     """
     if not has_surface(run):
-        raise UserError(f"{run.path}: the host of this run has no surface to export", "export from a run of another host")
+        raise UserError(
+            f"{run.path}: the host of this run has no surface to export", "export from a run of another host"
+        )
     if run.step <= run.config.train.sdf_steps:
         raise UserError(f"{run.path}: there is no material yet at step {run.step}", "train the next stage")
     if not SMALLEST <= options.texture_size <= LARGEST:
-        raise UserError(f"a texture of {options.texture_size} texels a side", f"ask for {SMALLEST} to {LARGEST}")
+        raise UserError(
+            f"a texture of {options.texture_size} texels a side", f"ask for {SMALLEST} to {LARGEST}"
+        )
     if not FEWEST <= options.faces <= MOST_FACES:
-        raise UserError(f"an asset of {options.faces} triangles", f"ask for {FEWEST} to {MOST_FACES} with --faces")
+        raise UserError(
+            f"an asset of {options.faces} triangles", f"ask for {FEWEST} to {MOST_FACES} with --faces"
+        )
     if not options.error >= 0:
         raise UserError(f"--error {options.error:g}", "give a length in scene units, from 0 on")
 
@@ -109,7 +115,9 @@ def export_asset(
     with bar("textures") as advance:
         reach = max(NEAREST * distance.near, LEAST_REACH)
         textures = bake(run, mesh, fine, reach, options.texture_size, unsure, advance)
-    console.print(f"textures: {mesh.charts} charts on {100 * textures.covered:.0f} % of {options.texture_size}² texels")
+    console.print(
+        f"textures: {mesh.charts} charts on {100 * textures.covered:.0f} % of {options.texture_size}² texels"
+    )
     vertices = run.capture.normalisation.to_world(torch.from_numpy(mesh.vertices)).numpy()
     write_asset(run, replace(mesh, vertices=vertices), textures, out)
     if not has_usd():

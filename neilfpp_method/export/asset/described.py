@@ -33,7 +33,9 @@ def describe_scene(run: Run, environment: bool) -> dict[str, Any]:
         "frame": "world of the capture, right-handed, Z up",
         "environment": maps if environment else None,
         "lamps": lamps_in_world(run),
-        "cameras": [_camera(view, "test" if view.name in run.capture.test else "train") for view in run.capture.views],
+        "cameras": [
+            _camera(view, "test" if view.name in run.capture.test else "train") for view in run.capture.views
+        ],
     }
 
 

@@ -26,10 +26,16 @@ FINER, ENOUGH = 4, 512
 texels stays so."""
 
 
-def equirectangular(radiance: Float[Tensor, "3 H W"], program: Literal["blender", "unreal"]) -> Float[Tensor, "h w 3"]:
+def equirectangular(
+    radiance: Float[Tensor, "3 H W"], program: Literal["blender", "unreal"]
+) -> Float[Tensor, "h w 3"]:
     """A map of ours, resampled, linear RGB as before; twice as many columns as rows."""
     height = max(radiance.shape[1], min(FINER * radiance.shape[1], ENOUGH))
     theta = math.pi * (torch.arange(height, dtype=torch.float64)[:, None] + 0.5) / height
-    phi = 2 * math.pi * ((torch.arange(2 * height, dtype=torch.float64) + 0.5) / (2 * height) + LEFT_EDGE[program])
+    phi = (
+        2
+        * math.pi
+        * ((torch.arange(2 * height, dtype=torch.float64) + 0.5) / (2 * height) + LEFT_EDGE[program])
+    )
     axes = (phi.sin() * theta.sin(), phi.cos() * theta.sin(), theta.cos().expand(-1, 2 * height))
     return interpolate(radiance, torch.stack(axes, dim=-1).to(radiance))

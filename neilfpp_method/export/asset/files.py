@@ -57,7 +57,9 @@ def write_asset(run: Run, mesh: Unwrapped, textures: Textures, out: Path) -> Non
         if radiance is not None:
             write_exr(folder / "environment.exr", {"RGB": radiance.permute(1, 2, 0).numpy()})
             for program in ("blender", "unreal"):
-                write_exr(folder / f"environment_{program}.exr", {"RGB": equirectangular(radiance, program).numpy()})
+                write_exr(
+                    folder / f"environment_{program}.exr", {"RGB": equirectangular(radiance, program).numpy()}
+                )
         write_json(folder / "scene.json", described)
         for name in SCRIPTS:
             source = resources.files("neilfpp_method.export.asset.scripts") / name

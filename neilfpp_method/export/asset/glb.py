@@ -72,7 +72,9 @@ def _add_lamps(tree: dict[str, Any], lamps: Sequence[Mapping[str, Any]]) -> None
         light = {
             "name": f"lamp {number}",
             "type": "point" if lamp["axis"] is None else "spot",
-            "color": [channel / brightest for channel in lamp["intensity"]] if brightest > 0 else [1.0, 1.0, 1.0],
+            "color": [channel / brightest for channel in lamp["intensity"]]
+            if brightest > 0
+            else [1.0, 1.0, 1.0],
             "intensity": brightest,
         }
         node = {

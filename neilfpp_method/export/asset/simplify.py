@@ -17,7 +17,9 @@ SAMPLES = 20_000
 SHARE = 99.0
 """Per cent of them that are at most at the distance that is reported."""
 MOST_MISSED = 0.02
-"""Share of the points that may have nothing near: next to borders, and where decimation has folded a plane."""
+"""Share of the points that may have nothing near: next to borders, and where decimation has folded a
+plane.
+"""
 FEWEST = 100
 """Triangles below which nothing is gained."""
 REACH = 0.1
@@ -26,7 +28,9 @@ REACH = 0.1
 
 @dataclass(frozen=True)
 class Distance:
-    """How far a fine surface is from a coarse one, scene units, where it has one near; and the share where not."""
+    """How far a fine surface is from a coarse one, scene units, where it has one near; and the share where
+    not.
+    """
 
     near: float
     missed: float

@@ -61,7 +61,8 @@ def fine_surface(run: Run, resolution: int) -> Surface:
         return Surface(vertices, faces, _shading_normals(host, position, normal).reshape(-1, 3, 3))
     device = next(run.model.parameters()).device
     position, normal = (
-        torch.as_tensor(np.array(a), dtype=torch.float32, device=device) for a in (vertices, mesh.vertex_normals)
+        torch.as_tensor(np.array(a), dtype=torch.float32, device=device)
+        for a in (vertices, mesh.vertex_normals)
     )
     return Surface(vertices, faces, _shading_normals(host, position, normal)[faces])
 
@@ -128,7 +129,9 @@ def meet_along(
     return Footing(found.numpy(), nearest.numpy(), place.numpy(), turned.numpy())
 
 
-def _shading_normals(host: object, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> Float[np.ndarray, "N 3"]:
+def _shading_normals(
+    host: object, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
+) -> Float[np.ndarray, "N 3"]:
     if isinstance(host, SmoothsNormals):
         pairs = zip(position.split(POINTS_AT_ONCE), normal.split(POINTS_AT_ONCE), strict=True)
         normal = torch.cat([host.smooth_normals(places, normals) for places, normals in pairs])

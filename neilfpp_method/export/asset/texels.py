@@ -27,7 +27,9 @@ class Texels:
     face: Int[np.ndarray, " T"]
     weights: Float[np.ndarray, "T 3"]
 
-    def interpolate(self, values: Float[np.ndarray, "V C"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "T C"]:
+    def interpolate(
+        self, values: Float[np.ndarray, "V C"], faces: Int[np.ndarray, "F 3"]
+    ) -> Float[np.ndarray, "T C"]:
         """Values at vertices, at the texels."""
         return (values[faces[self.face]] * self.weights[..., None]).sum(axis=1)
 
@@ -51,7 +53,9 @@ def covered_texels(mesh: Unwrapped, size: int) -> Iterator[Texels]:
         yield Texels(number[rows].numpy(), face.numpy(), weights.numpy())
 
 
-def dilate(texture: UInt8[np.ndarray, "S S C"], covered: Bool[np.ndarray, "S S"]) -> UInt8[np.ndarray, "S S C"]:
+def dilate(
+    texture: UInt8[np.ndarray, "S S C"], covered: Bool[np.ndarray, "S S"]
+) -> UInt8[np.ndarray, "S S C"]:
     """The texture with what the nearest covered texel holds in every other, so that no look-up between texels
     or in a smaller copy of the texture meets a colour that is not of the surface."""
     rows, columns = distance_transform_edt(~covered, return_distances=False, return_indices=True)

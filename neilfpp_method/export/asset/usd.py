@@ -41,8 +41,12 @@ def usd_text(mesh: Unwrapped, lamps: Sequence[Mapping[str, Any]]) -> str:
     shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     shape.CreateDoubleSidedAttr(True)
-    shape.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([mesh.vertices.min(0), mesh.vertices.max(0)]).astype(np.float32)))
-    place = UsdGeom.PrimvarsAPI(shape).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex)
+    shape.CreateExtentAttr(
+        Vt.Vec3fArray.FromNumpy(np.stack([mesh.vertices.min(0), mesh.vertices.max(0)]).astype(np.float32))
+    )
+    place = UsdGeom.PrimvarsAPI(shape).CreatePrimvar(
+        "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex
+    )
     place.Set(Vt.Vec2fArray.FromNumpy(mesh.uv.astype(np.float32)))
     UsdShade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(_material(stage))
     for number, lamp in enumerate(lamps):
@@ -68,7 +72,9 @@ def _material(stage: Any) -> Any:
         return shader
 
     def connect(name: str, kind: Any, shader: Any, channel: str) -> None:
-        source = shader.CreateOutput(channel, Sdf.ValueTypeNames.Float3 if channel == "rgb" else Sdf.ValueTypeNames.Float)
+        source = shader.CreateOutput(
+            channel, Sdf.ValueTypeNames.Float3 if channel == "rgb" else Sdf.ValueTypeNames.Float
+        )
         surface.CreateInput(name, kind).ConnectToSource(source)
 
     packed, normal = texture("metallic_roughness", "raw"), texture("normal", "raw")
@@ -92,7 +98,9 @@ def _lamp(stage: Any, path: str, lamp: Mapping[str, Any]) -> None:
     brightest = max(lamp["radiance"])
     light.CreateRadiusAttr(lamp["radius"])
     light.CreateIntensityAttr(brightest)
-    light.CreateColorAttr(Gf.Vec3f(*(channel / brightest if brightest > 0 else 1.0 for channel in lamp["radiance"])))
+    light.CreateColorAttr(
+        Gf.Vec3f(*(channel / brightest if brightest > 0 else 1.0 for channel in lamp["radiance"]))
+    )
     pose = UsdGeom.Xformable(light)
     pose.AddTranslateOp().Set(Gf.Vec3d(*lamp["position"]))
     if panel:

@@ -1,4 +1,6 @@
-"""The sphere of `make_capture` as bare material for other layouts: images, masks, cameras and known projections."""
+"""The sphere of `make_capture` as bare material for other layouts: images, masks, cameras and known
+projections.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +61,9 @@ def _load(root: Path, **options) -> PixelDataset:
 
 
 def refused(root: Path, *words: str, **options) -> None:
-    """Loading the capture, its pixels included, raises a one-line `UserError` with a remedy and all these words."""
+    """Loading the capture, its pixels included, raises a one-line `UserError` with a remedy and all these
+    words.
+    """
     with pytest.raises(UserError) as caught:
         _load(root, **options)
     message = str(caught.value)

@@ -34,7 +34,9 @@ def scene(root: Path, hdr: bool = True) -> Path:
                 source.rename(root / split / f"{k:04d}.exr")
                 mask.rename(root / f"{split}_mask" / f"{k:04d}.png")
             else:
-                layers = np.concatenate([read_image(source).pixels, read_image(mask).pixels[..., :1]], axis=-1)
+                layers = np.concatenate(
+                    [read_image(source).pixels, read_image(mask).pixels[..., :1]], axis=-1
+                )
                 write_png(root / split / f"{k:04d}.png", np.rint(255 * layers).astype(np.uint8))
             path = f"{split}/{k:04d}" if hdr else f"./{split}/{k:04d}"
             frames.append({"file_path": path, "transform_matrix": opengl_pose(i).tolist(), "rotation": 0.01})
@@ -49,7 +51,9 @@ def test_cameras_masks_and_splits(tmp_path: Path, hdr: bool) -> None:
     assert capture.format == "blender"
     assert capture.hdr == hdr
     assert len(capture.views) == VIEWS
-    assert [view.name for view in capture.train_views] == [f"train-{k:04d}" for k in range(4)]  # 0000 is in both folders
+    assert [view.name for view in capture.train_views] == [
+        f"train-{k:04d}" for k in range(4)
+    ]  # 0000 is in both folders
     assert [view.name for view in capture.test_views] == ["test-0000", "test-0001"]
     for i, view in enumerate(capture.views):
         x, y, z = local(i).T

@@ -79,7 +79,9 @@ def test_models_are_found_where_colmap_puts_them(tmp_path: Path, place: str) -> 
     capture = load_capture(tmp_path)
     assert capture.format == "colmap"
     assert [view.name for view in capture.views] == [f"{i:03d}" for i in range(VIEWS)]
-    assert capture.views[2].image == tmp_path / "images" / "002.exr"  # the model lists the tone-mapped 002.png
+    assert (
+        capture.views[2].image == tmp_path / "images" / "002.exr"
+    )  # the model lists the tone-mapped 002.png
     assert capture.hdr
 
 
@@ -100,7 +102,10 @@ def test_a_model_from_before_rigs(tmp_path: Path) -> None:
     assert capture.scene_from == "masks"  # one point is too few
     for i, view in enumerate(capture.views):
         assert view.name == f"{i:03d}"
-        assert np.abs(project(view.camera, torch.from_numpy(POINTS)).pixel.numpy() - pinhole_pixels(i)).max() < 1e-6
+        assert (
+            np.abs(project(view.camera, torch.from_numpy(POINTS)).pixel.numpy() - pinhole_pixels(i)).max()
+            < 1e-6
+        )
 
 
 def test_the_sparse_points_tell_where_the_scene_is(tmp_path: Path) -> None:
@@ -127,7 +132,9 @@ def test_the_points_of_the_object_tell_where_it_is(tmp_path: Path) -> None:
 def test_the_dense_cloud_and_masks_are_found(tmp_path: Path) -> None:
     write(material(tmp_path), reconstruction(colmap_camera("PINHOLE")))
     (tmp_path / "cloud.ply").rename(tmp_path / "fused.ply")
-    (tmp_path / "masks" / "003.png").rename(tmp_path / "masks" / "003.png.png")  # COLMAP's own name for 003.png
+    (tmp_path / "masks" / "003.png").rename(
+        tmp_path / "masks" / "003.png.png"
+    )  # COLMAP's own name for 003.png
     capture = load_capture(tmp_path)
     assert capture.point_cloud == tmp_path / "fused.ply"
     assert [view.mask.name for view in capture.views][2:4] == ["002.png", "003.png.png"]
@@ -141,7 +148,9 @@ def test_images_of_one_name_in_two_folders(tmp_path: Path) -> None:
         (images / f"{i:03d}.exr").rename((images / name).with_suffix(".exr"))
     write(tmp_path, reconstruction(colmap_camera("PINHOLE"), names))
     capture = load_capture(tmp_path)
-    assert [view.name for view in capture.views] == [f"{side}-{i:03d}" for side in ("left", "right") for i in range(3)]
+    assert [view.name for view in capture.views] == [
+        f"{side}-{i:03d}" for side in ("left", "right") for i in range(3)
+    ]
     assert np.allclose(capture.views[1].camera.w2c, POSES[2])
 
 
@@ -151,10 +160,12 @@ def test_a_model_from_windows(tmp_path: Path) -> None:
     for i in range(VIEWS):
         (images / f"{i:03d}.exr").rename(images / "left" / f"{i:03d}.exr")
     write(tmp_path, reconstruction(colmap_camera("PINHOLE"), [f"left\\{i:03d}.png" for i in range(VIEWS)]))
-    assert [view.image for view in load_capture(tmp_path).views] == [images / "left" / f"{i:03d}.exr" for i in range(VIEWS)]
+    assert [view.image for view in load_capture(tmp_path).views] == [
+        images / "left" / f"{i:03d}.exr" for i in range(VIEWS)
+    ]
 
 
-# --------------------------------------------------------------------------------------------------------------- refused
+# ---------------------------------------------------------------------------------------------------- refused
 
 
 def test_images_that_are_missing_or_outside(tmp_path: Path) -> None:
@@ -207,7 +218,9 @@ def test_a_frame_without_its_image(tmp_path: Path) -> None:
 def test_a_model_without_images_and_a_panorama(tmp_path: Path) -> None:
     write(material(tmp_path, masks=None), pycolmap.Reconstruction())
     refused(tmp_path, "no registered image")
-    sphere = pycolmap.Camera(model="EQUIRECTANGULAR", width=WIDTH, height=HEIGHT, params=[WIDTH, HEIGHT], camera_id=1)
+    sphere = pycolmap.Camera(
+        model="EQUIRECTANGULAR", width=WIDTH, height=HEIGHT, params=[WIDTH, HEIGHT], camera_id=1
+    )
     write(tmp_path, reconstruction(sphere))
     refused(tmp_path, "EQUIRECTANGULAR", "perspective")
 
@@ -221,7 +234,12 @@ def test_a_camera_of_another_size_than_its_image(tmp_path: Path) -> None:
 
 def test_rigs_of_several_cameras_with_observations(tmp_path: Path) -> None:
     options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 3, 2, 60
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = (
+        1,
+        3,
+        2,
+        60,
+    )
     options.camera_width, options.camera_height = WIDTH, HEIGHT
     options.sensor_from_rig_rotation_stddev, options.sensor_from_rig_translation_stddev = 5.0, 0.1
     model = pycolmap.synthesize_dataset(options)

@@ -1,4 +1,6 @@
-"""The layout of IDR and NeuS: projection matrices of any scale and sign, and the unit sphere of the scale matrices."""
+"""The layout of IDR and NeuS: projection matrices of any scale and sign, and the unit sphere of the scale
+matrices.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,16 @@ import torch
 
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.views import project
-from tests.data.formats.scenes import FOCAL, POINTS, POSES, PRINCIPAL, VIEWS, material, pinhole_pixels, refused
+from tests.data.formats.scenes import (
+    FOCAL,
+    POINTS,
+    POSES,
+    PRINCIPAL,
+    VIEWS,
+    material,
+    pinhole_pixels,
+    refused,
+)
 from tests.data.make_capture import CENTRE, SCALE
 
 # A pixel's centre lies at whole numbers in these files.
@@ -31,7 +42,9 @@ def matrices(factor: float = 1.0) -> dict[str, np.ndarray]:
     return arrays
 
 
-def scan(root: Path, folder: str = "image", archive: str = "cameras_sphere.npz", hdr: bool = True, **changes) -> Path:
+def scan(
+    root: Path, folder: str = "image", archive: str = "cameras_sphere.npz", hdr: bool = True, **changes
+) -> Path:
     material(root, folder, "mask", hdr)
     np.savez(root / archive, **{**matrices(), **changes})
     return root
@@ -44,8 +57,13 @@ def test_projection_matrices(tmp_path: Path, factor: float, folder: str, archive
     assert capture.format == "dtu"
     assert len(capture.views) == VIEWS
     for i, view in enumerate(capture.views):
-        assert np.abs(project(view.camera, torch.from_numpy(POINTS)).pixel.numpy() - pinhole_pixels(i)).max() < 1e-6
-        expected = cv2.projectPoints(POINTS, *map(np.ascontiguousarray, (POSES[i][:3, :3], POSES[i][:3, 3])), K, None)[0]
+        assert (
+            np.abs(project(view.camera, torch.from_numpy(POINTS)).pixel.numpy() - pinhole_pixels(i)).max()
+            < 1e-6
+        )
+        expected = cv2.projectPoints(
+            POINTS, *map(np.ascontiguousarray, (POSES[i][:3, :3], POSES[i][:3, 3])), K, None
+        )[0]
         assert np.abs(pinhole_pixels(i) - 0.5 - expected[:, 0]).max() < 1e-6
         assert view.mask == tmp_path / "mask" / f"{i:03d}.png"
 
@@ -104,7 +122,9 @@ def test_bad_archives_are_refused(tmp_path: Path) -> None:
         bomb.writestr("world_mat_0.npy", bytes(2**27))
     refused(tmp_path, "too large for matrices of cameras")
     header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (2**40, 4)})
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f8", "fortran_order": False, "shape": (2**40, 4)}
+    )
     with zipfile.ZipFile(archive, "w") as boast:
         boast.writestr("world_mat_0.npy", header.getvalue())
     refused(tmp_path, "not an archive of matrices")

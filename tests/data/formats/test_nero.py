@@ -15,7 +15,16 @@ from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.formats.pickled_arrays import read_pickled_arrays
 from neilfpp_method.data.views import project
 from neilfpp_method.errors import UserError
-from tests.data.formats.scenes import FOCAL, POINTS, POSES, PRINCIPAL, VIEWS, material, pinhole_pixels, refused
+from tests.data.formats.scenes import (
+    FOCAL,
+    POINTS,
+    POSES,
+    PRINCIPAL,
+    VIEWS,
+    material,
+    pinhole_pixels,
+    refused,
+)
 
 K = np.array([[FOCAL[0], 0, PRINCIPAL[0]], [0, FOCAL[1], PRINCIPAL[1]], [0, 0, 1]])
 
@@ -41,7 +50,9 @@ def test_cameras(tmp_path: Path, protocol: int, kind: type) -> None:
         assert np.abs(seen - pinhole_pixels(i)).max() < (1e-6 if kind is np.float64 else 1e-4)
 
 
-@pytest.mark.parametrize("array", [np.asfortranarray(K), K.astype(">f8"), K.astype(np.int64), K[::2, 1:], np.float32(K)])
+@pytest.mark.parametrize(
+    "array", [np.asfortranarray(K), K.astype(">f8"), K.astype(np.int64), K[::2, 1:], np.float32(K)]
+)
 @pytest.mark.parametrize("protocol", [0, 2, 4, 5])
 def test_arrays_come_back(tmp_path: Path, array: np.ndarray, protocol: int) -> None:
     (tmp_path / "a.pkl").write_bytes(pickle.dumps([array, array], protocol))
@@ -81,7 +92,10 @@ class Evil:
         (lambda mark: b"\x80\x02Nr" + struct.pack("<I", 2**32 - 1) + b".", "damaged"),
         (lambda mark: b"\x80\x05\x96" + struct.pack("<Q", 2**40) + b"abc.", "no pickled arrays"),
         (lambda mark: b"", "no pickled arrays"),
-        (lambda mark: pickle.dumps((K, K), 2).replace(b"K\x03K\x03\x86", b"K\x03K\x09\x86"), "no pickled arrays"),
+        (
+            lambda mark: pickle.dumps((K, K), 2).replace(b"K\x03K\x03\x86", b"K\x03K\x09\x86"),
+            "no pickled arrays",
+        ),
     ],
 )
 def test_what_is_no_array_is_refused_and_nothing_is_run(tmp_path: Path, made, words: str) -> None:

@@ -1,4 +1,6 @@
-"""Known points in known pixels: every layout, in worlds whose up is z, y, or somewhere else; every lens in the own folder."""
+"""Known points in known pixels: every layout, in worlds whose up is z, y, or somewhere else; every lens in
+the own folder.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,18 @@ from scipy.spatial.transform import Rotation
 from neilfpp_method.data.capture import READERS, load_capture
 from neilfpp_method.data.lens import LENSES
 from neilfpp_method.data.views import project
-from tests.data.formats.scenes import FOCAL, HEIGHT, POINTS, POSES, PRINCIPAL, VIEWS, WIDTH, local, material, pinhole_pixels
+from tests.data.formats.scenes import (
+    FOCAL,
+    HEIGHT,
+    POINTS,
+    POSES,
+    PRINCIPAL,
+    VIEWS,
+    WIDTH,
+    local,
+    material,
+    pinhole_pixels,
+)
 from tests.data.make_capture import CENTRE, SCALE
 from tests.data.test_lens import COEFFICIENTS
 
@@ -42,14 +55,27 @@ WORLDS = {
 
 
 def neilfpp(root: Path, w2c: list[np.ndarray], centre: np.ndarray, lens: dict | None = None) -> None:
-    camera = {"fx": FOCAL[0], "fy": FOCAL[1], "cx": PRINCIPAL[0], "cy": PRINCIPAL[1], "width": WIDTH, "height": HEIGHT}
+    camera = {
+        "fx": FOCAL[0],
+        "fy": FOCAL[1],
+        "cx": PRINCIPAL[0],
+        "cy": PRINCIPAL[1],
+        "width": WIDTH,
+        "height": HEIGHT,
+    }
     camera |= {"lens": lens} if lens else {}
     views = [
         {"name": str(i), "image": f"images/{name}", "camera": camera | {"w2c": pose.tolist()}}
         for i, (name, pose) in enumerate(zip(NAMES, w2c, strict=True))
     ]
     scene = {"centre": centre.tolist(), "radius": SCALE}
-    content = {"format": "neilfpp-capture", "version": 1, "response": "linear", "scene": scene, "views": views}
+    content = {
+        "format": "neilfpp-capture",
+        "version": 1,
+        "response": "linear",
+        "scene": scene,
+        "views": views,
+    }
     (root / "capture.json").write_text(json.dumps(content))
 
 
@@ -87,7 +113,14 @@ def transforms(root: Path, w2c: list[np.ndarray], centre: np.ndarray) -> None:
         {"file_path": f"images/{name}", "transform_matrix": (np.linalg.inv(pose) @ OPENGL).tolist()}
         for name, pose in zip(NAMES, w2c, strict=True)
     ]
-    shared = {"fl_x": FOCAL[0], "fl_y": FOCAL[1], "cx": PRINCIPAL[0], "cy": PRINCIPAL[1], "w": WIDTH, "h": HEIGHT}
+    shared = {
+        "fl_x": FOCAL[0],
+        "fl_y": FOCAL[1],
+        "cx": PRINCIPAL[0],
+        "cy": PRINCIPAL[1],
+        "w": WIDTH,
+        "h": HEIGHT,
+    }
     (root / "transforms.json").write_text(json.dumps(shared | {"camera_model": "OPENCV", "frames": frames}))
 
 
@@ -98,7 +131,9 @@ def blender(root: Path, w2c: list[np.ndarray], centre: np.ndarray) -> None:
 
 def colmap(root: Path, w2c: list[np.ndarray], centre: np.ndarray) -> None:
     model = pycolmap.Reconstruction()
-    camera = pycolmap.Camera(model="PINHOLE", width=WIDTH, height=HEIGHT, params=[*FOCAL, *PRINCIPAL], camera_id=1)
+    camera = pycolmap.Camera(
+        model="PINHOLE", width=WIDTH, height=HEIGHT, params=[*FOCAL, *PRINCIPAL], camera_id=1
+    )
     model.add_camera_with_trivial_rig(camera)
     for i, (name, pose) in enumerate(zip(NAMES, w2c, strict=True)):
         image = pycolmap.Image(name=name, camera_id=1, image_id=i + 1)
@@ -133,7 +168,9 @@ def test_every_layout_is_here() -> None:
 def test_points_are_seen_where_they_are(tmp_path: Path, layout: str, world: str) -> None:
     move = WORLDS[world]
     material(tmp_path, masks=None)
-    WRITERS[layout](tmp_path, [pose @ np.linalg.inv(move) for pose in POSES], move[:3, :3] @ CENTRE + move[:3, 3])
+    WRITERS[layout](
+        tmp_path, [pose @ np.linalg.inv(move) for pose in POSES], move[:3, :3] @ CENTRE + move[:3, 3]
+    )
     capture = load_capture(tmp_path)
     assert capture.format == layout
     points = torch.from_numpy(POINTS @ move[:3, :3].T + move[:3, 3])
@@ -146,7 +183,9 @@ def test_points_are_seen_where_they_are(tmp_path: Path, layout: str, world: str)
 
 @pytest.mark.parametrize("model", LENSES)
 def test_every_lens_in_the_own_folder(tmp_path: Path, model: str) -> None:
-    neilfpp(material(tmp_path, masks=None), POSES, CENTRE, {"model": model, "coefficients": COEFFICIENTS[model]})
+    neilfpp(
+        material(tmp_path, masks=None), POSES, CENTRE, {"model": model, "coefficients": COEFFICIENTS[model]}
+    )
     plane = pycolmap.Camera.create_from_model_name(0, model, 1.0, 1, 1)
     parameters = np.array(plane.params)
     parameters[list(plane.focal_length_idxs())] = 1.0
@@ -155,4 +194,6 @@ def test_every_lens_in_the_own_folder(tmp_path: Path, model: str) -> None:
     plane.params = parameters
     for i, view in enumerate(load_capture(tmp_path).views):
         expected = plane.img_from_cam(local(i)) * FOCAL + PRINCIPAL
-        assert np.abs(project(view.camera, torch.from_numpy(POINTS)).pixel.numpy() - expected).max() < TOLERANCE
+        assert (
+            np.abs(project(view.camera, torch.from_numpy(POINTS)).pixel.numpy() - expected).max() < TOLERANCE
+        )

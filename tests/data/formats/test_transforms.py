@@ -29,10 +29,19 @@ from tests.data.formats.scenes import (
 )
 from tests.data.make_capture import CENTRE, RADIUS
 
-INTRINSICS = {"fl_x": FOCAL[0], "fl_y": FOCAL[1], "cx": PRINCIPAL[0], "cy": PRINCIPAL[1], "w": WIDTH, "h": HEIGHT}
+INTRINSICS = {
+    "fl_x": FOCAL[0],
+    "fl_y": FOCAL[1],
+    "cx": PRINCIPAL[0],
+    "cy": PRINCIPAL[1],
+    "w": WIDTH,
+    "h": HEIGHT,
+}
 
 
-def scene(root: Path, world: np.ndarray | None = None, per_frame: bool = False, hdr: bool = True, **entries) -> Path:
+def scene(
+    root: Path, world: np.ndarray | None = None, per_frame: bool = False, hdr: bool = True, **entries
+) -> Path:
     """Write a transforms.json; `world` turns its frame."""
     suffix = ".exr" if hdr else ".png"
     frames = []
@@ -63,7 +72,7 @@ def opencv_pixels(i: int, coefficients: list[float], fisheye: bool) -> np.ndarra
     return oracle(points, zero, zero, k, np.array(coefficients))[0][:, 0]
 
 
-# --------------------------------------------------------------------------------------------------------------- cameras
+# ---------------------------------------------------------------------------------------------------- cameras
 
 
 @pytest.mark.parametrize("per_frame", [False, True])
@@ -93,7 +102,9 @@ def test_a_world_with_y_up_is_left_as_it_is(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("place", ["file", "frame"])
-def test_lenses(tmp_path: Path, model: str | None, names: dict[str, float], fisheye: bool, place: str) -> None:
+def test_lenses(
+    tmp_path: Path, model: str | None, names: dict[str, float], fisheye: bool, place: str
+) -> None:
     scene(tmp_path, camera_model=model, **({} if model else {"is_fisheye": fisheye}))
 
     def add(content: dict) -> None:
@@ -108,10 +119,15 @@ def test_lenses(tmp_path: Path, model: str | None, names: dict[str, float], fish
 def test_a_file_from_windows(tmp_path: Path) -> None:
     """Its separators, and the mark that its editors put first."""
     scene(tmp_path)
-    edit(tmp_path, lambda c: [f.update(file_path=".\\" + f["file_path"].replace("/", "\\")) for f in c["frames"]])
+    edit(
+        tmp_path,
+        lambda c: [f.update(file_path=".\\" + f["file_path"].replace("/", "\\")) for f in c["frames"]],
+    )
     path = tmp_path / "transforms.json"
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
-    assert [view.image for view in load_capture(tmp_path).views] == [tmp_path / "images" / f"{i:03d}.exr" for i in range(VIEWS)]
+    assert [view.image for view in load_capture(tmp_path).views] == [
+        tmp_path / "images" / f"{i:03d}.exr" for i in range(VIEWS)
+    ]
     upward = path.read_text("utf-8-sig").replace(".\\\\images", "..\\\\images")
     path.write_text(upward)
     refused(tmp_path, "not a path within the capture")
@@ -129,11 +145,15 @@ def test_a_field_of_view_stands_for_the_focal_length(tmp_path: Path) -> None:
     assert (camera.width, camera.height) == (WIDTH, HEIGHT)  # from the image
     assert camera.fx == camera.fy == pytest.approx(30.0)
     assert (camera.cx, camera.cy) == (WIDTH / 2, HEIGHT / 2)
-    camera = load_capture(edit(tmp_path, lambda c: c.update(camera_angle_y=2 * np.arctan(HEIGHT / 2 / 40.0)))).views[0].camera
+    camera = (
+        load_capture(edit(tmp_path, lambda c: c.update(camera_angle_y=2 * np.arctan(HEIGHT / 2 / 40.0))))
+        .views[0]
+        .camera
+    )
     assert camera.fy == pytest.approx(40.0)
 
 
-# ----------------------------------------------------------------------------------------------------- files and splits
+# ------------------------------------------------------------------------------------------- files and splits
 
 
 def test_masks_and_the_box_that_they_tell(tmp_path: Path) -> None:
@@ -169,7 +189,10 @@ def test_split_lists(tmp_path: Path) -> None:
     assert load_capture(tmp_path).test == {"005"}
     assert load_capture(edit(tmp_path, lambda c: c.pop("test_filenames"))).test == {"004", "005"}
     assert load_capture(tmp_path, test_every=2).test == {"001", "003", "005"}
-    refused(edit(tmp_path, lambda c: c.update(train_filenames=["images/009.exr"])), "train_filenames: names a file")
+    refused(
+        edit(tmp_path, lambda c: c.update(train_filenames=["images/009.exr"])),
+        "train_filenames: names a file",
+    )
 
 
 def test_hdr_and_ldr(tmp_path: Path) -> None:
@@ -178,7 +201,7 @@ def test_hdr_and_ldr(tmp_path: Path) -> None:
     assert load_capture(edit(tmp_path / "ldr", lambda c: c.update(response="linear"))).hdr
 
 
-# --------------------------------------------------------------------------------------------------------------- refused
+# ---------------------------------------------------------------------------------------------------- refused
 
 
 def frame(content: dict) -> dict:
@@ -202,9 +225,18 @@ def frame(content: dict) -> dict:
         (lambda c: c.update(ply_file_path="../secret.exr"), ["secret.exr: not a path within the capture"]),
         (lambda c: c.update(ply_file_path="x.ply"), ["ply_file_path: there is no"]),
         (lambda c: frame(c).pop("transform_matrix"), ["frames.2.transform_matrix is missing"]),
-        (lambda c: frame(c).update(transform_matrix=[[1, 0], [0, 1]]), ["frames.2.transform_matrix: not 4×4 or 3×4"]),
-        (lambda c: frame(c).update(transform_matrix=(2 * np.eye(4)).tolist()), ["transform_matrix: not a rotation"]),
-        (lambda c: frame(c).update(transform_matrix=np.diag([-1.0, 1, 1, 1]).tolist()), ["002.exr: the extrinsic is no"]),
+        (
+            lambda c: frame(c).update(transform_matrix=[[1, 0], [0, 1]]),
+            ["frames.2.transform_matrix: not 4×4 or 3×4"],
+        ),
+        (
+            lambda c: frame(c).update(transform_matrix=(2 * np.eye(4)).tolist()),
+            ["transform_matrix: not a rotation"],
+        ),
+        (
+            lambda c: frame(c).update(transform_matrix=np.diag([-1.0, 1, 1, 1]).tolist()),
+            ["002.exr: the extrinsic is no"],
+        ),
         (lambda c: c.pop("fl_x"), ["frames.0: no focal length"]),
         (lambda c: c.update(fl_x=-3), ["the focal length is not positive"]),
         (lambda c: c.update(fl_x="wide"), ["fl_x: not a finite number"]),
@@ -222,8 +254,13 @@ def test_bad_entries_are_refused(tmp_path: Path, change: Callable[[dict], object
 
 
 def test_an_image_on_its_side(tmp_path: Path) -> None:
-    """Some programs turn a picture as its EXIF says before they look for its camera, and leave the file as it is."""
-    refused(edit(scene(tmp_path), lambda c: c.update(w=HEIGHT, h=WIDTH)), "18×24; turn the pixels as the image's EXIF says")
+    """Some programs turn a picture as its EXIF says before they look for its camera, and leave the file as it
+    is.
+    """
+    refused(
+        edit(scene(tmp_path), lambda c: c.update(w=HEIGHT, h=WIDTH)),
+        "18×24; turn the pixels as the image's EXIF says",
+    )
 
 
 def test_what_is_no_json(tmp_path: Path) -> None:

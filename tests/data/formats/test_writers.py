@@ -1,4 +1,6 @@
-"""What is written for others comes back: cameras, pixels, masks, the box, the split; lenses and exposures where known."""
+"""What is written for others comes back: cameras, pixels, masks, the box, the split; lenses and exposures
+where known.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,10 @@ from tests.data.formats.scenes import POINTS, pinhole_pixels
 from tests.data.make_capture import make_capture
 from tests.data.test_lens import COEFFICIENTS
 
-WRITERS: dict[str, Callable[[Capture, Path], Path]] = {"transforms": write_transforms, "sfm_scene": write_sfm_scene}
+WRITERS: dict[str, Callable[[Capture, Path], Path]] = {
+    "transforms": write_transforms,
+    "sfm_scene": write_sfm_scene,
+}
 
 
 @pytest.fixture(params=WRITERS)
@@ -65,7 +70,10 @@ def test_a_capture_comes_back(tmp_path: Path, writer: str, hdr: bool, masks: boo
         assert new.image.is_relative_to(tmp_path / "out")
         assert not new.image.is_symlink()
         assert (new.mask and new.mask.read_bytes()) == (old.mask and old.mask.read_bytes())
-        assert np.abs(project(new.camera, torch.from_numpy(POINTS)).pixel.numpy() - pinhole_pixels(i)).max() < 1e-6
+        assert (
+            np.abs(project(new.camera, torch.from_numpy(POINTS)).pixel.numpy() - pinhole_pixels(i)).max()
+            < 1e-6
+        )
 
 
 def test_validity_comes_back(tmp_path: Path, writer: str) -> None:
@@ -78,7 +86,9 @@ def test_validity_comes_back(tmp_path: Path, writer: str) -> None:
 
 
 def test_exposures_are_divided_out(tmp_path: Path, writer: str) -> None:
-    first = with_views(capture(tmp_path / "in"), lambda view: replace(view, exposure=0.25, white_balance=(2.0, 1.0, 0.5)))
+    first = with_views(
+        capture(tmp_path / "in"), lambda view: replace(view, exposure=0.25, white_balance=(2.0, 1.0, 0.5))
+    )
     back = written(first, writer, tmp_path / "out")
     for new, old in zip(back.views, first.views, strict=True):
         assert (new.exposure, new.white_balance) == (1.0, (1.0, 1.0, 1.0))
@@ -104,7 +114,8 @@ def test_other_lenses_are_undone(tmp_path: Path, writer: str, hdr: bool) -> None
     for new, old in zip(back.views, first.views, strict=True):
         assert new.camera.lens is None
         assert new.image.suffix == (".exr" if hdr else ".png")
-        # A pixel well inside the sphere shows what the bent image shows of the same point, to within a pixel's step.
+        # A pixel well inside the sphere shows what the bent image shows of the same point, to within a
+        # pixel's step.
         point = torch.from_numpy(POINTS.mean(axis=0, keepdims=True))
         there, here = (project(view.camera, point).pixel[0].long() for view in (old, new))
         shown = read_image(new.image).pixels[here[1], here[0]]
@@ -121,7 +132,9 @@ def test_a_resampled_pixel_is_valid_where_all_that_it_is_made_of_is(tmp_path: Pa
     write_png(tmp_path / "usable.png", np.where(usable, 255, 0).astype(np.uint8))
     write_exr(tmp_path / "clipped.exr", {"RGB": np.where(usable, 1.0, 1e6)[..., None].repeat(3, axis=2)})
     files = {"image": tmp_path / "clipped.exr", "valid": tmp_path / "usable.png"}
-    for view in written(with_views(first, lambda view: replace(view, **files)), writer, tmp_path / "out").views:
+    for view in written(
+        with_views(first, lambda view: replace(view, **files)), writer, tmp_path / "out"
+    ).views:
         kept, pixels = read_image(view.valid).pixels[..., 0] == 1, read_image(view.image).pixels
         assert (pixels[kept] == 1.0).all()
         assert (pixels[~kept] > 1.0).all()

@@ -1,4 +1,6 @@
-"""Published protocols against a second implementation of the official formulas, pixel by pixel in plain Python."""
+"""Published protocols against a second implementation of the official formulas, pixel by pixel in plain
+Python.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ from tests.evaluate.test_protocols import KnownSphere, make_run
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory) -> Path:
-    return scene.make_capture(tmp_path_factory.mktemp("capture") / "c", size=(40, 30), views=6, test=(0, 3), masks=True)
+    return scene.make_capture(
+        tmp_path_factory.mktemp("capture") / "c", size=(40, 30), views=6, test=(0, 3), masks=True
+    )
 
 
 @pytest.fixture
@@ -37,14 +41,19 @@ def made_up(run: Run) -> tuple[RenderedView, ...]:
     generator = np.random.default_rng(3)
     views = []
     for view in render_test_views(run):
-        maps = {name: (m + generator.normal(0, 0.1, m.shape)).clip(0, None).astype(np.float32) for name, m in view.maps.items()}
+        maps = {
+            name: (m + generator.normal(0, 0.1, m.shape)).clip(0, None).astype(np.float32)
+            for name, m in view.maps.items()
+        }
         normal = view.maps["normal"] + generator.normal(0, 0.2, view.maps["normal"].shape).astype(np.float32)
-        opacity = generator.uniform(0.8, 1.0, view.maps["opacity"].shape).astype(np.float32) * view.maps["opacity"]
+        opacity = (
+            generator.uniform(0.8, 1.0, view.maps["opacity"].shape).astype(np.float32) * view.maps["opacity"]
+        )
         views.append(RenderedView(view.name, maps | {"normal": normal, "opacity": opacity}))
     return tuple(views)
 
 
-# ------------------------------------------------------------------------------------------------------ neilf-synthetic
+# -------------------------------------------------------------------------------------------- neilf-synthetic
 
 
 def mean_psnr(estimates, truths, masks) -> float:
@@ -56,7 +65,9 @@ def mean_psnr(estimates, truths, masks) -> float:
         for y in range(height):
             for x in range(width):
                 m = 1.0 if mask[y, x] else 0.0
-                total += sum((float(estimate[y, x, c]) * m - float(truth[y, x, c]) * m) ** 2 for c in range(channels))
+                total += sum(
+                    (float(estimate[y, x, c]) * m - float(truth[y, x, c]) * m) ** 2 for c in range(channels)
+                )
         scores.append(10 * math.log10(1 / (total / (height * width * channels))))
     return sum(scores) / len(scores)
 
@@ -68,7 +79,11 @@ def test_neilf_synthetic_is_the_official_formula(run, root):
     files = root / "ground_truths" / "materials"
     true = {
         name: [read_image(files / folder / f"{view.name}.png").pixels[..., :channels] for view in rendered]
-        for name, folder, channels in (("base_color", "kd", 3), ("roughness", "roughness", 1), ("metallic", "metallic", 1))
+        for name, folder, channels in (
+            ("base_color", "kd", 3),
+            ("roughness", "roughness", 1),
+            ("metallic", "metallic", 1),
+        )
     }
     pooled = [
         [float(v) for image, mask in zip(side, masks, strict=True) for v in image[mask].flatten()]
@@ -78,7 +93,9 @@ def test_neilf_synthetic_is_the_official_formula(run, root):
     assert figures["base_color_gamma"] == pytest.approx(gamma, abs=1e-5)
     assert abs(gamma - 1) > 0.1, "the power matters in this test"
     aligned = [view.maps["base_color"].clip(0, 1) ** gamma for view in rendered]
-    assert figures["base_color_psnr"] == pytest.approx(mean_psnr(aligned, true["base_color"], masks), abs=1e-3)
+    assert figures["base_color_psnr"] == pytest.approx(
+        mean_psnr(aligned, true["base_color"], masks), abs=1e-3
+    )
     for name in ("roughness", "metallic"):
         estimates = [view.maps[name] for view in rendered]
         assert figures[f"{name}_psnr"] == pytest.approx(mean_psnr(estimates, true[name], masks), abs=1e-3)
@@ -86,7 +103,10 @@ def test_neilf_synthetic_is_the_official_formula(run, root):
     def curve(x):
         return (2.51 * x**2 + 0.03 * x) / (2.43 * x**2 + 0.59 * x + 0.14)
 
-    images = [curve(read_image(root / "inputs" / "images" / f"{view.name}.exr").pixels.astype(float)) for view in rendered]
+    images = [
+        curve(read_image(root / "inputs" / "images" / f"{view.name}.exr").pixels.astype(float))
+        for view in rendered
+    ]
     shown = [curve(view.maps["rgb"].astype(float)) for view in rendered]
     assert figures["render_psnr"] == pytest.approx(mean_psnr(shown, images, masks), abs=1e-3)
 
@@ -106,7 +126,7 @@ def test_a_capture_without_material_is_told_where_it_belongs(root, tmp_path):
     assert "ground_truths/materials/kd/000.png" in told.value.remedy
 
 
-# -------------------------------------------------------------------------------------------------------- shiny-normals
+# ---------------------------------------------------------------------------------------------- shiny-normals
 
 
 def test_shiny_normals_weigh_by_opacity_and_alpha(run, root, tmp_path):
@@ -129,7 +149,9 @@ def test_shiny_normals_weigh_by_opacity_and_alpha(run, root, tmp_path):
                 weight = float(view.maps["opacity"][y, x, 0]) * (chosen == 1 or d > 0)
                 a, b = view.maps["normal"][y, x].astype(float), truth[y, x].astype(float)
                 if weight:
-                    cosine = sum(a * b) / math.sqrt(max(sum(a * a), 2**-23)) / math.sqrt(max(sum(b * b), 2**-23))
+                    cosine = (
+                        sum(a * b) / math.sqrt(max(sum(a * a), 2**-23)) / math.sqrt(max(sum(b * b), 2**-23))
+                    )
                     total += weight * math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
                     weights += weight
             means.append(total / weights)

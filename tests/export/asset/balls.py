@@ -70,7 +70,9 @@ def ball_run(
         radiance[:, 3, 2] = torch.tensor([8.0, 4.0, 2.0])
         model.light.show(radiance)
     if kind == "distant_near":
-        model.lamps.place(torch.tensor([BULB, PANEL]), torch.tensor(INTENSITY), torch.tensor([[0.0, 0.0, 0.0], AXIS]))
+        model.lamps.place(
+            torch.tensor([BULB, PANEL]), torch.tensor(INTENSITY), torch.tensor([[0.0, 0.0, 0.0], AXIS])
+        )
     capture = load_capture(make_capture(folder / "capture", views=8, size=(48, 36)))
     return Run(folder, config, capture, model.facts, model, step)
 
@@ -89,4 +91,6 @@ def write_ball(
     deviations=None,
     resolution: int = 48,
 ) -> None:
-    export_asset(run, out, resolution, AssetOptions(size, faces, error), Console(quiet=True), no_bar, deviations)
+    export_asset(
+        run, out, resolution, AssetOptions(size, faces, error), Console(quiet=True), no_bar, deviations
+    )

@@ -37,7 +37,9 @@ SIZE = 256
 @pytest.fixture(scope="module")
 def asset(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("ball")
-    write_ball(ball_run(folder), folder / "asset", SIZE, deviations=lambda run, points: 0.5 + 0.5 * points.position)
+    write_ball(
+        ball_run(folder), folder / "asset", SIZE, deviations=lambda run, points: 0.5 + 0.5 * points.position
+    )
     return folder / "asset"
 
 
@@ -99,7 +101,9 @@ def test_the_files_beside_hold_the_same(asset, shape):
         np.testing.assert_array_equal(np.rint(255 * stored), np.array(texture))
     packed = read_image(asset / "textures" / "metallic_roughness.png").pixels
     for name, channel in (("roughness", 1), ("metallic", 2)):
-        np.testing.assert_array_equal(read_image(asset / "textures" / f"{name}.png").pixels[..., 0], packed[..., channel])
+        np.testing.assert_array_equal(
+            read_image(asset / "textures" / f"{name}.png").pixels[..., 0], packed[..., channel]
+        )
     points, at_vertices = random_points(shape)
     deviation = look_up(
         255 * read_image(asset / "textures" / "deviation.png").pixels.astype(float),
@@ -162,9 +166,10 @@ def test_the_normal_map_turns_the_coarse_surface_into_the_fine_one(tmp_path):
     shape = trimesh.load(asset / "asset.glb", process=False).geometry["surface"]
     points, at_vertices = random_points(shape)
     n, t, sign = at_vertices(normal), at_vertices(tangent[:, :3]), np.sign(at_vertices(tangent[:, 3:]))
-    x, y, z = (look_up(np.array(shape.visual.material.normalTexture, float), at_vertices(shape.visual.uv)) / 127.5 - 1).T[
-        ..., None
-    ]
+    x, y, z = (
+        look_up(np.array(shape.visual.material.normalTexture, float), at_vertices(shape.visual.uv)) / 127.5
+        - 1
+    ).T[..., None]
     bumped = x * t + y * sign * np.cross(n, t) + z * n
     bumped /= np.linalg.norm(bumped, axis=1, keepdims=True)
     scene = to_scene(points)
@@ -190,7 +195,9 @@ def test_lamps_are_where_they_were(asset):
     for node, place, intensity in zip(nodes, (BULB, PANEL), INTENSITY, strict=True):
         light = lights[node["extensions"]["KHR_lights_punctual"]["light"]]
         np.testing.assert_allclose(to_scene(np.array([node["translation"]]))[0], place, atol=1e-6)
-        np.testing.assert_allclose(np.array(light["color"]) * light["intensity"], np.array(intensity) * SCALE**2, rtol=1e-6)
+        np.testing.assert_allclose(
+            np.array(light["color"]) * light["intensity"], np.array(intensity) * SCALE**2, rtol=1e-6
+        )
     # A spot looks along −Z of its node.
     looks = trimesh.transformations.quaternion_matrix(np.roll(nodes[1]["rotation"], 1))[:3, :3] @ [0, 0, -1]
     np.testing.assert_allclose(looks, [AXIS[0], AXIS[2], -AXIS[1]], atol=1e-6)

@@ -49,7 +49,9 @@ def given(tmp_path_factory) -> Path:
 
 
 def test_an_asset_of_a_given_mesh(given, tmp_path, capfd):
-    assert main(["export", str(given), "--what", "asset", "--confidence", "--out", str(tmp_path), *SMALL]) == 0
+    assert (
+        main(["export", str(given), "--what", "asset", "--confidence", "--out", str(tmp_path), *SMALL]) == 0
+    )
     said = capfd.readouterr()
     assert said.err == ""
     for words in (
@@ -72,7 +74,9 @@ def test_an_asset_of_a_given_mesh(given, tmp_path, capfd):
     run = load_run(given)
     row = (1 - shape.visual.uv[:, 1]) * 128 - 0.5
     column = shape.visual.uv[:, 0] * 128 - 0.5
-    texel = np.array(shape.visual.material.baseColorTexture)[row.round().astype(int), column.round().astype(int)]
+    texel = np.array(shape.visual.material.baseColorTexture)[
+        row.round().astype(int), column.round().astype(int)
+    ]
     scene = torch.as_tensor((world - CENTRE) / SCALE, dtype=torch.float32)
     truth = 255 * srgb(run.model.materials(scene).base_color.detach().numpy())
     assert np.abs(texel - truth).mean() < 2
@@ -105,7 +109,9 @@ def test_a_run_without_a_material(tmp_path, capfd, monkeypatch):
     monkeypatch.setitem(PRESETS, "tiny", small_config)
     capture = make_capture(tmp_path / "capture", masks=True)
     run = tmp_path / "run"
-    assert main(["train", "--data", str(capture), "--preset", "tiny", "--out", str(run), "--device", "cpu"]) == 0
+    assert (
+        main(["train", "--data", str(capture), "--preset", "tiny", "--out", str(run), "--device", "cpu"]) == 0
+    )
     command = ["export", run, "--what", "asset", "--checkpoint", "sdf_init", *SMALL]
     refused(capfd, command, "no material yet at step 4", leaves=tmp_path)
     # Later there is one, on the surface that the run has found; its light is free at every point, so there is

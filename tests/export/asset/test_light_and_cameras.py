@@ -45,7 +45,9 @@ def test_a_bright_texel_is_where_a_program_looks_for_it(program, place, texel):
     radiance = torch.full((3, 9, 18), 0.1)
     radiance[:, row, column] = 5.0
     theta, phi = math.pi * row / 8, 2 * math.pi * (column + 0.5) / 18
-    u, v = place(np.array([math.sin(phi) * math.sin(theta), math.cos(phi) * math.sin(theta), math.cos(theta)]))
+    u, v = place(
+        np.array([math.sin(phi) * math.sin(theta), math.cos(phi) * math.sin(theta), math.cos(theta)])
+    )
     picture = equirectangular(radiance, program).numpy()
     height, width = picture.shape[:2]
     assert width == 2 * height
@@ -63,7 +65,9 @@ def test_the_map_brings_the_same_light(program):
     height, width = picture.shape[:2]
     weight = np.sin(np.pi * (np.arange(height) + 0.5) / height)[:, None, None]
     mean = (weight * picture).sum((0, 1)) / (weight.sum() * width)
-    directions = torch.nn.functional.normalize(torch.randn(1, 200_000, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
+    directions = torch.nn.functional.normalize(
+        torch.randn(1, 200_000, 3, generator=torch.Generator().manual_seed(1)), dim=-1
+    )
     shown = light.radiance(torch.zeros(1, 3), directions)[0]
     np.testing.assert_allclose(mean, shown.mean(0).numpy(), rtol=5e-3)
 
@@ -95,7 +99,9 @@ def test_our_own_map_lies_beside(run, asset):
     np.testing.assert_allclose(shown, run.model.light.log_radiance.exp().permute(1, 2, 0).numpy(), rtol=1e-6)
     for program in ("blender", "unreal"):
         stored = read_image(asset / f"environment_{program}.exr").pixels
-        np.testing.assert_allclose(stored, equirectangular(run.model.light.log_radiance.exp(), program), rtol=1e-6)
+        np.testing.assert_allclose(
+            stored, equirectangular(run.model.light.log_radiance.exp(), program), rtol=1e-6
+        )
 
 
 def test_cameras_are_those_of_the_capture(run, asset):

@@ -96,7 +96,9 @@ def test_small_holes_are_closed_and_large_ones_stay():
     np.testing.assert_allclose(mesh.face_normals[-len(added) :, 2], 1, atol=0.02)
     tracer = first_hits(closed)
     for height, met in ((1.0, True), (-1.0, False)):
-        found = meet_along(closed, tracer, np.array([[0.004, 0.003, height]]), np.array([[0.0, 0.0, np.sign(height)]]), 0.7)
+        found = meet_along(
+            closed, tracer, np.array([[0.004, 0.003, height]]), np.array([[0.0, 0.0, np.sign(height)]]), 0.7
+        )
         assert found.found[0] == met
 
 
@@ -114,12 +116,16 @@ def test_points_come_down_on_the_surface_that_faces_their_way():
     plates = trimesh.util.concatenate([trimesh.creation.box((1, 1, 0.02)) for _ in range(2)])
     plates.vertices[8:, 2] += 0.1
     shape = surface(plates)
-    found = meet_along(shape, first_hits(shape), np.array([[0.1, 0.2, 0.03]]), np.array([[0.0, 0.0, 1.0]]), 0.2)
+    found = meet_along(
+        shape, first_hits(shape), np.array([[0.1, 0.2, 0.03]]), np.array([[0.0, 0.0, 1.0]]), 0.2
+    )
     assert found.found.all()
     np.testing.assert_allclose(found.position, [[0.1, 0.2, 0.01]], atol=1e-6)
     np.testing.assert_allclose(found.distance, 0.02, atol=1e-6)
     np.testing.assert_allclose(found.normal, [[0, 0, 1]], atol=1e-6)
-    short = meet_along(shape, first_hits(shape), np.array([[0.1, 0.2, 0.03]]), np.array([[0.0, 0.0, 1.0]]), 0.015)
+    short = meet_along(
+        shape, first_hits(shape), np.array([[0.1, 0.2, 0.03]]), np.array([[0.0, 0.0, 1.0]]), 0.015
+    )
     assert not short.found.any()
     np.testing.assert_allclose(short.position, [[0.1, 0.2, 0.03]], atol=1e-6)
 
@@ -154,4 +160,6 @@ def test_few_triangles_stay_as_they_are():
     kept = simplified(box, 5000, 0.0)
     assert len(kept.surface.faces) == 12
     # Edges stay edges: each corner has the normal of its side.
-    np.testing.assert_allclose(kept.surface.normals, np.repeat(box.mesh().face_normals[:, None], 3, axis=1), atol=1e-6)
+    np.testing.assert_allclose(
+        kept.surface.normals, np.repeat(box.mesh().face_normals[:, None], 3, axis=1), atol=1e-6
+    )

@@ -22,7 +22,9 @@ SENSOR = 36.0  # mm; only its ratio to the focal length matters
 
 
 def main(arguments):
-    parser = argparse.ArgumentParser(prog="open_in_blender.py", description="Open an exported asset in Blender.")
+    parser = argparse.ArgumentParser(
+        prog="open_in_blender.py", description="Open an exported asset in Blender."
+    )
     parser.add_argument("--camera", help="name of a view; the first one where none is given")
     parser.add_argument("--render", type=Path, help="render to this EXR file, linear")
     parser.add_argument("--samples", type=int, default=128, help="samples per pixel")

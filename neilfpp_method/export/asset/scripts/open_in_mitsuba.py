@@ -17,7 +17,9 @@ HERE = Path(__file__).resolve().parent
 
 
 def main():
-    parser = argparse.ArgumentParser(prog="open_in_mitsuba.py", description="Render an exported asset with Mitsuba 3.")
+    parser = argparse.ArgumentParser(
+        prog="open_in_mitsuba.py", description="Render an exported asset with Mitsuba 3."
+    )
     parser.add_argument("out", type=Path, help="EXR file, linear")
     parser.add_argument("--camera", help="name of a view; the first one where none is given")
     parser.add_argument("--samples", type=int, default=128, help="samples per pixel")
