@@ -213,7 +213,8 @@ class NeilfMethod(Model):
             CONSOLE.log(f"health after {position.stage.value}: {Health.of(self.watch.findings.values())}")
             if self.proxy is not None and self.proxy.report() is not None:
                 CONSOLE.log(str(self.proxy.report()))
-        if ends or (step > 0 and step % trainer.config.steps_per_save == 0):  # as nerfstudio has it
+        saves = step > 0 and step % trainer.config.steps_per_save == 0  # as nerfstudio has it
+        if ends or saves or done == trainer._start_step + trainer.config.max_num_iterations:
             write_findings(trainer.base_dir, self.watch)
             if self.record is not None:
                 self.record.save(self.neilf, self.light_solver, self.watch, trainer, done)
