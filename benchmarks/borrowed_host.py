@@ -27,6 +27,7 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.protocols import evaluate
+from neilfpp_method.evaluate.size import at_size
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.schedule import stage_at
 from neilfpp_method.settings.presets import fixed_geometry, preset
@@ -56,6 +57,8 @@ class Options:
     """Where the run on the mesh goes."""
     steps: int = 1500
     """Steps with a material, of both."""
+    scale: float = 1.0
+    """Size of the test views over that of their files."""
     save: str | None = None
     """Keep the figures under this name in benchmarks/results; none: they are printed alone."""
 
@@ -133,18 +136,18 @@ def main(options: Options) -> None:
     given = fixed_geometry(preset("fast"))
     given = dataclasses.replace(given, train=dataclasses.replace(given.train, material_steps=options.steps))
     on_mesh = options.out / options.capture.resolve().name
-    if not (on_mesh / "checkpoints" / "last.pt").exists():
-        run_training(
-            data=options.capture,
-            out=on_mesh,
-            config=given,
-            resume=False,
-            test_every=None,
-            response="auto",
-            device="cpu",
-            devices=1,
-            console=Console(),
-        )
+    begun = (on_mesh / "checkpoints" / "last.pt").exists()
+    run_training(  # a run that is finished is left as it is
+        data=None if begun else options.capture,
+        out=on_mesh,
+        config=None if begun else given,
+        resume=begun,
+        test_every=None,
+        response="auto",
+        device="cpu",
+        devices=1,
+        console=Console(),
+    )
     pixels = PixelDataset(capture, capture.train_views)
     borrowed = dataclasses.replace(given, train=dataclasses.replace(given.train, sdf_steps=0))
     runs = {
@@ -152,8 +155,9 @@ def main(options: Options) -> None:
         "the true surface as a plain function, borrowed": borrow(capture, pixels, borrowed, options.out),
     }
     name = options.capture.resolve().name
-    rows = tuple(Row(label, evaluate(run), name) for label, run in runs.items())
-    command = f"python -m benchmarks.borrowed_host DATA/{name} --steps {options.steps}"
+    rows = tuple(Row(label, evaluate(at_size(run, options.scale)), name) for label, run in runs.items())
+    size = f"--steps {options.steps} --scale {options.scale:g}"
+    command = f"python -m benchmarks.borrowed_host DATA/{name} {size}"
     result = Result(TABLE, revision(), command, hardware(), rows)
     print(markdown([result]))
     if options.save is not None:

@@ -48,7 +48,7 @@ def test_a_step_that_is_not_finite_moves_nothing_and_is_said(caplog):
     with caplog.at_level(logging.WARNING):
         step(neilf, optimizer, 1, spoil=torch.nan)
     assert all(torch.equal(p, q) for p, q in zip(neilf.parameters(), before, strict=True))
-    assert [r.message for r in caplog.records] == [
+    assert [r.message for r in caplog.records if "skipped" in r.message] == [
         "step 1 skipped: the gradient of brdf is not finite (1 skipped so far)"
     ]
     step(neilf, optimizer, 2)
