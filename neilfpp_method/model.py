@@ -124,9 +124,7 @@ class NeilfModel(nn.Module):
         self.replay = Replay(config.train.fresh if stands_still else 1.0, config.train.rays)
 
     def use(self, config: NeilfConfig) -> None:
-        """Compute with these settings from now on. They switch effects; sizes of fields stay what they were
-        built with.
-        """
+        """Compute with these settings from now on. Effects change; the sizes of fields stay."""
         self.config = config
         self.lobe = LOBES[config.shading.lobe] if config.shading.specular else None
         self.brdf.metals = config.brdf.metals
@@ -162,8 +160,7 @@ class NeilfModel(nn.Module):
         if not plan.moves_material:
             return StepResult.of(terms, SurfacePixels.none_of(batch), batch[:0])
 
-        # 2. Rays that meet one surface, on the object, are shaded; a scaled gradient goes back to where they
-        #   met it.
+        # 2. Rays that meet one surface, on the object, are shaded. The gradient to their hits is scaled.
         rows = torch.nonzero(hits.is_hit(self.config.shading.hit_share) & (batch.mask > 0.5))[:, 0]
         rendered = self._surface_pixels(hits[rows], batch[rows])
         surface = self.replay.beside_earlier(rendered) if replays else rendered
@@ -251,9 +248,7 @@ class NeilfModel(nn.Module):
 
     @property
     def scene(self) -> SceneTracer | None:
-        """What the scene's own surfaces send, where inter-reflection is traced; none where it is off or a
-        loss.
-        """
+        """What the scene's own surfaces send, where inter-reflection is traced (hard); else none."""
         if self.config.inter_reflection.mode != "hard":
             return None
         return scene_tracer(self.host, self.config.inter_reflection, self.config.shading.hit_share)
@@ -275,9 +270,7 @@ class NeilfModel(nn.Module):
     def shading_normals(
         self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
-        """Unit normals at hits as surfaces are shaded with them; their gradient is that of the hits'
-        normals.
-        """
+        """Unit normals that hits are shaded with; their gradient is that of the hits' normals."""
         if not isinstance(self.host, SmoothsNormals):
             return normal
         smooth = self.host.smooth_normals(position.detach(), normal.detach())
@@ -296,9 +289,7 @@ class NeilfModel(nn.Module):
         material: Material,
         samples: int,
     ) -> Shading:
-        """Outgoing radiance towards wo by the rendering equation, from `samples` incident directions per
-        point.
-        """
+        """Outgoing radiance towards wo by the rendering equation, from `samples` directions a point."""
         about, roughness, sampler = normal.detach(), material.roughness.detach(), self.config.shading.sampler
         drawn = draw_directions(sampler, self.light, about, wo, roughness, samples, self.lobe, self.training)
         return shade(material, normal, wo, arriving(self.sources, position, drawn), self.lobe)

@@ -1,5 +1,4 @@
-"""Brackets taken by hand: the photographs of a pose are brought onto its middle exposure before they are
-merged.
+"""Hand-held brackets: the photographs of a pose are aligned with its middle exposure before merging.
 
 Neighbours in exposure are compared, as these share most levels of light that neither clips, and the motions
 are chained. No response is needed: the levels of one image are first mapped to those of the other by their
@@ -38,8 +37,7 @@ SHIFT_BITS = 5
 
 @dataclass(frozen=True)
 class Aligned:
-    """A bracket whose images lie on one another, and the largest motion that was undone, in pixels; 0: a
-    tripod's.
+    """An aligned bracket, and the largest motion that was undone, in pixels; 0 for a bracket on a tripod.
 
     What an image does not show after its motion, and what it had clipped, is 1 there: no evidence.
     """
@@ -76,9 +74,7 @@ def align(bracket: Bracket) -> Aligned:
 def _motion(
     fixed: Float32[np.ndarray, "H W 3"], moving: Float32[np.ndarray, "H W 3"]
 ) -> Float64[np.ndarray, "3 3"]:
-    """The homography from pixels of `fixed` to those of `moving`; the identity where none explains the images
-    better.
-    """
+    """The homography from pixels of `fixed` to those of `moving`; the identity where none fits better."""
     size = fixed.shape[:2]
     still = np.eye(3)
     pair = _pair(fixed, moving, SIDES[1])
@@ -144,8 +140,7 @@ def _first_shift(pair: _Pair) -> Float64[np.ndarray, "3 3"]:
 def _refined(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
     """The motion, from one that is nearly right, under which the images differ least but for gain and offset.
 
-    Inverse compositional Gauss–Newton: the small motion is one of the fixed image, whose derivatives are
-    taken once.
+    Inverse compositional Gauss–Newton: the derivatives are those of the fixed image, computed once.
     """
     height, width = pair.fixed.shape
     unit = max(height, width) / 2
@@ -195,9 +190,7 @@ def _corner_shift(motion: Float64[np.ndarray, "3 3"], size: tuple[int, int]) -> 
 def _moved(
     image: Float32[np.ndarray, "H W 3"], motion: Float64[np.ndarray, "3 3"]
 ) -> Float32[np.ndarray, "H W 3"]:
-    """The image seen from where the middle exposure was; 1 where a clipped pixel, or none, has a part in
-    it.
-    """
+    """The image warped to the middle exposure, and 1 where a clipped or missing pixel contributes."""
     size, flags = image.shape[1::-1], cv2.WARP_INVERSE_MAP
     moved = cv2.warpPerspective(
         image, motion, size, flags=cv2.INTER_CUBIC | flags, borderMode=cv2.BORDER_REPLICATE

@@ -41,9 +41,7 @@ class Bracket:
 
 @dataclass(frozen=True)
 class Merged:
-    """Linear radiance, and where it is known: a pixel that is clipped at every exposure holds only a lower
-    bound.
-    """
+    """Linear radiance, and where it is known: a pixel clipped at every exposure holds only a lower bound."""
 
     radiance: Float32[np.ndarray, "H W 3"]
     valid: Bool[np.ndarray, "H W"]

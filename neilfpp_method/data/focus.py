@@ -19,9 +19,7 @@ __all__ = ["Axes", "Focus", "axes_of", "find_focus", "meeting_point"]
 ITERATIONS = 50
 """Rounds of reweighting; the place moves no more after some twenty."""
 FLOOR = 1e-3
-"""Share of the median distance below which an axis counts as passing through the place: it has no weight
-without bound.
-"""
+"""Share of the median distance below which an axis passes through the centre: it bounds the weights."""
 MIDDLE = 0.5
 """A camera looks at what lies in this part of its picture, along both sides, about the middle."""
 MOST = 2 / 3
@@ -34,9 +32,7 @@ the depth at which axes meet that are nearer to parallel is that of chance.
 
 @dataclass(frozen=True)
 class Axes:
-    """Optical axes: where the cameras stand and the unit vectors along which they look, in the world
-    frame.
-    """
+    """Optical axes: camera centres and unit viewing directions, in the world frame."""
 
     eyes: Float64[np.ndarray, "V 3"]
     ahead: Float64[np.ndarray, "V 3"]

@@ -1,6 +1,4 @@
-"""How much memory is free, and a word before more than that is taken: a process that takes too much is killed
-without one.
-"""
+"""How much memory is free, and a warning before a process takes more and is killed without a word."""
 
 from __future__ import annotations
 

@@ -20,9 +20,7 @@ __all__ = ["BYTES", "ENCODINGS", "Encoded", "Encoding", "encodings_for"]
 TOP = 32_768.0
 """What the brightest value of a view comes to in half precision, at most; half ends at 65 504."""
 LEAST_MEDIAN = 2.0**-4
-"""Median of a view's values that half precision is good for: a thousandth of it then still has all 11 bits,
-which end at 2⁻¹⁴.
-"""
+"""Least median of a view in half precision: a thousandth of it still has 11 bits (they end at 2⁻¹⁴)."""
 LOOKED_AT = 2**20
 """Values of which the median is taken."""
 

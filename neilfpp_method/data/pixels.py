@@ -34,8 +34,7 @@ MOST_COUNTED = 2**20
 
 
 class PixelDataset:
-    """P pixels of the chosen views, view after view, row by row. `len` is P; `PixelBatch.view` counts in
-    `views`.
+    """P pixels of the chosen views, view after view, row by row. `PixelBatch.view` indexes `views`.
 
     Colours, masks and validity are kept in a `PixelStore`, 4 to 13 bytes a pixel, in a folder or in memory;
     rays and image gradients are computed when asked for. Colours of a linear capture are radiance on the
@@ -86,8 +85,7 @@ class PixelDataset:
         return len(self.store)
 
     def sample(self, count: int, gradients: bool = True) -> PixelBatch:
-        """`count` valid pixels drawn by torch's global generator as `data.drawing` says: most on the object
-        or near it.
+        """`count` valid pixels from torch's global generator, most on or near the object (`data.drawing`).
 
         Image gradients take nine reads a pixel; without `gradients` they are 0.
         """
@@ -101,9 +99,7 @@ class PixelDataset:
         return self._draws.draw(count)
 
     def view(self, i: int, gradients: bool = True) -> PixelBatch:
-        """All pixels of `views[i]`, row by row; those that are not `valid` as well. Image gradients as in
-        `sample`.
-        """
+        """All pixels of `views[i]`, row by row, invalid ones included. Image gradients as in `sample`."""
         rows, camera = self.store.rows(i), self.views[i].camera
         numbers, colors = np.arange(rows.start, rows.stop), self.store.view_colors(i)
         shape = camera.height, camera.width
@@ -121,9 +117,7 @@ class PixelDataset:
         return self._bit(self.store.bits[self.store.rows(i)], VALID)
 
     def near(self, i: int) -> Bool[Tensor, " N"]:
-        """Which pixels of `views[i]` are on the object or near its outline; none where nothing is known of
-        the object.
-        """
+        """Which pixels of `views[i]` are on or near the object; none where nothing is known of it."""
         return self._bit(self.store.bits[self.store.rows(i)], NEAR)
 
     def _views_of(self, numbers: Int[np.ndarray, " N"]) -> Int[np.ndarray, " N"]:
@@ -198,9 +192,7 @@ class PixelDataset:
         return float(lit.median())
 
     def radiance_quantile(self, share: float) -> float:
-        """The linear value that `share` of the values of the valid object pixels and channels do not
-        exceed.
-        """
+        """The linear value that `share` of the values of valid object pixels and channels stay below."""
         values = self._of_the_object().flatten()
         return float(values.kthvalue(max(1, round(share * len(values)))).values)
 
@@ -257,9 +249,7 @@ class PixelDataset:
         views: Int[np.ndarray, " N"],
         other: Callable[[Float32[np.ndarray, "V 3"]], Bool[Tensor, " V"]],
     ) -> bool:
-        """Whether what some pixels show can lie within the scene, as the views have it by which of their
-        pixels are `other`.
-        """
+        """Whether what these pixels show can lie in the scene, judged by which pixels are `other`."""
         if not len(numbers):
             return True
         step = -(-len(numbers) // MOST_RAYS)

@@ -120,9 +120,7 @@ def _columns(path: Path, vertices: np.ndarray, names: tuple[str, str, str]) -> F
 
 
 def _vertices(data: bytes) -> np.ndarray:
-    """The vertex table as a structured array; the vertices have to come first, as they do in every common
-    writer.
-    """
+    """The vertex table as a structured array; the vertices must come first, as all common writers do."""
     head, separator, _ = data[:HEADER_LIMIT].partition(b"end_header")
     if not separator or not head.startswith(b"ply"):
         raise ValueError("it has no PLY header")

@@ -1,5 +1,4 @@
-"""Where the scene is, for captures that do not say it: told by points, by silhouettes, or else by the cameras
-alone.
+"""Where the scene is, for captures that do not say: from points, from silhouettes, or from the cameras.
 
 The scene frame has the object in the unit sphere; a box gives its centre and half of its largest extent
 (METHOD's normalisation). What is known best decides: points on the surface, then the masks, whose visual hull
@@ -93,8 +92,7 @@ def box_of_focus(views: Sequence[View]) -> Normalisation | None:
 def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalisation:
     """A guess: what the cameras look at, as large as the circle that fits into their images, times `fill`.
 
-    The centre is the place that most cameras look at, or else the point nearest to all optical axes, by least
-    squares.
+    The centre is where most cameras look, or else the least-squares point nearest to all optical axes.
 
     Raises:
         UserError: the axes do not come near one point in front of the cameras.

@@ -37,9 +37,7 @@ __all__ = [
 ]
 
 MOST_BLIND = 0.6
-"""A fisheye's circle fills 44 % of a picture of 16:9. A lens that shows less was calibrated for other
-images.
-"""
+"""A fisheye's circle fills 44 % of a 16:9 picture. A lens that shows less is of other images."""
 MOST_LOOKED_UP = 2**26
 """Pixels of different lenses whose rays are kept: half a gigabyte."""
 PLANE_PART = 2**20
@@ -125,9 +123,7 @@ class View:
 
 @dataclass(frozen=True)
 class Normalisation:
-    """scene = (world − centre) / scale: no rotation, so that directions and normals are the same in both
-    frames.
-    """
+    """scene = (world − centre) / scale: without rotation, directions are the same in both frames."""
 
     scale: float
     centre: tuple[float, float, float]
@@ -198,17 +194,14 @@ def plain_name(name: str) -> bool:
 
 @dataclass(frozen=True)
 class Projection:
-    """Image points (column + ½ at a pixel's centre) and depth along the camera's axis, in the units of the
-    pose.
-    """
+    """Image points (column + ½ at a pixel's centre) and depth along the camera's axis, in pose units."""
 
     pixel: Float[Tensor, "N 2"]
     depth: Float[Tensor, " N"]
 
 
 def project(camera: Camera, points: Float[Tensor, "N 3"]) -> Projection:
-    """Where the camera sees points: u = fx·x/z + cx, v = fy·y/z + cy, with x/z and y/z bent by a lens where
-    there is one.
+    """Where the camera sees points: u = fx·x/z + cx, v = fy·y/z + cy, with x/z and y/z bent by its lens.
 
     A depth ≤ 0 means the point is behind the camera. Differentiable without a lens.
     """
@@ -264,9 +257,7 @@ class CameraRays:
             self._lens_plane = torch.from_numpy(planes).to(device)
 
     def shown(self, i: int) -> Bool[Tensor, " P"]:
-        """Which pixels of camera `i`, row by row, have a ray of their own; all but those where its lens shows
-        nothing.
-        """
+        """Which pixels of camera `i`, row by row, have a ray; all but those where its lens shows nothing."""
         camera = self._cameras[i]
         size = camera.width * camera.height
         if camera.lens is None:
@@ -315,9 +306,7 @@ def _shape(camera: Camera) -> tuple[Lens | None, float, float, float, float, int
 
 
 def _whole_plane(camera: Camera, dtype: torch.dtype) -> Float[np.ndarray, "P 2"]:
-    """`_straight_plane` of all pixels of a camera, in the precision of rays; in parts, which take several
-    times as much.
-    """
+    """`_straight_plane` of all pixels of a camera, at ray precision; in parts, to bound the memory."""
     count = camera.width * camera.height
     parts = np.split(np.arange(count), range(PLANE_PART, count, PLANE_PART))
     plane = np.concatenate(

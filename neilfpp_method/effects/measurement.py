@@ -32,8 +32,7 @@ class Measurement:
     samples: int
 
     def favours(self, chosen: bool) -> bool | None:
-        """Whether to simulate the effect; `chosen`: it is simulated so far. None: too few samples to say
-        anything.
+        """Whether to simulate the effect, given whether it is now (`chosen`). None: too few samples.
 
         An effect that is off must be worth more than the threshold, and more than chance brings about once in
         forty times. One that is on stays unless it is worth less than the threshold, as surely. So nothing

@@ -157,8 +157,7 @@ def _better_light(
 def _best_material(
     fit: PlaceFit, places: Places, transport: Transport, typical: float, metallics: tuple[float, ...]
 ) -> PlaceFit:
-    """Of all pairs of roughness and metallic at a place the one whose best base colour leaves the smallest
-    error.
+    """Of all pairs of roughness and metallic at a place, the one with the least error (best base colour).
 
     Radiance is linear in the base colour, b · slope + rest, so the best is a weighted mean.
     """

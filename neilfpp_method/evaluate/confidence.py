@@ -1,5 +1,4 @@
-"""How far off a run's material may be at points of its surface, from how well what the training views saw
-determines it.
+"""Expected error of a run's material at surface points, from how well the training views determine it.
 
 Two things stand between the images and the material. Noise, and what no model explains, is different in every
 view; its size is that of the run's own residuals. Errors of the light are the same for all views of a point:
@@ -53,9 +52,7 @@ latter ties down.
 KNOWN = 0.05
 """The same of a light that was given."""
 PIXELS = 1024
-"""Training pixels whose points say how well the run explains its images, and what light a typical point
-receives.
-"""
+"""Training pixels that measure how well the run explains its images, and the light at typical points."""
 TYPICAL_LOOKS = 1
 """Looks at a point that is explained as well as a typical one, which count beside those that there are."""
 POINTS_AT_ONCE, SIGHTED_AT_ONCE = 512, 2**16
@@ -167,8 +164,7 @@ def deviations_at(run: Run, points: OrientedPoints) -> Float[Tensor, "N 3"]:
 
 
 def with_deviation(run: Run, evidence: Evidence, view: RenderedView, step: int = 1) -> RenderedView:
-    """A rendered view with the maps base_color_std, roughness_std and metallic_std, 0 where it shows no
-    surface.
+    """A rendered view with the maps base_color_std, roughness_std and metallic_std, 0 off the surface.
 
     With a `step` of k only every k-th pixel of every k-th row is asked, and the k × k about it take after it.
     A Lambertian run has the first map alone.
@@ -272,9 +268,7 @@ def _light_deviations(model: NeilfModel) -> Float[Tensor, " E"]:
 
 
 def _unit_error(model: NeilfModel, pixel: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
-    """The radiance that a relative error of 1 stands for at a pixel, as fits of the light have it
-    (`Objective`).
-    """
+    """The radiance that a relative error of 1 means at a pixel, as in fits of the light (`Objective`)."""
     response = model.facts.response
     typical = apply_response(torch.tensor(model.facts.median_radiance), response)
     unit = error_unit(pixel, response, response_slope(typical, response).item())

@@ -55,9 +55,7 @@ __all__ = ["evaluate", "protocol", "write_metrics"]
 RENDERING = 0.9
 """Share of the work that rendering the test views is, for the progress bar."""
 SURFACE_POINTS = 500_000
-"""Points on each surface for Chamfer distances. Sampling alone gives a mean distance of about ½ √(area /
-points).
-"""
+"""Points on each surface for Chamfer distances. Sampling alone gives a mean of ½ √(area / points)."""
 MESH_RESOLUTION = 256
 CONFIDENCE_PIXELS = 8192
 """Test pixels, evenly spread, whose error is compared with the one that is expected there."""
@@ -233,8 +231,7 @@ def _pooled(pairs: Pairs, name: str) -> Float[np.ndarray, "P C"]:
 def chamfer_metrics(run: Run, truth: Mesh) -> dict[str, float]:
     """Chamfer distance between the run's surface and the true mesh, scene units.
 
-    Both are sampled by area; of the estimate only what lies within `MARGIN` of the truth's box counts. Absent
-    where none does.
+    Both are sampled by area; the estimate within `MARGIN` of the truth's box. Absent where none is.
     """
     true = trimesh.Trimesh(truth.vertices.numpy(), truth.faces.numpy(), process=False)
     margin = MARGIN * np.linalg.norm(true.extents)
@@ -242,8 +239,7 @@ def chamfer_metrics(run: Run, truth: Mesh) -> dict[str, float]:
     volume = run.config.volume
     corner = np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))
     device = next(run.model.parameters()).device
-    # The sphere that may close the scene is no surface of the object, and what lies far from the truth is cut
-    # anyway.
+    # The sphere that may close the scene is no surface of the object; far parts are cut anyway.
     radius = min(float(corner), volume.radius - HIT_RADIUS)
     surface = extract_mesh(run.model.host.sdf, radius, MESH_RESOLUTION, device=device)
     points = metrics.sample_surface(surface, SURFACE_POINTS)

@@ -51,8 +51,7 @@ def extract_mesh(
 ) -> trimesh.Trimesh:
     """The zero set of a signed distance field within a sphere about the origin; faces are wound outwards.
 
-    The grid is asked for its block centres first, then for every point of the blocks that the surface may
-    cross.
+    The grid is asked for its block centres first, then for all points of blocks that the surface may cross.
 
     Args:
         sdf: signed distance, negative inside; its slope should be about 1.
@@ -71,8 +70,7 @@ def extract_mesh(
     )
     if not volume.min() < 0.0 < volume.max():
         raise _no_surface(radius)
-    # scikit-image counts faces by the left hand: its default winds them towards growing values, which is
-    # outwards.
+    # scikit-image winds faces by the left hand towards growing values by default, which is outwards.
     vertices, faces, _, _ = marching_cubes(volume, 0.0, allow_degenerate=False)
     vertices = vertices * step - radius
     inside = np.linalg.norm(vertices, axis=-1) <= radius

@@ -57,8 +57,7 @@ class IncidentLightField(nn.Module):
             width, outputs, config.layers - middle - 1, width, config.activation, output_scale=0.1
         )
         nn.init.zeros_(self.tail.layers[-1].bias)
-        # Position and direction meet in one layer: its weights start alike. So do those of the tail, a hidden
-        # layer's.
+        # Position and direction meet in one layer, so its weights start alike; those of the tail as well.
         bound = self.direction_part.layers[-1].weight.abs().max().item()
         nn.init.uniform_(self.position_part.weight, -bound, bound)
         self.tail.activation.init_(self.tail.layers[0])

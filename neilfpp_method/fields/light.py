@@ -22,9 +22,7 @@ FREE_BASE = {"linear": 10.0, "srgb": math.e}
 MOST_LAMPS = 8
 """Lamps close by: more than photographs of one object tell apart."""
 LAMP_RADIUS = 0.06
-"""Of every lamp, scene units: a bulb beside an object of a metre. Only how sharp its reflections are depends
-on it.
-"""
+"""Of every lamp, scene units: a bulb beside a 1 m object. It decides how sharp its reflections are."""
 
 
 @runtime_checkable
@@ -42,9 +40,7 @@ class Light(Protocol):
 
 @dataclass(frozen=True)
 class LightModel:
-    """The light of a scene: `light` from far away or free at every point, and `lamps` close by, perhaps
-    none.
-    """
+    """The light of a scene: `light`, distant or free at every point, and near `lamps`, perhaps none."""
 
     light: nn.Module
     lamps: Lamps

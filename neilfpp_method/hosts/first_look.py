@@ -1,5 +1,4 @@
-"""What goes wrong when a host meets the method for the first time, looked for in the first batches and said
-once.
+"""What goes wrong when a host first meets the method: looked for in the first batches, said once.
 
 An error where nothing right can come of it; a warning where it may be meant.
 """
@@ -27,9 +26,7 @@ OFF_RAY = 0.02
 MOST_OFF = 0.5
 """Share of hits that may be off their rays or turned away: blended hits at edges are, a few."""
 REACH = 1.5
-"""Where positions are far outside the unit sphere, scene units: a little room for what an object stands
-on.
-"""
+"""Distance from the centre at which positions are outside the scene, scene units; a ground has room."""
 SIZES = 30.0
 """Factor between the median of the pixels and `median_radiance` that no exposure explains."""
 

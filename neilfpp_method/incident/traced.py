@@ -29,8 +29,7 @@ leaves: it is left out.
 
 @dataclass(frozen=True)
 class TracedLight:
-    """Rays that left the surface: where from, which way, the radiance that arrives along them, and which ones
-    hit.
+    """Rays that left the surface: origin, direction, the radiance that arrives, and which ones hit.
 
     Rays that start too far away, or of which the host knows at once that they meet nothing, are left out.
     """

@@ -1,6 +1,4 @@
-"""What is wrong with a capture: the figures held against limits, each finding with its remedy, and a
-verdict.
-"""
+"""What is wrong with a capture: figures held against limits, findings with remedies, a verdict."""
 
 from __future__ import annotations
 
@@ -111,8 +109,7 @@ def problems(inspection: Inspection) -> tuple[str, ...]:
 
 
 def to_leave_out(inspection: Inspection) -> Mapping[str, str]:
-    """The views that the capture is better without, and why: those that are black or blurred, and pictures
-    that it has twice.
+    """The views that a capture is better without, and why: black ones, blurred ones, and duplicates.
 
     None where too few would remain.
 

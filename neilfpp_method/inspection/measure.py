@@ -34,8 +34,7 @@ SOME = 200_000
 
 @dataclass(frozen=True)
 class ViewFigures:
-    """What an image holds. Shares are of the object's pixels, where a mask, the alpha channel or an even
-    background tells it.
+    """Figures of an image. Shares are of the object's pixels, by mask, alpha or an even background.
 
     Attributes:
         name: the view's.

@@ -1,6 +1,4 @@
-"""The picture of an inspection: where the cameras stand, along two axes, and all views, flagged ones
-first.
-"""
+"""The picture of an inspection: the cameras along two axes, and all views, flagged ones first."""
 
 from __future__ import annotations
 
@@ -61,9 +59,7 @@ def _colors(inspection: Inspection) -> list[tuple[int, int, int]]:
 def _plan(
     inspection: Inspection, axes: tuple[int, int], colors: list[tuple[int, int, int]], title: str
 ) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Cameras as dots with their viewing directions, seen along an axis of the world; the circle is the unit
-    sphere.
-    """
+    """Cameras as dots with viewing directions, seen along a world axis; the circle is the unit sphere."""
     plan = Image.new("RGB", (PLAN, PLAN), (255, 255, 255))
     pen = ImageDraw.Draw(plan)
     centres, forward = inspection.stand.centres[:, axes], inspection.stand.axes[:, axes]

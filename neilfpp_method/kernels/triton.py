@@ -37,9 +37,7 @@ def kernel(function: Callable) -> triton.runtime.KernelInterface:
 
 @kernel
 def _locate(points, n, here, axis, cells):
-    """Along one axis: the cell, the fraction of it, and d(position in cells) / d(coordinate), which is 0 off
-    the cube.
-    """
+    """Along one axis: the cell, the fraction of it, and d(cells) / d(coordinate), 0 off the cube."""
     scale = cells.to(points.dtype.element_ty)
     free = tl.load(points + 3 * n + axis, mask=here, other=0.0) * scale
     inner = tl.maximum(free, 0.0, propagate_nan=tl.PropagateNan.ALL)
@@ -275,9 +273,7 @@ def _jacobian(gradients: OutputGradients) -> Float[Tensor, "M F 3"]:
 
 @lru_cache(maxsize=32)
 def _grid(spec: GridSpec, device: torch.device) -> Int[Tensor, "4 L"]:
-    """Per level: its first table row, its cells along an edge, its rows, and whether each vertex has its own
-    row.
-    """
+    """Per level: first table row, cells along an edge, rows, and whether each vertex has its own row."""
     dense = [spec.is_dense(level) for level in range(len(spec.resolutions))]
     rows = [spec.offsets[:-1], spec.resolutions, spec.entries_per_level, dense]
     return torch.tensor([list(map(int, row)) for row in rows], device=device)

@@ -24,9 +24,7 @@ STEEPEST = 0.17
 
 @dataclass(frozen=True)
 class OrientedDepth:
-    """Depth along the camera's axis, 0 where it is not known, and unit normals of the world, towards the
-    camera.
-    """
+    """Depth along the camera's axis, 0 where unknown, and unit world normals towards the camera."""
 
     depth: Float32[np.ndarray, "H W"]
     normal: Float32[np.ndarray, "H W 3"]

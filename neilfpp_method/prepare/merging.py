@@ -1,6 +1,4 @@
-"""Exposure brackets among the photographs: each becomes one linear image, which then stands for its
-photographs.
-"""
+"""Exposure brackets among the photographs: each becomes one linear image, which replaces them."""
 
 from __future__ import annotations
 
@@ -125,9 +123,7 @@ def merge_photos(
 def _merge(
     brackets: Brackets, folder: Path, response: Literal["auto", "linear", "srgb"], bar: Bar
 ) -> dict[str, float]:
-    """Merge what is not merged yet; returns by how many pixels the photographs of each pose were moved, now
-    or before.
-    """
+    """Merge the remaining brackets; returns each pose's largest shift in pixels, earlier ones included."""
     known = folder / MOVED
     moved = dict(Entry.load(known).entries()) if known.is_file() else {}
 

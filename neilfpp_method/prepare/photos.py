@@ -1,6 +1,4 @@
-"""The photographs of a folder: which files, under which names, and what their headers and EXIF entries
-say.
-"""
+"""The photographs of a folder: files, names, and what their headers and EXIF entries say."""
 
 from __future__ import annotations
 
@@ -50,9 +48,7 @@ class Photo:
 
 @dataclass(frozen=True)
 class Photos:
-    """The photographs of a folder in the order of their paths; all of one kind. `unreadable`: what is wrong
-    with others.
-    """
+    """A folder's photographs in path order, all of one kind. `unreadable`: what is wrong with others."""
 
     root: Path
     items: tuple[Photo, ...]
@@ -74,8 +70,7 @@ class Picture:
 
 
 def survey(root: Path, response: Literal["auto", "linear", "srgb"]) -> Photos:
-    """Find the photographs under a folder and read their headers; hidden files and other files are passed
-    over.
+    """Find the photographs under a folder and read their headers; hidden and other files are skipped.
 
     Args:
         root: the folder.

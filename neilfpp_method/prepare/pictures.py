@@ -1,6 +1,4 @@
-"""A picture of what was found: cameras and points from above and from the side, and how well each image
-fits.
-"""
+"""A picture of what was found: cameras and points from two sides, and how well each image fits."""
 
 from __future__ import annotations
 
@@ -45,8 +43,7 @@ def write_picture(
 def draw_scene(
     views: Sequence[View], test: Collection[str], points: WorldPoints, box: Normalisation
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Cameras as pyramids, points coloured by their normals and the scene's unit sphere, from above and from
-    the side.
+    """Cameras as pyramids, points coloured by normals, and the unit sphere, from above and the side.
 
     Args:
         views: in the world frame; +z is up in the picture.
@@ -87,9 +84,7 @@ def draw_scene(
 
 
 def draw_fit(placed: Sequence[Placement], width: int) -> UInt8[np.ndarray, "H W 3"]:
-    """A bar per image: its reprojection error in pixels; an image that is not placed has a red bar of full
-    height.
-    """
+    """A bar per image: its reprojection error in pixels; a full red bar where it has no pose."""
     sheet = Image.new("RGB", (width, FIT_HEIGHT + AXIS + MARGIN), PAPER)
     draw = ImageDraw.Draw(sheet)
     _write(draw, (MARGIN, 0), "reprojection error of each image, pixels", NOTE)

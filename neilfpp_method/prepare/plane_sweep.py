@@ -33,9 +33,7 @@ NEAREST = 0.05
 
 @dataclass(frozen=True)
 class GreyView:
-    """A view as it is compared: a pinhole, small enough to be searched densely, and its grey values from 0 to
-    1.
-    """
+    """A view as it is compared: a pinhole, small enough for a dense search, with grey values in [0, 1]."""
 
     camera: Camera
     grey: Float32[np.ndarray, "H W"]
@@ -73,8 +71,7 @@ def grey_view(view: View, linear: bool) -> GreyView:
 def choose_sources(
     cameras: Sequence[Camera], centre: Float64[np.ndarray, " 3"], count: int
 ) -> list[list[int]]:
-    """For each camera at most `count` others to compare it with: those whose angle to it, at the scene's
-    centre, is best.
+    """For each camera at most `count` others to compare with: those at the best angles to it.
 
     Wider angles tell depth better, narrower ones show the same picture. A camera may have none.
     """
@@ -88,9 +85,7 @@ def choose_sources(
 
 
 def grain(camera: Camera, sources: Sequence[Camera]) -> float:
-    """The difference of inverse depth that moves the picture of the farthest source by a pixel; without
-    sources 0.
-    """
+    """The step of inverse depth that moves the farthest source's picture by a pixel; 0 without sources."""
     return (
         1.0 / (camera.fx * max(float(np.linalg.norm(s.c2w[:, 3] - camera.c2w[:, 3])) for s in sources))
         if sources

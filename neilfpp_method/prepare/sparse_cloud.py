@@ -1,6 +1,4 @@
-"""The points of structure from motion as an oriented cloud: outliers out, normals by the neighbours, turned
-to the cameras.
-"""
+"""Points of structure from motion as an oriented cloud: outliers removed, normals towards cameras."""
 
 from __future__ import annotations
 
@@ -59,9 +57,7 @@ def sparse_points(model: pycolmap.Reconstruction) -> SparsePoints:
 
 
 def reliable(points: SparsePoints) -> Bool[np.ndarray, " P"]:
-    """Which points can be trusted: seen in at least 3 images, within 2 pixels of where they should be, and
-    not alone.
-    """
+    """Which points to trust: seen in at least 3 images, with errors of at most 2 pixels, not alone."""
     good = (
         (points.error <= LARGEST_ERROR)
         & (points.track >= SHORTEST_TRACK)
@@ -103,8 +99,7 @@ def estimate_normals(
 
 
 def _in_company(position: Float64[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
-    """Which points have neighbours no farther away, in the mean, than is common among all: by 3 deviations of
-    the logarithm.
+    """Which points have a mean neighbour distance within 3 deviations of its logarithm over all points.
 
     The median and the median deviation tell what is common, so that outliers have no say in it.
     """

@@ -52,8 +52,7 @@ def view_shots(capture: Capture, views: Sequence[View], scale: float | None, wid
 
 
 def turntable(capture: Capture, frames: int, scale: float | None, width: int | None) -> list[Shot]:
-    """Cameras on a circle about the scene's +z, which look at its centre; height, distance and lens are those
-    of the capture.
+    """Cameras on a circle about the scene's +z, facing its centre; height, distance, lens as captured.
 
     Distance and elevation are the medians of the capture's cameras; the lens is that of the view whose
     distance is nearest to the median, straightened.

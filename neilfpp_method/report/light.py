@@ -19,9 +19,7 @@ LEAST_HEIGHT = 192
 
 
 def picture_of_map(run: Run) -> tuple[str, float] | None:
-    """The environment map as a data address, +z at the top, and its exposure; none where the light has no
-    map.
-    """
+    """The environment map as a data address, +z at the top, and its exposure; none without a map."""
     light = run.model.light
     if not run.has_material or not isinstance(light, EnvironmentLight):
         return None

@@ -31,9 +31,7 @@ VIEWS_SHARE = 0.85
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """How much a page shows: views, the longest side of a picture in pixels, and whether expected errors are
-    among the maps.
-    """
+    """How much a page shows: views, longest side of a picture in pixels, and expected errors or not."""
 
     views: int = 2
     size: int = 320

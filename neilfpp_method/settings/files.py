@@ -49,8 +49,7 @@ _Loader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(loader
 
 
 def read_settings(path: Path) -> Mapping[str, Any]:
-    """The settings that a file names: nested, or with dots in their names. A run folder's `config.json` gives
-    its own.
+    """The settings in a file: nested, or with dotted names. A run folder's `config.json` works too.
 
     Raises:
         UserError: there is no such file, or it holds no settings.

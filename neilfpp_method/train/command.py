@@ -289,9 +289,7 @@ def _nothing_left_on_failure(out: Path) -> Iterator[None]:
 
 @doing("data", apart=True)
 def _load_pixels(capture: Capture, folder: Path, fabric: Fabric, console: Console) -> PixelDataset:
-    """One process reads the images, and all find them in the folder; what is wrong with them is wrong for
-    all.
-    """
+    """One process reads the images, all find them in the folder; an error in them ends all of them."""
     problem: tuple[str, str] | None = None
     if fabric.is_global_zero:
         try:

@@ -19,9 +19,7 @@ MOST_SIDE = 1600
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a camera stands, how it is turned to the scene (w x y z), and its vertical field of view in
-    radians.
-    """
+    """Where a camera stands, its orientation (w x y z), and its vertical field of view in radians."""
 
     position: Float[np.ndarray, " 3"]
     wxyz: Float[np.ndarray, " 4"]

@@ -38,8 +38,7 @@ def writing(out: Path) -> Iterator[None]:
 
 
 def copy_view(view: View, out: Path, hdr: bool, straight: bool) -> View:
-    """Copy a view's files to `out`/images, masks and valid, under the view's name; returns the view that they
-    make.
+    """Copy a view's files to `out`/images, masks and valid, under the view's name; returns the new view.
 
     The files are copied as they are where that says all. An exposure or white balance is divided out, as the
     layouts know none: the image is then written as EXR. With `straight` a lens is undone: the image is

@@ -4,8 +4,7 @@ cameras_sphere.npz, or cameras.npz      world_mat_<i>: image ← world, 4×4 (th
                                         scale_mat_<i>: world ← unit sphere, a scale and a shift
 image/ or rgb/, mask/                   the i-th file belongs to camera i
 
-In these files a pixel's centre lies at whole numbers; here it lies at +½, so principal points move by half a
-pixel.
+These files put pixel centres at whole numbers, we at +½, so principal points move by half a pixel.
 """
 
 from __future__ import annotations
@@ -127,9 +126,7 @@ def _normalisation(matrices: Mapping[str, np.ndarray], count: int, archive: Path
 
 
 def _files(root: Path, folder: Path) -> tuple[Path, ...]:
-    """The images of a folder, in the order of their names, which must not contradict that of their
-    numbers.
-    """
+    """The images of a folder, in the order of their names, which must agree with that of their numbers."""
     shown = (
         file
         for file in folder.iterdir()

@@ -3,8 +3,7 @@
 <i>-camera.pkl      a pickled pair of arrays: world to camera, 3×4, OpenCV axes; and the intrinsics, 3×3,
 pixel centres at +½ <i>.png             the image; 0, 1, …, without gaps
 
-The object lies in the unit sphere. NeRO's real scenes, and others prepared for it, are COLMAP models in
-colmap/sparse/0.
+The object lies in the unit sphere. NeRO's real scenes come as COLMAP models in colmap/sparse/0.
 """
 
 from __future__ import annotations

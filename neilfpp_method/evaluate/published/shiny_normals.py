@@ -1,5 +1,4 @@
-"""Normals as Ref-NeRF measures them on Shiny Blender: google-research/multinerf, `eval.py` and
-`internal/ref_utils.py`.
+"""Normals as Ref-NeRF measures them on Shiny Blender: google-research/multinerf, `ref_utils.py`.
 
 What is particular about it:
 
@@ -38,9 +37,7 @@ LARGEST_COSINE = 1 - 2.0**-23
 def weighted_angle(
     estimate: Float[np.ndarray, "H W 3"], truth: Float[np.ndarray, "H W 3"], weight: Float[np.ndarray, "H W"]
 ) -> float:
-    """The weighted mean angle between normals, degrees (`compute_weighted_mae`); NaN where nothing has a
-    weight.
-    """
+    """Weighted mean angle between normals, degrees (`compute_weighted_mae`); NaN without any weight."""
     cosine = (_unit(estimate) * _unit(truth)).sum(-1).clip(-LARGEST_COSINE, LARGEST_COSINE)
     total = weight.sum(dtype=np.float64)
     return float(np.degrees((weight * np.arccos(cosine)).sum() / total)) if total > 0 else float("nan")

@@ -1,5 +1,4 @@
-"""`neilfpp export --what asset`: the surface with textures, the light, and scripts that open both in other
-programs."""
+"""`neilfpp export --what asset`: a textured surface, the light, and scripts that open both elsewhere."""
 
 from __future__ import annotations
 

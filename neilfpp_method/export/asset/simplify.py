@@ -17,9 +17,7 @@ SAMPLES = 20_000
 SHARE = 99.0
 """Per cent of them that are at most at the distance that is reported."""
 MOST_MISSED = 0.02
-"""Share of the points that may have nothing near: next to borders, and where decimation has folded a
-plane.
-"""
+"""Share of points that may have nothing near: beside borders, and where decimation folds a plane."""
 FEWEST = 100
 """Triangles below which nothing is gained."""
 REACH = 0.1
@@ -28,9 +26,7 @@ REACH = 0.1
 
 @dataclass(frozen=True)
 class Distance:
-    """How far a fine surface is from a coarse one, scene units, where it has one near; and the share where
-    not.
-    """
+    """How far a fine surface is from a coarse one near it, scene units, and the share that has none near."""
 
     near: float
     missed: float

@@ -15,8 +15,7 @@ from neilfpp_method.export.asset.surface import Surface, first_hits
 __all__ = ["seen_faces"]
 
 MOST_RAYS = 2**24
-"""Rays through pixels, of all cameras together: a quarter of a minute with Embree. What they miss is asked on
-its own."""
+"""Rays through pixels of all cameras together: 15 s with Embree. Faces they miss are tested alone."""
 RAYS_AT_ONCE = 2**20
 NEAR = 1e-3
 """Scene units that may lie between a triangle's middle and what a ray towards it meets."""
