@@ -173,7 +173,7 @@ def rate_factor(config: OptimizerConfig, position: StagePosition) -> float:
         >>> halfway = StagePosition(Stage.SDF_INIT, step=50, length=100)
         >>> rate_factor(OptimizerConfig(final=(0.01, 1.0, 1.0)), halfway)
         0.1
-        >>> rate_factor(OptimizerConfig(final=(0.01, 1.0, 1.0), drops=(1, 0, 0)), halfway)  # it drops there, at once
+        >>> rate_factor(OptimizerConfig(final=(0.01, 1.0, 1.0), drops=(1, 0, 0)), halfway)  # at once
         0.01
     """
     stage = list(Stage).index(position.stage)

@@ -197,5 +197,6 @@ def test_the_order_is_the_order(module, imported, wrong):
 
 
 def test_imports_are_found_wherever_they_stand():
-    text = "import a.b\nfrom neilfpp_method import losses\ndef f():\n  from neilfpp_method.data.images import write_png"
+    text = "import a.b\nfrom neilfpp_method import losses\n"
+    text += "def f():\n  from neilfpp_method.data.images import write_png"
     assert list(imports(ast.parse(text))) == ["a.b", f"{PACKAGE}.losses", f"{PACKAGE}.data.images"]

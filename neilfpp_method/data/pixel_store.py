@@ -1,6 +1,6 @@
 """The pixels of many views, view after view, row by row: in memory, or in memory-mapped files.
 
-    color.npy    (P, 3) codes of `pixel_encoding`: 3 bytes a pixel for 8-bit images, 6 for 16 bits and for radiance
+    color.npy    (P, 3) codes of `pixel_encoding`: 3 bytes a pixel for 8-bit images, else 6
     bits.npy     (P,) one byte: valid, mask, mask known, near the object (`drawing`); padded to whole blocks
     store.json   what they were made from, written last: a folder without it holds no store
 

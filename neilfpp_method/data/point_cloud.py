@@ -96,7 +96,8 @@ def has_normals(path: Path) -> bool:
 def write_oriented_ply(path: Path, points: WorldPoints) -> Path:
     """Write points as binary PLY, in single precision; returns the path."""
     properties = "".join(f"property float {name}\n" for name in POSITION + NORMAL)
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points.position)}\n{properties}end_header\n"
+    vertices = f"element vertex {len(points.position)}\n"
+    head = f"ply\nformat binary_little_endian 1.0\n{vertices}{properties}end_header\n"
     rows = np.concatenate([points.position, points.normal], axis=1).astype("<f4")
     with replacing(path) as temporary:
         temporary.write_bytes(head.encode("ascii") + rows.tobytes())

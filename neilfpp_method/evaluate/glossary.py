@@ -36,7 +36,9 @@ def _log(title: str, meaning: str) -> Entry:
 
 
 def _ratio(title: str) -> Entry:
-    meaning = "Error where the run is surest, over the error elsewhere, half of the pixels each; 1 is no better than chance."
+    meaning = (
+        "Error of the surest half of the pixels over that of the other half; 1 is no better than chance."
+    )
     return Entry(title, "%.2f", "lower", meaning)
 
 

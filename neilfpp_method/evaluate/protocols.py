@@ -4,17 +4,17 @@ An image metric is taken per view and averaged over the test views. A figure is 
 hand and the run has an estimate of it. Alignments are never silent: each has a key of its own beside the
 figure without it.
 
-    volume_psnr, pbr_psnr, *_ssim     R and the rendering equation against the image, both clipped and sRGB-encoded
+    volume_psnr, pbr_psnr, *_ssim     R and the rendering equation against the image, clipped, sRGB-encoded
     *_psnr_linear                     the same on linear radiance, peak 1, HDR captures
-    base_color_psnr, _gamma, _scaled  as estimated; with one global gamma; with a least-squares factor per channel
+    base_color_psnr, _gamma, _scaled  as estimated; with one gamma; with a least-squares factor per channel
     roughness_psnr, metallic_psnr     as estimated
     *_frame                           the same over the whole frame, the background counted as free of error
     normal_mae_deg                    mean angle where the truth and the estimate have a normal, degrees
     chamfer, _accuracy, _completeness scene units
-    incident_light_log_mae            mean |ln L − ln L_true| over points and directions of the true light field
-      _occluded, _scaled              over directions that meet the scene again; without the scale of each channel
-    confidence_*_ratio                mean error of the half of the pixels with the smallest expected error over that of the
-                                      other half; base colour scaled
+    incident_light_log_mae            mean |ln L − ln L_true| over points and directions of the true field
+      _occluded, _scaled              over directions that meet the scene; up to a factor per channel
+    confidence_*_ratio                mean error of the half of the pixels with the smallest expected error,
+                                      over that of the other half; base colour scaled
     baseline_*                        what needs no method, on the same pixels
 """
 

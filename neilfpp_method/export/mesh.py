@@ -28,10 +28,12 @@ __all__ = ["HasSdf", "export_mesh", "extract_mesh", "has_surface", "materials_in
 
 Sdf = Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]
 
-# Grid points along an edge of a block. A block is skipped when |sdf| at its centre exceeds SLACK half-diagonals of it.
-# With 8 and 1.5 nothing is lost, the edges between blocks included, for every field whose slope stays below 1.29.
 BLOCK = 8
+"""Grid points along an edge of a block."""
 SLACK = 1.5
+"""A block is skipped when |sdf| at its centre exceeds this many of its half-diagonals. With blocks of 8
+points nothing is lost, the edges between blocks included, for every field whose slope stays below 1.29.
+"""
 POINTS_AT_ONCE = 65_536
 """Points at which the material is asked together: bounds the memory."""
 

@@ -109,8 +109,7 @@ class FirstLook:
                 "no hit",
                 f"none of {len(batch)} rays meets a surface, so nothing is learned of them",
                 "is the frame of the rays the host's, the object in the unit sphere? A hit has a "
-                "concentration of "
-                f"{self.hit_share} or more (of a function: a normal)",
+                f"concentration of {self.hit_share} or more (of a function: a normal)",
             )
 
     def _look_at_colors(self, color: Tensor) -> None:

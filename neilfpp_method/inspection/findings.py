@@ -236,8 +236,8 @@ def _of_scene(capture: Capture) -> Iterator[Finding]:
         remedy = "make the scene box larger, or cut the cloud to the object"
         yield Finding("scale", "problem" if outside > 0.5 else "warning", text, remedy)
     elif np.quantile(reach, 0.95) < SMALL_CLOUD:
-        text = f"the object is small: 95 % of the point cloud lies within {100 * SMALL_CLOUD:.0f} % of the scene's box"
-        yield Finding("scale", "warning", text, "make the scene box smaller")
+        text = f"95 % of the point cloud lies within {100 * SMALL_CLOUD:.0f} % of the scene's box"
+        yield Finding("scale", "warning", f"the object is small: {text}", "make the scene box smaller")
 
 
 def _verdict(capture: Capture, views: Sequence[ViewFigures], findings: Sequence[Finding]) -> Verdict:

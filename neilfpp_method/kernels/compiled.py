@@ -273,7 +273,7 @@ def _from_bits(_context, _bits):
 def _falling_exponential(t):
     """e^−t for t ≥ 0, to the last digit or two; t counts for FAINT at most.
 
-    e^−t = 2^−n e^r with |r| ≤ ½ ln 2, where e^r is its Taylor series and ln 2 is taken off in two parts (Cody & Waite 1980).
+    e^−t = 2^−n e^r with |r| ≤ ½ ln 2: e^r by its Taylor series, ln 2 in two parts (Cody & Waite 1980).
     """
     t = FAINT if t > FAINT else t  # what is not a number stays none
     n = np.int32(t * np.float32(1.4426950408889634) + HALF)

@@ -164,7 +164,8 @@ def _add_to_table(
 
 @kernel
 def _pull_to_points(
-    points, table, grid, features, jacobian, gradient, count, levels, f_point, f_column, j_point, j_column, j_axis,
+    points, table, grid, features, jacobian, gradient, count, levels,
+    f_point, f_column, j_point, j_column, j_axis,
     width: tl.constexpr, with_jacobian: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
     n = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
@@ -241,7 +242,8 @@ def table_gradient(
     features, jacobian = gradients.features, _jacobian(gradients)
     with torch.cuda.device_of(x01):
         _add_to_table[_blocks(count), levels](
-            x01, _grid(spec, x01.device), features, jacobian, table, count, levels, *features.stride(), *jacobian.stride(),
+            x01, _grid(spec, x01.device), features, jacobian, table, count, levels,
+            *features.stride(), *jacobian.stride(),
             spec.features, gradients.jacobian is not None, BLOCK, **FUSED,
         )  # fmt: skip
     return table
@@ -257,7 +259,8 @@ def point_gradient(
     with torch.cuda.device_of(x01):
         _pull_to_points[(_blocks(count),)](
             x01, table, _grid(spec, x01.device), features, jacobian, found, count, levels,
-            *features.stride(), *jacobian.stride(), spec.features, gradients.jacobian is not None, BLOCK, **FUSED,
+            *features.stride(), *jacobian.stride(),
+            spec.features, gradients.jacobian is not None, BLOCK, **FUSED,
         )  # fmt: skip
     return found
 

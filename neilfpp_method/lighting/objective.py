@@ -146,7 +146,7 @@ def nearest_points(position: Float[Tensor, "N 3"]) -> Int[Tensor, "N K"]:
 
 
 def unevenness(base_color: Float[Tensor, "N 3"], nearest: Int[Tensor, "N K"]) -> Float[Tensor, ""]:
-    """Mean |difference of log base colour| between neighbours: an edge costs what it is, in however many steps it comes."""
+    """Mean |difference of log base colour| between neighbours: sharp and gradual edges cost the same."""
     logarithm = base_color.clamp_min(DARK_FLOOR).log()
     apart = logarithm[:, None] - logarithm[nearest]
     return _size(apart).sum() / max(1, apart.numel())

@@ -2,7 +2,8 @@
 
 With geometry and roughness fixed, a map of T texels of radiance E and M lamps of intensity I,
 
-    L_o = k_d (D E + D' I + d) + F0 (F E + F' I + f) + (G E + G' I + g),   k_d = (1 − m) b,   F0 = 0.04 (1 − m) + b m
+    L_o = k_d (D E + D' I + d) + F0 (F E + F' I + f) + (G E + G' I + g)
+    k_d = (1 − m) b,   F0 = 0.04 (1 − m) + b m
 
 D, F, G hold cosine, visibility, solid angle, and the diffuse, the facing and the grazing part of the BRDF; d,
 f, g are what the scene's own surfaces add.

@@ -16,7 +16,10 @@ __all__ = ["LEAST_SHARE", "map_scene", "refuse_partial"]
 
 LEAST_SHARE = 0.6
 SEED = 7
-SHOT_ADVICE = "take more photographs between those that are there, so that neighbours differ by 15° at most, with texture in sight"
+SHOT_ADVICE = (
+    "take more photographs between those that are there, so that neighbours differ by 15° at most, "
+    "with texture in sight"
+)
 
 
 def map_scene(

@@ -116,7 +116,8 @@ def merge_photos(
     if unused := len(photos.items) - len(set(used)):
         remark += f"; {unused} in no bracket left out"
     if by_hand := [shift for shift in step.result["moved"].values() if shift]:
-        remark += f"; taken by hand: those of {len(by_hand)} were moved onto one another, by up to {max(by_hand):.1f} pixels"
+        remark += f"; taken by hand: those of {len(by_hand)} were moved onto one another, "
+        remark += f"by up to {max(by_hand):.1f} pixels"
     return Merged(replace(photos, root=folder, items=tuple(items), linear=True), step, remark)
 
 

@@ -145,7 +145,7 @@ LOBES: Mapping[str, Lobe] = {"spherical_gaussian": SPHERICAL_GAUSSIAN, "ggx": GG
 
 @dataclass(frozen=True)
 class Cosines:
-    """`i` = n·wi, `o` = n·wo, `h` = n·h, `d` = wo·h = wi·h ≥ 0, with the half vector h = (wi + wo)/|wi + wo|."""
+    """`i` = n·wi, `o` = n·wo, `h` = n·h, `d` = wo·h = wi·h ≥ 0; half vector h = (wi + wo)/|wi + wo|."""
 
     i: Float[Tensor, "N S"]
     o: Float[Tensor, "N 1"]
@@ -156,8 +156,8 @@ class Cosines:
 def cosines(n: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"], wi: Float[Tensor, "#N S 3"]) -> Cosines:
     """The cosines that the BRDF is a function of, for unit vectors.
 
-    h is never formed: |wi + wo| = 2 wo·h and (wo·h)² = (1 + wi·wo)/2. For wi = −wo there is no h; the floor on (wo·h)²
-    keeps value and gradient finite there.
+    h is never formed: |wi + wo| = 2 wo·h and (wo·h)² = (1 + wi·wo)/2. For wi = −wo there is no h; the floor
+    on (wo·h)² keeps value and gradient finite there.
     """
     i, o = dot(wi, n), dot(wo.unsqueeze(1), n)
     d = ((1 + dot(wi, wo)) / 2).clamp(1e-8, 1).sqrt()

@@ -267,8 +267,7 @@ def _check(config: NeilfConfig) -> None:
 def _scaled(scale: float, pixels: int, rays: int) -> str:
     return (
         f"images at {scale:.3g} of their size: {pixels / 1e6:.1f} million pixels for {rays / 1e6:.1f} "
-        "million rays; "
-        "--scale 1 takes them whole"
+        "million rays; --scale 1 takes them whole"
     )
 
 

@@ -237,8 +237,7 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], step: int) ->
         raise Diverged(
             f"{MOST_SKIPPED} steps in a row were not finite, the last one in {where}",
             f"the last good checkpoint is kept in {run.path / 'checkpoints'}; look at the capture's "
-            "brightest pixels "
-            "or lower the learning rates",
+            "brightest pixels or lower the learning rates",
         )
 
 

@@ -280,7 +280,8 @@ class _Session:
         self.map.image = light_picture(radiance, normal)
         material = point.material
         colour = ", ".join(f"{value:.2f}" for value in material.base_color[0].tolist())
-        self.told.content = f"base colour {colour} · roughness {material.roughness.item():.2f} · metallic {material.metallic.item():.2f}"
+        roughness, metallic = material.roughness.item(), material.metallic.item()
+        self.told.content = f"base colour {colour} · roughness {roughness:.2f} · metallic {metallic:.2f}"
         place = point.position.cpu().numpy()
         segment = np.stack((place, place + 0.15 * normal))[None]
         self.client.scene.add_line_segments(

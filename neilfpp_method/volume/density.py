@@ -44,8 +44,8 @@ def laplace_depth(
 ) -> Float[Tensor, "*shape M-1"]:
     """Optical depth between neighbouring samples of a ray: the density's integral, the SDF linear there.
 
-    With u = sdf/β the antiderivative of Ψ(−u) is F(u) = min(u, 0) − ½ e^{−|u|}, so an interval of width δ has the depth
-    (δ/β) (F(u₁) − F(u₀)) / (u₁ − u₀). An even cut of a homogeneous medium gives δ σ.
+    With u = sdf/β the antiderivative of Ψ(−u) is F(u) = min(u, 0) − ½ e^{−|u|}, so an interval of width δ has
+    the depth (δ/β) (F(u₁) − F(u₀)) / (u₁ − u₀). An even cut of a homogeneous medium gives δ σ.
 
     The rule of VolSDF, δ times the density of the first sample, takes the last sample before empty space for
     all of it: rays that graze a surface come out too opaque.
@@ -59,7 +59,8 @@ def laplace_depth(
         Depths ≥ 0, in float32 or wider.
 
     Example:
-        >>> laplace_depth(torch.zeros(2), torch.tensor([0.0, 1.0]), torch.tensor(0.1))  # along a surface: 1 / (2 β)
+        >>> along_a_surface = torch.zeros(2)  # its density is 1 / (2 β)
+        >>> laplace_depth(along_a_surface, torch.tensor([0.0, 1.0]), torch.tensor(0.1))
         tensor([5.])
     """
     scaled = sdf.to(torch.promote_types(sdf.dtype, torch.float32)) / beta

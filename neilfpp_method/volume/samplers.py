@@ -108,10 +108,11 @@ class Partition(Indexable):
 def cut(distances: Float[Tensor, "N E"], sdf: Float[Tensor, "N E"]) -> Partition:
     """Rays cut at `distances`, where the SDF is `sdf`.
 
-    d* is how close the surface can come to an interval (VolSDF Theorem 1 and supplement). The surface does not enter
-    the balls of radius |sdf| about the ends of the interval; d* is the distance from the interval to what is outside
-    both: to the circle where the spheres meet if its foot is in the interval, else the smaller radius. It is 0 where
-    they do not meet, and where the sign changes: a learned distance may promise more room than there is.
+    d* is how close the surface can come to an interval (VolSDF Theorem 1 and supplement). The surface does
+    not enter the balls of radius |sdf| about the ends of the interval; d* is the distance from the interval
+    to what is outside both: to the circle where the spheres meet if its foot is in the interval, else the
+    smaller radius. It is 0 where they do not meet, and where the sign changes: a learned distance may promise
+    more room than there is.
     """
     width = distances.diff(dim=-1)
     start, end = sdf[:, :-1], sdf[:, 1:]
@@ -182,9 +183,9 @@ def bounded_beta(
 class ErrorBoundedSamples:
     """Samples of each ray, their cost, and how far the opacity they follow can be from the truth.
 
-    `distances` ascend. `error_bound` is that of `log_error_bound` at the true β, at most 1: above `OPACITY_ERROR` the
-    rounds were used up, and the samples follow a wider density. It holds where |∇ sdf| ≤ 1. `sdf_queries` is the number
-    of SDF queries per ray, a mean over the rays.
+    `distances` ascend. `error_bound` is that of `log_error_bound` at the true β, at most 1: above
+    `OPACITY_ERROR` the rounds were used up, and the samples follow a wider density. It holds where
+    |∇ sdf| ≤ 1. `sdf_queries` is the number of SDF queries per ray, a mean over the rays.
     """
 
     distances: Float[Tensor, "N M"]
