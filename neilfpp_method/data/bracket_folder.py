@@ -29,9 +29,9 @@ Brackets = Mapping[str, Mapping[Path, float]]
 GROUPS = "brackets.json"
 NUMBERED = re.compile(r"[_-]\d+$")
 CALIBRATED = 6
-"""Most brackets that a response is calibrated from."""
+"""Largest number of brackets that a response is calibrated from."""
 CALIBRATION_SIDE = 1024
-"""Most pixels a side that it is calibrated from."""
+"""Longest side, pixels, of the images that a response is calibrated from."""
 
 
 def find_brackets(folder: Path, exposures: Path | None = None, unreadable: Collection[Path] = ()) -> Brackets:

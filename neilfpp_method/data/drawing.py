@@ -30,7 +30,7 @@ SMALL_SIDE = 256
 BLOCK = 1024
 """Pixels of a block, whose chosen pixels are counted; pixel planes are padded to whole blocks."""
 COUNTED = 2**14
-"""Blocks that are counted at once."""
+"""Blocks that are counted together."""
 
 
 class PixelSet:

@@ -35,9 +35,11 @@ __all__ = [
 ]
 
 MAX_SIDE = 65_536
+"""Longest side of an image, pixels."""
 MAX_PIXELS = 2**30
+"""Largest image: bounds the memory."""
 RADIANCE_HEADER = 4096
-"""Bytes; longer ones are not written."""
+"""Longest header of a Radiance HDR file that is read, bytes."""
 
 
 @dataclass(frozen=True)

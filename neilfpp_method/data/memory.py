@@ -10,7 +10,7 @@ from neilfpp_method.errors import UserError
 __all__ = ["available_memory", "check_memory"]
 
 UNLIMITED = 2**60
-"""What a control group of version 1 says that has no limit is above this."""
+"""Bytes above which the limit of a version 1 control group means no limit."""
 
 
 def available_memory(proc: Path = Path("/proc"), groups: Path = Path("/sys/fs/cgroup")) -> int | None:

@@ -37,11 +37,13 @@ __all__ = ["PixelStore", "border", "expect_draws", "load_pixels", "store_bytes"]
 
 FORMAT, VERSION = "neilfpp-pixels", 1
 BORDER_SHARE = 0.5
+"""Share of the border pixels of one colour from which that colour is the background."""
 REPAIR = "repair the images, or mark the pixels in a validity mask"
-MOST_MAPPED = 2**29
+MAX_MAPPED = 2**29
 """Bytes of the files that draws may leave mapped; a page with one drawn pixel maps 16 pages."""
 BYTES_OF_A_DRAW = 2 * 16 * 4096
-SPARE = 2**28
+"""Bytes that reading one pixel maps: 16 pages of each of two files."""
+MIN_FREE_BYTES = 2**28
 """Bytes that a disk should keep free."""
 
 
@@ -80,7 +82,7 @@ class PixelStore:
     ) -> Float32[np.ndarray, "*N 3"]:
         """Colours of single pixels of views; kept in a folder, only the pages that hold them are read."""
         self._drawn += numbers.size
-        if self._drawn * BYTES_OF_A_DRAW > MOST_MAPPED:
+        if self._drawn * BYTES_OF_A_DRAW > MAX_MAPPED:
             self.release()
         return self.encoding.decode(self.codes[numbers], self.scales[view])
 
@@ -287,7 +289,7 @@ def _plane(path: Path | None, shape: tuple[int, ...], dtype: np.dtype) -> np.nda
 def _check_room(folder: Path, needed: int) -> None:
     above = next(place for place in (folder, *folder.absolute().parents) if place.exists())
     free = shutil.disk_usage(above).free
-    if needed + SPARE > free:
+    if needed + MIN_FREE_BYTES > free:
         raise UserError(
             f"{folder}: the pixels of the training views take {needed / 1e9:.1f} GB, and {free / 1e9:.1f} GB "
             "are free there",

@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int
 from torch import Tensor
 
-from neilfpp_method.data.backdrop import MOST_RAYS, leaves_room
+from neilfpp_method.data.backdrop import MAX_RAYS, leaves_room
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.drawing import KNOWN, MASK, NEAR, VALID, PixelDraws
 from neilfpp_method.data.pixel_store import PixelStore, border, expect_draws, load_pixels
-from neilfpp_method.data.silhouettes import MOST_VIEWS, Outline
+from neilfpp_method.data.silhouettes import MAX_VIEWS, Outline
 from neilfpp_method.data.views import CameraRays, View
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.color import luminance, srgb_to_linear, tone_map
@@ -29,8 +29,8 @@ DARK = 1e-3
 MIDDLE_GREY = 0.18
 NEIGHBOURS = np.array([(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1)])
 """Rows and columns of the nine values about a pixel."""
-MOST_COUNTED = 2**20
-"""Pixels of the object, evenly over all views, that statistics are taken of; all where there are no more."""
+MAX_COUNTED = 2**20
+"""Pixels of the object, evenly over all views, from which statistics are computed."""
 
 
 class PixelDataset:
@@ -179,7 +179,7 @@ class PixelDataset:
     def median_radiance(self) -> float:
         """The median luminance, linear, of the object: of valid pixels within the mask that are not black.
 
-        Of more than `MOST_COUNTED` pixels so many are counted, evenly over the views.
+        Of more than `MAX_COUNTED` pixels so many are counted, evenly over the views.
 
         Raises:
             UserError: there is no such pixel.
@@ -203,7 +203,7 @@ class PixelDataset:
 
     def _of_the_object(self) -> Float[Tensor, "S 3"]:
         """The linear colours of valid pixels within the mask: all, or every so many-th."""
-        step = -(-len(self) // MOST_COUNTED)
+        step = -(-len(self) // MAX_COUNTED)
         colors = []
         for i in range(len(self.views)):
             rows = self.store.rows(i)
@@ -252,11 +252,11 @@ class PixelDataset:
         """Whether what these pixels show can lie in the scene, judged by which pixels are `other`."""
         if not len(numbers):
             return True
-        step = -(-len(numbers) // MOST_RAYS)
+        step = -(-len(numbers) // MAX_RAYS)
         number, view = numbers[::step], torch.from_numpy(np.ascontiguousarray(views[::step])).to(self.device)
         rays = self._rays(view, torch.from_numpy(number - self.store.starts[views[::step]]).to(self.device))
         outlines = []
-        for i in range(0, len(self.views), -(-len(self.views) // MOST_VIEWS)):
+        for i in range(0, len(self.views), -(-len(self.views) // MAX_VIEWS)):
             inside = other(self.store.view_colors(i)).view(self.views[i].camera.height, -1)
             outlines.append(Outline(self.views[i], inside.numpy()))
             self.store.release()

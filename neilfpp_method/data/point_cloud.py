@@ -30,6 +30,7 @@ CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 TYPES = dict(zip(OLD_NAMES + NEW_NAMES, CODES + CODES, strict=True))
 BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": None}
 HEADER_LIMIT = 65_536
+"""Longest header of a PLY file, bytes."""
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
 

@@ -37,11 +37,11 @@ __all__ = [
 PIXELS_OF_A_VIEW = 2**17
 """Pixels of a view that suffice to look at and to measure it, unless more are asked for: 420 × 310."""
 PIXELS_OF_A_RAY = 4
-"""Pixels of the training views to a ray of the whole training. With more, most pixels are never drawn, and a
-smaller image holds what they had to say, with less noise.
+"""Training pixels per ray of the whole training. With more, most are never drawn; a smaller image holds their
+means, with less noise.
 """
 SAME = 0.98
-"""A scale this close to 1 is 1: what is left out is not worth resampling for."""
+"""Scales from here to 1 count as 1: so small a reduction is not worth resampling."""
 
 
 def file_size(view: View) -> tuple[int, int]:

@@ -13,13 +13,13 @@ from jaxtyping import Bool, Float64, Int64
 from neilfpp_method.data.images import read_image
 from neilfpp_method.data.views import Camera, View, project
 
-__all__ = ["AGREEMENT", "MOST_VIEWS", "Outline", "Sightings", "agreement", "read_outlines", "sightings"]
+__all__ = ["AGREEMENT", "MAX_VIEWS", "Outline", "Sightings", "agreement", "read_outlines", "sightings"]
 
 AGREEMENT = 0.9
-"""A place is held where so many of the views that can tell have it in their silhouette."""
-MOST_VIEWS = 32
-"""Views that are asked, evenly chosen."""
-LONGEST = 512
+"""Share of the views that see a place which must have it in their silhouette."""
+MAX_VIEWS = 32
+"""Evenly chosen views whose silhouettes are read."""
+MAX_SIDE = 512
 """Pixels along the longer side of a silhouette: places are resolved to hundredths of the scene only."""
 
 
@@ -36,7 +36,7 @@ class Outline:
         return not (mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
 
 
-def read_outlines(views: Sequence[View], most: int = MOST_VIEWS, longest: int = LONGEST) -> list[Outline]:
+def read_outlines(views: Sequence[View], most: int = MAX_VIEWS, longest: int = MAX_SIDE) -> list[Outline]:
     """The silhouettes, by mask or alpha, of at most `most` evenly chosen views, with matching cameras.
 
     None where fewer than half of these have one. An alpha channel that is opaque all over is none. The masks

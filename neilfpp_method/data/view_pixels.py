@@ -19,9 +19,9 @@ from neilfpp_method.shading.color import linear_to_srgb, srgb_to_linear
 __all__ = ["ViewPixels", "pixel_colors", "read_colors", "read_mask", "read_view"]
 
 HALF = 0.5
-"""A pixel of a smaller image is on the object where at least so much of its area is."""
+"""Share of the area of a reduced pixel that must be on the object."""
 ROWS = 256
-"""Rows of an image that are made linear at once."""
+"""Rows of an image that are made linear together: bounds the memory."""
 
 
 @dataclass(frozen=True)

@@ -36,12 +36,12 @@ __all__ = [
     "project",
 ]
 
-MOST_BLIND = 0.6
-"""A fisheye's circle fills 44 % of a 16:9 picture. A lens that shows less is of other images."""
-MOST_LOOKED_UP = 2**26
-"""Pixels of different lenses whose rays are kept: half a gigabyte."""
+MAX_BLIND_SHARE = 0.6
+"""Share of an image that a lens may leave dark: a fisheye's circle fills 44 % of 16:9."""
+MAX_TABULATED = 2**26
+"""Pixels of different lenses whose rays are kept in memory: half a gigabyte."""
 PLANE_PART = 2**20
-"""Pixels whose rays are computed at once."""
+"""Pixels whose rays are computed together: bounds the memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +226,7 @@ class CameraRays:
 
     The rays of a pinhole are computed when asked for; those of a lens are looked up, as its equations have no
     closed inverse: 8 bytes a pixel, shared by cameras that differ in their pose alone. Where lenses have more
-    than `MOST_LOOKED_UP` pixels together, as when every photograph has been calibrated by itself, they are
+    than `MAX_TABULATED` pixels together, as when every photograph has been calibrated by itself, they are
     computed when asked for, too, which takes longer. A pixel at which a lens shows nothing, as in the corners
     of a fisheye, has a ray that leads backwards, away from what the camera sees.
 
@@ -248,7 +248,7 @@ class CameraRays:
         sizes = [camera.width * camera.height for camera in kinds.values()]
         self._bent = torch.tensor([camera.lens is not None for camera in cameras], device=device)
         self._lens_plane: Float[Tensor, "P 2"] | None = None
-        if kinds and sum(sizes) <= MOST_LOOKED_UP:
+        if kinds and sum(sizes) <= MAX_TABULATED:
             starts = dict(zip(kinds, itertools.accumulate(sizes, initial=0), strict=False))
             self._lens_start = torch.tensor(
                 [starts.get(_shape(camera), 0) for camera in cameras], device=device
@@ -313,7 +313,7 @@ def _whole_plane(camera: Camera, dtype: torch.dtype) -> Float[np.ndarray, "P 2"]
         [torch.from_numpy(_straight_plane(camera, part)).to(dtype).numpy() for part in parts]
     )
     blind = int(np.isnan(plane).any(axis=1).sum())
-    if blind > MOST_BLIND * count:
+    if blind > MAX_BLIND_SHARE * count:
         raise UserError(
             f"a camera of the lens {camera.lens.model} shows nothing at {blind} of its {count} pixels",
             "crop or undistort the images, or calibrate the camera again",

@@ -23,16 +23,16 @@ __all__ = ["HULL_RADIUS", "RESOLUTION", "DistanceCube", "find_hull", "signed_dis
 HULL_RADIUS = 1.3
 """Half an edge of the carved cube, scene units: the unit sphere, which holds the object, and a margin."""
 RESOLUTION = 96
-"""Cells along an edge; a cell is 0.027 scene units wide. Training knows better soon."""
-CONTRADICTED = 0.05
-"""Share of the views that may exclude a place they see, rounded down: a few masks are wrong."""
-SEEN = 0.25
-"""Least share of all views, and at least two views, that must see a place in the hull."""
-LEAST_CELLS = 64
-"""Fewer cells are no body that a field could start as."""
+"""Cells along an edge, 0.027 scene units each: a start that training refines."""
+MAX_EXCLUDING_SHARE = 0.05
+"""Share of the views of a place that may exclude it, rounded down: a few masks are wrong."""
+MIN_SEEN_SHARE = 0.25
+"""Share of all views, and at least two views, that must see a place in the hull."""
+MIN_CELLS = 64
+"""Cells of the smallest hull that a field is started from."""
 SMOOTHING = 1.5
-"""Standard deviation, in cells, of the blur that takes the steps of the cells from the distance. A ball of
-0.6 scene units then has normals that are 2° off, in place of 8°, and is 0.004 units smaller.
+"""Standard deviation, cells, of the blur that removes the steps of the cells. A ball of radius 0.6 then has
+normals that are 2° off instead of 8°, and a radius that is 0.004 too small.
 """
 
 
@@ -76,7 +76,7 @@ def find_hull(
         >>> hull if isinstance(hull, str) else hull.at(torch.zeros(1, 3))  # negative: the origin is inside
     """
     hull = visual_hull(outlines, radius, resolution)
-    if hull.sum() < LEAST_CELLS:
+    if hull.sum() < MIN_CELLS:
         return "the masks have next to no place in common"
     # A body that leaves the cube has no surface there: masks show a ground, or the box is too small.
     faces = np.ones_like(hull)
@@ -107,9 +107,10 @@ def visual_hull(outlines: Sequence[Outline], radius: float, resolution: int) -> 
         found = sightings([outline], points[left])
         seen[left] += found.seen
         outside[left] += found.seen - found.inside
-        left = left[outside[left] <= CONTRADICTED * len(outlines)]
+        left = left[outside[left] <= MAX_EXCLUDING_SHARE * len(outlines)]
     hull = np.zeros(len(points), bool)
-    hull[left] = (seen[left] >= max(2, SEEN * len(outlines))) & (outside[left] <= CONTRADICTED * seen[left])
+    known = seen[left] >= max(2, MIN_SEEN_SHARE * len(outlines))
+    hull[left] = known & (outside[left] <= MAX_EXCLUDING_SHARE * seen[left])
     return hull.reshape(resolution, resolution, resolution)
 
 

@@ -34,10 +34,13 @@ from neilfpp_method.train.run import Run
 __all__ = ["ComparedMap", "Comparison", "albedo_scale", "compared_maps", "light_sections", "view_sections"]
 
 POINTS = 4
+"""Surface points whose light is shown."""
 POINTS_PER_SECTION = 2
+"""Of these, side by side in a row."""
 LIGHT_HEIGHT = 120
+"""Of a picture of light, pixels."""
 SHADE = (232, 232, 229)
-"""The directions below a surface."""
+"""Colour of directions below the surface."""
 
 
 # ------------------------------------------------------------------------------------------------------ views

@@ -17,7 +17,7 @@ from neilfpp_method.structures import Indexable, Material, Source
 __all__ = ["PATCHES", "PatchLight", "by_patch", "light_by_patch", "patch_count"]
 
 PATCHES = 32
-"""Parts of the sphere, about 40° wide."""
+"""Parts that the sphere is divided into, each about 40° wide."""
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,11 @@ from neilfpp_method.structures import Indexable, Material
 __all__ = ["ROUGHNESS_NODES", "Deviation", "Looks", "Sights", "expected_error", "guessed_error"]
 
 ROUGHNESS_NODES = (0.05, 0.15, 0.25, 0.35, 0.5, 0.65, 0.8, 1.0)
-"""Roughnesses at which F and G are known; between them both are linear."""
+"""Roughnesses at which F and G are computed; between them both are interpolated linearly."""
 ROUGHNESS_CELLS, METALLIC_CELLS = 20, 9
+"""Cells of the grid over which the posterior is summed."""
 PRIOR_PRECISION = 1e-2
-"""Of a channel of base colour that nothing depends on; the cut at 0 and 1 makes an even prior of it."""
+"""Precision of the prior on a channel of base colour: nearly uniform within [0, 1]."""
 
 
 @dataclass(frozen=True)

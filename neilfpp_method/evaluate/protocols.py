@@ -53,18 +53,19 @@ from neilfpp_method.train.run import Run, write_json
 __all__ = ["evaluate", "protocol", "write_metrics"]
 
 RENDERING = 0.9
-"""Share of the work that rendering the test views is, for the progress bar."""
+"""Share of the work that is rendering the test views, for the progress bar."""
 SURFACE_POINTS = 500_000
 """Points on each surface for Chamfer distances. Sampling alone gives a mean of ½ √(area / points)."""
 MESH_RESOLUTION = 256
+"""Cells along an edge of the grid from which the estimated surface is extracted."""
 CONFIDENCE_PIXELS = 8192
-"""Test pixels, evenly spread, whose error is compared with the one that is expected there."""
+"""Evenly spread test pixels whose error is compared with the expected error."""
 MARGIN = 0.05
-"""The estimate counts up to this share of the diagonal of the truth's bounding box around that box: beyond
-it, where no image looks, a distance field closes its surface as it likes.
+"""Share of the diagonal of the truth's bounding box by which the box is enlarged. The estimate counts within
+it; beyond, where no image looks, a distance field closes its surface arbitrarily.
 """
 OFFSET = 1e-3
-"""How far off the surface a ray starts that asks whether a direction meets the scene, scene units."""
+"""Height above the surface, scene units, at which visibility rays start."""
 
 Pairs = Sequence[tuple[RenderedView, KnownView]]
 

@@ -20,7 +20,7 @@ __all__ = ["render_run"]
 
 LAYERS = {"normal": "XYZ"}
 PART = 0.95
-"""Of the work on a view that rendering is."""
+"""Share of the work on a view that is rendering; the rest is writing."""
 
 
 def render_run(

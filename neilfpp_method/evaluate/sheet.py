@@ -19,8 +19,9 @@ from neilfpp_method.train.run import Run
 __all__ = ["write_contact_sheet", "write_light_picture"]
 
 SHOWN_VIEWS = 3
+"""Views on a contact sheet."""
 CONFIDENCE_STEP = 2
-"""One pixel in so many by so many is asked how far off it may be."""
+"""Expected errors are computed for every n-th pixel of every n-th row."""
 
 
 def write_contact_sheet(run: Run, path: Path, rendered: Sequence[RenderedView] = ()) -> None:

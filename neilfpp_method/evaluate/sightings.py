@@ -18,9 +18,9 @@ from neilfpp_method.structures import Indexable, PixelBatch, RayBatch
 __all__ = ["Sightings", "TrainingViews"]
 
 TOLERANCE = 0.05
-"""Surfaces this close to one another count as one, scene units, as they do for a hit."""
+"""Distance, scene units, within which two surfaces count as one, as for a hit."""
 MIN_COSINE = 0.05
-"""Flatter looks see a pixel's width of surface, and a bend of the normal."""
+"""Flatter views are left out: a pixel then covers much surface."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ __all__ = ["InvertedSphere", "field_beyond"]
 
 POSITION_OCTAVES = 10
 DIRECTION_OCTAVES = 4
-DARKEST = 1e-2
+MIN_START = 1e-2
 """Share of the largest radiance that the field starts away from both ends of its sigmoid, at least."""
 START_SCALE = 1e-3
 """Of the weights that make it vary at the start."""
@@ -62,7 +62,7 @@ class InvertedSphere(nn.Module):
         self.head = Mlp(width + self.direction.width, 3, 1, width // 2, "relu", output_scale=START_SCALE)
         if start is not None:
             with torch.no_grad():
-                self.head.layers[-1].bias.copy_(torch.logit(start / scale, eps=DARKEST))
+                self.head.layers[-1].bias.copy_(torch.logit(start / scale, eps=MIN_START))
 
     def forward(
         self, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]

@@ -25,7 +25,7 @@ UNIFORM_SHARE = 0.1
 """Share of the samples spread evenly over the sphere, so that every direction has a density."""
 MEAN_OF_CELL = (1 / 8, 3 / 4)
 """Mean over a cell of what is linear between cell middles: shares of each neighbour, and of the cell."""
-DARKEST = 1e-6
+MIN_RADIANCE = 1e-6
 """Of the mean of a map that is shown: what is darker counts as this, as radiance is kept as its logarithm."""
 
 
@@ -58,7 +58,7 @@ class EnvironmentLight(nn.Module):
     def show(self, radiance: Float[Tensor, "3 H W"]) -> None:
         """Be this map, of any size from 2 rows on, and not all black; its device stays."""
         self._resize(*radiance.shape[1:])
-        self.log_radiance.copy_(radiance.clamp_min(DARKEST * radiance.mean()).log())
+        self.log_radiance.copy_(radiance.clamp_min(MIN_RADIANCE * radiance.mean()).log())
 
     @torch.no_grad()
     def at_most(self, height: int) -> EnvironmentLight:

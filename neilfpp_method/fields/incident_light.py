@@ -18,7 +18,7 @@ from neilfpp_method.settings.types import FreeLightConfig, FrequencyConfig, Hash
 __all__ = ["IncidentLightField", "exponential"]
 
 
-LARGEST_EXPONENT = 20.0  # radiance stays within e^±20 of its start
+MAX_EXPONENT = 20.0  # radiance stays within e^±20 of its start
 DIRECTION_OCTAVES, DIRECTION_BANDS = 6, 5
 """Of the encoding of directions: light is sharper in direction than what surfaces send (NeILF++ §5)."""
 
@@ -83,5 +83,5 @@ def exponential(exponent: Float[Tensor, "*B C"], initial_radiance: float) -> Flo
 
     The exponent is clamped, with derivative 1 everywhere: a value beyond the limit still feels the loss.
     """
-    limited = exponent.clamp(-LARGEST_EXPONENT, LARGEST_EXPONENT).detach() + (exponent - exponent.detach())
+    limited = exponent.clamp(-MAX_EXPONENT, MAX_EXPONENT).detach() + (exponent - exponent.detach())
     return (initial_radiance * limited.exp()).expand(*exponent.shape[:-1], 3)

@@ -23,7 +23,7 @@ UNIT = 1e-3
 """Most that the length of a direction may differ from 1."""
 OFF_RAY = 0.02
 """How far a hit may lie beside its ray, in shares of its distance."""
-MOST_OFF = 0.5
+MAX_OFF = 0.5
 """Share of hits that may be off their rays or turned away: blended hits at edges are, a few."""
 REACH = 1.5
 """Distance from the centre at which positions are outside the scene, scene units; a ground has room."""
@@ -141,14 +141,14 @@ class FirstLook:
         depth = (offset * directions).sum(-1)
         beside = (offset - depth[:, None] * directions).norm(dim=-1)
         off = ((beside > OFF_RAY * offset.norm(dim=-1)) | (depth <= 0)).float().mean().item()
-        if off > MOST_OFF:
+        if off > MAX_OFF:
             raise UserError(
                 f"{self.name}: {off:.0%} of its hits do not lie on their rays",
                 "return positions in the frame of the rays, origin + distance · direction, with unit "
                 "directions",
             )
         away = ((hits.normal[hit] * directions).sum(-1) > 0).float().mean().item()
-        if away > MOST_OFF:
+        if away > MAX_OFF:
             raise UserError(
                 f"{self.name}: {away:.0%} of its normals point away from the viewer",
                 "turn them outwards: normal = -normal",

@@ -16,11 +16,13 @@ PAPER, INK, PALE_INK = (250, 250, 248), (28, 30, 34), (150, 154, 160)
 PROBLEM, WARNING, FINE = (200, 40, 40), (225, 150, 20), (70, 130, 180)
 CELL, LABEL, GAP, MARGIN = 160, 40, 12, 32
 COLUMNS = 7
+"""Views in a row."""
 PLAN = 420
+"""Side of a plan of the cameras, pixels."""
 MAX_DRAWN = 210
-"""Views that are shown at most: a picture of more is too long to look at."""
+"""Largest number of views in the picture."""
 KEY = 0.25
-"""What the median luminance of the capture is shown as, linear."""
+"""Linear value at which the capture's median luminance is shown."""
 
 
 def draw(inspection: Inspection) -> UInt8[np.ndarray, "H W 3"]:

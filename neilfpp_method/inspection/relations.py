@@ -16,10 +16,14 @@ from neilfpp_method.data.views import project
 __all__ = ["Stand", "duplicates", "exposure_factors", "stand"]
 
 NEIGHBOURS = 6
+"""Views nearest in pose that a view is compared with."""
 THUMBNAIL = (32, 32)
 SAME = 0.02
+"""Root mean square difference of standardised thumbnails below which two views are one picture."""
 SEEN_ANGLE = 30.0
+"""Degrees around a view within which directions count as covered."""
 SPHERE = 1000
+"""Directions that the sphere is sampled by."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ PAPER, INK, PALE = (250, 250, 248), (28, 30, 34), (176, 180, 186)
 TRAIN, TEST, BAD = (42, 92, 170), (222, 128, 20), (190, 40, 50)
 PANEL, MARGIN, TITLE, NOTE = 720, 40, 24, 16
 FINE = 2
-MOST_POINTS = 40_000
+MAX_POINTS = 40_000
 FRUSTUM = 0.18
 FIT_HEIGHT, AXIS, TICK = 190, 60, 0.5
 
@@ -54,7 +54,7 @@ def draw_scene(
     pyramids = np.stack([_pyramid(view.camera, box.scale) for view in views])
     centre = np.array(box.centre)
     reach = 1.08 * float(np.abs(pyramids - centre).max(initial=1.2 * box.scale))
-    rows = np.random.default_rng(0).permutation(len(points.position))[:MOST_POINTS]
+    rows = np.random.default_rng(0).permutation(len(points.position))[:MAX_POINTS]
     sheet = Image.new("RGB", (2 * PANEL + 3 * MARGIN, PANEL + 2 * MARGIN + TITLE), PAPER)
     sides = {"from above": (0, 1, 2), "from the side": (0, 2, 1)}
     for i, (title, (right, up, depth)) in enumerate(sides.items()):

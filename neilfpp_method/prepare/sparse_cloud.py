@@ -14,8 +14,8 @@ from neilfpp_method.data.point_cloud import WorldPoints
 __all__ = ["SparsePoints", "estimate_normals", "oriented", "reliable", "sparse_points", "without_outliers"]
 
 NEIGHBOURS = 12
-LARGEST_ERROR = 2.0
-SHORTEST_TRACK = 3
+MAX_ERROR = 2.0
+MIN_TRACK = 3
 FAR = 3.0
 FLAT = 0.1
 
@@ -59,9 +59,7 @@ def sparse_points(model: pycolmap.Reconstruction) -> SparsePoints:
 def reliable(points: SparsePoints) -> Bool[np.ndarray, " P"]:
     """Which points to trust: seen in at least 3 images, with errors of at most 2 pixels, not alone."""
     good = (
-        (points.error <= LARGEST_ERROR)
-        & (points.track >= SHORTEST_TRACK)
-        & np.isfinite(points.position).all(axis=1)
+        (points.error <= MAX_ERROR) & (points.track >= MIN_TRACK) & np.isfinite(points.position).all(axis=1)
     )
     good[good] = _in_company(points.position[good])
     return good

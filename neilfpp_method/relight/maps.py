@@ -20,7 +20,7 @@ __all__ = ["Layout", "LightMap", "check_map", "map_names", "read_map"]
 
 Layout = Literal["ours", "common"]
 
-FEWEST_ROWS, MOST_ROWS = 4, 4096
+MIN_ROWS, MAX_ROWS = 4, 4096
 RINGING = 0.01
 """Of a map's mean: filters that sharpen leave negative texels as small as this; they count as 0."""
 QUARTER_TURN = math.pi / 2
@@ -42,10 +42,10 @@ def check_map(path: Path) -> None:
         UserError: no such file, no image, or not of the shape of a whole sphere.
     """
     header = image_header(path)
-    if not FEWEST_ROWS <= header.height <= MOST_ROWS:
+    if not MIN_ROWS <= header.height <= MAX_ROWS:
         raise UserError(
             f"{path}: an environment map of {header.height} rows",
-            f"scale it to between {FEWEST_ROWS} and {MOST_ROWS} rows",
+            f"scale it to between {MIN_ROWS} and {MAX_ROWS} rows",
         )
     # Twice as many columns as rows; a map with rows at both poles may have one row more.
     if abs(header.width - 2 * header.height) > 2:

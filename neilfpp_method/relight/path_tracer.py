@@ -29,7 +29,7 @@ DIMENSIONS = 9
 """Numbers per vertex: three for the next direction, two for the map, three for a lamp, one roulette."""
 ROULETTE_FROM = 3
 """Vertices of a path before it may end by chance: the first ones carry most of the light."""
-LONGEST_LIFE = 0.95
+MAX_SURVIVAL = 0.95
 """The largest probability of going on: a path between white walls ends, too."""
 
 
@@ -116,7 +116,7 @@ def trace_paths(
         radiance[paths] += throughput * _met_light(scene, at, origins, directions, pdf, met)
 
         if bounce + 1 >= ROULETTE_FROM:
-            life = throughput.amax(-1).clamp_max(LONGEST_LIFE)
+            life = throughput.amax(-1).clamp_max(MAX_SURVIVAL)
             throughput = throughput / life[:, None]
             met = met[torch.nonzero((u[:, 8] < life)[met.rows])[:, 0]]
     return Traced(radiance, alpha, albedo, normal)

@@ -20,7 +20,7 @@ from neilfpp_method.structures import Indexable, Material
 
 __all__ = ["Vertices", "scatter", "scattered", "scattering_pdf", "vertices"]
 
-LEAST_SHARE = 0.1
+MIN_SHARE = 0.1
 """Of either technique: an error in the lobe's share costs at most ten times the variance."""
 
 
@@ -59,7 +59,7 @@ def vertices(
         reflectance = normal_reflectance(material)
         specular = (reflectance + (1 - reflectance) * (1 - cosine).pow(5)).mean(-1)
         diffuse = diffuse_reflectance(material).mean(-1)
-        share = (specular / (specular + diffuse).clamp_min(1e-6)).clamp(LEAST_SHARE, 1 - LEAST_SHARE)
+        share = (specular / (specular + diffuse).clamp_min(1e-6)).clamp(MIN_SHARE, 1 - MIN_SHARE)
     return Vertices(
         position, normal, flat, wo, material.base_color, material.roughness, material.metallic, share
     )

@@ -43,7 +43,7 @@ from neilfpp_method.train.work_record import write_work
 __all__ = ["Training", "adam", "make_optimizer", "seed_step", "set_rates", "train"]
 
 # So many steps in a row without a finite gradient are no accident.
-MOST_SKIPPED = 10
+MAX_SKIPPED = 10
 LOG_EVERY = 50
 """Steps between TensorBoard scalars: a thousand points of a curve in the longest training."""
 
@@ -233,9 +233,9 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], step: int) ->
         else f"the gradient of {', '.join(fields) or 'another process'}"
     )
     run.reporter.warn(f"step {step} skipped: {where} is not finite ({run.skipped} skipped so far)")
-    if run.skipped_in_a_row >= MOST_SKIPPED:
+    if run.skipped_in_a_row >= MAX_SKIPPED:
         raise Diverged(
-            f"{MOST_SKIPPED} steps in a row were not finite, the last one in {where}",
+            f"{MAX_SKIPPED} steps in a row were not finite, the last one in {where}",
             f"the last good checkpoint is kept in {run.path / 'checkpoints'}; look at the capture's "
             "brightest pixels or lower the learning rates",
         )

@@ -21,7 +21,7 @@ from neilfpp_method.structures import RayBatch
 
 __all__ = ["write_preview"]
 
-MOST_PIXELS = 160
+MAX_SIDE = 160
 """Longest side of a panel."""
 
 
@@ -31,7 +31,7 @@ def write_preview(model: NeilfModel, capture: Capture, stage: Stage, path: Path)
     Left to right: photograph, R, normals; with a material also PBR, base colour, roughness, metallic.
     """
     view = (capture.test_views or capture.train_views)[0]
-    view = scaled_view(view, min(1.0, MOST_PIXELS / max(file_size(view))))
+    view = scaled_view(view, min(1.0, MAX_SIDE / max(file_size(view))))
     shape = (view.camera.height, view.camera.width, 3)
     panels = [_photograph(view, capture.hdr)]
     rays = camera_rays(capture.normalisation.camera(view.camera))

@@ -13,7 +13,7 @@ from neilfpp_method.data.views import Camera
 
 __all__ = ["Pose", "pinhole", "pose_of"]
 
-MOST_SIDE = 1600
+MAX_SIDE = 1600
 """Pixels: larger windows show a picture of this size enlarged."""
 
 
@@ -29,7 +29,7 @@ class Pose:
 
 def pinhole(pose: Pose, width: int, height: int) -> Camera:
     """The camera of a window of width × height pixels."""
-    share = min(1.0, MOST_SIDE / max(width, height, 1))
+    share = min(1.0, MAX_SIDE / max(width, height, 1))
     width, height = max(1, round(width * share)), max(1, round(height * share))
     rotation = Rotation.from_quat(np.roll(pose.wxyz, -1)).as_matrix().T
     w2c = np.eye(4)

@@ -35,7 +35,7 @@ HARDLY_MISSED = 1e-3
 """The same in pictures: a quarter of a level of 8 bits."""
 OPAQUE = 8.0
 """Optical depth behind which nothing is seen."""
-LEAST_LIFE, MOST_LIFE = 20, 100
+MIN_LIFE, MAX_LIFE = 20, 100
 """Steps in which the field moves before the grid may, and must, be sampled anew."""
 
 
@@ -84,7 +84,7 @@ class EmptySpace(nn.Module):
         edges, clearance = self._edges(interval), self._clearance(beta, MISSED)
         empty, opaque = self._known(rays, edges, clearance, beta)
         if rays.origins.device.type == "cpu" and not self._holds(sdf, rays, edges, empty, clearance):
-            if self.age is not None and self.age >= LEAST_LIFE:
+            if self.age is not None and self.age >= MIN_LIFE:
                 self.age = None  # the next use samples it
             return interval
         return _span(edges, ~empty & ~opaque, interval).interval
@@ -129,7 +129,7 @@ class EmptySpace(nn.Module):
         return ((distance.diff(dim=-1) < 0.0) & ~empty[:, 1:]).any(-1)
 
     def _renew(self, sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]) -> None:
-        if self.age is None or self.age >= MOST_LIFE:
+        if self.age is None or self.age >= MAX_LIFE:
             self._sample(sdf)
 
     def _sample(self, sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]) -> None:

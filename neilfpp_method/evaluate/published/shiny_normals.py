@@ -30,7 +30,7 @@ from neilfpp_method.train.run import Run
 __all__ = ["SHINY_NORMALS", "weighted_angle"]
 
 NAME = "shiny-normals"
-LARGEST_COSINE = 1 - 2.0**-23
+MAX_COSINE = 1 - 2.0**-23
 """One less the spacing of float32 at 1."""
 
 
@@ -38,7 +38,7 @@ def weighted_angle(
     estimate: Float[np.ndarray, "H W 3"], truth: Float[np.ndarray, "H W 3"], weight: Float[np.ndarray, "H W"]
 ) -> float:
     """Weighted mean angle between normals, degrees (`compute_weighted_mae`); NaN without any weight."""
-    cosine = (_unit(estimate) * _unit(truth)).sum(-1).clip(-LARGEST_COSINE, LARGEST_COSINE)
+    cosine = (_unit(estimate) * _unit(truth)).sum(-1).clip(-MAX_COSINE, MAX_COSINE)
     total = weight.sum(dtype=np.float64)
     return float(np.degrees((weight * np.arccos(cosine)).sum() / total)) if total > 0 else float("nan")
 
