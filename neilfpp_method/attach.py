@@ -1,5 +1,4 @@
-"""`attach_neilf`: material and light on top of somebody else's geometry and radiance, in somebody else's
-loop.
+"""`attach_neilf`: material and light on top of another system's geometry and radiance, in its own loop.
 
 Three lines, the last one in every step:
 
@@ -89,8 +88,7 @@ class AttachedNeilf(nn.Module):
         return self.losses(batch, step, hits)
 
     def losses(self, batch: PixelBatch, step: int | Stage | str, hits: Rendered | None = None) -> Total:
-        """The weighted sum of what counts in a step, to add to a loss of your own, and each term before its
-        weight.
+        """The weighted sum of the losses of a step, to add to your own loss, and each term before its weight.
 
         Args:
             batch: pixels with their rays in the scene frame; see `pixel_batch`.

@@ -1,4 +1,4 @@
-"""The optional methods of a host: who asks for each, and what happens without it. docs/hosts.md shows the table.
+"""The optional methods of a host: who asks for each, and what happens without it (the table of docs/hosts.md).
 
 python -m neilfpp_method.hosts.capabilities      the table in Markdown
 """

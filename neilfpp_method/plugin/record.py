@@ -38,7 +38,7 @@ class RunRecord:
 
     Attributes:
         path: the folder.
-        config: the settings as they are trained, with the number of rays that nerfstudio's data manager draws.
+        config: the settings as they are trained, with as many rays as nerfstudio's data manager draws.
         source: how the capture is read again.
         facts: what the images decided.
     """
