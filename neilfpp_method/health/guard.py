@@ -2,9 +2,9 @@
 
     guard = StepGuard(warn=print)
     guard.watch(optimizer)
-    guard.begin_step(neilf_losses)   # in every step, with what is about to be minimised
+    guard.begin_step(total.terms, step)   # in every step, with the losses by name
     loss.backward()
-    optimizer.step()                 # moves nothing where a loss or a gradient is not finite
+    optimizer.step()                      # moves nothing where a loss or a gradient is not finite
 
 The loop of `neilfpp train` does the same by itself (`train.loop`).
 """

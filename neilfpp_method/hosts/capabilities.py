@@ -1,6 +1,6 @@
-"""The optional methods of a host: who asks for each, and what happens without it (the table of docs/hosts.md).
+"""The optional methods of a host: who asks for each, and what happens without it.
 
-python -m neilfpp_method.hosts.capabilities      the table in Markdown
+`python -m neilfpp_method.hosts.capabilities` prints the table of docs/hosts.md.
 """
 
 from __future__ import annotations
