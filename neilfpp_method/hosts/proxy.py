@@ -157,7 +157,7 @@ class SurfaceProxy(nn.Module):
         ]
         points, distance, hit, clear = joined
         self._pending.clear()
-        if self._surface is not None:
+        if self._known_surface() is not None:
             told = torch.nonzero(hit | clear)[:, 0]
             self._measure(Looks(rays[told], distance[told]))
         stamp = torch.full_like(points[:, :1], float(self.steps))
