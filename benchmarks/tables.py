@@ -1,4 +1,4 @@
-"""The tables of docs/results.md, docs/performance.md and docs/hosts.md, from the result files in benchmarks/results.
+"""The tables of docs/results.md, performance.md and hosts.md, from the result files in benchmarks/results.
 
     python -m benchmarks.tables            write the tables into the documents
     python -m benchmarks.tables --check    exit status 1 where a document is not what the result files say
