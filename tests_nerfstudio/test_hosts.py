@@ -15,7 +15,9 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.data.views import Normalisation
 from neilfpp_method.errors import UserError
+from neilfpp_method.hosts import proxy
 from neilfpp_method.hosts.nerfstudio import NerfstudioHost
+from neilfpp_method.plugin import model as plugin_model
 from neilfpp_method.plugin.foreign import build_foreign
 from neilfpp_method.schedule import Stage
 from neilfpp_method.structures import RayBatch
@@ -24,6 +26,15 @@ from neilfpp_method.train.run import run_folder
 from tests.data.make_capture import make_capture
 from tests.scenes import sphere_batch
 from tests_nerfstudio.runs import checkpoint, ns_train, small_settings, trainer_config, weights
+
+
+@pytest.fixture(autouse=True)
+def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Looks of a few rays: NeuS takes half a minute for 512 on a busy core."""
+    monkeypatch.setattr(proxy, "ROUNDS", 1)
+    monkeypatch.setattr(proxy, "ROUND", 16)
+    monkeypatch.setattr(plugin_model, "LOOKED_AT", 16)
+
 
 CENTRE, RADIUS = torch.tensor([4.0, -2.0, 1.0]), 1.5
 DRAWN = 0.5
