@@ -49,9 +49,7 @@ def metal_evidence(
     what = "error that metals save in views kept back, at places taken for metal"
     if model.lobe is None:
         return Measurement(what, 0.0, 0.0, WORTH, 0)
-    places = gather_places(model, pixels, position[:PLACES], normal[:PLACES], VIEWS)
-    views = torch.bincount(places.place, minlength=places.count)
-    places = places.where(torch.nonzero(views[places.place] >= MIN_VIEWS)[:, 0])
+    places = gather_places(model, pixels, position[:PLACES], normal[:PLACES], VIEWS).in_views(MIN_VIEWS)
     if not len(places.place):
         return Measurement(what, 0.0, 0.0, WORTH, 0)
     transport = place_transport(places, model.lobe, model.scene)

@@ -64,6 +64,13 @@ class BrdfField(nn.Module):
             self._material(saturation), roughness, metallic if self.metals else torch.zeros_like(metallic)
         )
 
+    @torch.no_grad()
+    def start_at(self, base_color: Float[Tensor, " 3"]) -> None:
+        """Be of this base colour everywhere, up to what the untrained network adds; roughness and metallic
+        stay.
+        """
+        self.mlp.layers[-1].bias[:3] = torch.atanh(2 * base_color.clamp(0.02, 0.98) - 1)
+
     def _material(self, saturation: Float[Tensor, "N 5"]) -> Material:
         base_color, roughness, metallic = (0.5 + 0.5 * saturation).split((3, 1, 1), -1)
         return Material(base_color, roughness, metallic if self.metals else torch.zeros_like(metallic))

@@ -33,6 +33,7 @@ class SurfaceMemory(nn.Module):
         self.points = Ring(capacity, 12)
         self.waited = 0
         self.age: int | None = None
+        self.fits = 0
 
     @property
     def due(self) -> bool:
@@ -51,15 +52,20 @@ class SurfaceMemory(nn.Module):
         if self.age is not None:
             self.age += 1
 
+    def wait(self) -> None:
+        """Let the first fit be due after `every` steps, as the light that there is needs none before."""
+        self.age = 0
+
     def recall(self) -> Observed:
         """Everything that is remembered, for a fit that is done now."""
         self.age = 0
+        self.fits += 1
         return Observed(*self.points.kept().split(3, -1))
 
     def get_extra_state(self) -> dict[str, int | None]:
         """Where the memory stands, for checkpoints."""
-        return {"age": self.age, "waited": self.waited}
+        return {"age": self.age, "waited": self.waited, "fits": self.fits}
 
     def set_extra_state(self, state: dict[str, int | None]) -> None:
         """The inverse of `get_extra_state`."""
-        self.age, self.waited = state["age"], state["waited"]
+        self.age, self.waited, self.fits = state["age"], state["waited"], state["fits"]

@@ -56,6 +56,15 @@ class LightSolver(Protocol):
         """Solve with these settings, and for surfaces of this lobe, from now on; what is remembered stays."""
         ...
 
+    @property
+    def seeks_start(self) -> bool:
+        """Whether a map is sought, and nothing is known of it yet."""
+        ...
+
+    def started(self) -> None:
+        """The light has been set to something that surfaces can learn under."""
+        ...
+
     def solve(self, brdf: BrdfField, scene: SceneTracer | None) -> Evidence | None:
         """Set the light to what explains the remembered points, when it is time.
 
@@ -73,7 +82,10 @@ class LightSolver(Protocol):
 class NothingToSolve(nn.Module):
     """The solver of a light that is learned by gradients, or known."""
 
-    due, points = False, 0
+    due, points, seeks_start = False, 0, False
+
+    def started(self) -> None:
+        """Nothing is solved for."""
 
     def observe(self, step: StepResult) -> None:
         """Nothing is remembered."""
@@ -130,6 +142,15 @@ class MapSolver(nn.Module):
         if self.sky is not None:
             self.sky.remember(*step.beyond_rows.split(3, -1))
 
+    @property
+    def seeks_start(self) -> bool:
+        """As of `LightSolver`."""
+        return self.config.map is None and self.memory.age is None and self.points == 0
+
+    def started(self) -> None:
+        """As of `LightSolver`."""
+        self.memory.wait()
+
     def use(self, config: MapLightConfig, lobe: Lobe | None) -> None:
         """As of `LightSolver`."""
         self.config, self.lobe = config, lobe
@@ -139,7 +160,7 @@ class MapSolver(nn.Module):
         """As of `LightSolver`."""
         if not self.due:
             return None
-        first, observed = self.memory.age is None, self.memory.recall()
+        first, observed = self.memory.fits == 0, self.memory.recall()
         sky = None if self.sky is None else self.sky.known()
         objective = Objective(self.response, self.unit, self.config.fit, sky)
         return solve_light(
