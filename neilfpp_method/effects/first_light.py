@@ -21,7 +21,7 @@ from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.direction_map import interpolate, map_directions
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading.brdf import Lobe
-from neilfpp_method.structures import SceneTracer
+from neilfpp_method.structures import Material, Observed, SceneTracer
 
 __all__ = ["MIN_PLACES", "FirstLight", "find_first_light", "start_with"]
 
@@ -33,6 +33,8 @@ SCALES = (0.1, 0.15, 0.22, 0.33, 0.5, 0.7)
 """Geometric means of the base colour that are tried, from charcoal to snow."""
 FIRST_SCALE = 0.33
 """The first of them, from an even light; each other one starts from the nearest that has been tried."""
+LAMP_PIXELS = 1024
+"""Pixels among which lamps are sought, as many as the light solver remembers in preset `fast`."""
 CARRIED_ROUNDS = 2
 """Turns of light and material from a fit at another scale, or to fewer views."""
 
@@ -43,17 +45,22 @@ class FirstLight:
 
     Attributes:
         log_radiance: of the map.
-        base_color: geometric mean over the places, per channel.
+        mean: of the materials, N = 1; of base colours the geometric mean.
         errors: relative error in the views kept back for each mean base colour that was tried.
         scale: the mean base colour that these errors speak for.
         places: how many.
+        observed: pixels of the places, at most `LAMP_PIXELS`, for the search for lamps.
+        material: of these pixels. The base colour is the same everywhere: in the fit that of each place is
+            free, so it holds the glow of lamps.
     """
 
     log_radiance: Float[Tensor, "3 H W"]
-    base_color: Float[Tensor, " 3"]
+    mean: Material
     errors: Mapping[float, float]
     scale: float
     places: int
+    observed: Observed
+    material: Material
 
     def in_words(self) -> str:
         """For people."""
@@ -90,17 +97,26 @@ def find_first_light(
     errors = {scale: place_errors(fit, *unknown, typical).mean().item() for scale, fit in fits.items()}
     scale = _lowest(errors)
     best = fit_places(places, carried, typical, metals, scale, _carried(fits, scale), CARRIED_ROUNDS)
-    base_color = best.base_color[shown].log().mean(0).exp()
-    return FirstLight(best.log_radiance, base_color, errors, scale, len(shown))
+    materials = best.material(shown)
+    mean = Material(
+        materials.base_color.log().mean(0, keepdim=True).exp(),
+        materials.roughness.mean(0, keepdim=True),
+        materials.metallic.mean(0, keepdim=True),
+    )
+    drawn = torch.randperm(len(places.place), device=places.place.device)[:LAMP_PIXELS]
+    material = best.material(places.place[drawn])
+    even = Material(mean.base_color.expand(len(drawn), 3), material.roughness, material.metallic)
+    observed = places.observed[drawn]
+    return FirstLight(best.log_radiance, mean, errors, scale, len(shown), observed, even)
 
 
 @torch.no_grad()
 def start_with(model: NeilfModel, found: FirstLight) -> None:
-    """Give a model whose material is untrained the light that was found, and its mean base colour."""
+    """Give a model whose material is untrained the light that was found, and the mean material."""
     light = model.light.log_radiance
     directions = map_directions(*light.shape[1:]).to(light)
     light.copy_(interpolate(found.log_radiance, directions).permute(2, 0, 1))
-    model.brdf.start_at(found.base_color)
+    model.brdf.start_at(found.mean)
 
 
 def _carried(fits: Mapping[float, PlaceFit], scale: float) -> PlaceFit:

@@ -76,7 +76,7 @@ def look_at_light(
     typical, decisions = model.facts.median_radiance, []
     if plan.is_open("long-tails") and plan.newest("long-tails") is None:
         measured = lobe_evidence(places, model.scene, typical, model.brdf.metals)
-        decisions.append(plan.decide("long-tails", measured, step))
+        decisions.append(plan.decide("long-tails", measured, step, must_be_earned=True))
         model.use(plan.config)
     found = None
     if model.lobe is not None:

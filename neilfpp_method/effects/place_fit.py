@@ -22,7 +22,7 @@ from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.objective import FLOOR, OUTLIER, total_variation
 from neilfpp_method.lighting.transport import Transport, from_texels_at
 from neilfpp_method.shading.brdf import Lobe
-from neilfpp_method.structures import SceneTracer
+from neilfpp_method.structures import Material, SceneTracer
 
 __all__ = ["PlaceFit", "fit_places", "place_errors", "place_transport"]
 
@@ -71,6 +71,12 @@ class PlaceFit:
     def radiance(self) -> Float[Tensor, "T 3"]:
         """Of the texels, row by row."""
         return self.log_radiance.exp().flatten(1).t()
+
+    def material(self, place: Int[Tensor, " N"]) -> Material:
+        """Of places by number."""
+        roughness = torch.tensor(ROUGHNESSES, device=place.device)[self.roughness[place]]
+        metallic = torch.tensor(METALLICS, device=place.device)[self.metallic[place]]
+        return Material(self.base_color[place], roughness[:, None], metallic[:, None])
 
 
 @torch.no_grad()
@@ -140,7 +146,8 @@ def place_errors(fit: PlaceFit, places: Places, transport: Transport, typical: f
     """Relative error of each pixel, at most 1, mean of its channels."""
     shown = _at_roughness(transport, fit.roughness[places.place])
     sent = torch.einsum("knt,tc->knc", shown.sources, fit.radiance) + shown.scene
-    outgoing = _outgoing(sent, fit.base_color[places.place], _metallic(fit)[places.place])
+    material = fit.material(places.place)
+    outgoing = _outgoing(sent, material.base_color, material.metallic)
     return _relative_error(outgoing, places, typical).abs().clamp_max(1).mean(-1)
 
 
@@ -149,10 +156,6 @@ def _at_roughness(transport: Transport, number: Int[Tensor, " N"]) -> Transport:
     rows = torch.arange(len(number), device=number.device)
     layers = torch.stack((torch.zeros_like(number), 1 + 2 * number, 2 + 2 * number))
     return Transport(transport.sources[layers, rows].float(), transport.scene[layers, rows])
-
-
-def _metallic(fit: PlaceFit) -> Float[Tensor, "P 1"]:
-    return torch.tensor(METALLICS, device=fit.metallic.device)[fit.metallic][:, None]
 
 
 def _outgoing(sent: Tensor, base_color: Tensor, metallic: Tensor) -> Tensor:
@@ -176,7 +179,8 @@ def _better_light(
     mean_base_color: float | None,
 ) -> PlaceFit:
     """The light by descent, and the base colours with it, at the roughness and metallic that places have."""
-    shown, metallic = _at_roughness(transport, fit.roughness[places.place]), _metallic(fit)[places.place]
+    shown = _at_roughness(transport, fit.roughness[places.place])
+    metallic = fit.material(places.place).metallic
     flat = shown.sources.flatten(0, 1)
     log_radiance = fit.log_radiance.clone().requires_grad_()
     gain = torch.zeros_like(fit.base_color, requires_grad=True)

@@ -123,10 +123,13 @@ class Plan:
         newest = self.newest(name)
         return newest is None or newest.by == "evidence"
 
-    def decide(self, name: str, measured: Measurement, step: int) -> Decision:
-        """Decide an open effect by evidence, from now on; without enough samples it stays as it is."""
+    def decide(self, name: str, measured: Measurement, step: int, must_be_earned: bool = False) -> Decision:
+        """Decide an open effect by evidence, from now on; without enough samples it stays as it is.
+
+        `must_be_earned`: it counts as off so far, whatever the settings say.
+        """
         before = self.is_on(name)
-        favoured = measured.favours(before)
+        favoured = measured.favours(before and not must_be_earned)
         on = before if favoured is None else favoured
         reason = measured.in_words()
         if favoured is None:

@@ -31,7 +31,6 @@ class SurfaceMemory(nn.Module):
         self.points = Ring(capacity, 12)
         self.waited = 0
         self.age: int | None = None
-        self.fits = 0
 
     @property
     def due(self) -> bool:
@@ -57,13 +56,12 @@ class SurfaceMemory(nn.Module):
     def recall(self) -> Observed:
         """Everything that is remembered, for a fit that is done now."""
         self.age = 0
-        self.fits += 1
         return Observed(*self.points.kept().split(3, -1))
 
     def get_extra_state(self) -> dict[str, int | None]:
         """Where the memory stands, for checkpoints."""
-        return {"age": self.age, "waited": self.waited, "fits": self.fits}
+        return {"age": self.age, "waited": self.waited}
 
     def set_extra_state(self, state: dict[str, int | None]) -> None:
         """The inverse of `get_extra_state`."""
-        self.age, self.waited, self.fits = state["age"], state["waited"], state["fits"]
+        self.age, self.waited = state["age"], state["waited"]

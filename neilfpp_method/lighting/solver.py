@@ -25,7 +25,7 @@ from neilfpp_method.lighting.solve import solve_light
 from neilfpp_method.settings.facts import RadianceUnits, SceneFacts
 from neilfpp_method.settings.types import FreeLightConfig, MapLightConfig
 from neilfpp_method.shading.brdf import Lobe
-from neilfpp_method.structures import SceneTracer, StepResult
+from neilfpp_method.structures import Material, Observed, SceneTracer, StepResult
 
 __all__ = ["LightSolver", "MapSolver", "NothingToSolve", "make_light_solver"]
 
@@ -57,8 +57,17 @@ class LightSolver(Protocol):
         """Whether a map is sought, and nothing is known of it yet."""
         ...
 
-    def started(self) -> None:
-        """The light has been set to something that surfaces can learn under."""
+    def start(self, observed: Observed, material: Material, scene: SceneTracer | None) -> Evidence | None:
+        """Seek lamps before the map that has been set; without any it stays as it is. Surfaces learn under it
+        for a while before the first `solve`.
+
+        Args:
+            observed, material: surface points, and what they are made of.
+            scene: as of `solve`.
+
+        Returns:
+            As of `solve`.
+        """
         ...
 
     def solve(self, brdf: BrdfField, scene: SceneTracer | None) -> Evidence | None:
@@ -80,7 +89,7 @@ class NothingToSolve(nn.Module):
 
     due, points, seeks_start = False, 0, False
 
-    def started(self) -> None:
+    def start(self, observed: Observed, material: Material, scene: SceneTracer | None) -> None:
         """Nothing is solved for."""
 
     def observe(self, step: StepResult) -> None:
@@ -142,9 +151,17 @@ class MapSolver(nn.Module):
         """As of `LightSolver`."""
         return self.config.map is None and self.memory.age is None and self.points == 0
 
-    def started(self) -> None:
+    @torch.no_grad()
+    def start(self, observed: Observed, material: Material, scene: SceneTracer | None) -> Evidence | None:
         """As of `LightSolver`."""
         self.memory.wait()
+        if self.config.kind == "distant":
+            return None
+        before = self.light.light.log_radiance.clone()
+        measured = self._solve(observed, material, scene, first=True, benefit_of_doubt=True)
+        if not self.light.lamps.lit:
+            self.light.light.log_radiance.copy_(before)
+        return measured
 
     def use(self, config: MapLightConfig, lobe: Lobe | None) -> None:
         """As of `LightSolver`."""
@@ -155,11 +172,29 @@ class MapSolver(nn.Module):
         """As of `LightSolver`."""
         if not self.due:
             return None
-        first, observed = self.memory.fits == 0, self.memory.recall()
+        first, observed = self.memory.age is None, self.memory.recall()
+        return self._solve(observed, brdf(observed.position), scene, first)
+
+    def _solve(
+        self,
+        observed: Observed,
+        material: Material,
+        scene: SceneTracer | None,
+        first: bool,
+        benefit_of_doubt: bool = False,
+    ) -> Evidence | None:
         sky = None if self.sky is None else self.sky.known()
         objective = Objective(self.response, self.unit, self.config.fit, sky)
         return solve_light(
-            self.light, observed, brdf(observed.position), self.lobe, scene, objective, self.config, first
+            self.light,
+            observed,
+            material,
+            self.lobe,
+            scene,
+            objective,
+            self.config,
+            first,
+            benefit_of_doubt,
         )
 
 

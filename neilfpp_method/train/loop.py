@@ -185,9 +185,11 @@ def _start_light(run: Training, model: NeilfModel, step: int) -> None:
         decisions, found = look_at_light(run.plan, model, run.pixels, step)
         _tell(run, decisions)
         if found is not None:
-            start_with(model, found)
-            run.light_solver.started()
             run.reporter.say(found.in_words())
+            start_with(model, found)
+            measured = run.light_solver.start(found.observed, found.material, model.scene)
+            note_fit(run.fits, measured, model.lamps.lit, step)
+            _tell(run, after_fit(run.plan, measured, model.lamps.lit, step))
     _share_light(run, model)
     _share_decisions(run, model, decisions)
 

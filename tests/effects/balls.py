@@ -1,4 +1,4 @@
-"""A convex ball under a made-up sky, photographed from all around: places whose material and light are known."""
+"""A convex ball under a made-up sky, photographed from all around: known places, material and light."""
 
 from __future__ import annotations
 
