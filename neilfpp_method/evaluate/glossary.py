@@ -17,7 +17,7 @@ class Entry:
 
     title: str
     pattern: str
-    better: Literal["higher", "lower"]
+    better: Literal["higher", "lower", "neither"]
     meaning: str
 
     def format(self, value: float) -> str:
@@ -93,6 +93,13 @@ ENTRIES: Mapping[str, Entry] = {
     ),
     "incident_light_log_mae_occluded_scaled": _log(
         "Light from surfaces, scaled", "As above, with one factor per channel taken out."
+    ),
+    "render_psnr": _decibels("Image", "New views, as the protocol shows them."),
+    "base_color_gamma": Entry(
+        "Gamma of base colour",
+        "%.3f",
+        "neither",
+        "The power that matches the medians; 1 would change nothing.",
     ),
     "confidence_base_color_ratio": _ratio("Confidence, base colour"),
     "confidence_roughness_ratio": _ratio("Confidence, roughness"),
