@@ -29,7 +29,7 @@ class Compare:
 
 
 def run(options: Compare) -> None:
-    from neilfpp_method.compare.terminal import table_of
+    from neilfpp_method.compare.terminal import tables_of
     from neilfpp_method.compare.write import compare_runs
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.device import pick_device
@@ -44,7 +44,13 @@ def run(options: Compare) -> None:
             advance,
         )
     console = terminal()
-    console.print(table_of(found))
+    for title, table, notes in tables_of(found):
+        console.print(f"\n{title}", style="bold", soft_wrap=True)
+        console.print(table)
+        for note in notes:
+            console.print(f"* {note}", soft_wrap=True)
+    for note in found.notes:
+        console.print(f"* {note}", soft_wrap=True)
     for file in found.files:
         console.print(f"written to {file}", soft_wrap=True)
 

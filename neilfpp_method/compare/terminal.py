@@ -4,36 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
 from neilfpp_method.compare.parts import Part, Row
 from neilfpp_method.compare.write import Comparison
 
-__all__ = ["table_of"]
+__all__ = ["tables_of"]
 
 ARROWS = {"higher": " ↑", "lower": " ↓", "neither": ""}
 MARK = " *"
 """Behind a figure that is not to be compared with the others."""
+TITLE_WIDTH = 32
+WIDEST = 28
+"""Letters of a column; longer texts go on in the next line."""
 
 
-def table_of(found: Comparison) -> Group:
-    """The table with its notes; the best of the figures that can be compared are bold."""
-    shown = Table(box=None, pad_edge=False, header_style="bold")
-    shown.add_column("", overflow="fold")
-    for label in found.labels:
-        shown.add_column(Text(label), justify="right", overflow="fold")
-    notes = list(found.notes)
+def tables_of(found: Comparison) -> Iterator[tuple[str, Table, tuple[str, ...]]]:
+    """Title, table and notes of each part; the best of the figures that can be compared are bold."""
+    texts = [[*found.labels], *(row.shown for part in found.parts for row in part.rows)]
+    widths = [min(max(map(len, column)) + len(MARK), WIDEST) for column in zip(*texts, strict=True)]
     for part in found.parts:
         if not part.rows and not part.notes:
             continue
-        shown.add_row()
-        shown.add_row(Text(part.title, style="bold"))
+        table = Table(box=None, pad_edge=False, header_style="bold")
+        table.add_column("", width=TITLE_WIDTH, overflow="fold")
+        for label, width in zip(found.labels, widths, strict=True):
+            table.add_column(Text(label), justify="right", width=width, overflow="fold")
         for row in part.rows:
-            shown.add_row(Text(row.title + ARROWS[row.better]), *_cells(part, row))
-        notes += part.notes
-    return Group(shown, "", *(Text(f"* {note}") for note in notes))
+            table.add_row(Text(row.title + ARROWS[row.better]), *_cells(part, row))
+        yield part.title, table, part.notes
 
 
 def _cells(part: Part, row: Row) -> Iterator[Text]:

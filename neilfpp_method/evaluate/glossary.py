@@ -33,6 +33,14 @@ def _length(title: str, meaning: str) -> Entry:
     return Entry(title, "%.4f", "lower", meaning)
 
 
+def _millimetres(title: str, meaning: str) -> Entry:
+    return Entry(title, "%.3f mm", "lower", meaning)
+
+
+def _similar(title: str) -> Entry:
+    return Entry(title, "%.4f", "higher", "Likeness of local structure; 1 is the same.")
+
+
 def _log(title: str, meaning: str) -> Entry:
     return Entry(title, "%.3f", "lower", meaning)
 
@@ -95,6 +103,23 @@ ENTRIES: Mapping[str, Entry] = {
         "Light from surfaces, scaled", "As above, with one factor per channel taken out."
     ),
     "render_psnr": _decibels("Image", "New views, as the protocol shows them."),
+    "render_ssim": _similar("Structure of the image"),
+    "render_psnr_h": _decibels(
+        "Image, linear", "New views, linear, brought to the level of a display, up to 4."
+    ),
+    "render_psnr_l": _decibels("Image, as displayed", "New views as a display shows them."),
+    "albedo_psnr": _decibels("Albedo, scaled", "After the factor per channel that the protocol takes."),
+    "albedo_ssim": _similar("Structure of the albedo, scaled"),
+    "albedo_single_psnr": _decibels("Albedo, one factor", "After one factor for all channels."),
+    "albedo_single_ssim": _similar("Structure of the albedo, one factor"),
+    "roughness_mse": Entry("Roughness", "%.4f", "lower", "Mean squared error over the frame."),
+    "normal_distance": Entry("Normals, 1 − cosine", "%.4f", "lower", "Mean over the eroded mask."),
+    "depth_mse": Entry(
+        "Depth, scaled", "%.4g", "lower", "Mean squared error after one factor for all views."
+    ),
+    "chamfer_mm": _millimetres("Surface", "Mean of the two below."),
+    "chamfer_accuracy_mm": _millimetres("Surface, accuracy", "From the estimate to the truth."),
+    "chamfer_completeness_mm": _millimetres("Surface, completeness", "From the truth to the estimate."),
     "base_color_gamma": Entry(
         "Gamma of base colour",
         "%.3f",

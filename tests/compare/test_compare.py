@@ -23,12 +23,14 @@ from tests.train.small_runs import small_config
 CELL, GAP, LEFT, TOP = 240, 8, 290, 206
 """Of a sheet: width of a picture, pixels between two, and where the first one begins."""
 
+STEPS = [f"--config.train.{stage}-steps=2" for stage in ("sdf", "material", "joint")]
+
 
 def train(capture: Path, out: Path, *options: str) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PRESETS, "tiny", small_config)
         command = ["train", "--data", str(capture), "--out", str(out), "--preset", "tiny", "--device", "cpu"]
-        assert main([*command, "--no-report", *options]) == 0
+        assert main([*command, "--no-report", *STEPS, *options]) == 0
     return out
 
 
@@ -38,16 +40,36 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory, capture: Path) -> dict[str, Path]:
+def given(tmp_path_factory: pytest.TempPathFactory, capture: Path) -> Path:
+    """A run of a given mesh."""
+    out = tmp_path_factory.mktemp("runs") / "mesh"
+    return train(capture, out, "--host", "mesh", "--config.train.joint-steps=0")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory, capture: Path, given: Path) -> dict[str, Path]:
     """Runs of one capture: found geometry with its figures, a given mesh, and one with no view held out."""
     root = tmp_path_factory.mktemp("runs")
-    runs = {
-        "found": train(capture, root / "found"),
-        "mesh": train(capture, root / "mesh", "--host", "mesh", "--config.train.joint-steps", "0"),
-        "all": train(capture, root / "all", "--test-every", "0"),
-    }
-    assert main(["eval", str(runs["found"]), "--device", "cpu"]) == 0
-    return runs
+    everything = Path(shutil.copytree(given, root / "all"))
+    point_at(everything, test_every=0)
+    return {"found": measured(train(capture, root / "found")), "mesh": given, "all": everything}
+
+
+def measured(run: Path) -> Path:
+    """The run with figures as `neilfpp eval` leaves them."""
+    figures = {"pbr_psnr": 20.0, "volume_psnr": 21.0, "base_color_psnr": 12.5}
+    what = {"view_names": ["000", "003"], "width": 40, "height": 30, "step": 6}
+    (run / "metrics.json").write_text(json.dumps(figures | {"health": "sound"}))
+    described = {"mask_source": "true depth", "measured": what}
+    (run / "metrics-protocol.json").write_text(json.dumps(described))
+    return run
+
+
+def point_at(run: Path, **changes: object) -> Path:
+    """The run with its capture read in another way."""
+    source = run / "capture.json"
+    source.write_text(json.dumps(json.loads(source.read_text()) | changes))
+    return run
 
 
 @pytest.fixture
@@ -73,7 +95,7 @@ def test_runs_of_two_hosts_stand_side_by_side(runs, tmp_path, capsys):
     assert table["runs"] == ["found", "mesh"]
     assert table["views"] == ["000", "003"]
     settings = {key: row["values"] for key, row in part(table, "settings")["rows"].items()}
-    assert settings["train.joint_steps"] == {"found": "4", "mesh": "0"}
+    assert settings["train.joint_steps"] == {"found": "2", "mesh": "0"}
     assert settings["host.kind"] == {"found": "volsdf", "mesh": "mesh"}
     assert "train.seed" not in settings  # the same in both
     assert "capture.root" not in settings
@@ -171,7 +193,8 @@ def test_figures_of_other_views_pixels_and_versions_are_marked(runs, tmp_path):
 
 def test_runs_of_two_captures_have_a_table_and_no_picture(runs, tmp_path):
     other = make_capture(tmp_path / "other", size=(40, 30), views=7, masks=True)
-    table = compare(tmp_path / "out", runs["found"], train(other, tmp_path / "runs" / "stranger"))
+    stranger = Path(shutil.copytree(runs["mesh"], tmp_path / "runs" / "stranger"))
+    table = compare(tmp_path / "out", runs["found"], point_at(stranger, root=str(other)))
     assert table["views"] == []
     assert "stranger is of another capture" in table["notes"][0]
     assert part(table, "figures", "neilfpp")["apart"] == ["stranger"]
@@ -182,10 +205,9 @@ def test_other_photographs_from_the_same_cameras_are_told(runs, tmp_path):
     copied = make_capture(tmp_path / "copied", size=(40, 30), masks=True, test=(0, 3))
     bright = make_capture(tmp_path / "bright", size=(40, 30), masks=True, test=(0, 3), background=0.5)
     for root, told in ((copied, 0), (bright, 1)):
-        shutil.copytree(runs["mesh"], tmp_path / "runs" / root.name)
-        source = tmp_path / "runs" / root.name / "capture.json"
-        source.write_text(json.dumps({**json.loads(source.read_text()), "root": str(root)}))
-        table = compare(tmp_path / "out", runs["found"], source.parent, "--views", "1", "--size", "40")
+        other = Path(shutil.copytree(runs["mesh"], tmp_path / "runs" / root.name))
+        point_at(other, root=str(root))
+        table = compare(tmp_path / "out", runs["found"], other, "--views", "1", "--size", "40")
         assert sum("other photographs" in note for note in table["notes"]) == told
         assert table["views"] == ["000"]
 
@@ -201,17 +223,17 @@ def test_a_run_without_test_views_shows_views_that_it_learned_from(runs, tmp_pat
     assert image_header(tmp_path / "compare.png").width == LEFT + 3 * CELL + 2 * GAP + 40
 
 
-def test_runs_without_truth_have_figures_of_images_alone(tmp_path):
-    root = make_capture(tmp_path / "photos", hdr=False, test=(0,))
+def test_runs_without_truth_have_figures_of_images_alone(given, tmp_path):
+    root = make_capture(tmp_path / "photos", size=(40, 30), test=(0,))
     for folder in ("inputs/depth_maps", "inputs/normal_maps", "ground_truths"):
         shutil.rmtree(root / folder)
-    runs = [train(root, tmp_path / name) for name in ("a", "b")]
+    runs = [point_at(Path(shutil.copytree(given, tmp_path / name)), root=str(root)) for name in ("a", "b")]
     table = compare(tmp_path / "out", *runs, "--views", "1", "--size", "24")
     shown = part(table, "figures", "shown")
     assert {"pbr_psnr", "volume_psnr"} <= shown["rows"].keys()
     assert not [key for key in shown["rows"] if key.startswith(("base_color", "normal", "rough"))]
     a, b = shown["rows"]["pbr_psnr"]["values"].values()
-    assert a == b  # same settings, same seed
+    assert a == b  # one training, copied
     assert part(table, "settings")["rows"] == {}
 
 
@@ -250,8 +272,7 @@ def test_what_is_no_run_is_told_in_one_line(runs, tmp_path, capsys):
 
 
 def test_a_capture_that_has_moved_is_named(runs, tmp_path):
-    source = runs["mesh"] / "capture.json"
-    source.write_text(json.dumps({**json.loads(source.read_text()), "root": str(tmp_path / "gone")}))
+    point_at(runs["mesh"], root=str(tmp_path / "gone"))
     with pytest.raises(UserError, match="gone: the run's capture is not there"):
         compare_runs([runs["found"], runs["mesh"]], tmp_path / "out", 1, 40, "cpu")
     assert not (tmp_path / "out").exists()

@@ -34,6 +34,8 @@ class Protocol:
         check: raises a `UserError` where the capture lacks what the protocol needs; called before views are
             rendered.
         measure: figures by name, from the test views in order.
+        needs_views: whether views are rendered for it; if not, `measure` is given none.
+        side: width in pixels at which views are rendered; none: that of their files.
     """
 
     name: str
@@ -41,6 +43,8 @@ class Protocol:
     left_out: str
     check: Callable[[Run], None]
     measure: Callable[[Run, Sequence[RenderedView]], dict[str, float]]
+    needs_views: bool = True
+    side: int | None = None
 
 
 def decibels(squared_error: float) -> float:
