@@ -141,4 +141,7 @@ def explain(name: str) -> Entry:
         return replace(
             base, title=f"{base.title}, without a method", meaning="A constant, or the mean image."
         )
+    whole = ENTRIES.get(name.removesuffix("_frame"))
+    if whole is not None:
+        return replace(whole, title=f"{whole.title}, whole frame", meaning="The background counts as right.")
     return Entry(name.replace("_", " ").capitalize(), "%.4g", "higher", "")

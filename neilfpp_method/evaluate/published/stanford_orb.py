@@ -126,7 +126,7 @@ def _mask_file(view: View) -> Path:
     return folder.with_name(f"{folder.name}_mask") / f"{view.image.stem}.png"
 
 
-def _quarter(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+def _quarter(values: Float[np.ndarray, "_ _ ..."]) -> Float[np.ndarray, "_ _ ..."]:
     return cv2.resize(values, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
 
 
