@@ -73,6 +73,7 @@ def _published(options: Eval) -> None:
         console.print(f"{size}; published figures are at the size of the files", soft_wrap=True)
     with computing_fast(), progress_bar("evaluating") as advance:
         figures = protocol.measure(run, render_test_views(run, advance) if protocol.needs_views else ())
+        advance(1.0)
     write_figures(out, protocol, run, figures)
     console.print(
         f"protocol {protocol.name}, as {protocol.source}; left out: {protocol.left_out}", soft_wrap=True
