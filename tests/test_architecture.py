@@ -33,6 +33,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("evaluate",),
     ("relight",),
     ("report", "view"),
+    ("compare",),
     ("demo", "plugin", "prepare"),
     ("commands",),
     ("cli",),

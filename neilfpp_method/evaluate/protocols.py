@@ -34,6 +34,7 @@ from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.data.truth import LightField, Truth
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.evaluate.confidence import gather_evidence, material_deviation, shown_surface
+from neilfpp_method.evaluate.size import what_is_measured
 from neilfpp_method.evaluate.views import (
     KnownView,
     RenderedView,
@@ -113,12 +114,13 @@ def protocol(run: Run) -> dict[str, str]:
 def write_metrics(path: Path, run: Run, figures: Mapping[str, float]) -> None:
     """Write the figures and the verdict on the run's health as a flat JSON object.
 
-    Beside it, as `<stem>-protocol.json`, stands how to read them.
+    Beside it, as `<stem>-protocol.json`, stands how to read them, and what was measured.
     """
     findings = read_findings(run.path)
     health = {} if findings is None else {"health": verdict_of(findings)}
     write_json(path, {**figures, **health})
-    write_json(path.with_name(f"{path.stem}-protocol.json"), protocol(run))
+    described = {**protocol(run), "measured": what_is_measured(run)}
+    write_json(path.with_name(f"{path.stem}-protocol.json"), described)
 
 
 # ---------------------------------------------------------------------------------- images, material, normals

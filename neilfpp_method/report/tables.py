@@ -11,6 +11,7 @@ from neilfpp_method.report.files import Changed
 from neilfpp_method.report.markup import Html, cell, element, joined, table
 
 __all__ = [
+    "STAGE_TITLES",
     "effects_section",
     "facts_section",
     "figures_section",
@@ -87,7 +88,8 @@ def figures_section(metrics: Mapping[str, float], said: str) -> Html:
         value, frame, baseline = (
             entry.format(metrics[key]) if key in metrics else "–" for key in (name, *beside[name])
         )
-        arrow = {"higher": "↑", "lower": "↓"}[entry.better]
+        arrow = {"higher": "↑", "lower": "↓"}.get(entry.better)
+        beside_value = (" ", element("span", arrow, title=f"{entry.better} is better")) if arrow else ()
         rows.append(
             element(
                 "tr",
@@ -95,8 +97,7 @@ def figures_section(metrics: Mapping[str, float], said: str) -> Html:
                 element(
                     "td",
                     element("b", value),
-                    " ",
-                    element("span", arrow, title=f"{entry.better} is better"),
+                    *beside_value,
                     class_="number",
                 ),
                 element("td", frame, class_="number"),
