@@ -44,8 +44,9 @@ from neilfpp_method.evaluate.views import (
     render_test_views,
     surface_points,
 )
-from neilfpp_method.export.mesh import HasSdf, extract_mesh
+from neilfpp_method.export.mesh import extract_mesh
 from neilfpp_method.health.cases import verdict_of
+from neilfpp_method.hosts.base import HasSdf
 from neilfpp_method.hosts.volsdf import HIT_RADIUS
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.train.health_record import read_findings

@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -18,13 +17,14 @@ from torch import Tensor
 
 from neilfpp_method.data.images import replacing
 from neilfpp_method.errors import UserError
+from neilfpp_method.hosts.base import HasSdf
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.hosts.volsdf import HIT_RADIUS
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.structures import Material
 from neilfpp_method.train.run import Run
 
-__all__ = ["HasSdf", "export_mesh", "extract_mesh", "has_surface", "materials_in_parts", "surface_mesh"]
+__all__ = ["export_mesh", "extract_mesh", "has_surface", "materials_in_parts", "surface_mesh"]
 
 Sdf = Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]
 
@@ -36,15 +36,6 @@ points nothing is lost, the edges between blocks included, for every field whose
 """
 POINTS_AT_ONCE = 65_536
 """Points at which the material is asked together: bounds the memory."""
-
-
-@runtime_checkable
-class HasSdf(Protocol):
-    """A host whose surface is the zero set of a distance field. Without: there is no mesh to export."""
-
-    def sdf(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-        """Signed distance at points of the scene frame, negative inside."""
-        ...
 
 
 @torch.no_grad()

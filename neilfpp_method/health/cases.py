@@ -14,6 +14,7 @@ from neilfpp_method.health.look import Look
 
 __all__ = [
     "Finding",
+    "Health",
     "Verdict",
     "few_light_points",
     "material_findings",
@@ -68,6 +69,28 @@ def verdict_of(findings: Iterable[Finding]) -> Verdict:
     """The worst of all findings."""
     severe = [finding.severe for finding in findings]
     return "failed" if any(severe) else "doubtful" if severe else "sound"
+
+
+@dataclass(frozen=True)
+class Health:
+    """A verdict and what it rests on.
+
+    Attributes:
+        verdict: the worst of all findings.
+        findings: what is wrong, a case each; none where the verdict is "sound".
+    """
+
+    verdict: Verdict
+    findings: tuple[Finding, ...]
+
+    @staticmethod
+    def of(findings: Iterable[Finding]) -> Health:
+        """The health that findings come to."""
+        found = tuple(findings)
+        return Health(verdict_of(found), found)
+
+    def __str__(self) -> str:
+        return self.verdict + (": " + "; ".join(f.what for f in self.findings) if self.findings else "")
 
 
 def surface_findings(seen: Look, step: int) -> list[Finding]:

@@ -20,6 +20,7 @@ from neilfpp_method.structures import LossTerms, PixelBatch, RayBatch, SceneLigh
 
 __all__ = [
     "HasParameterGroups",
+    "HasSdf",
     "HasStages",
     "HasSurfaceWidth",
     "Host",
@@ -138,6 +139,15 @@ class HasParameterGroups(Protocol):
 
     def parameter_groups(self) -> Mapping[str, list[Parameter]]:
         """Parameters by field: geometry, beta, radiance, background."""
+        ...
+
+
+@runtime_checkable
+class HasSdf(Protocol):
+    """A host whose surface is the zero set of a distance field. Without: there is no mesh to export."""
+
+    def sdf(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
+        """Signed distance at points of the scene frame, negative inside."""
         ...
 
 

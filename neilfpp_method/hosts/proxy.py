@@ -12,8 +12,9 @@ that they pass through. A host that moves is followed in that way, a few dozen s
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -156,7 +157,7 @@ class SurfaceProxy(nn.Module):
         ]
         points, distance, hit, clear = joined
         self._pending.clear()
-        if self._surface is not None:
+        if self._known_surface() is not None:
             told = torch.nonzero(hit | clear)[:, 0]
             self._measure(Looks(rays[told], distance[told]))
         stamp = torch.full_like(points[:, :1], float(self.steps))
@@ -295,11 +296,25 @@ class SurfaceProxy(nn.Module):
 
     # -------------------------------------------------------------------------------------------- checkpoints
 
-    def get_extra_state(self) -> dict[str, int]:
-        """Steps that were observed."""
-        return {"steps": self.steps}
+    def get_extra_state(self) -> dict[str, Any]:
+        """Steps that were observed, and the rays that came since the last refresh."""
+        pending = [{**_tensors(rays), **_tensors(hits)} for rays, hits in self._pending]
+        return {"steps": self.steps, "pending": pending}
 
-    def set_extra_state(self, state: dict[str, int]) -> None:
+    def set_extra_state(self, state: dict[str, Any]) -> None:
         """The inverse of `get_extra_state`; the grid is made of the points again when it is asked."""
         self.steps, self._surface, self._report = state["steps"], None, None
-        self._pending.clear()
+        self._pending = [
+            (_made(RayBatch, tensors), _made(SurfaceHits, tensors)) for tensors in state["pending"]
+        ]
+
+
+Part = TypeVar("Part", RayBatch, SurfaceHits)
+
+
+def _tensors(part: RayBatch | SurfaceHits) -> dict[str, Tensor]:
+    return {f.name: getattr(part, f.name) for f in fields(part)}
+
+
+def _made(kind: type[Part], tensors: Mapping[str, Tensor]) -> Part:
+    return kind(**{f.name: tensors[f.name] for f in fields(kind)})

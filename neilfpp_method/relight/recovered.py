@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.export.mesh import HasSdf, extract_mesh
-from neilfpp_method.hosts.base import SmoothsNormals
+from neilfpp_method.export.mesh import extract_mesh
+from neilfpp_method.hosts.base import HasSdf, SmoothsNormals
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.hosts.volsdf import HIT_RADIUS
 from neilfpp_method.relight.surface import Surface

@@ -17,6 +17,7 @@ from neilfpp_method.effects.first_light import start_with
 from neilfpp_method.effects.looks import after_fit, look_at_light, look_at_surface, wants_surface
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.errors import Diverged, Stopped, UserError
+from neilfpp_method.health.guard import MAX_SKIPPED_IN_A_ROW
 from neilfpp_method.health.watch import Watch
 from neilfpp_method.lighting.solver import LightSolver
 from neilfpp_method.model import NeilfModel
@@ -43,8 +44,6 @@ from neilfpp_method.train.work_record import write_work
 
 __all__ = ["Training", "adam", "make_optimizer", "seed_step", "set_rates", "train"]
 
-# So many steps in a row without a finite gradient are no accident.
-MAX_SKIPPED = 10
 LOG_EVERY = 50
 """Steps between TensorBoard scalars: a thousand points of a curve in the longest training."""
 
@@ -272,9 +271,9 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], step: int) ->
         else f"the gradient of {', '.join(fields) or 'another process'}"
     )
     run.reporter.warn(f"step {step} skipped: {where} is not finite ({run.skipped} skipped so far)")
-    if run.skipped_in_a_row >= MAX_SKIPPED:
+    if run.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
         raise Diverged(
-            f"{MAX_SKIPPED} steps in a row were not finite, the last one in {where}",
+            f"{MAX_SKIPPED_IN_A_ROW} steps in a row were not finite, the last one in {where}",
             f"the last good checkpoint is kept in {run.path / 'checkpoints'}; look at the capture's "
             "brightest pixels or lower the learning rates",
         )
