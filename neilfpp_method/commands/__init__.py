@@ -14,6 +14,7 @@ from neilfpp_method.commands import (
     prepare,
     relight,
     render,
+    replay,
     report,
     train,
     view,
@@ -31,6 +32,7 @@ COMMANDS = {
     "export": export.COMMAND,
     "relight": relight.COMMAND,
     "report": report.COMMAND,
+    "replay": replay.COMMAND,
     "view": view.COMMAND,
     "completion": completion.COMMAND,
 }
