@@ -17,8 +17,8 @@ def _short(text: str) -> str:
 
 
 def _printable(text: str) -> str:
-    """One line that does nothing to a terminal, whatever a file says or is called: control characters, and bytes
-    that are no text, are written as escapes.
+    """One line that does nothing to a terminal, whatever a file says or is called: control characters, and
+    bytes that are no text, are written as escapes.
     """
     hidden = {sign for sign in text if unicodedata.category(sign) in ("Cc", "Cf", "Cs", "Zl", "Zp")}
     return text.translate({ord(sign): sign.encode("unicode_escape").decode() for sign in hidden})

@@ -3,8 +3,8 @@
 Loaded before OpenCV, it brings its own zlib into the process first, and OpenCV's PNG writer then aborts with
 "free(): invalid pointer". OpenCV is therefore loaded before it, here and nowhere else.
 
-It also has SIGTERM print a stack trace, as if the program had failed. What SIGTERM did before comes back, and a
-SIGTERM that arrives while it is loaded waits until then.
+It also has SIGTERM print a stack trace, as if the program had failed. What SIGTERM did before comes back,
+and a SIGTERM that arrives while it is loaded waits until then.
 
 Its interface changes with its versions, so others than those that this project is made for are refused when
 they are loaded, and not somewhere in the middle of the work.

@@ -1,7 +1,7 @@
 """Which operation is the first whose result is not finite, and comes to bear on a loss or a gradient.
 
-Infinities that a mask takes out again are harmless and common. So every value that is not finite is followed from
-the operation that made it out of finite values, and only what arrives at the end is told.
+Infinities that a mask takes out again are harmless and common. So every value that is not finite is
+followed from the operation that made it out of finite values, and only what arrives at the end is told.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ class Origin:
     """An operation that made values that are not finite out of finite ones.
 
     Attributes:
+        order: how many such operations came before it.
         operation: torch's name of it, such as `aten.div.Tensor`.
         derivative_of: the operation whose derivative it computes, such as `DivBackward0`; none: it is part of
             the forward pass.
@@ -41,6 +42,7 @@ class Origin:
         length: of its first axis.
     """
 
+    order: int
     operation: str
     derivative_of: str | None
     place: str | None
@@ -65,6 +67,7 @@ class OriginsOfNotFinite(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
         self._origins: dict[int, Origin] = {}
+        self._count = 0
 
     def origin_of(self, value: Tensor) -> Origin | None:
         """The operation that a value's NaN or infinity comes from; none: the value is finite, or no operation
@@ -80,7 +83,9 @@ class OriginsOfNotFinite(TorchDispatchMode):
             return result
         for value in _tensors(result):
             if not is_finite(value):
-                self._origins[_memory(value)] = known[0] if known else _origin(func, value)
+                self._count += not known
+                origin = min(known, key=lambda o: o.order) if known else _origin(self._count - 1, func, value)
+                self._origins[_memory(value)] = origin
         return result
 
 
@@ -98,14 +103,14 @@ def _memory(value: Tensor) -> int:
     return value.untyped_storage().data_ptr()
 
 
-def _origin(func: Any, value: Tensor) -> Origin:
+def _origin(order: int, func: Any, value: Tensor) -> Origin:
     flat = value.detach().reshape(len(value) if value.ndim else 1, -1)
     wrong = ~torch.isfinite(flat)
     rows = tuple(torch.nonzero(wrong.any(1))[:, 0].tolist())
     node = torch._C._current_autograd_node()
     place, code = _place_of_forward(node) if node is not None else _place_here()
     derivative = None if node is None else node.name()
-    return Origin(str(func), derivative, place, code, int(wrong.sum()), flat.numel(), rows, len(flat))
+    return Origin(order, str(func), derivative, place, code, int(wrong.sum()), flat.numel(), rows, len(flat))
 
 
 def _place_here() -> tuple[str | None, str]:
@@ -117,7 +122,9 @@ def _place_here() -> tuple[str | None, str]:
 
 
 def _place_of_forward(node: Any) -> tuple[str | None, str]:
-    """From what torch's anomaly mode noted when the operation was computed: lines `File "…", line 3, in f`."""
+    """From what torch's anomaly mode noted when the operation was computed: lines `File "…", line 3, in
+    f`.
+    """
     for entry in reversed(node.metadata.get("traceback_", [])):
         head, _, code = entry.strip().partition("\n")
         name, _, rest = head.removeprefix('File "').partition('", line ')

@@ -82,8 +82,10 @@ def _computed(model: NeilfModel, skipped: SkippedStep) -> Rerun:
     }
     gradients = tuple(name for name, found in broken.items() if found)
     ends = [terms[name].values for name in losses] + [grad for found in broken.values() for grad in found]
-    known = (origin for end in ends if (origin := origins.origin_of(end)) is not None)
-    return Rerun(skipped, inputs, losses, gradients, next(known, None))
+    # What passes through a compiled loop comes out as if made there: the earliest is where it began.
+    known = [origin for end in ends if (origin := origins.origin_of(end)) is not None]
+    first = min(known, key=lambda origin: origin.order, default=None)
+    return Rerun(skipped, inputs, losses, gradients, first)
 
 
 def _broken_inputs(model: NeilfModel, batch: PixelBatch) -> Iterator[str]:
@@ -96,12 +98,8 @@ def in_words(rerun: Rerun) -> str:
     skipped, origin = rerun.skipped, rerun.origin
     lines = [f"step {skipped.step}, stage {skipped.stage.value}, {len(skipped.batch)} rays"]
     if rerun.finite:
-        return "\n".join(
-            [
-                *lines,
-                "every loss and gradient is finite this time: another process or device computed what was not",
-            ]
-        )
+        lines.append("every loss and gradient is finite now: another process or device computed what was not")
+        return "\n".join(lines)
     parts = {"not finite from the start": rerun.inputs, "losses": rerun.losses, "gradients": rerun.gradients}
     lines += [f"{what}: {', '.join(names)}" for what, names in parts.items() if names]
     if origin is None:

@@ -8,6 +8,7 @@ pixels/           of the training views; can be deleted, and is made again when 
 work.json         seconds of each stage by kind of work (docs/budget.md)
 effects.json      which effects are simulated, and why
 light.json        what spoke for lamps, fit by fit; not there where the settings had decided
+skipped/          steps that were not finite, for `neilfpp replay`; not there where none was
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Steps that were skipped because they were not finite, in `RUN/skipped/STEP.pt`: all that it takes to run one of
-them again.
+"""Steps that were skipped because they were not finite, in `RUN/skipped/STEP.pt`: all that it takes to run
+one of them again.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ __all__ = ["FOLDER", "Moment", "SkippedStep", "keep_step", "load_step"]
 
 FOLDER = "skipped"
 MAX_KEPT = 4
-"""Steps of a run that are kept, the first ones: a file is as large as the model, and later faults are mostly the
-first one again.
+"""Steps of a run that are kept, the first ones: a file is as large as the model, and later faults are
+mostly the first one again.
 """
 FORMAT = 1
 KEYS = {"format", "step", "stage", "share", "batch", "model", "random"}

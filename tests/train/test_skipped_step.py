@@ -14,12 +14,12 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.structures import LossTerm
 from neilfpp_method.train.first_not_finite import OriginsOfNotFinite
+from neilfpp_method.train.loop import Training, train
 from neilfpp_method.train.rerun import in_words, rerun_step
 from neilfpp_method.train.run import CaptureSource, create_run
 from neilfpp_method.train.skipped import FOLDER, MAX_KEPT, load_step
-from neilfpp_method.train.loop import Training, train
 from tests.data.make_capture import make_capture
-from tests.train.small_runs import small_config, small_training, solved_light
+from tests.train.small_runs import small_config, small_training
 
 
 @pytest.fixture(scope="module")
@@ -28,9 +28,10 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def training(tmp_path: Path, capture: Path) -> Training:
-    """A run on disk, four steps a stage, whose material stage remembers surface points."""
-    config = solved_light(small_config())
+def training(tmp_path: Path, capture: Path, monkeypatch: pytest.MonkeyPatch) -> Training:
+    """A run on disk, four steps a stage, whose material stage shades points of earlier steps again."""
+    monkeypatch.setattr("neilfpp_method.lighting.replay.KEPT_STEPS", 1)
+    config = small_config(fresh=0.5)
     made = small_training(capture, tmp_path / "run", config)
     create_run(made.path, config, CaptureSource(str(capture)), made.model.facts)
     return made
@@ -66,7 +67,7 @@ def test_a_loss_that_is_not_finite(training, monkeypatch, step):
     spoil(monkeypatch, training, step, divided)
     train(training)
     assert training.skipped == 1
-    assert f"neilfpp replay {training.path} {step}" in training.reporter.said[-1]
+    assert f"neilfpp replay {training.path} {step}" in "\n".join(training.reporter.said)
     assert [file.stem for file in (training.path / FOLDER).iterdir()] == [str(step)]
     found = rerun_step(training.path, step)
     assert not found.finite
@@ -120,6 +121,7 @@ def test_a_rerun_repeats_the_step_bit_for_bit(training, monkeypatch):
     found = rerun_step(training.path, 6)
     assert found.finite
     assert "finite this time" in in_words(found)
+    assert training.model.replay.ring.full  # points of earlier steps were shaded
     assert values[6].keys() == again[0].keys()
     for name, value in values[6].items():
         assert torch.equal(value, again[0][name]), name

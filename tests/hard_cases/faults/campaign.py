@@ -2,9 +2,10 @@
 
     python -m tests.hard_cases.faults.campaign FOLDER REPORT SEED KILLS
 
-This process loads the package once; every command runs in a copy of it (`fork`). REPORT holds the number of kills by
-command and signal, and every fault: a trace of the inside, an exit status that nobody expects, a file under its own
-name that cannot be read, or a result that is not, bit for bit, that of a command which nobody killed.
+This process loads the package once; every command runs in a copy of it (`fork`). REPORT holds the number
+of kills by command and signal, and every fault: a trace of the inside, an exit status that nobody expects,
+a file under its own name that cannot be read, or a result that is not, bit for bit, that of a command which
+nobody killed.
 """
 
 from __future__ import annotations
@@ -123,7 +124,9 @@ def train_words(folder: Path, out: Path, resume: bool) -> list[str]:
 
 
 def attack_training(report: Report, folder: Path, draw: random.Random, kills: int) -> Path:
-    """Kill trainings, up to four times each, and let each go on to its end; returns one that nobody killed."""
+    """Kill trainings, up to four times each, and let each go on to its end; returns one that nobody
+    killed.
+    """
     whole = folder / "whole"
     took = run(folder, *train_words(folder, whole, resume=False))
     if took.status:

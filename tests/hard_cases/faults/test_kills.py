@@ -1,5 +1,5 @@
-"""Commands that are killed at random moments: no file is lost or halved, no run is other than it would have been, and
-nothing of the inside is shown.
+"""Commands that are killed at random moments: no file is lost or halved, no run is other than it would
+have been, and nothing of the inside is shown.
 """
 
 from __future__ import annotations

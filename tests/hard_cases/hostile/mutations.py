@@ -15,11 +15,12 @@ COUNTS = [0, 1, -1, 2**7, 2**15, 2**16 - 1, 2**24, 2**31 - 1, -(2**31), 2**32 - 
 """Numbers that a reader may take for a size or a count."""
 FLOATS = [float("nan"), float("inf"), float("-inf"), 0.0, -1.0, 1e-45, 1e38, 1e308, -1e300]
 WORDS = [
-    *("NaN", "Infinity", "-Infinity", "null", "true", "[]", "{}", '""', "-1", "0", "1e999", "0.5", "99999999999"),
-    *("'", '"', ",", ":", "[", "{", "\\", "\x00", "../../../../etc/passwd", "/etc/passwd", "..", "~", "\n", "﻿"),
-    *('"../../../../etc/passwd"', '"/etc/passwd"', "<script>alert(1)</script>", "!!python/object:os.system", "&a", "*a"),
+    *("NaN", "Infinity", "-Infinity", "null", "true", "[]", "{}", '""', "-1", "0", "1e999", "0.5"),
+    *("99999999999", "'", '"', ",", ":", "[", "{", "\\", "\x00", "\n", "\ufeff", "~", "&a", "*a"),
+    *("../../../../etc/passwd", "/etc/passwd", "..", '"../../../../etc/passwd"', '"/etc/passwd"'),
+    *("<script>alert(1)</script>", "!!python/object:os.system"),
     *("9" * 400, "[" * 5000, "x" * 5000),
-]  # fmt: skip
+]
 """What a text may say in the place of a number or a word."""
 
 

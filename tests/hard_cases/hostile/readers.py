@@ -345,27 +345,61 @@ RUN_FILES = (
 def _run(folder: Path) -> list[Path]:
     contents = {
         "config.json": {"format": 2, "config": to_dict(preset("fast"))},
-        "capture.json": {"root": "captures/a", "test_every": 8, "response": "auto", "format": None, "scale": 1.0},
+        "capture.json": {
+            "root": "captures/a",
+            "test_every": 8,
+            "response": "auto",
+            "format": None,
+            "scale": 1.0,
+        },
         "scene.json": {
-            "response": "linear", "median_radiance": 0.2, "radiance_scale": 3.0, "background": "constant",
+            "response": "linear",
+            "median_radiance": 0.2,
+            "radiance_scale": 3.0,
+            "background": "constant",
             "background_color": [0.0, 0.1, 0.2],
         },
         "effects.json": {
-            "format": 1, "asked": "auto,-lamps", "effects": [],
-            "decisions": [{
-                "step": 4, "effect": "inter-reflection", "on": True, "by": "evidence", "reason": "why",
-                "evidence": {"what": "hits", "value": 0.1, "deviation": 0.01, "threshold": 0.05, "samples": 100},
-            }],
+            "format": 1,
+            "asked": "auto,-lamps",
+            "effects": [],
+            "decisions": [
+                {
+                    "step": 4,
+                    "effect": "inter-reflection",
+                    "on": True,
+                    "by": "evidence",
+                    "reason": "why",
+                    "evidence": {
+                        "what": "hits",
+                        "value": 0.1,
+                        "deviation": 0.01,
+                        "threshold": 0.05,
+                        "samples": 100,
+                    },
+                }
+            ],
         },
-        "light.json": {"format": 1, "fits": [{"step": 3, "gain": 0.1, "deviation": 0.01, "points": 99, "lamps": 1}]},
+        "light.json": {
+            "format": 1,
+            "fits": [{"step": 3, "gain": 0.1, "deviation": 0.01, "points": 99, "lamps": 1}],
+        },
         "health.json": {
-            "format": 1, "verdict": "doubtful",
-            "findings": [{
-                "case": "fog", "step": 4, "what": "w", "cause": "c", "remedy": "r", "severe": False,
-            }],
+            "format": 1,
+            "verdict": "doubtful",
+            "findings": [
+                {
+                    "case": "fog",
+                    "step": 4,
+                    "what": "w",
+                    "cause": "c",
+                    "remedy": "r",
+                    "severe": False,
+                }
+            ],
         },
         "work.json": {"format": 1, "seconds": {"joint": {"rendering": 1.5, "data": 0.2}}},
-    }  # fmt: skip
+    }
     for name, content in contents.items():
         (folder / name).write_text(json.dumps(content))
     return [folder / name for name in RUN_FILES]
@@ -391,7 +425,8 @@ READERS: Mapping[str, Reader] = {
     "mesh (PLY, OBJ, STL, OFF, GLB)": Reader(_mesh, _read_mesh),
     "sfm_scene.json, split.json": Reader(
         _json_capture(lambda root: make_capture(root, masks=True), "inputs/sfm_scene.json", "split.json"),
-        _read_capture, 0.2,
+        _read_capture,
+        0.2,
     ),
     "capture.json": Reader(_json_capture(own_capture, "capture.json"), _read_capture, 0.2),
     "transforms.json": Reader(_json_capture(test_transforms.scene, "transforms.json"), _read_capture, 0.2),
@@ -407,4 +442,4 @@ READERS: Mapping[str, Reader] = {
     "settings (YAML, JSON)": Reader(_yaml, _read_yaml),
     "checkpoint": Reader(_checkpoint, _read_checkpoint),
     "run folder (JSON)": Reader(_run, _read_run),
-}  # fmt: skip
+}

@@ -1,7 +1,8 @@
 """Damaged files: every reader gives a good value or one line, and nothing else.
 
-What a damaged file must not do: end in a traceback, hang, take much memory, end the process by a native library, lead
-out of the capture, or run code. Counts and memory of the long campaign stand in docs/stability.md.
+What a damaged file must not do: end in a traceback, hang, take much memory, end the process by a native
+library, lead out of the capture, or run code. Counts and memory of the long campaign stand in
+docs/stability.md.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ from pathlib import Path
 
 import pytest
 
-from neilfpp_method.report.markup import element
 from tests.hard_cases.hostile.mutations import mutated
 from tests.hard_cases.hostile.readers import READERS
 
@@ -66,7 +66,9 @@ def test_the_same_number_does_the_same_damage() -> None:
 
 
 def test_the_worker_notices_what_it_is_for(tmp_path: Path) -> None:
-    """A traceback, a crash and a large allocation are faults, each with its number, and the next input follows."""
+    """A traceback, a crash and a large allocation are faults, each with its number, and the next input
+    follows.
+    """
     program = """
 import ctypes, json, sys
 from pathlib import Path

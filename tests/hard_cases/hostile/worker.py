@@ -2,9 +2,9 @@
 
     python -m tests.hard_cases.hostile.worker FOLDER REPORT FIRST READER=COUNT …
 
-This process loads what readers need, once, and is then copied (`fork`) for each reader. A copy notes the number
-of the input that it reads, so that its parent knows which one was the end of it; the next copy goes on behind it.
-REPORT holds an `Outcome` for each reader.
+This process loads what readers need, once, and is then copied (`fork`) for each reader. A copy notes the
+number of the input that it reads, so that its parent knows which one was the end of it; the next copy goes on
+behind it. REPORT holds an `Outcome` for each reader.
 """
 
 from __future__ import annotations
