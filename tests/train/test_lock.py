@@ -11,6 +11,7 @@ import pytest
 
 from neilfpp_method.errors import UserError
 from neilfpp_method.train.lock import LOCK, alone_in
+from neilfpp_method.train.run import check_free
 
 HOLDER = "import sys, time; from pathlib import Path; from neilfpp_method.train.lock import alone_in\n" \
     "with alone_in(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)"  # fmt: skip
@@ -53,3 +54,14 @@ def test_other_processes_of_one_training_are_let_in(tmp_path, monkeypatch):
         monkeypatch.setenv("LOCAL_RANK", "0")
         with pytest.raises(UserError), alone_in(tmp_path):
             pytest.fail("two at once")
+
+
+def test_what_a_killed_training_left_before_it_was_a_run_is_in_nobodys_way(tmp_path):
+    for name in (LOCK, "capture.json", "scene.json", ".config.4711.json"):
+        (tmp_path / name).write_text("{")
+    check_free(tmp_path)
+    for name in ("config.json", "notes.txt", ".config.json"):
+        (tmp_path / name).write_text("{}")
+        with pytest.raises(UserError, match="exists already"):
+            check_free(tmp_path)
+        (tmp_path / name).unlink()

@@ -188,8 +188,9 @@ def main(folder: Path, report_file: Path, seed: int, kills: int) -> None:
     draw, report = random.Random(seed), Report()
     make_capture(folder / "capture", masks=True)
     whole = attack_training(report, folder, draw, kills)
-    for name, *options in COMMANDS:
-        attack_command(report, folder, [name, str(whole), *options], draw, max(1, kills // 10))
+    each = kills // 10
+    for name, *options in COMMANDS if each else ():
+        attack_command(report, folder, [name, str(whole), *options], draw, each)
     told = {"kills": dict(report.kills), "files": report.files, "faults": report.faults}
     report_file.write_text(json.dumps(told, indent=1))
 

@@ -18,7 +18,7 @@ import pytest
 from tests.data.make_capture import make_capture
 
 REPOSITORY = Path(__file__).parents[3]
-KILLS = int(os.environ.get("HARD_KILLS", "120"))
+KILLS = int(os.environ.get("HARD_KILLS", "150"))
 """Kills of trainings in the long campaign; a tenth of it for each of five other commands."""
 
 
@@ -42,7 +42,7 @@ def test_commands_are_killed_at_random_moments(tmp_path: Path, record_property) 
     assert told["faults"] == []
 
 
-def test_a_few_kills(tmp_path: Path) -> None:
+def test_a_few_kills_of_trainings(tmp_path: Path) -> None:
     assert attack(tmp_path, seed=0, kills=4)["faults"] == []
 
 
