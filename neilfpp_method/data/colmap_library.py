@@ -21,9 +21,10 @@ with sigterm_waits():
 
 __all__ = ["pycolmap"]
 
-OLDEST, END = (4, 2), (5, 0)
+MIN_VERSION, END_VERSION = (4, 2), (5, 0)
+"""Versions of pycolmap that are supported: from the first, before the second."""
 
-if not OLDEST <= tuple(int(part) for part in pycolmap.__version__.split(".")[:2]) < END:
+if not MIN_VERSION <= tuple(int(part) for part in pycolmap.__version__.split(".")[:2]) < END_VERSION:
     raise UserError(
         f"pycolmap {pycolmap.__version__} is installed, of another interface",
         "pip install 'pycolmap>=4.2,<5'",
