@@ -15,6 +15,7 @@ from neilfpp_method.commands import (
     prepare,
     relight,
     render,
+    replay,
     report,
     train,
     view,
@@ -33,6 +34,7 @@ COMMANDS = {
     "relight": relight.COMMAND,
     "report": report.COMMAND,
     "compare": compare.COMMAND,
+    "replay": replay.COMMAND,
     "view": view.COMMAND,
     "completion": completion.COMMAND,
 }

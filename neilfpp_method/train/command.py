@@ -24,7 +24,7 @@ from neilfpp_method.effects.asked import Asked, check_asked
 from neilfpp_method.effects.looks import note_facts
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.table import table
-from neilfpp_method.errors import Unsound, UserError
+from neilfpp_method.errors import Stopped, Unsound, UserError
 from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.health.watch import LOOKED_AT, Watch
 from neilfpp_method.model import NeilfModel
@@ -37,6 +37,7 @@ from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.health_record import in_words as health_in_words
 from neilfpp_method.train.light_record import in_words
+from neilfpp_method.train.lock import alone_in
 from neilfpp_method.train.loop import Training, seed_step, train
 from neilfpp_method.train.memory import check_training_memory
 from neilfpp_method.train.preview import write_preview
@@ -129,7 +130,7 @@ def run_training(
         capture = at_scale(capture, source.scale)
     check_training_memory(capture)
     fabric = _launch(place, devices)
-    with listening(ledger), _nothing_left_on_failure(out):
+    with listening(ledger), _nothing_left_on_failure(out), alone_in(out):
         pixels = _load_pixels(capture, out / PIXELS, fabric, console)
         facts = described.facts if resume else scene_facts(capture, pixels, config)
         note_facts(plan, facts)
@@ -154,9 +155,10 @@ def run_training(
     fabric.barrier()
     continue_with = _continue_with(command, out, device, devices)
     with (
+        alone_in(out),
         listening(ledger),
         reporting(out, console, fabric.is_global_zero) as reporter,
-        _stop_request() as stopped,
+        _stop_request(continue_with) as stopped,
     ):
         preview = _preview(out, capture, fabric, reporter)
         solver, watch = model.light_solver(), _watch(pixels, config, reporter)
@@ -322,8 +324,10 @@ def _preview(
 
 
 @contextmanager
-def _stop_request() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C and SIGTERM ask for a stop after the step in progress; a second Ctrl-C does not wait."""
+def _stop_request(continue_with: str) -> Iterator[Callable[[], bool]]:
+    """Ctrl-C and SIGTERM ask for a stop after the step in progress; a second one does not wait, and loses the
+    steps since the last checkpoint.
+    """
     asked = []
 
     def ask(number: int, _frame: object) -> None:
@@ -337,6 +341,8 @@ def _stop_request() -> Iterator[Callable[[], bool]]:
         before = {}
     try:
         yield lambda: bool(asked)
+    except KeyboardInterrupt:
+        raise Stopped("stopped at once", f"continue from its last checkpoint with: {continue_with}") from None
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -33,13 +34,14 @@ from neilfpp_method.schedule import (
 )
 from neilfpp_method.settings.facts import RadianceUnits
 from neilfpp_method.settings.types import NeilfConfig, OptimizerConfig
-from neilfpp_method.structures import LossTerms, StepResult
+from neilfpp_method.structures import LossTerms, PixelBatch, StepResult
 from neilfpp_method.timing.ledger import Ledger, doing
 from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.health_record import read_findings, write_findings
 from neilfpp_method.train.light_record import LightFit, note_fit, read_fits, write_fits
 from neilfpp_method.train.progress import Reporter
 from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, save_checkpoint, write_json
+from neilfpp_method.train.skipped import Moment, keep_step
 from neilfpp_method.train.work_record import write_work
 
 __all__ = ["Training", "adam", "make_optimizer", "seed_step", "set_rates", "train"]
@@ -125,9 +127,13 @@ def _train_stage(
             set_rates(optimizer, run.config.optimizer, at, background_waits=not run.model.facts.far_points)
             with doing("data"):
                 batch = run.pixels.sample(settings.rays, gradients)
+            moment = Moment.before_step(model, keeps_points=not model.stages[stage].moves_host)
+            skipped = run.skipped
             computed = wrapped(batch, stage)
             total = weigh(computed.terms, active_losses(stage, model.config, model.stages, share))
             stop = _update(run, model, optimizer, computed.terms, total, step)
+            if run.skipped > skipped:
+                _keep_skipped(run, model, batch, moment, at, step)
             _solve_light(run, model, computed, step)
         run.watch.after_step(model.stages[stage], computed, step)
         step += 1
@@ -277,6 +283,19 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], step: int) ->
             f"the last good checkpoint is kept in {run.path / 'checkpoints'}; look at the capture's "
             "brightest pixels or lower the learning rates",
         )
+
+
+def _keep_skipped(
+    run: Training, model: NeilfModel, batch: PixelBatch, moment: Moment, at: StagePosition, step: int
+) -> None:
+    """Write down what was skipped, for `neilfpp replay`; a full disk is no reason to stop for it."""
+    if not run.fabric.is_global_zero:
+        return
+    try:
+        if keep_step(run.path, model, batch, moment, at.stage, at.share, step):
+            run.reporter.warn(f"what made it so: neilfpp replay {shlex.quote(str(run.path))} {step}")
+    except UserError as error:
+        run.reporter.warn(f"the rays of step {step} are not kept: {error.problem}")
 
 
 # -------------------------------------------------------------------------------------------------- optimiser

@@ -8,6 +8,7 @@ pixels/           of the training views; can be deleted, and is made again when 
 work.json         seconds of each stage by kind of work (docs/budget.md)
 effects.json      which effects are simulated, and why
 light.json        what spoke for lamps, fit by fit; not there where the settings had decided
+skipped/          steps that were not finite, for `neilfpp replay`; not there where none was
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import platform
+import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -37,6 +39,7 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model
 from neilfpp_method.train.effects_record import read_plan
 from neilfpp_method.train.json_files import read_json, write_json
+from neilfpp_method.train.lock import LOCK
 
 __all__ = [
     "BESIDE_NERFSTUDIO",
@@ -62,6 +65,10 @@ BESIDE_NERFSTUDIO = "neilfpp"
 """Folder beside nerfstudio's `config.yml` in which the plugin keeps a training as a run."""
 PIXELS = "pixels"
 """Folder of a run in which the pixels of its training views are kept."""
+DESCRIBING = ("capture.json", "scene.json", "environment.json")
+"""What is written before `config.json`, which makes a folder a run."""
+HALF_WRITTEN = re.compile(r"\.(capture|scene|environment|config)\.[0-9]+\.json")
+"""What `replacing` calls them while they are written."""
 PACKAGES = (
     "neilfpp-method",
     "torch",
@@ -163,12 +170,17 @@ def check_free(path: Path) -> None:
     """That a new run may take this folder.
 
     Raises:
-        UserError: the folder is there already and holds more than the pixels of a training that never began,
-            or cannot be made.
+        UserError: the folder is there already and holds more than a training that never began left there, or
+            cannot be made.
     """
-    if path.exists() and (not path.is_dir() or any(inner.name != PIXELS for inner in path.iterdir())):
+    if path.exists() and (not path.is_dir() or any(not _of_no_run(inner.name) for inner in path.iterdir())):
         raise UserError(f"{path}: exists already", "choose another --out, or continue it with --resume")
     check_writable(path)
+
+
+def _of_no_run(name: str) -> bool:
+    """Whether a file is left over from a training that was killed before it was a run."""
+    return name in (PIXELS, LOCK, *DESCRIBING) or bool(HALF_WRITTEN.fullmatch(name))
 
 
 def check_writable(path: Path) -> None:
