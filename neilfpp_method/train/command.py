@@ -18,6 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.environment_map import check_environment
+from neilfpp_method.data.held_back import hold_back
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import at_scale, scale_for_rays
 from neilfpp_method.effects.asked import Asked, check_asked
@@ -41,6 +42,7 @@ from neilfpp_method.train.loop import Training, seed_step, train
 from neilfpp_method.train.memory import check_training_memory
 from neilfpp_method.train.preview import write_preview
 from neilfpp_method.train.progress import Reporter, reporting
+from neilfpp_method.train.quality import Quality
 from neilfpp_method.train.run import (
     PIXELS,
     CaptureSource,
@@ -158,6 +160,7 @@ def run_training(
         reporting(out, console, fabric.is_global_zero) as reporter,
         _stop_request() as stopped,
     ):
+        held_back = hold_back(pixels, config.train.seed)
         preview = _preview(out, capture, fabric, reporter)
         solver, watch = model.light_solver(), _watch(pixels, config, reporter)
         training = Training(
@@ -173,6 +176,7 @@ def run_training(
             solver,
             watch,
             plan,
+            Quality(held_back, capture.hdr),
             ledger,
         )
         train(training)

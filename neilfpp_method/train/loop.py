@@ -37,6 +37,7 @@ from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.health_record import read_findings, write_findings
 from neilfpp_method.train.light_record import LightFit, note_fit, read_fits, write_fits
 from neilfpp_method.train.progress import Reporter
+from neilfpp_method.train.quality import Quality, read_looks, write_looks
 from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, save_checkpoint, write_json
 from neilfpp_method.train.work_record import write_work
 
@@ -64,6 +65,7 @@ class Training:
     light_solver: LightSolver
     watch: Watch
     plan: Plan
+    quality: Quality
     ledger: Ledger = field(default_factory=Ledger)
     fits: list[LightFit] = field(default_factory=list)
     skipped: int = 0
@@ -131,6 +133,7 @@ def _train_stage(
             _solve_light(run, model, computed, step)
         run.watch.after_step(model.stages[stage], computed, step)
         step += 1
+        _look_at_quality(run, model, StagePosition(stage, number + 1, position.length), step)
         run.seconds[stage.value] = before + time.perf_counter() - started
         if number + 1 == position.length:
             break  # The end of a stage is saved under its name, and a stop waits for that.
@@ -160,6 +163,12 @@ def _solve_light(run: Training, model: NeilfModel, computed: StepResult, step: i
     if fabric.world_size > 1:
         for part in (model.light, model.lamps):
             part.load_state_dict(fabric.broadcast(part.state_dict()))
+
+
+@doing("looks", apart=True)
+def _look_at_quality(run: Training, model: NeilfModel, position: StagePosition, step: int) -> None:
+    if run.fabric.is_global_zero:
+        run.quality.look_when_due(model, position, step, run.ledger.total)
 
 
 def _look_at_effects(run: Training, model: NeilfModel, step: int) -> None:
@@ -325,6 +334,7 @@ def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str 
             write_fits(run.path, run.fits)
             write_findings(run.path, run.watch)
             write_plan(run.path, run.plan)
+            write_looks(run.path, run.quality)
             for name in filter(None, (also, "last")):
                 save_checkpoint(
                     run.path / "checkpoints" / f"{name}.pt", run.model, run.light_solver, optimizer, step
@@ -348,6 +358,7 @@ def _restore(run: Training, optimizer: torch.optim.Optimizer) -> int:
         run.seconds.update(read_json(run.path / "timing.json"))
     run.fits += read_fits(run.path, saved["step"])
     run.plan = read_plan(run.path, run.plan.settings, saved["step"])
+    run.quality.looks += read_looks(run.path, saved["step"])
     _use(run, run.model)
     run.watch.findings |= {finding.case: finding for finding in read_findings(run.path) or ()}
     return saved["step"]

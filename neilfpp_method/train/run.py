@@ -6,6 +6,7 @@ scene.json        what the images decided     checkpoints/      last.pt, and one
 previews/         a picture per stage         tensorboard/      scalars and pictures
 pixels/           of the training views; can be deleted, and is made again when training goes on
 work.json         seconds of each stage by kind of work (docs/budget.md)
+quality.json      how good the run was on the way, at pixels that no step learned from
 effects.json      which effects are simulated, and why
 light.json        what spoke for lamps, fit by fit; not there where the settings had decided
 """
