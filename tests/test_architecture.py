@@ -27,7 +27,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("hosts.base", "lighting", "inspection"),
     ("hosts", "incident"),
     ("model",),
-    ("health", "effects"),
+    ("health", "effects", "budget"),
     ("attach", "train"),
     ("export",),
     ("evaluate",),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from itertools import pairwise
 
 import pytest
 import torch
@@ -48,7 +49,7 @@ def test_looks_change_nothing_and_a_resumed_run_goes_on_with_them(tmp_path, capt
     looks = read_looks(tmp_path / "often")
     assert [look.step for look in looks] == list(range(1, 13))
     assert [look.physical is None for look in looks] == [True] * 4 + [False] * 8
-    assert all(later.seconds > look.seconds for look, later in zip(looks, looks[1:], strict=False))
+    assert all(later.seconds > look.seconds for look, later in pairwise(looks))
     for name in ("seldom", "stopped"):
         assert differences(state(tmp_path / name), state(tmp_path / "often")) == []
     again = read_looks(tmp_path / "stopped")
