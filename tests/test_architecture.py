@@ -33,7 +33,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("evaluate",),
     ("relight",),
     ("report", "view"),
-    ("demo", "plugin", "prepare"),
+    ("demo", "plugin", "prepare", "tradeoff"),
     ("commands",),
     ("cli",),
 )

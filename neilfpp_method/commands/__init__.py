@@ -15,6 +15,7 @@ from neilfpp_method.commands import (
     relight,
     render,
     report,
+    tradeoff,
     train,
     view,
 )
@@ -26,6 +27,7 @@ COMMANDS = {
     "inspect": inspect.COMMAND,
     "prepare": prepare.COMMAND,
     "train": train.COMMAND,
+    "tradeoff": tradeoff.COMMAND,
     "eval": evaluate.COMMAND,
     "render": render.COMMAND,
     "export": export.COMMAND,

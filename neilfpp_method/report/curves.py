@@ -13,9 +13,9 @@ from neilfpp_method.train.quality import Look
 
 __all__ = ["quality_curve", "work_bars"]
 
-WIDTH, HEIGHT = 640, 260
-LEFT, RIGHT, TOP, BOTTOM = 46, 96, 14, 40
-BAR, GAP = 22, 14
+WIDTH, HEIGHT = 640.0, 260.0
+LEFT, RIGHT, TOP, BOTTOM = 46.0, 96.0, 14.0, 40.0
+BAR, GAP = 22.0, 14.0
 TICKS = 5
 COLORS = (
     "#4477aa",
@@ -72,9 +72,9 @@ def work_bars(work: Mapping[str, Mapping[str, float]], titles: Mapping[str, str]
     longest = max(sums.values(), default=0.0)
     if longest <= 0.0:
         return None
-    left, bars, seen = 110, [], set()
+    left, bars, seen = 110.0, [], set()
     for number, (stage, parts) in enumerate(work.items()):
-        top, x = TOP + number * (BAR + GAP), float(left)
+        top, x = TOP + number * (BAR + GAP), left
         bars.append(_text(left - 8, top + 15, titles.get(stage, stage), "end"))
         for kind, color in zip(WORK, COLORS, strict=True):
             width = (WIDTH - left - 60) * parts.get(kind, 0.0) / longest
@@ -125,6 +125,6 @@ def _text(x: float, y: float, text: str, anchor: str) -> Html:
     return element("text", text, **place, fill="currentColor", font_size=12)
 
 
-def _svg(height: int, label: str, *children: Html) -> Html:
+def _svg(height: float, label: str, *children: Html) -> Html:
     size = {"viewBox": f"0 0 {WIDTH} {height}", "width": WIDTH, "style": "max-width: 100%; height: auto"}
     return element("svg", *children, **size, role="img", aria_label=label)

@@ -1,10 +1,10 @@
 """What a training costs on this machine and this capture: a few steps of each stage, measured and thrown
 away.
 
-A trial trains a model of its own on four views, with a few steps of each stage and two fits of the light, and
-makes one small picture. What it cannot try in seconds is estimated from that: the report, from the picture.
-Geometry that is still a sphere, or a hull, costs other than a finished one; so a plan is made again by the
-clock (`budget.plan`).
+A trial trains a model of its own on four views, with a few steps of each stage and two small fits of the
+light, and makes small pictures. What it cannot try in seconds is estimated from that: the report, from the
+pictures. Geometry that is still a sphere, or a hull, costs other than a finished one; so a plan is made again
+by the clock (`budget.plan`).
 """
 
 from __future__ import annotations
@@ -42,8 +42,10 @@ VIEWS = 4
 """Training views that a trial reads."""
 WARM, LEAST, MOST = 2, 4, 40
 """Steps of a stage that are not counted, as they compile and allocate; and how many are counted."""
-FIT_EVERY = 8
-"""Steps between the fits of a trial: the second one has as many points as those of a training."""
+FIT_EVERY, FIT_PART = 2, 8
+"""Steps between the fits of a trial, and one in how many points they have: a whole first fit takes as long as
+a hundred steps. Time and points are taken to be proportional.
+"""
 REPORT = 12.0
 """Time of the report over that of a preview, which has an eighth of its pixels; the rest is its surface."""
 
@@ -94,7 +96,11 @@ def try_out(
     facts = scene_facts(small, pixels, config)
     note_facts(plan, facts)
     config = plan.config_of_model
-    often = config if config.light.kind == "free" else changed(config, {"light.fit.every": FIT_EVERY})
+    often, larger = config, 1.0
+    if config.light.kind != "free":
+        points = max(1, config.light.fit.points // FIT_PART)
+        often = changed(config, {"light.fit.every": FIT_EVERY, "light.fit.points": points})
+        larger = config.light.fit.points / points
     seed_step(config.train.seed, step=-1)
     model = build_model(small, facts, often).to(device).train()
     show_known_light(model)
@@ -113,11 +119,11 @@ def try_out(
         seen = pixels.sample(LOOKED_AT, gradients=False)
         looked = _timed(lambda seen=seen, moves=moves: look(model, seen, moves), wait)
         model.train()
-        start = (surface if moves else 0.0) + (seconds.fits[0] if first and seconds.fits else 0.0)
+        start = (surface if moves else 0.0) + (larger * seconds.fits[0] if first and seconds.fits else 0.0)
         later = seconds.fits[-1:] or [0.0]
         every = 1 if config.light.kind == "free" else config.light.fit.every
         step = sum(seconds.steps) / len(seconds.steps)
-        costs[stage.value] = StageCost(steps, step, later[0] / every, start, picture + 2 * looked)
+        costs[stage.value] = StageCost(steps, step, larger * later[0] / every, start, picture + 2 * looked)
         first = first and not seconds.fits
     return Trial(Costs(costs, REPORT * picture if report else 0.0), metals)
 
