@@ -4,7 +4,7 @@ run.
 A stage costs its steps, each with its share of the fits of the light, and what happens once at its start and
 at its end. The stages keep the proportions that the settings have; one factor, the `share`, makes them fit:
 
-    share · Σ steps · (step + fit) = budget − spent − Σ (start + end) − reserve
+    share · Σ steps · (step + fit) = budget − spent − Σ once − reserve
 
 While the run goes on the same sum is solved for what is left, with the rates that the clock has shown.
 """
@@ -46,8 +46,9 @@ class StageCost:
     Attributes:
         steps: of the settings; the proportion of the stages.
         step: of one step.
-        fit: of the fits of the light, to a step; those of the first few steps are in `start`.
-        start: once, before or in its first steps: evidence for effects, the first fit of the light.
+        fit: of the fits of the light, to a step, without the first fit of the run.
+        start: once, before its first step: evidence for effects.
+        first_fit: once, in its first steps: the first fit of the light takes longer than those after it.
         end: once, at its end: pictures, looks, a checkpoint.
     """
 
@@ -56,6 +57,12 @@ class StageCost:
     fit: float = 0.0
     start: float = 0.0
     end: float = 0.0
+    first_fit: float = 0.0
+
+    @property
+    def once(self) -> float:
+        """What does not depend on the number of steps."""
+        return self.start + self.first_fit + self.end
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,7 @@ class Costs:
     @property
     def once(self) -> float:
         """All that does not depend on the number of steps."""
-        return self.reserve + sum(cost.start + cost.end for cost in self.stages.values())
+        return self.reserve + sum(cost.once for cost in self.stages.values())
 
     @property
     def all_steps(self) -> float:
@@ -144,13 +151,12 @@ def revised_steps(costs: Costs, planned: Mapping[str, int], at: Progress, budget
     here = costs.stages[at.stage]
     trusted = TRUSTED_STEPS + at.step
     step = (TRUSTED_STEPS * here.step + at.stepping) / trusted
-    # The first fit takes longer than those after it, and is no part of their rate.
-    fits = max(0.0, at.fitting - here.start)
+    fits = max(0.0, at.fitting - here.first_fit)
     fit = (TRUSTED_STEPS * here.fit + fits) / trusted
     slower = step / here.step if here.step > 0 else 1.0
 
-    once = costs.reserve + here.end + (0.0 if at.step else here.start)
-    once += slower * sum(costs.stages[name].start + costs.stages[name].end for name in later)
+    once = costs.reserve + here.end + (0.0 if at.fitting else here.first_fit)
+    once += slower * sum(costs.stages[name].once for name in later)
     left = {at.stage: max(planned[at.stage] - at.step, 0), **{name: planned[name] for name in later}}
     seconds = left[at.stage] * (step + fit)
     seconds += slower * sum(left[name] * (costs.stages[name].step + costs.stages[name].fit) for name in later)

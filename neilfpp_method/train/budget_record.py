@@ -103,7 +103,7 @@ def _plan(stored: Mapping[str, Any], where: str) -> BudgetPlan:
 
 def _sensible(plan: BudgetPlan) -> bool:
     costs = plan.costs.stages.values()
-    seconds = [plan.budget, plan.costs.reserve, *(n for c in costs for n in (c.step, c.fit, c.start, c.end))]
+    seconds = [plan.budget, plan.costs.reserve, *(n for c in costs for n in (c.step, c.fit, c.once))]
     seconds += [revision.seconds for revision in plan.revisions] + [plan.took or 0.0]
     counts = [
         *(cost.steps for cost in costs),

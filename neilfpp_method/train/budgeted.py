@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 
@@ -16,13 +17,13 @@ from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.timing.ledger import Ledger
-from neilfpp_method.train.budget_record import BudgetPlan, Revision
+from neilfpp_method.train.budget_record import BudgetPlan, Revision, write_budget
 from neilfpp_method.train.pace import with_steps
 from neilfpp_method.train.quality import Look
 from neilfpp_method.train.trial import Trial, try_out
 from neilfpp_method.train.work_record import waiting
 
-__all__ = ["outcome", "plan_budget", "planned_effects", "planned_settings"]
+__all__ = ["close_budget", "outcome", "plan_budget", "planned_effects", "planned_settings"]
 
 TRIAL_SHARE, MAX_TRIAL = 0.03, 10.0
 """Of the budget, and seconds, that the steps of a trial may take, about."""
@@ -65,16 +66,16 @@ def plan_budget(
     def share(size: Size) -> float:
         if size not in trials:
             limit = min(TRIAL_SHARE * budget, MAX_TRIAL)
-            trials[size] = try_out(capture, sized(config, size), asked, device, limit, report, wait)
-        costs, metals = trials[size].costs, _metals(trials[size], budget)
-        return share_for(costs, budget, ledger.total + metals)
+            changed = sized(config, size)
+            metals = METALS_SHARE * budget
+            trials[size] = try_out(capture, changed, asked, device, limit, metals, report, wait)
+        return share_for(trials[size].costs, budget, ledger.total)
 
     size: Size = "usual"
     tried = next_size(share("usual"))
     if tried == "small" or (tried == "large" and share("large") >= 1.0):
         size = tried
     found, trial = share(size), trials[size]
-    metals = _metals(trial, budget)
     if found < MIN_SHARE:
         needed = smallest_budget(trial.costs, ledger.total)
         raise UserError(
@@ -82,15 +83,10 @@ def plan_budget(
             f"{in_words(trial.costs.once)} go to what does not depend on the number of steps",
             f"the smallest that makes sense on this machine, as it is now, is --budget {in_words(needed)}",
         )
-    plan = BudgetPlan(budget, size, trial.costs, metals > 0.0)
+    plan = BudgetPlan(budget, size, trial.costs, trial.metals > 0.0)
     plan.revisions.append(Revision(ledger.total, 0, steps_for(trial.costs, found)))
     say(_in_words(plan))
     return plan
-
-
-def _metals(trial: Trial, budget: float) -> float:
-    """Seconds of evidence for metals; 0 where it is not looked for."""
-    return trial.metals if trial.metals <= METALS_SHARE * budget else 0.0
 
 
 def planned_settings(plan: BudgetPlan, config: NeilfConfig) -> NeilfConfig:
@@ -114,6 +110,12 @@ def _in_words(plan: BudgetPlan) -> str:
         f"{in_words(plan.costs.once)} go to looks, pictures and the report. How accurate it will be is not "
         "known before"
     )
+
+
+def close_budget(run: Path, plan: BudgetPlan, seconds: float) -> None:
+    """Note what a run took that has come to its end."""
+    plan.took = seconds
+    write_budget(run, plan)
 
 
 def outcome(plan: BudgetPlan, looks: Sequence[Look]) -> str:

@@ -35,7 +35,13 @@ from neilfpp_method.settings.check import check_config
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.timing.ledger import Ledger, doing, listening
 from neilfpp_method.train.budget_record import read_budget, write_budget
-from neilfpp_method.train.budgeted import outcome, plan_budget, planned_effects, planned_settings
+from neilfpp_method.train.budgeted import (
+    close_budget,
+    outcome,
+    plan_budget,
+    planned_effects,
+    planned_settings,
+)
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.effects_record import read_plan, write_plan
@@ -119,10 +125,12 @@ def run_training(
         if budget not in (None, planned and planned.budget):
             was = "no budget" if planned is None else f"a budget of {time_in_words(planned.budget)}"
             raise UserError(f"{out}: the run has {was}", "leave --budget out, or start a new run")
+        ledger.add(read_work(out))
         if _is_finished(out, config):
+            if planned is not None and planned.took is None:  # it was ended while its report was made
+                close_budget(out, planned, ledger.total)
             console.print(f"run folder {out}: finished already, nothing to continue", soft_wrap=True)
             return out
-        ledger.add(read_work(out))
     else:
         if data is None or config is None:
             raise UserError("no capture given", "name its folder with --data DIR")
@@ -214,8 +222,7 @@ def run_training(
         if at_end is not None:
             at_end(out)
     if fabric.is_global_zero and planned is not None:
-        planned.took = ledger.total
-        write_budget(out, planned)
+        close_budget(out, planned, ledger.total)
         console.print(outcome(planned, training.quality.looks), soft_wrap=True)
     if strict and verdict_of(findings) == "failed":
         raise Unsound(f"{out}: {findings[0].what}", findings[0].remedy)

@@ -40,14 +40,16 @@ __all__ = ["Trial", "try_out"]
 
 VIEWS = 4
 """Training views that a trial reads."""
-WARM, LEAST, MOST = 2, 4, 40
+WARM_STEPS, MIN_STEPS, MAX_STEPS = 2, 4, 40
 """Steps of a stage that are not counted, as they compile and allocate; and how many are counted."""
 FIT_EVERY, FIT_PART = 2, 8
 """Steps between the fits of a trial, and one in how many points they have: a whole first fit takes as long as
 a hundred steps. Time and points are taken to be proportional.
 """
 REPORT = 12.0
-"""Time of the report over that of a preview, which has an eighth of its pixels; the rest is its surface."""
+"""Time of the report over that of a picture, which has an eighth of the pixels of the report's views; the
+rest is for its surface. An estimate, not measured.
+"""
 
 
 @dataclass(frozen=True)
@@ -55,8 +57,8 @@ class Trial:
     """What was measured.
 
     Attributes:
-        costs: of a training, without evidence for metals.
-        metals: seconds of that evidence; 0 where none would be asked for.
+        costs: of a training.
+        metals: of them, those of evidence for metals; 0 where that is not looked for.
     """
 
     costs: Costs
@@ -75,6 +77,7 @@ def try_out(
     asked: Asked,
     device: torch.device,
     limit: float,
+    most_for_metals: float,
     report: bool,
     wait: Callable[[], object] = lambda: None,
 ) -> Trial:
@@ -86,6 +89,7 @@ def try_out(
         asked: which effects are simulated.
         device: where to compute.
         limit: seconds that the steps of all stages may take together, about.
+        most_for_metals: seconds that evidence for metals may take; if it takes more it is not looked for.
         report: whether the run will end with its page.
         wait: returns when the device has done its work.
     """
@@ -109,8 +113,10 @@ def try_out(
 
     lengths = {stage: steps for stage, steps in stage_steps(config.train).items() if steps}
     metals = seconds_of_evidence(device) if plan.is_open("metals") and model.lobe is not None else 0.0
+    if metals > most_for_metals:
+        metals = 0.0
     surface = _timed(lambda: _look_at_surface(plan, model, pixels), wait)
-    costs, picture, first = {}, 0.0, True
+    costs, picture, fitted = {}, 0.0, False
     for stage, steps in lengths.items():
         moves = model.stages[stage].moves_material
         seconds = _steps(model, solver, optimizer, pixels, often, stage, limit / len(lengths), wait)
@@ -119,12 +125,18 @@ def try_out(
         seen = pixels.sample(LOOKED_AT, gradients=False)
         looked = _timed(lambda seen=seen, moves=moves: look(model, seen, moves), wait)
         model.train()
-        start = (surface if moves else 0.0) + (larger * seconds.fits[0] if first and seconds.fits else 0.0)
-        later = seconds.fits[-1:] or [0.0]
+        first, later = (seconds.fits[:1] or [0.0])[0], (seconds.fits[-1:] or [0.0])[0]
         every = 1 if config.light.kind == "free" else config.light.fit.every
         step = sum(seconds.steps) / len(seconds.steps)
-        costs[stage.value] = StageCost(steps, step, larger * later[0] / every, start, picture + 2 * looked)
-        first = first and not seconds.fits
+        costs[stage.value] = StageCost(
+            steps,
+            step,
+            fit=larger * later / every,
+            start=(surface if moves else 0.0) + (metals if moves and not fitted else 0.0),
+            end=picture + 2 * looked,
+            first_fit=0.0 if fitted else larger * first,
+        )
+        fitted = fitted or moves
     return Trial(Costs(costs, REPORT * picture if report else 0.0), metals)
 
 
@@ -145,16 +157,16 @@ def _steps(
     wait: Callable[[], object],
 ) -> _Seconds:
     """Steps of a stage as `train.loop` takes them, until the time is over and, where light is fitted, there
-    were two fits; at most `MOST`.
+    were two fits; at most `MAX_STEPS` are counted.
     """
     model.freeze_for(stage)
     found, began = _Seconds(), time.perf_counter()
     fits = model.stages[stage].moves_material and not isinstance(solver, NothingToSolve)
     gradients = "smoothness" in active_losses(stage, config, model.stages)
-    for number in range(WARM + MOST):
+    for number in range(WARM_STEPS + MAX_STEPS):
         step_began = time.perf_counter()
         seed_step(config.train.seed, number)
-        set_rates(optimizer, config.optimizer, StagePosition(stage, number, WARM + MOST))
+        set_rates(optimizer, config.optimizer, StagePosition(stage, number, WARM_STEPS + MAX_STEPS))
         computed = model.step(pixels.sample(config.train.rays, gradients), stage)
         optimizer.zero_grad(set_to_none=True)
         total = weigh(computed.terms, active_losses(stage, config, model.stages)).loss
@@ -162,13 +174,13 @@ def _steps(
             total.backward()
             optimizer.step()
         wait()
-        if number >= WARM:
+        if number >= WARM_STEPS:
             found.steps.append(time.perf_counter() - step_began)
         solver.observe(computed)
         if solver.due:
             found.fits.append(_timed(lambda: solver.solve(model.brdf, model.scene), wait))
         if (
-            number >= WARM + LEAST
+            number >= WARM_STEPS + MIN_STEPS
             and time.perf_counter() - began > limit
             and (not fits or len(found.fits) > 1)
         ):

@@ -48,7 +48,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> None:
     stages = {name.replace("steps", "init").replace("joint_init", "joint"): n for name, n in STEPS.items()}
     costs = Costs({stage: StageCost(steps=n, **cost) for stage, n in stages.items()}, reserve=0.0)
     monkeypatch.setattr(command, "Ledger", ticking)
-    monkeypatch.setattr(budgeted, "try_out", lambda *_: Trial(costs, metals=30.0))
+    monkeypatch.setattr(budgeted, "try_out", lambda *_: Trial(costs, metals=0.0))
 
 
 def run(data: Path | None, out: Path, resume: bool = False, **options) -> str:
@@ -81,7 +81,7 @@ def test_a_run_keeps_to_its_budget_though_steps_take_longer_than_the_trial_said(
     assert "budget 2m: steps planned: sdf init" in said
     assert f"budget: {plan.took:.1f} s of 120 s" in said
 
-    # Evidence for metals would have taken a quarter of the time, so there may be metals.
+    # The trial found no time for evidence for metals, so there may be metals.
     decisions = json.loads((tmp_path / "run" / "effects.json").read_text())["decisions"]
     metals = [decision for decision in decisions if decision["effect"] == "metals"]
     assert [(decision["on"], decision["by"]) for decision in metals] == [(True, "settings")]
@@ -135,20 +135,34 @@ def test_a_run_without_a_budget_has_none(tmp_path, capture, clock):
 def test_a_trial_measures_every_stage_that_has_steps(capture):
     config = solved_light(small_config(sdf_steps=100, material_steps=0, joint_steps=50))
     state = load_capture(capture)
-    trial = try_out(state, config, Asked("auto"), torch.device("cpu"), limit=0.2, report=True)
+    trial = try_out(
+        state, config, Asked("auto"), torch.device("cpu"), limit=0.2, most_for_metals=1e9, report=True
+    )
     costs = trial.costs
     assert {stage: cost.steps for stage, cost in costs.stages.items()} == {"sdf_init": 100, "joint": 50}
     assert all(cost.step > 0 and cost.end > 0 for cost in costs.stages.values())
     assert costs.stages["sdf_init"].fit == costs.stages["sdf_init"].start == 0.0
     assert costs.stages["joint"].fit > 0
-    assert costs.stages["joint"].start > 0  # evidence and the first fit
+    assert costs.stages["joint"].first_fit > 0
+    assert costs.stages["joint"].start > trial.metals > 0  # that of the surface, and that of metals
     assert costs.reserve > 0
-    assert trial.metals > 0
+
+
+def test_evidence_that_takes_too_long_is_not_looked_for(capture):
+    config = solved_light(small_config(sdf_steps=0))
+    trial = try_out(
+        load_capture(capture), config, Asked("auto"), torch.device("cpu"), 0.05, 1e-9, report=False
+    )
+    assert trial.metals == 0.0
+    assert list(trial.costs.stages) == ["material_init", "joint"]
+    assert trial.costs.stages["joint"].first_fit == 0.0  # it was in the stage before
 
 
 def test_what_settings_decide_is_not_tried(capture):
     config = small_config(joint_steps=0)
-    trial = try_out(load_capture(capture), config, Asked("as-set"), torch.device("cpu"), 0.05, report=False)
+    trial = try_out(
+        load_capture(capture), config, Asked("as-set"), torch.device("cpu"), 0.05, 1.0, report=False
+    )
     assert list(trial.costs.stages) == ["sdf_init", "material_init"]
     assert trial.costs.stages["material_init"].fit == 0.0  # a light that is free is not solved for
     assert trial.costs.reserve == trial.metals == 0.0
