@@ -17,6 +17,7 @@ from neilfpp_method.commands import (
     render,
     replay,
     report,
+    tradeoff,
     train,
     view,
 )
@@ -28,6 +29,7 @@ COMMANDS = {
     "inspect": inspect.COMMAND,
     "prepare": prepare.COMMAND,
     "train": train.COMMAND,
+    "tradeoff": tradeoff.COMMAND,
     "eval": evaluate.COMMAND,
     "render": render.COMMAND,
     "export": export.COMMAND,

@@ -8,17 +8,28 @@ takes for metal: at the others the two fits hardly differ. Lamps are no part of 
 
 from __future__ import annotations
 
+import time
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.measurement import Measurement, mean_of
-from neilfpp_method.effects.place_fit import METALLICS, fit_places, place_errors, place_transport
+from neilfpp_method.effects.place_fit import (
+    FIRST_STEPS,
+    METALLICS,
+    ROUNDS,
+    ROWS,
+    STEPS,
+    fit_places,
+    place_errors,
+    place_transport,
+)
 from neilfpp_method.effects.places import gather_places
 from neilfpp_method.model import NeilfModel
 
-__all__ = ["metal_evidence"]
+__all__ = ["metal_evidence", "seconds_of_evidence"]
 
 PLACES, VIEWS = 160, 20
 """How many places, and of each at most so many views: seconds, and 300 MB, on a laptop."""
@@ -28,6 +39,10 @@ MIN_VIEWS = 4
 """Views that must show a place: fewer do not tell materials apart."""
 WORTH = 0.01
 """Relative error that metals must save at the places that are taken for metal."""
+TRIED, REST = 3, 0.5
+"""Steps of a descent that are tried to tell how long all of it takes, and the share that other work adds, an
+estimate.
+"""
 METAL = 0.5
 """Metallic above which a place is taken for metal."""
 
@@ -65,6 +80,22 @@ def metal_evidence(
         )
         gains.append(unknown.mean(gain)[counts])
     return mean_of(torch.cat(gains), what, WORTH)
+
+
+def seconds_of_evidence(device: torch.device) -> float:
+    """About how long `metal_evidence` takes here, where all places are seen by many views.
+
+    Most of it are products of the transport to all pixels with the texels of the map, and back, one of each
+    in every step of the light's descent; two are measured. `REST` of that is added for all else.
+    """
+    rows, texels = 3 * PLACES * VIEWS * (FOLDS - 1) // FOLDS, 2 * ROWS**2
+    transport, light = torch.ones(rows, texels, device=device), torch.ones(texels, 3, device=device)
+    began = time.perf_counter()
+    for _ in range(TRIED):
+        back = transport.T @ (transport @ light)
+    back.sum().item()  # waits for a device
+    step = (time.perf_counter() - began) / TRIED
+    return (1 + REST) * 2 * TURNS * (FIRST_STEPS + (ROUNDS - 1) * STEPS) * step
 
 
 def _first_metal() -> int:

@@ -16,8 +16,10 @@ from lightning_fabric.strategies import DDPStrategy
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+from neilfpp_method.budget.durations import in_words as time_in_words
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.environment_map import check_environment
+from neilfpp_method.data.held_back import hold_back
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import at_scale, scale_for_rays
 from neilfpp_method.effects.asked import Asked, check_asked
@@ -32,6 +34,14 @@ from neilfpp_method.schedule import Stage, stage_steps
 from neilfpp_method.settings.check import check_config
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.timing.ledger import Ledger, doing, listening
+from neilfpp_method.train.budget_record import read_budget, write_budget
+from neilfpp_method.train.budgeted import (
+    close_budget,
+    outcome,
+    plan_budget,
+    planned_effects,
+    planned_settings,
+)
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.effects_record import read_plan, write_plan
@@ -40,8 +50,10 @@ from neilfpp_method.train.light_record import in_words
 from neilfpp_method.train.lock import alone_in
 from neilfpp_method.train.loop import Training, seed_step, train
 from neilfpp_method.train.memory import check_training_memory
+from neilfpp_method.train.pace import Pace
 from neilfpp_method.train.preview import write_preview
 from neilfpp_method.train.progress import Reporter, reporting
+from neilfpp_method.train.quality import Quality
 from neilfpp_method.train.run import (
     PIXELS,
     CaptureSource,
@@ -72,6 +84,7 @@ def run_training(
     scale: float | None = None,
     strict: bool = False,
     effects: Asked | None = None,
+    budget: float | None = None,
     command: str = "neilfpp train",
     at_end: Callable[[Path], None] | None = None,
 ) -> Path:
@@ -85,6 +98,8 @@ def run_training(
         strict: end with an error where the result is of no use.
         effects: which effects are simulated (`effects.asked`); none: those of the settings, or with `resume`
             of the run.
+        budget: seconds that all of it may take, from here to the end of `at_end`; none: as many steps as the
+            settings say, or with `resume` what the run was given.
         command: what a person types to get here, for the line that says how a stopped run continues.
         at_end: called with the folder of a run that came to its end, sound or not, by the first process.
 
@@ -107,24 +122,38 @@ def run_training(
             raise UserError(
                 f"{out}: its effects are '{plan.asked}'", "leave --effects out, or start a new run"
             )
-        config = plan.config_of_model
+        config, planned = plan.config_of_model, read_budget(out)
+        if budget not in (None, planned and planned.budget):
+            was = "no budget" if planned is None else f"a budget of {time_in_words(planned.budget)}"
+            raise UserError(f"{out}: the run has {was}", "leave --budget out, or start a new run")
+        ledger.add(read_work(out))
         if _is_finished(out, config):
+            if planned is not None and planned.took is None:  # it was ended while its report was made
+                close_budget(out, planned, ledger.total)
             console.print(f"run folder {out}: finished already, nothing to continue", soft_wrap=True)
             return out
-        ledger.add(read_work(out))
     else:
         if data is None or config is None:
             raise UserError("no capture given", "name its folder with --data DIR")
         asked = effects or Asked("as-set")
         check_asked(asked, config)
-        plan = Plan.begin(asked, config)
-        settings, config = config, plan.config
-        _check(config)
+        _check(Plan.begin(asked, config).config)
         source = CaptureSource(str(data.resolve()), test_every, response, format)
         out = out or Path("runs") / f"{data.resolve().name}-{config.preset}"
         check_free(out)
     capture = source.load_again(out) if resume else source.load()
     if not resume:
+        planned = None
+        if budget is not None:
+            with_page = at_end is not None
+            planned = plan_budget(
+                budget, capture, config, asked, place, devices, ledger, with_page, console.print
+            )
+            config = planned_settings(planned, config)
+        settings, plan = config, Plan.begin(asked, config)
+        if planned is not None:
+            planned_effects(planned, plan)
+        config = plan.config
         rays = config.train.rays * devices * sum(stage_steps(config.train).values())
         source = replace(source, scale=scale_for_rays(capture.train_views, rays) if scale is None else scale)
         capture = at_scale(capture, source.scale)
@@ -144,6 +173,8 @@ def run_training(
             if not resume:
                 create_run(out, settings, source, facts)
                 write_plan(out, plan)
+                if planned is not None:
+                    write_budget(out, planned)
             console.print(capture.summary, soft_wrap=True)
             if source.scale < 1 and not resume:
                 console.print(_scaled(source.scale, len(pixels), rays), soft_wrap=True)
@@ -160,6 +191,7 @@ def run_training(
         reporting(out, console, fabric.is_global_zero) as reporter,
         _stop_request(continue_with) as stopped,
     ):
+        held_back = hold_back(pixels, config.train.seed)
         preview = _preview(out, capture, fabric, reporter)
         solver, watch = model.light_solver(), _watch(pixels, config, reporter)
         training = Training(
@@ -175,7 +207,9 @@ def run_training(
             solver,
             watch,
             plan,
+            Quality(held_back, capture.hdr),
             ledger,
+            None if planned is None else Pace(planned, ledger),
         )
         train(training)
     if fabric.is_global_zero:
@@ -189,6 +223,9 @@ def run_training(
         console.print(f"health: {health_in_words(findings)}", soft_wrap=True, markup=False)
         if at_end is not None:
             at_end(out)
+    if fabric.is_global_zero and planned is not None:
+        close_budget(out, planned, ledger.total)
+        console.print(outcome(planned, training.quality.looks), soft_wrap=True)
     if strict and verdict_of(findings) == "failed":
         raise Unsound(f"{out}: {findings[0].what}", findings[0].remedy)
     return out

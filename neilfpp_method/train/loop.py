@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import shlex
 import time
@@ -39,7 +40,9 @@ from neilfpp_method.timing.ledger import Ledger, doing
 from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.health_record import read_findings, write_findings
 from neilfpp_method.train.light_record import LightFit, note_fit, read_fits, write_fits
+from neilfpp_method.train.pace import Pace
 from neilfpp_method.train.progress import Reporter
+from neilfpp_method.train.quality import Quality, read_looks, write_looks
 from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, save_checkpoint, write_json
 from neilfpp_method.train.skipped import Moment, keep_step
 from neilfpp_method.train.work_record import write_work
@@ -52,7 +55,9 @@ LOG_EVERY = 50
 
 @dataclass
 class Training:
-    """A run in progress; `continue_with` is the command that goes on with it after a stop."""
+    """A run in progress. `continue_with` is the command that goes on with it after a stop, `pace` keeps it
+    to a budget; none: it has none.
+    """
 
     path: Path
     config: NeilfConfig
@@ -66,7 +71,9 @@ class Training:
     light_solver: LightSolver
     watch: Watch
     plan: Plan
+    quality: Quality
     ledger: Ledger = field(default_factory=Ledger)
+    pace: Pace | None = None
     fits: list[LightFit] = field(default_factory=list)
     skipped: int = 0
     skipped_in_a_row: int = 0
@@ -80,22 +87,20 @@ def train(run: Training) -> None:
         Stopped: `run.should_stop` said so; the state is saved, and training continues from it bit for bit.
         Diverged: ten steps in a row were not finite; the last good checkpoint is kept.
     """
-    settings = run.config.train
     model = run.model.to(run.fabric.device).train()
     run.light_solver.to(run.fabric.device)
     optimizer = make_optimizer(model, run.config.optimizer)
     step = _restore(run, optimizer)
-    total = sum(stage_steps(settings).values())
     optimizer = run.fabric.setup_optimizers(optimizer)
     if step == 0:
         _look(run, model, 0)
-    while step < total:
-        position = stage_at(step, settings)
+    while step < _all_steps(run):
+        position = stage_at(step, run.config.train)
         step = _train_stage(run, model, optimizer, step, position)
         if run.fabric.is_global_zero:
             with doing("looks", apart=True):
                 run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
-        if step < total:
+        if step < _all_steps(run):
             with doing("looks", apart=True):
                 _look(run, model, step)
         _save(run, optimizer, step, also=position.stage.value)
@@ -103,6 +108,11 @@ def train(run: Training) -> None:
             model.eval()
             run.preview(model, position.stage)
             model.train()
+
+
+def _all_steps(run: Training) -> int:
+    """Of the whole training, as planned so far."""
+    return sum(stage_steps(run.config.train).values())
 
 
 def _train_stage(
@@ -119,32 +129,45 @@ def _train_stage(
     started = time.perf_counter()
     before = run.seconds.get(stage.value, 0.0)
     gradients = "smoothness" in active_losses(stage, model.config, model.stages)  # nothing else asks for them
-    for number in range(position.step, position.length):
+    number, length = position.step, position.length
+    while number < length:
         with run.ledger.step(number):
             seed_step(settings.seed, step, run.fabric.global_rank)
-            share = number / position.length
-            at = StagePosition(stage, number, position.length)
+            at = StagePosition(stage, number, length)
             set_rates(optimizer, run.config.optimizer, at, background_waits=not run.model.facts.far_points)
             with doing("data"):
                 batch = run.pixels.sample(settings.rays, gradients)
             moment = Moment.before_step(model, keeps_points=not model.stages[stage].moves_host)
             skipped = run.skipped
             computed = wrapped(batch, stage)
-            total = weigh(computed.terms, active_losses(stage, model.config, model.stages, share))
+            total = weigh(computed.terms, active_losses(stage, model.config, model.stages, at.share))
             stop = _update(run, model, optimizer, computed.terms, total, step)
             if run.skipped > skipped:
                 _keep_skipped(run, model, batch, moment, at, step)
             _solve_light(run, model, computed, step)
         run.watch.after_step(model.stages[stage], computed, step)
-        step += 1
+        number, step = number + 1, step + 1
+        length = _keep_pace(run, StagePosition(stage, number, length), step)
+        _look_at_quality(run, model, StagePosition(stage, number, length), step)
         run.seconds[stage.value] = before + time.perf_counter() - started
-        if number + 1 == position.length:
+        if number == length:
             break  # The end of a stage is saved under its name, and a stop waits for that.
         if stop or step % settings.checkpoint_every == 0:
             _save(run, optimizer, step)
         if stop:
             raise Stopped(f"stopped after step {step}", f"continue with: {run.continue_with}")
     return step
+
+
+def _keep_pace(run: Training, position: StagePosition, step: int) -> int:
+    """Keep to the budget, where there is one. Returns how many steps the stage has."""
+    if run.pace is None:
+        return position.length
+    kept = run.pace.keep(run.config.train, position, step)
+    if kept is not run.config.train:
+        run.config = dataclasses.replace(run.config, train=kept)
+        run.reporter.lengthen(stage_steps(kept)[position.stage])
+    return stage_steps(kept)[position.stage]
 
 
 def _solve_light(run: Training, model: NeilfModel, computed: StepResult, step: int) -> None:
@@ -197,6 +220,12 @@ def _start_light(run: Training, model: NeilfModel, step: int) -> None:
             _tell(run, after_fit(run.plan, measured, model.lamps.lit, step))
     _share_light(run, model)
     _share_decisions(run, model, decisions)
+
+
+@doing("looks", apart=True)
+def _look_at_quality(run: Training, model: NeilfModel, position: StagePosition, step: int) -> None:
+    if run.fabric.is_global_zero:
+        run.quality.look_when_due(model, position, step, run.ledger.total)
 
 
 def _look_at_effects(run: Training, model: NeilfModel, step: int) -> None:
@@ -376,6 +405,9 @@ def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str 
             write_fits(run.path, run.fits)
             write_findings(run.path, run.watch)
             write_plan(run.path, run.plan)
+            write_looks(run.path, run.quality)
+            if run.pace is not None:
+                run.pace.save(run.path, run.config.train)
             for name in filter(None, (also, "last")):
                 save_checkpoint(
                     run.path / "checkpoints" / f"{name}.pt", run.model, run.light_solver, optimizer, step
@@ -399,6 +431,7 @@ def _restore(run: Training, optimizer: torch.optim.Optimizer) -> int:
         run.seconds.update(read_json(run.path / "timing.json"))
     run.fits += read_fits(run.path, saved["step"])
     run.plan = read_plan(run.path, run.plan.settings, saved["step"])
+    run.quality.looks += read_looks(run.path, saved["step"])
     _use(run, run.model)
     run.watch.findings |= {finding.case: finding for finding in read_findings(run.path) or ()}
     return saved["step"]

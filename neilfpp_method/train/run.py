@@ -6,6 +6,8 @@ scene.json        what the images decided     checkpoints/      last.pt, and one
 previews/         a picture per stage         tensorboard/      scalars and pictures
 pixels/           of the training views; can be deleted, and is made again when training goes on
 work.json         seconds of each stage by kind of work (docs/budget.md)
+quality.json      how good the run was on the way, at pixels that no step learned from
+plan.json         what was planned for a budget, and how the clock changed it; not there without --budget
 effects.json      which effects are simulated, and why
 light.json        what spoke for lamps, fit by fit; not there where the settings had decided
 skipped/          steps that were not finite, for `neilfpp replay`; not there where none was
@@ -35,7 +37,7 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import has_material
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.plain import from_dict, to_dict
-from neilfpp_method.settings.types import NeilfConfig
+from neilfpp_method.settings.types import NeilfConfig, TrainConfig
 from neilfpp_method.train.build import build_model
 from neilfpp_method.train.effects_record import read_plan
 from neilfpp_method.train.json_files import read_json, write_json
@@ -55,6 +57,7 @@ __all__ = [
     "load_weights",
     "read_description",
     "read_json",
+    "rewrite_training",
     "run_folder",
     "save_checkpoint",
     "write_json",
@@ -214,6 +217,13 @@ def create_run(path: Path, config: NeilfConfig, source: CaptureSource, facts: Sc
         for name in description:
             (path / name).unlink(missing_ok=True)
         raise
+
+
+def rewrite_training(path: Path, config: TrainConfig) -> None:
+    """The settings of the loop of a run that is there already, where its steps are planned anew."""
+    stored = read_json(path / "config.json")
+    stored["config"]["train"] = to_dict(config)
+    write_json(path / "config.json", stored)
 
 
 def load_run(path: Path | str, device: torch.device | str = "cpu", checkpoint: str = "last") -> Run:
