@@ -74,8 +74,8 @@ PAPER_NGP: Mapping[str, Any] = {
 
 
 def paper_ngp() -> NeilfConfig:
-    """The published hash-grid setting, for display images: 40k steps, 4 h on a V100; it asks for a point
-    cloud.
+    """The published hash-grid setting, for display images: 40k steps, 4 h on a V100; it is meant for captures
+    with a point cloud.
     """
     return changed(paper_mlp(), PAPER_NGP)
 
@@ -149,6 +149,7 @@ FAST: Mapping[str, Any] = {
     "loss.hessian_joint": 1.6e-3,
     "loss.surface": 1e-2,
     "loss.surface_joint": 1e-3,
+    "loss.point_cloud": 0.1,
     "loss.mask": 0.1,
     "loss.smoothness": 0.0,
     "loss.lambertian": 0.0,

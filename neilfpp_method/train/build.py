@@ -24,7 +24,7 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import OrientedPoints
 
-__all__ = ["build_model", "scene_facts", "show_known_light"]
+__all__ = ["build_model", "cloud_in_words", "scene_facts", "show_known_light"]
 
 # The sigmoid of R reaches 1 for LDR input. Radiance has no unit: the paper's 3 for HDR is twenty times the
 # median of a well exposed image. Where more is bright R needs more room; the few brightest pixels (a lamp in
@@ -57,7 +57,8 @@ def build_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> Nei
     """An untrained model for a capture.
 
     Raises:
-        UserError: the settings ask for a point cloud or a mesh that the capture does not have.
+        UserError: the settings ask for a mesh that the capture does not have, or its point cloud is of no
+            use.
     """
     return NeilfModel(HOSTS[config.host.kind](capture, facts, config), config, facts)
 
@@ -97,6 +98,17 @@ def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
 HOSTS: Mapping[str, Callable[[Capture, SceneFacts, NeilfConfig], Host]] = {"volsdf": _volsdf, "mesh": _mesh}
 
 
+def cloud_in_words(capture: Capture, config: NeilfConfig) -> str | None:
+    """What a point cloud that geometry could learn from comes to, for people; none where there is nothing to
+    say.
+    """
+    if config.host.kind != "volsdf" or config.loss.point_cloud == 0.0:
+        return None
+    if capture.point_cloud is None:
+        return "point cloud: the capture has none with normals, so geometry is found from the images alone"
+    return f"point cloud: geometry keeps to {capture.point_cloud.name}; --config.loss.point-cloud 0 leaves it out"
+
+
 def _check_seen(host: MeshHost, capture: Capture, path: str) -> None:
     """That the cameras see the outside of the mesh."""
     cameras = [capture.normalisation.camera(view.camera) for view in capture.train_views]
@@ -111,13 +123,8 @@ def _check_seen(host: MeshHost, capture: Capture, path: str) -> None:
 
 
 def _points(capture: Capture, config: NeilfConfig) -> OrientedPoints | None:
-    if config.loss.point_cloud == 0.0:
+    if config.loss.point_cloud == 0.0 or capture.point_cloud is None:
         return None
-    if capture.point_cloud is None:
-        raise UserError(
-            f"{capture.root}: the point-cloud loss is on, and the capture has no oriented point cloud",
-            "add inputs/model/oriented_pcd.ply or set --config.loss.point-cloud 0",
-        )
     points = load_point_cloud(capture.point_cloud, capture.normalisation)
     # What lies beyond the scene sphere is no business of G.
     within = points[points.position.norm(dim=-1) < config.volume.radius]

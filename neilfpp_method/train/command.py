@@ -32,7 +32,7 @@ from neilfpp_method.schedule import Stage, stage_steps
 from neilfpp_method.settings.check import check_config
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.timing.ledger import Ledger, doing, listening
-from neilfpp_method.train.build import build_model, scene_facts, show_known_light
+from neilfpp_method.train.build import build_model, cloud_in_words, scene_facts, show_known_light
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.health_record import in_words as health_in_words
@@ -146,6 +146,8 @@ def run_training(
             console.print(capture.summary, soft_wrap=True)
             if source.scale < 1 and not resume:
                 console.print(_scaled(source.scale, len(pixels), rays), soft_wrap=True)
+            if (cloud := cloud_in_words(capture, config)) is not None and not resume:
+                console.print(cloud, soft_wrap=True)
             console.print(f"run folder {out}", soft_wrap=True)
         # Every process fits the same geometry for itself.
         started = start_geometry(model, capture, config) if begins else None
