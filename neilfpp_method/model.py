@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from neilfpp_method import losses
 from neilfpp_method.fields.brdf import BrdfField
+from neilfpp_method.fields.exposure import make_gains
 from neilfpp_method.fields.light import LightModel, make_light
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
@@ -33,6 +34,7 @@ from neilfpp_method.settings.check import check_config
 from neilfpp_method.settings.facts import SceneFacts, radiance_units
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading import LOBES, initial_albedo, shade
+from neilfpp_method.shading.color import at_common_exposure
 from neilfpp_method.structures import (
     LossTerm,
     LossTerms,
@@ -89,6 +91,7 @@ class NeilfModel(nn.Module):
     Attributes:
         host: geometry and outgoing radiance R.
         brdf: B, the material at every point.
+        gains: how much brighter each photograph is than the others; none where all are taken to be alike.
         light, lamps: L, what arrives where nothing stands in the way, and small lamps close by, perhaps none.
         lobe: distribution of the specular reflection; none for Lambertian surfaces.
         stages: which losses count and what moves in each stage, for this kind of host.
@@ -117,6 +120,7 @@ class NeilfModel(nn.Module):
         self.brdf = BrdfField(config.brdf, config.encoding, config.volume.radius)
         self.use(config)
         albedo = initial_albedo(config.brdf.initial_base_color, config.brdf.initial_metallic, self.lobe)
+        self.gains = make_gains(config, facts)
         parts = make_light(config, facts.response, facts.median_radiance / albedo)
         self.light, self.lamps = parts.light, parts.lamps
         # The surface of a borrowed host moves as its own trainer likes.
@@ -156,11 +160,14 @@ class NeilfModel(nn.Module):
         # 1. The host renders colour, hit position and normal.
         hits, terms = self._render_host(batch, plan, names, hits)
         if "volume" in names:
-            terms["volume"] = losses.photometric(
-                hits.color, batch.color, self.facts.response, self.units.volume
-            )
+            color = hits.color if self.gains is None else hits.color * self.gains(batch.view)
+            terms["volume"] = losses.photometric(color, batch.color, self.facts.response, self.units.volume)
+            if "exposure" in names and self.gains is not None:
+                terms["exposure"] = losses.exposure(self.gains.drift())
         if not plan.moves_material:
             return StepResult.of(terms, SurfacePixels.none_of(batch), batch[:0])
+        # From here on all photographs are as one of mean exposure. R, which sees all pixels, finds the gains.
+        batch = replace(batch, color=self.at_common_exposure(batch.color, batch.view))
 
         # 2. Rays that meet one surface, on the object, are shaded; a scaled gradient goes back to where they
         #   met it.
@@ -248,6 +255,17 @@ class NeilfModel(nn.Module):
         return batch[torch.nonzero(off_object & (hits.opacity.detach() < CLEAR_OPACITY))[:, 0]]
 
     # ---------------------------------------------------------------------------------------------- the parts
+
+    @torch.no_grad()
+    def at_common_exposure(
+        self, color: Float[Tensor, "N 3"], view: Int[Tensor, " N"]
+    ) -> Float[Tensor, "N 3"]:
+        """Pixels of training views, by number, as a photograph of mean exposure would hold them, in the
+        capture's response.
+        """
+        if self.gains is None:
+            return color
+        return at_common_exposure(color, self.gains(view), self.facts.response)
 
     @property
     def scene(self) -> SceneTracer | None:
@@ -345,7 +363,10 @@ class NeilfModel(nn.Module):
         """Parameters by field, the host's among them where it offers them and is not borrowed."""
         offered = isinstance(self.host, HasParameterGroups) and not self.borrowed
         host = self.host.parameter_groups() if offered else {}
-        return {**host, "brdf": list(self.brdf.parameters()), "light": list(self.light.parameters())}
+        own = {"brdf": self.brdf, "light": self.light}
+        if self.gains is not None:
+            own["exposure"] = self.gains
+        return {**host, **{name: list(field.parameters()) for name, field in own.items()}}
 
     def freeze_for(self, stage: Stage) -> None:
         """Let exactly the fields move that the stage moves; the others get no gradient."""

@@ -88,12 +88,9 @@ class TrainingViews:
             kept = (index >= 0) & usable[index] & ((direction * normal[rows]).sum(-1) > MIN_COSINE)
             rows, direction, distance, index = rows[kept], direction[kept], distance[kept], index[kept]
             free = _nothing_between(model, self.centres[i], position[rows], direction, distance)
-            rows, slot = rows[free], seen[rows[free]].sum(1)
-            seen[rows, slot], wo[rows, slot], pixel[rows, slot] = (
-                True,
-                direction[free],
-                view.color[index[free]],
-            )
+            rows, slot, index = rows[free], seen[rows[free]].sum(1), index[free]
+            seen[rows, slot], wo[rows, slot] = True, direction[free]
+            pixel[rows, slot] = model.at_common_exposure(view.color[index], view.view[index])
         return Sightings(seen, wo, pixel)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.plain import changed
-from neilfpp_method.settings.types import FrequencyConfig, MeshConfig, NeilfConfig
+from neilfpp_method.settings.types import EXPOSURE_RATE, FrequencyConfig, MeshConfig, NeilfConfig
 
 __all__ = ["PRESETS", "fixed_geometry", "free_light", "preset"]
 
@@ -163,6 +163,7 @@ FAST: Mapping[str, Any] = {
     "optimizer.light": 3e-2,
     "optimizer.background": 1e-3,
     "optimizer.beta": 1e-3,
+    "optimizer.exposure": EXPOSURE_RATE,
     "optimizer.joint": 0.1,
     "optimizer.background_from": 0.5,
     "train.sdf_steps": 2_000,

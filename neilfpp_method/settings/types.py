@@ -14,6 +14,9 @@ import tyro
 __all__ = ["NeilfConfig"]
 
 
+EXPOSURE_RATE = 1e-3
+"""Learning rate of log gains where they are switched on: a percent takes ten steps."""
+
 # ----------------------------------------------------------------------------------------------------- fields
 
 
@@ -335,6 +338,10 @@ class OptimizerConfig:
     light: float = 1e-3
     background: float = 1e-3
     beta: float = 1e-3
+    exposure: float = 0.0
+    """Of the logarithms of the gains of photographs, where evidence or a person calls for them; 0: all
+    photographs are taken to be exposed alike.
+    """
     joint: float = 1.0
     """Factor on all rates in the joint stage."""
     final: tuple[float, float, float] = (0.1, 0.1, 0.1)

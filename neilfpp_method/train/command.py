@@ -15,13 +15,14 @@ from lightning_fabric import Fabric
 from lightning_fabric.strategies import DDPStrategy
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from torch import Tensor
 
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.environment_map import check_environment
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import at_scale, scale_for_rays
 from neilfpp_method.effects.asked import Asked, check_asked
-from neilfpp_method.effects.looks import note_facts
+from neilfpp_method.effects.looks import note_exposures, note_facts
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.table import table
 from neilfpp_method.errors import Unsound, UserError
@@ -32,7 +33,13 @@ from neilfpp_method.schedule import Stage, stage_steps
 from neilfpp_method.settings.check import check_config
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.timing.ledger import Ledger, doing, listening
-from neilfpp_method.train.build import build_model, cloud_in_words, scene_facts, show_known_light
+from neilfpp_method.train.build import (
+    build_model,
+    cloud_in_words,
+    exposures_of,
+    scene_facts,
+    show_known_light,
+)
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.health_record import in_words as health_in_words
@@ -131,7 +138,11 @@ def run_training(
     fabric = _launch(place, devices)
     with listening(ledger), _nothing_left_on_failure(out):
         pixels = _load_pixels(capture, out / PIXELS, fabric, console)
-        facts = described.facts if resume else scene_facts(capture, pixels, config)
+        if resume:
+            facts = described.facts
+        else:
+            gains = _log_gains(plan, capture, pixels)
+            facts = scene_facts(capture, pixels, config, gains)
         note_facts(plan, facts)
         config = plan.config_of_model
         seed_step(config.train.seed, step=-1)
@@ -192,6 +203,19 @@ def run_training(
     if strict and verdict_of(findings) == "failed":
         raise Unsound(f"{out}: {findings[0].what}", findings[0].remedy)
     return out
+
+
+def _log_gains(plan: Plan, capture: Capture, pixels: PixelDataset) -> Tensor | None:
+    """The gains that photographs start with, where the plan has them on after it has heard the photographs;
+    zeros where a person asks for them and nothing shows what they are.
+    """
+    if not plan.is_on("exposure"):
+        return None
+    found = exposures_of(capture, pixels)
+    note_exposures(plan, found)
+    if not plan.is_on("exposure"):
+        return None
+    return torch.zeros(len(pixels.views), 3) if found is None else found.log_gain
 
 
 def _watch(pixels: PixelDataset, config: NeilfConfig, reporter: Reporter) -> Watch:
