@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from neilfpp_method.settings.plain import changed
-from neilfpp_method.settings.types import EXPOSURE_RATE, FreeLightConfig, MapLightConfig, NeilfConfig
+from neilfpp_method.settings.presets import EXPOSURE_RATE
+from neilfpp_method.settings.types import FreeLightConfig, MapLightConfig, NeilfConfig
 
 __all__ = ["EFFECTS", "Effect", "switched"]
 

@@ -9,10 +9,12 @@ from typing import Any
 
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.plain import changed
-from neilfpp_method.settings.types import EXPOSURE_RATE, FrequencyConfig, MeshConfig, NeilfConfig
+from neilfpp_method.settings.types import FrequencyConfig, MeshConfig, NeilfConfig
 
-__all__ = ["PRESETS", "fixed_geometry", "free_light", "preset"]
+__all__ = ["EXPOSURE_RATE", "PRESETS", "fixed_geometry", "free_light", "preset"]
 
+EXPOSURE_RATE = 1e-3
+"""Learning rate of log gains of photographs where they are switched on: a percent takes ten steps."""
 SINE_FREQUENCY = 30.0
 """ω of the sine layers sin(ω (W x + b)) of B and L. In the published code ω is part of W and b, so that a
 step of Adam there is one of 1/ω here.

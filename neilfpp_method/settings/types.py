@@ -14,9 +14,6 @@ import tyro
 __all__ = ["NeilfConfig"]
 
 
-EXPOSURE_RATE = 1e-3
-"""Learning rate of log gains where they are switched on: a percent takes ten steps."""
-
 # ----------------------------------------------------------------------------------------------------- fields
 
 
@@ -339,9 +336,7 @@ class OptimizerConfig:
     background: float = 1e-3
     beta: float = 1e-3
     exposure: float = 0.0
-    """Of the logarithms of the gains of photographs, where evidence or a person calls for them; 0: all
-    photographs are taken to be exposed alike.
-    """
+    """Of log gains of photographs, where evidence calls for them; 0: all are taken to be exposed alike."""
     joint: float = 1.0
     """Factor on all rates in the joint stage."""
     final: tuple[float, float, float] = (0.1, 0.1, 0.1)
@@ -352,8 +347,7 @@ class OptimizerConfig:
     """Steps at the start of each stage in which the rate rises from a tenth."""
     background_from: float = 0.0
     """Share of SDF init that is over when the field beyond the scene starts to move. Until then it is the
-    colour that it starts as, so that what lies within the scene is made of surfaces: a field that is seen
-    from everywhere can paint it as well.
+    colour that it starts as: a field that is seen from everywhere can paint the scene as well.
     """
 
 

@@ -28,6 +28,7 @@ from neilfpp_method.effects.table import table
 from neilfpp_method.errors import Unsound, UserError
 from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.health.watch import LOOKED_AT, Watch
+from neilfpp_method.inspection.findings import problems_of_poses
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, stage_steps
 from neilfpp_method.settings.check import check_config
@@ -155,10 +156,14 @@ def run_training(
                 create_run(out, settings, source, facts)
                 write_plan(out, plan)
             console.print(capture.summary, soft_wrap=True)
-            if source.scale < 1 and not resume:
-                console.print(_scaled(source.scale, len(pixels), rays), soft_wrap=True)
-            if (cloud := cloud_in_words(capture, config)) is not None and not resume:
-                console.print(cloud, soft_wrap=True)
+            if not resume:
+                for line in problems_of_poses(capture):
+                    console.print(line, style="yellow", soft_wrap=True, markup=False)
+                if source.scale < 1:
+                    console.print(_scaled(source.scale, len(pixels), rays), soft_wrap=True)
+                for line in (cloud_in_words(capture, config), _exposures_in_words(plan)):
+                    if line is not None:
+                        console.print(line, soft_wrap=True)
             console.print(f"run folder {out}", soft_wrap=True)
         # Every process fits the same geometry for itself.
         started = start_geometry(model, capture, config) if begins else None
@@ -216,6 +221,12 @@ def _log_gains(plan: Plan, capture: Capture, pixels: PixelDataset) -> Tensor | N
     if not plan.is_on("exposure"):
         return None
     return torch.zeros(len(pixels.views), 3) if found is None else found.log_gain
+
+
+def _exposures_in_words(plan: Plan) -> str | None:
+    """That photographs have gains, and why; none where they have none."""
+    decision = plan.newest("exposure")
+    return f"effects: exposure on, {decision.reason}" if decision is not None and decision.on else None
 
 
 def _watch(pixels: PixelDataset, config: NeilfConfig, reporter: Reporter) -> Watch:
