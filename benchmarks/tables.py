@@ -9,9 +9,9 @@ A result file holds the rows of one command on one machine:
      "machine": "…", "rows": [{"capture": "tabletop_env", "name": "`fast`", "figures": {"seconds": 0.13}}]}
 
 `table` says where the rows go: between `<!-- table: joint-step -->` and `<!-- end -->` of a document, or
-`<!-- table: joint-step seconds -->`, which shows the named figures alone. Several files may have rows of one table;
-they follow one another in the order of the files' names, and rows of one capture stand together. `capture` may be
-missing. `figures` are named as in `COLUMNS`.
+`<!-- table: joint-step seconds -->`, which shows the named figures alone. Several files may have rows of one
+table: they follow one another in the order of the files' names, and rows of one capture stand together.
+`capture` may be missing. `figures` are named as in `COLUMNS`.
 """
 
 from __future__ import annotations
@@ -61,6 +61,9 @@ COLUMNS: Mapping[str, Column] = {
     "confidence_roughness_ratio": Column("roughness"),
     "confidence_metallic_ratio": Column("metallic"),
     "steps_done": Column("steps", 0),
+    "peak_gb": Column("peak, GB"),
+    "files_gb": Column("files of pixels, GB"),
+    "planes_gb": Column("float32 planes, GB"),
     "naive_ms": Column("as one writes it down, ms", 0),
     "reference_ms": Column("reference, ms", 0),
     "compiled_ms": Column("compiled loops, ms", 0),

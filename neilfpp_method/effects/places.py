@@ -12,6 +12,7 @@ from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.views import project
+from neilfpp_method.fields.exposure import at_mean_exposure
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading.color import CLIPPED, srgb_to_linear
 from neilfpp_method.structures import Observed
@@ -61,8 +62,7 @@ def gather_places(
     normal: Float[Tensor, "P 3"],
     views: int,
 ) -> Places:
-    """The pixels that show given points of the surface, each in at most `views` views that are drawn at
-    random.
+    """The pixels that show given surface points, each in at most `views` randomly drawn views.
 
     Args:
         model: whose host says what a pixel shows.
@@ -95,7 +95,7 @@ def gather_places(
             & ((shaded * normal[place]).sum(-1) > SAME_NORMAL)
             & ((shaded * -batch.directions).sum(-1) > MIN_COSINE)
         )
-        linear = model.at_common_exposure(batch.color, batch.view)
+        linear = at_mean_exposure(model.gains, batch.color, batch.view, model.facts.response)
         if model.facts.response == "srgb":
             same = same & (batch.color.amax(-1) < CLIPPED)
             linear = srgb_to_linear(linear)

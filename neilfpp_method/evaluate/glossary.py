@@ -11,9 +11,7 @@ __all__ = ["Entry", "explain"]
 
 @dataclass(frozen=True)
 class Entry:
-    """A figure for people: its title, how its values are written (`%`-style), which way is better, what it
-    says.
-    """
+    """How a figure is shown: title, number format (`%`-style), which way is better, and its meaning."""
 
     title: str
     pattern: str
@@ -38,13 +36,13 @@ def _log(title: str, meaning: str) -> Entry:
 
 
 def _ratio(title: str) -> Entry:
-    meaning = "Error where the run is surest, over the error elsewhere, half of the pixels each; 1 is no better than chance."
+    meaning = (
+        "Error of the surest half of the pixels over that of the other half; 1 is no better than chance."
+    )
     return Entry(title, "%.2f", "lower", meaning)
 
 
-EXPOSED = (
-    "New views with the factor per channel that brings each closest: the exposure of a new photograph is unknown."
-)
+EXPOSED = "New views times the factor per channel that brings each closest, as their exposure is unknown."
 
 ENTRIES: Mapping[str, Entry] = {
     "volume_psnr": _decibels(
@@ -113,9 +111,7 @@ ENTRIES: Mapping[str, Entry] = {
 
 
 def explain(name: str) -> Entry:
-    """The entry of a figure; a baseline has that of what it stands beside, and an unknown figure its own
-    name.
-    """
+    """The entry of a figure; a baseline has that of its figure, and an unknown figure its own name."""
     if name in ENTRIES:
         return ENTRIES[name]
     base = ENTRIES.get(name.removeprefix("baseline_"))

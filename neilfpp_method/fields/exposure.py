@@ -10,10 +10,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from neilfpp_method.settings.facts import SceneFacts
-from neilfpp_method.settings.types import NeilfConfig
+from neilfpp_method.shading.color import at_common_exposure
 
-__all__ = ["PhotographGains", "make_gains"]
+__all__ = ["PhotographGains", "at_mean_exposure"]
 
 
 class PhotographGains(nn.Module):
@@ -41,10 +40,11 @@ class PhotographGains(nn.Module):
         return self.logarithms() - self.start
 
 
-def make_gains(config: NeilfConfig, facts: SceneFacts) -> PhotographGains | None:
-    """The gains of a capture's training views; none where they are switched off, or nothing is known of
-    views.
+@torch.no_grad()
+def at_mean_exposure(
+    gains: PhotographGains | None, color: Float[Tensor, "N 3"], view: Int[Tensor, " N"], response: str
+) -> Float[Tensor, "N 3"]:
+    """Pixels of some views, by number, as a photograph of mean exposure would hold them, in the capture's
+    response; as they are where there are no gains.
     """
-    if config.optimizer.exposure <= 0 or not facts.log_gains:
-        return None
-    return PhotographGains(torch.tensor(facts.log_gains).view(-1, 3))
+    return color if gains is None else at_common_exposure(color, gains(view), response)

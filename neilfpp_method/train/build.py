@@ -28,10 +28,10 @@ from neilfpp_method.structures import OrientedPoints
 
 __all__ = ["build_model", "cloud_in_words", "exposures_of", "scene_facts", "show_known_light"]
 
-# The sigmoid of R reaches 1 for LDR input, as published. Where errors have a unit of their own it reaches twice
-# that: clipped pixels are lower bounds, and dark photographs show more than others before they clip.
-# Radiance has no unit: the paper's 3 for HDR is twenty times the median of a well exposed image. Where more is
-# bright R needs more room; the few brightest pixels (a lamp in view) do not decide for all.
+# The sigmoid of R reaches 1 for LDR input, as published. Where errors have a unit of their own it reaches
+# twice that: clipped pixels are lower bounds, and dark photographs show more than others before they clip.
+# Radiance has no unit: the paper's 3 for HDR is twenty times the median of a well exposed image. Where more
+# is bright R needs more room; the few brightest pixels (a lamp in view) do not decide for all.
 LDR_SCALE = 1.0
 LDR_ROOM = 2.0
 HDR_MEDIANS = 20.0

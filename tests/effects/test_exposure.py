@@ -17,6 +17,7 @@ from neilfpp_method.effects.exposure import measure_exposures
 from neilfpp_method.effects.looks import note_exposures
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.evaluate.protocols import exposed_alike
+from neilfpp_method.fields.exposure import at_mean_exposure
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, active_losses, weigh
@@ -75,7 +76,7 @@ def test_photographs_that_are_exposed_alike_need_no_gains(tmp_path):
     assert "exposure" not in model.parameter_groups()
     assert "exposure" not in active_losses(Stage.SDF_INIT, config)
     batch = sphere_batch()
-    assert model.at_common_exposure(batch.color, batch.view) is batch.color
+    assert at_mean_exposure(model.gains, batch.color, batch.view, "linear") is batch.color
 
 
 def test_without_a_cloud_nothing_is_known(tmp_path):

@@ -70,7 +70,7 @@ def test_a_clipped_pixel_is_a_lower_bound():
     off = residual(radiance, pixel, "srgb")
     off.abs().sum().backward()
     off = off.detach()
-    # Brighter than white: free. Darker: it costs. Too bright where the camera saw less: it costs, and leads back.
+    # Brighter than white is free, darker costs. Too bright where the camera saw less costs, and leads back.
     assert off[0] == 0
     assert radiance.grad[0] == 0
     assert off[1] < -0.4
