@@ -2,8 +2,11 @@
 
 The points of the capture's cloud are looked up in every photograph that faces them. A place has its own
 colour, and a photograph its own gain for each channel. Errors count by their size, not by their square, so
-that a view in which something hides a place, or a highlight lies on it, has little say. Gains are judged at
-points that were kept back from them.
+that a view in which something hides a place, or a highlight lies on it, has little say.
+
+A table that mirrors a window in some photographs is brighter there as well, at all of its points. An exposure
+goes with the photograph, a sheen with the way that a surface faces. So gains of the points that face one way
+are judged at those that face another, and the worse of the two ways decides.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
@@ -21,10 +24,10 @@ from neilfpp_method.effects.measurement import Measurement, mean_of
 from neilfpp_method.shading.color import CLIPPED, srgb_to_linear
 from neilfpp_method.structures import OrientedPoints
 
-__all__ = ["WORTH", "Exposures", "measure_exposures"]
+__all__ = ["WORTH", "Exposures", "judge_gains", "measure_exposures"]
 
 WORTH = 0.01
-"""Relative error that gains must save at the points that were kept back."""
+"""Relative error that gains must save at points that they were not fitted to."""
 POINTS = 2000
 """So many points of the cloud, drawn at random: a second or two, and gains within a percent."""
 MIN_VIEWS = 3
@@ -37,8 +40,8 @@ ROUNDS = 50
 """Of means over the places and over the photographs in turns, with weights by the errors before."""
 QUADRATIC_BELOW = 0.01
 """Errors below this, relative, count by their square."""
-FOLDS = 2
-"""Each half of the points is kept back once."""
+SPLITS = 10
+"""Steps in which points are parted by their normals (k-means); they settle in three or four."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ class Exposures:
 
     Attributes:
         log_gain: natural logarithms, of the training views and channels; their mean over the views is 0.
-        measured: the error that the gains save at points that were kept back.
+        measured: the error that gains save at points that face another way than those they were fitted to.
     """
 
     log_gain: Float[Tensor, "V 3"]
@@ -63,19 +66,44 @@ def measure_exposures(pixels: PixelDataset, cloud: OrientedPoints) -> Exposures:
         cloud: of the surface, scene frame; points without a surface there do no harm while they are few.
     """
     chosen = torch.from_numpy(np.random.default_rng(0).permutation(len(cloud))[:POINTS])
-    seen = _seen(pixels, cloud[chosen])
-    seen = seen[(~seen.isnan()).any(-1).sum(1) >= MIN_VIEWS]
-    what = "error that gains of photographs save at points kept back"
-    if not len(seen):
-        return Exposures(torch.zeros(len(pixels.views), 3), mean_of(torch.zeros(0), what, WORTH))
-    fold = torch.arange(len(seen)) % FOLDS
-    saved = torch.cat(
-        [
-            _error(seen[fold == k], 0.0) - _error(seen[fold == k], _gains(seen[fold != k]))
-            for k in range(FOLDS)
-        ]
-    )
-    return Exposures(_gains(seen), mean_of(saved[~saved.isnan()], what, WORTH))
+    points = cloud[chosen]
+    seen = _seen(pixels, points)
+    known = (~seen.isnan()).any(-1).sum(1) >= MIN_VIEWS
+    seen, normal = seen[known], points.normal[known]
+    return Exposures(_gains(seen), judge_gains(seen, normal))
+
+
+def judge_gains(seen: Float[Tensor, "P V 3"], normal: Float[Tensor, "P 3"]) -> Measurement:
+    """The error that gains save at points that face another way than those that they were fitted to.
+
+    Args:
+        seen: the logarithm of what each view shows at each point; NaN where it shows nothing of use.
+        normal: of the points, unit.
+    """
+    what = "error that gains of photographs save at points that face another way"
+    group, measured = _facing(normal), []
+    for back in (group, ~group):
+        gain = _gains(seen[~back])
+        saved = _error(seen[back], torch.zeros_like(gain)) - _error(seen[back], gain)
+        measured.append(mean_of(saved[~saved.isnan()], what, WORTH))
+    few = [found for found in measured if found.favours(chosen=False) is None]
+    return (few or sorted(measured, key=lambda found: found.value))[0]
+
+
+def _facing(normal: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
+    """Points in two groups by the way that they face."""
+    group = torch.zeros(len(normal), dtype=torch.bool)
+    if not len(normal):
+        return group
+    common = torch.nn.functional.normalize(normal.sum(0), dim=0)
+    centre = torch.stack((common, normal[(normal @ common).argmin()]))
+    for _ in range(SPLITS):
+        group = (normal @ centre.T).argmax(1) == 1
+        if group.all() or not group.any():
+            break
+        means = torch.stack((normal[~group].mean(0), normal[group].mean(0)))
+        centre = torch.nn.functional.normalize(means, dim=-1)
+    return group
 
 
 def _seen(pixels: PixelDataset, points: OrientedPoints) -> Float[Tensor, "P V 3"]:
@@ -130,7 +158,7 @@ def _gains(seen: Float[Tensor, "P V 3"]) -> Float[Tensor, "V 3"]:
     return gain
 
 
-def _error(seen: Float[Tensor, "P V 3"], gain: Float[Tensor, "V 3"] | float) -> Float[Tensor, " P"]:
+def _error(seen: Float[Tensor, "P V 3"], gain: Float[Tensor, "V 3"]) -> Float[Tensor, " P"]:
     """How far the views of a place are from its median, in the mean, as a share of it."""
     common = seen - gain
     return (common - common.nanmedian(1, keepdim=True).values).abs().nanmean((1, 2))

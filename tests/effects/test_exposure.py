@@ -13,7 +13,7 @@ from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.asked import read_asked
-from neilfpp_method.effects.exposure import measure_exposures
+from neilfpp_method.effects.exposure import judge_gains, measure_exposures
 from neilfpp_method.effects.looks import note_exposures
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.evaluate.protocols import exposed_alike
@@ -88,6 +88,28 @@ def test_without_a_cloud_nothing_is_known(tmp_path):
     note_exposures(asked, None)
     assert asked.is_on("exposure")
     assert asked.config_of_model.optimizer.exposure > 0
+
+
+@pytest.mark.parametrize(("all_alike", "on"), [(True, True), (False, False)])
+def test_a_table_that_shines_is_no_exposure(all_alike, on):
+    """What makes a table brighter in some views and leaves all else alone goes with the table."""
+    generator = torch.Generator().manual_seed(0)
+    place = torch.randn(300, 1, 3, generator=generator)
+    factor = torch.randn(12, 3, generator=generator) * 0.3
+    table = torch.arange(300) < 240
+    noise = 0.05 * torch.randn(300, 12, 3, generator=generator)
+    seen = place + torch.where(table[:, None, None] | torch.tensor(all_alike), factor, 0.0) + noise
+    tilt = torch.randn(300, 3, generator=generator) * 0.1
+    facing = torch.where(table[:, None], torch.tensor([0.0, 0.0, 1.0]), torch.tensor([0.0, 1.0, 0.0]))
+    found = judge_gains(seen, torch.nn.functional.normalize(facing + tilt, dim=-1))
+    assert found.samples in (60, 240)
+    assert found.favours(chosen=False) is on
+
+
+def test_a_cloud_that_faces_one_way_decides_nothing():
+    seen = torch.randn(12, 3).expand(300, 12, 3)
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(300, 3)
+    assert judge_gains(seen, up).favours(chosen=False) is None
 
 
 def test_too_few_points_decide_nothing(tmp_path):
