@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from neilfpp_method import losses
 from neilfpp_method.fields.brdf import BrdfField
+from neilfpp_method.fields.exposure import PhotographGains, at_mean_exposure
 from neilfpp_method.fields.light import LightModel, make_light
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
@@ -107,6 +108,7 @@ class NeilfModel(nn.Module):
     Attributes:
         host: geometry and outgoing radiance R.
         brdf: B, the material at every point.
+        gains: how much brighter each photograph is than the others; none where all are taken to be alike.
         light, lamps: L, what arrives where nothing stands in the way, and small lamps close by, perhaps none.
         lobe: distribution of the specular reflection; none for Lambertian surfaces.
         stages: which losses count and what moves in each stage, for this kind of host.
@@ -135,6 +137,8 @@ class NeilfModel(nn.Module):
         self.brdf = BrdfField(config.brdf, config.encoding, config.volume.radius)
         self.use(config)
         albedo = initial_albedo(config.brdf.initial_base_color, config.brdf.initial_metallic, self.lobe)
+        has_gains = config.optimizer.exposure > 0 and len(facts.log_gains) > 0
+        self.gains = PhotographGains(torch.tensor(facts.log_gains).view(-1, 3)) if has_gains else None
         parts = make_light(config, facts.response, facts.median_radiance / albedo)
         self.light, self.lamps = parts.light, parts.lamps
         # The surface of a borrowed host moves as its own trainer likes.
@@ -172,9 +176,16 @@ class NeilfModel(nn.Module):
         # 1. The host renders colour, hit position and normal.
         hits, terms = self._render_host(batch, plan, names, hits)
         if "volume" in names:
-            terms["volume"] = losses.photometric(hits.color, batch.color, self.facts.response, units.volume)
+            color = hits.color
+            if self.gains is not None:
+                color = color * self.gains(batch.view)
+                terms["exposure"] = losses.exposure(self.gains.drift())
+            terms["volume"] = losses.photometric(color, batch.color, self.facts.response, units.volume)
         if not plan.moves_material:
             return StepResult.of(terms, SurfacePixels.none_of(batch), batch[:0])
+        # From here on all photographs are as one of mean exposure. R, which sees all pixels, finds the gains.
+        color = at_mean_exposure(self.gains, batch.color, batch.view, self.facts.response)
+        batch = replace(batch, color=color)
 
         # 2. Rays that meet one surface, on the object, are shaded. The gradient to their hits is scaled.
         rows = torch.nonzero(hits.is_hit(settings.hit_share) & (batch.mask > 0.5))[:, 0]
@@ -373,7 +384,10 @@ class NeilfModel(nn.Module):
         """Parameters by field, the host's among them where it offers them and is not borrowed."""
         offered = isinstance(self.host, HasParameterGroups) and not self.borrowed
         host = self.host.parameter_groups() if offered else {}
-        return {**host, "brdf": list(self.brdf.parameters()), "light": list(self.light.parameters())}
+        own = {"brdf": self.brdf, "light": self.light}
+        if self.gains is not None:
+            own["exposure"] = self.gains
+        return {**host, **{name: list(field.parameters()) for name, field in own.items()}}
 
     def freeze_for(self, stage: Stage) -> None:
         """Let exactly the fields move that the stage moves; the others get no gradient."""

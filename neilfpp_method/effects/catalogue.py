@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from neilfpp_method.settings.plain import changed
+from neilfpp_method.settings.presets import EXPOSURE_RATE
 from neilfpp_method.settings.types import FreeLightConfig, MapLightConfig, NeilfConfig
 
 __all__ = ["EFFECTS", "Effect", "switched"]
@@ -130,6 +131,16 @@ EFFECTS: Mapping[str, Effect] = {
             obstacle=lambda config: "R paints the scene sphere" if config.background.kind == "none" else "",
             cost=lambda config: f"{config.background.samples} network queries per ray",
             risk="what lies behind the scene becomes surfaces in it",
+        ),
+        Effect(
+            name="exposure",
+            title="exposure and white balance of each photograph",
+            is_on=lambda config: config.optimizer.exposure > 0,
+            on=lambda config: {"optimizer.exposure": config.optimizer.exposure or EXPOSURE_RATE},
+            off={"optimizer.exposure": 0.0},
+            obstacle=_none,
+            cost=lambda config: "three unknowns for each photograph",
+            risk="photographs of one place that differ become gloss, fog, and light that is uneven",
         ),
     )
 }

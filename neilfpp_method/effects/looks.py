@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.effects.exposure import Exposures
 from neilfpp_method.effects.first_light import FirstLight, find_first_light
 from neilfpp_method.effects.lobes import lobe_evidence
 from neilfpp_method.effects.measurement import Measurement
@@ -21,7 +22,15 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.structures import PixelBatch
 
-__all__ = ["LOOKED_AT", "after_fit", "look_at_light", "look_at_surface", "note_facts", "wants_surface"]
+__all__ = [
+    "LOOKED_AT",
+    "after_fit",
+    "look_at_light",
+    "look_at_surface",
+    "note_exposures",
+    "note_facts",
+    "wants_surface",
+]
 
 LOOKED_AT = 1024
 """Training pixels whose surface points are measured: the standard error of a 1 % share is 0.3 %."""
@@ -53,6 +62,20 @@ def note_facts(plan: Plan, facts: SceneFacts) -> None:
             else "one colour is all that the borders show"
         )
         plan.decisions.append(Decision(0, "background", on, "files", seen))
+
+
+def note_exposures(plan: Plan, found: Exposures | None) -> None:
+    """What the photographs say of their exposures before training; none where nothing shows them the same
+    places.
+    """
+    if plan.newest("exposure") is not None:
+        return
+    if found is None:
+        unknown = "without a point cloud nothing tells the same place in two photographs"
+        plan.decisions.append(Decision(0, "exposure", False, "files", unknown))
+        return
+    on, reason = found.measured.favours(chosen=False) is True, found.measured.in_words()
+    plan.decisions.append(Decision(0, "exposure", on, "files", reason, found.measured))
 
 
 def wants_surface(plan: Plan) -> bool:

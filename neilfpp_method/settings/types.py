@@ -311,6 +311,8 @@ class OptimizerConfig:
     light: float = 1e-3
     background: float = 1e-3
     beta: float = 1e-3
+    exposure: float = 0.0
+    """Of log gains of photographs, where evidence calls for them; 0: all are taken to be exposed alike."""
     joint: float = 1.0
     """Factor on all rates in the joint stage."""
     final: tuple[float, float, float] = (0.1, 0.1, 0.1)
@@ -321,8 +323,7 @@ class OptimizerConfig:
     """Steps at the start of each stage in which the rate rises from a tenth."""
     background_from: float = 0.0
     """Share of SDF init that is over when the field beyond the scene starts to move. Until then it is the
-    colour that it starts as, so that what lies within the scene is made of surfaces: a field that is seen
-    from everywhere can paint it as well.
+    colour that it starts as: a field that is seen from everywhere can paint the scene as well.
     """
 
 

@@ -15,6 +15,7 @@ from lightning_fabric import Fabric
 from lightning_fabric.strategies import DDPStrategy
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from torch import Tensor
 
 from neilfpp_method.budget.durations import in_words as time_in_words
 from neilfpp_method.data.capture import Capture
@@ -23,12 +24,13 @@ from neilfpp_method.data.held_back import hold_back
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import at_scale, scale_for_rays
 from neilfpp_method.effects.asked import Asked, check_asked
-from neilfpp_method.effects.looks import note_facts
+from neilfpp_method.effects.looks import note_exposures, note_facts
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.table import table
 from neilfpp_method.errors import Stopped, Unsound, UserError
 from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.health.watch import LOOKED_AT, Watch
+from neilfpp_method.inspection.findings import problems_of_poses
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, stage_steps
 from neilfpp_method.settings.check import check_config
@@ -42,7 +44,13 @@ from neilfpp_method.train.budgeted import (
     planned_effects,
     planned_settings,
 )
-from neilfpp_method.train.build import build_model, scene_facts, show_known_light
+from neilfpp_method.train.build import (
+    build_model,
+    cloud_in_words,
+    exposures_of,
+    scene_facts,
+    show_known_light,
+)
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.health_record import in_words as health_in_words
@@ -161,7 +169,11 @@ def run_training(
     fabric = _launch(place, devices)
     with listening(ledger), _nothing_left_on_failure(out), alone_in(out):
         pixels = _load_pixels(capture, out / PIXELS, fabric, console)
-        facts = described.facts if resume else scene_facts(capture, pixels, config)
+        if resume:
+            facts = described.facts
+        else:
+            gains = _log_gains(plan, capture, pixels)
+            facts = scene_facts(capture, pixels, config, gains)
         note_facts(plan, facts)
         config = plan.config_of_model
         seed_step(config.train.seed, step=-1)
@@ -176,8 +188,14 @@ def run_training(
                 if planned is not None:
                     write_budget(out, planned)
             console.print(capture.summary, soft_wrap=True)
-            if source.scale < 1 and not resume:
-                console.print(_scaled(source.scale, len(pixels), rays), soft_wrap=True)
+            if not resume:
+                for line in problems_of_poses(capture):
+                    console.print(line, style="yellow", soft_wrap=True, markup=False)
+                if source.scale < 1:
+                    console.print(_scaled(source.scale, len(pixels), rays), soft_wrap=True)
+                for line in (cloud_in_words(capture, config), _exposures_in_words(plan)):
+                    if line is not None:
+                        console.print(line, soft_wrap=True)
             console.print(f"run folder {out}", soft_wrap=True)
         # Every process fits the same geometry for itself.
         started = start_geometry(model, capture, config) if begins else None
@@ -229,6 +247,25 @@ def run_training(
     if strict and verdict_of(findings) == "failed":
         raise Unsound(f"{out}: {findings[0].what}", findings[0].remedy)
     return out
+
+
+def _log_gains(plan: Plan, capture: Capture, pixels: PixelDataset) -> Tensor | None:
+    """The gains that photographs start with, where the plan has them on after it has heard the photographs;
+    zeros where a person asks for them and nothing shows what they are.
+    """
+    if not plan.is_on("exposure"):
+        return None
+    found = exposures_of(capture, pixels)
+    note_exposures(plan, found)
+    if not plan.is_on("exposure"):
+        return None
+    return torch.zeros(len(pixels.views), 3) if found is None else found.log_gain
+
+
+def _exposures_in_words(plan: Plan) -> str | None:
+    """That photographs have gains, and why; none where they have none."""
+    decision = plan.newest("exposure")
+    return f"effects: exposure on, {decision.reason}" if decision is not None and decision.on else None
 
 
 def _watch(pixels: PixelDataset, config: NeilfConfig, reporter: Reporter) -> Watch:
