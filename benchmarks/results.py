@@ -34,7 +34,7 @@ from neilfpp_method.settings.presets import fixed_geometry, free_light, preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model
 from neilfpp_method.train.command import run_training
-from neilfpp_method.train.loop import make_optimizer, seed_step
+from neilfpp_method.train.optimizer import make_optimizer, seed_step
 from neilfpp_method.train.run import (
     create_run,
     load_checkpoint,

@@ -35,7 +35,7 @@ from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts
 from neilfpp_method.train.device import pick_device
-from neilfpp_method.train.loop import make_optimizer, seed_step, set_rates
+from neilfpp_method.train.optimizer import make_optimizer, seed_step, set_rates
 from neilfpp_method.train.run import Run
 
 __all__ = ["Curve", "Mark", "curve", "table"]

@@ -40,7 +40,7 @@ from neilfpp_method.shading.sampling import sample_directions
 from neilfpp_method.structures import RayBatch, StepResult
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.health_record import write_findings
-from neilfpp_method.train.loop import adam, seed_step, set_rates
+from neilfpp_method.train.optimizer import adam, seed_step, set_rates
 
 __all__ = ["FieldAdamConfig", "NeilfMethod", "NeilfMethodConfig"]
 
@@ -53,7 +53,7 @@ class FieldAdamConfig(OptimizerConfig):
     """The field."""
 
     def setup(self, params: list[nn.Parameter]) -> torch.optim.Optimizer:
-        """Adam, as in `train.loop.make_optimizer`."""
+        """Adam, as in `train.optimizer.make_optimizer`."""
         return adam([{"params": params, "name": self.name, "lr": self.lr}])
 
 

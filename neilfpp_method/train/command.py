@@ -14,7 +14,6 @@ import torch
 from lightning_fabric import Fabric
 from lightning_fabric.strategies import DDPStrategy
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from torch import Tensor
 
 from neilfpp_method.budget.durations import in_words as time_in_words
@@ -35,7 +34,7 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, stage_steps
 from neilfpp_method.settings.check import check_config
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.timing.ledger import Ledger, doing, listening
+from neilfpp_method.timing.ledger import Ledger, listening
 from neilfpp_method.train.budget_record import read_budget, write_budget
 from neilfpp_method.train.budgeted import (
     close_budget,
@@ -56,12 +55,14 @@ from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.health_record import in_words as health_in_words
 from neilfpp_method.train.light_record import in_words
 from neilfpp_method.train.lock import alone_in
-from neilfpp_method.train.loop import Training, seed_step, train
+from neilfpp_method.train.loop import Training, train
 from neilfpp_method.train.memory import check_training_memory
+from neilfpp_method.train.optimizer import seed_step
 from neilfpp_method.train.pace import Pace
 from neilfpp_method.train.preview import write_preview
 from neilfpp_method.train.progress import Reporter, reporting
 from neilfpp_method.train.quality import Quality
+from neilfpp_method.train.reading import load_pixels
 from neilfpp_method.train.run import (
     PIXELS,
     CaptureSource,
@@ -168,7 +169,7 @@ def run_training(
     check_training_memory(capture)
     fabric = _launch(place, devices)
     with listening(ledger), _nothing_left_on_failure(out), alone_in(out):
-        pixels = _load_pixels(capture, out / PIXELS, fabric, console)
+        pixels = load_pixels(capture, out / PIXELS, fabric, console)
         if resume:
             facts = described.facts
         else:
@@ -360,30 +361,6 @@ def _nothing_left_on_failure(out: Path) -> Iterator[None]:
                 for folder in made:
                     folder.rmdir()
         raise
-
-
-@doing("data", apart=True)
-def _load_pixels(capture: Capture, folder: Path, fabric: Fabric, console: Console) -> PixelDataset:
-    """One process reads the images, all find them in the folder; an error in them ends all of them."""
-    problem: tuple[str, str] | None = None
-    if fabric.is_global_zero:
-        try:
-            pixels = _read_pixels(capture, folder, fabric, console)
-        except UserError as error:
-            problem = (error.problem, error.remedy)
-    problem = fabric.broadcast(problem)
-    if problem is not None:
-        raise UserError(*problem)
-    return pixels if fabric.is_global_zero else _read_pixels(capture, folder, fabric, console)
-
-
-def _read_pixels(capture: Capture, folder: Path, fabric: Fabric, console: Console) -> PixelDataset:
-    columns = (TextColumn("reading images"), BarColumn(), MofNCompleteColumn())
-    hidden = not (fabric.is_global_zero and console.is_terminal)
-    with Progress(*columns, console=console, transient=True, disable=hidden) as progress:
-        task = progress.add_task("", total=len(capture.train_views))
-        views = capture.train_views
-        return PixelDataset(capture, views, fabric.device, lambda _: progress.advance(task), folder)
 
 
 def _preview(

@@ -28,18 +28,18 @@ from neilfpp_method.schedule import (
     StagePosition,
     Total,
     active_losses,
-    rate_factor,
     stage_at,
     stage_steps,
     weigh,
 )
 from neilfpp_method.settings.facts import RadianceUnits
-from neilfpp_method.settings.types import NeilfConfig, OptimizerConfig
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import LossTerms, PixelBatch, StepResult
 from neilfpp_method.timing.ledger import Ledger, doing
 from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.health_record import read_findings, write_findings
 from neilfpp_method.train.light_record import LightFit, note_fit, read_fits, write_fits
+from neilfpp_method.train.optimizer import gradient_norms, make_optimizer, seed_step, set_rates
 from neilfpp_method.train.pace import Pace
 from neilfpp_method.train.progress import Reporter
 from neilfpp_method.train.quality import Quality, read_looks, write_looks
@@ -47,7 +47,7 @@ from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, s
 from neilfpp_method.train.skipped import Moment, keep_step
 from neilfpp_method.train.work_record import write_work
 
-__all__ = ["Training", "adam", "make_optimizer", "seed_step", "set_rates", "train"]
+__all__ = ["Training", "train"]
 
 LOG_EVERY = 50
 """Steps between TensorBoard scalars: a thousand points of a curve in the longest training."""
@@ -277,7 +277,7 @@ def _update(
     if total.loss.requires_grad:
         with doing("gradients"):
             run.fabric.backward(total.loss)
-    norms = _gradient_norms(model)
+    norms = gradient_norms(model)
     psnr = _psnr(terms, run.model.units)
     stop = torch.full_like(psnr, run.should_stop())
     # The one transfer of the step: everything that the loop and the person must know. Every process takes the
@@ -325,61 +325,6 @@ def _keep_skipped(
             run.reporter.warn(f"what made it so: neilfpp replay {shlex.quote(str(run.path))} {step}")
     except UserError as error:
         run.reporter.warn(f"the rays of step {step} are not kept: {error.problem}")
-
-
-# -------------------------------------------------------------------------------------------------- optimiser
-
-
-def make_optimizer(model: NeilfModel, config: OptimizerConfig) -> torch.optim.Optimizer:
-    """Adam with a named group for each field; frozen parameters get no gradient and do not move."""
-    groups = [
-        {"params": parameters, "name": name, "lr": getattr(config, name)}
-        for name, parameters in model.parameter_groups().items()
-        if parameters
-    ]
-    return adam(groups)
-
-
-def adam(groups: Sequence[Mapping[str, object]]) -> torch.optim.Adam:
-    """Adam as every loop here uses it.
-
-    Fused: one pass over the tables of hash grids, which are most of all parameters, in place of a dozen.
-    """
-    return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
-
-
-def set_rates(
-    optimizer: torch.optim.Optimizer,
-    config: OptimizerConfig,
-    position: StagePosition,
-    background_waits: bool = True,
-) -> None:
-    """The rate of each field at a step of a stage.
-
-    `background_waits` off: what lies beyond the scene moves from the start, whatever `config.background_from`
-    says. Where structure from motion has found points there, one colour is no stand-in for it: training would
-    fill the scene with clouds.
-    """
-    factor = rate_factor(config, position)
-    waits = background_waits and position.stage is Stage.SDF_INIT and position.share < config.background_from
-    for group in optimizer.param_groups:
-        name = group["name"]
-        group["lr"] = 0.0 if waits and name == "background" else getattr(config, name) * factor
-
-
-def seed_step(seed: int, step: int, rank: int = 0) -> None:
-    """Seed every random number of a step: what a step draws depends on these three numbers alone."""
-    torch.manual_seed((seed * 1_000_003 + step) * 4_099 + rank)
-
-
-def _gradient_norms(model: NeilfModel) -> dict[str, Tensor]:
-    """Length of the gradient of each field that has one."""
-    norms = {}
-    for name, parameters in model.parameter_groups().items():
-        gradients = [p.grad for p in parameters if p.grad is not None]
-        if gradients:
-            norms[name] = torch.stack([g.norm() for g in gradients]).norm()
-    return norms
 
 
 def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:

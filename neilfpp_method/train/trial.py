@@ -33,7 +33,7 @@ from neilfpp_method.schedule import Stage, StagePosition, active_losses, stage_s
 from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
-from neilfpp_method.train.loop import make_optimizer, seed_step, set_rates
+from neilfpp_method.train.optimizer import make_optimizer, seed_step, set_rates
 from neilfpp_method.train.preview import write_preview
 
 __all__ = ["Trial", "try_out"]
