@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from neilfpp_method import losses
 from neilfpp_method.fields.brdf import BrdfField
+from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.light import LightModel, make_light
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
@@ -31,8 +32,8 @@ from neilfpp_method.lighting.solver import LightSolver, make_light_solver
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, StagePlan, active_losses
 from neilfpp_method.settings.check import check_config
 from neilfpp_method.settings.facts import SceneFacts, radiance_units
-from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.shading import LOBES, initial_albedo, shade
+from neilfpp_method.settings.types import NeilfConfig, ShadingConfig
+from neilfpp_method.shading import LOBES, Lobe, initial_albedo, shade
 from neilfpp_method.structures import (
     LossTerm,
     LossTerms,
@@ -115,10 +116,12 @@ class NeilfModel(nn.Module):
         self.check_outputs = OutputCheck(host, config.shading.hit_share)
         self.observers: list[Callable[[PixelBatch, SurfaceHits], None]] = []
         self.brdf = BrdfField(config.brdf, config.encoding, config.volume.radius)
-        self.use(config)
-        albedo = initial_albedo(config.brdf.initial_base_color, config.brdf.initial_metallic, self.lobe)
+        albedo = initial_albedo(
+            config.brdf.initial_base_color, config.brdf.initial_metallic, _lobe_of(config.shading)
+        )
         parts = make_light(config, facts.response, facts.median_radiance / albedo)
         self.light, self.lamps = parts.light, parts.lamps
+        self.use(config)
         # The surface of a borrowed host moves as its own trainer likes.
         stands_still = not borrowed and not self.stages[Stage.MATERIAL_INIT].moves_host
         self.replay = Replay(config.train.fresh if stands_still else 1.0, config.train.rays)
@@ -128,8 +131,10 @@ class NeilfModel(nn.Module):
         built with.
         """
         self.config = config
-        self.lobe = LOBES[config.shading.lobe] if config.shading.specular else None
-        self.brdf.metals = config.brdf.metals
+        self.lobe = _lobe_of(config.shading)
+        self.brdf.use(config.brdf)
+        if isinstance(self.light, EnvironmentLight):
+            self.light.be_even(config.light.environment_height == 1)
 
     # ----------------------------------------------------------------------------------------------- one step
 
@@ -353,3 +358,7 @@ class NeilfModel(nn.Module):
             for parameter in parameters:
                 parameter.requires_grad_(name in self.stages[stage].moves)
                 parameter.grad = None
+
+
+def _lobe_of(shading: ShadingConfig) -> Lobe | None:
+    return LOBES[shading.lobe] if shading.specular else None

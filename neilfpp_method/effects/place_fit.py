@@ -9,6 +9,7 @@ two take turns.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -23,7 +24,7 @@ from neilfpp_method.lighting.transport import Transport, from_texels_at
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import SceneTracer
 
-__all__ = ["PlaceFit", "fit_places", "place_errors", "place_transport"]
+__all__ = ["PlaceFit", "any_map", "fit_places", "place_errors", "place_transport"]
 
 ROUGHNESSES = (0.08, 0.14, 0.2, 0.28, 0.36, 0.45, 0.55, 0.66, 0.8, 1.0)
 """Of the grid; the lobe's width changes by about a half from one to the next."""
@@ -71,7 +72,18 @@ def place_transport(places: Places, lobe: Lobe, scene: SceneTracer | None) -> Tr
     return from_texels_at(environment, places.observed, ROUGHNESSES, lobe, scene)
 
 
-def fit_places(places: Places, transport: Transport, typical: float, metals: bool) -> PlaceFit:
+def any_map(log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+    """A map whose texels and channels have nothing to do with each other."""
+    return log_radiance
+
+
+def fit_places(
+    places: Places,
+    transport: Transport,
+    typical: float,
+    metals: bool,
+    form: Callable[[Float[Tensor, "3 H W"]], Float[Tensor, "3 H W"]] = any_map,
+) -> PlaceFit:
     """Light and materials from a start of grey paint under an even light.
 
     Args:
@@ -79,6 +91,7 @@ def fit_places(places: Places, transport: Transport, typical: float, metals: boo
         transport: of the same pixels.
         typical: radiance of a typical pixel.
         metals: whether metallic may be more than 0.
+        form: makes the map of log radiance from as many unknowns.
     """
     device = places.place.device
     count = places.count
@@ -89,7 +102,7 @@ def fit_places(places: Places, transport: Transport, typical: float, metals: boo
         metallic=torch.zeros(count, dtype=torch.long, device=device),
     )
     for turn in range(ROUNDS):
-        fit = _better_light(fit, places, transport, typical, STEPS if turn else FIRST_STEPS)
+        fit = _better_light(fit, places, transport, typical, STEPS if turn else FIRST_STEPS, form)
         fit = _best_material(fit, places, transport, typical, METALLICS if metals else METALLICS[:1])
     return fit
 
@@ -127,7 +140,12 @@ def _relative_error(outgoing: Tensor, places: Places, typical: float) -> Tensor:
 
 
 def _better_light(
-    fit: PlaceFit, places: Places, transport: Transport, typical: float, steps: int
+    fit: PlaceFit,
+    places: Places,
+    transport: Transport,
+    typical: float,
+    steps: int,
+    form: Callable[[Tensor], Tensor],
 ) -> PlaceFit:
     """The light by descent, and the base colours with it, at the roughness and metallic that places have."""
     shown, metallic = _at_roughness(transport, fit.roughness[places.place]), _metallic(fit)[places.place]
@@ -139,7 +157,7 @@ def _better_light(
     with torch.enable_grad():
         for _ in range(steps):
             base_color = fit.base_color * gain.exp()
-            sent = (flat @ log_radiance.exp().flatten(1).t()).view_as(shown.scene) + shown.scene
+            sent = (flat @ form(log_radiance).exp().flatten(1).t()).view_as(shown.scene) + shown.scene
             error = _relative_error(
                 _outgoing(sent, base_color.clamp(0, 1)[places.place], metallic), places, typical
             )
@@ -150,7 +168,7 @@ def _better_light(
             loss.backward()
             optimizer.step()
     base_color = (fit.base_color * gain.detach().exp()).clamp(DARKEST, 1)
-    return PlaceFit(log_radiance.detach(), base_color, fit.roughness, fit.metallic)
+    return PlaceFit(form(log_radiance).detach(), base_color, fit.roughness, fit.metallic)
 
 
 @torch.no_grad()

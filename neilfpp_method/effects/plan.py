@@ -96,6 +96,7 @@ class Plan:
                 plan.decisions.append(Decision(0, name, False, "settings", "off in the settings"))
             elif effect.unjudged(settings):
                 plan.decisions.append(Decision(0, name, True, "settings", effect.unjudged(settings)))
+        plan.leave_out_what_needs_others(0)
         return plan
 
     @property
@@ -124,12 +125,25 @@ class Plan:
         newest = self.newest(name)
         return newest is None or newest.by == "evidence"
 
-    def decide(self, name: str, measured: Measurement, step: int) -> Decision:
+    def leave_out_what_needs_others(self, step: int) -> list[Decision]:
+        """Decide against what there is none of without an effect that is off."""
+        decisions = []
+        for name, effect in EFFECTS.items():
+            cause = self.newest(effect.needs) if effect.needs else None
+            if cause is None or cause.on or not self.is_on(name) or effect.obstacle(self.settings):
+                continue
+            why = f"there is none without {effect.needs}"
+            decisions.append(Decision(step, name, False, cause.by, why))
+        self.decisions += decisions
+        return decisions
+
+    def decide(self, name: str, measured: Measurement, step: int, earned: bool = False) -> Decision:
         """What evidence makes of an effect that is open; without enough samples it stays as it is. It counts
-        from now on.
+        from now on. With `earned`, an effect of which nothing was decided yet must earn its place as if it
+        were off.
         """
         before = self.is_on(name)
-        favoured = measured.favours(before)
+        favoured = measured.favours(before and not (earned and self.newest(name) is None))
         on = before if favoured is None else favoured
         reason = measured.in_words()
         if favoured is None:

@@ -17,8 +17,8 @@ BY_COSINE, BY_LIGHT, BY_LOBE = 24, 24, 3
 viewer.
 """
 
-WITHOUT_LOBE = {"mis": "cosine", "lobe": "cosine"}
-"""A Lambertian surface has no lobe to sample: the cosine then leaves no variance but that of the light."""
+WITHOUT_LOBE = {"mis": "no_lobe", "lobe": "cosine"}
+"""A Lambertian surface has no lobe to sample."""
 
 
 def draw_directions(

@@ -110,7 +110,8 @@ class MapSolver(nn.Module):
         # Only a background that is no backdrop shows the light, and only a map that is sought has to keep to
         # it.
         sightings = config.map is None and facts.background == "inverted_sphere"
-        self.sky = SkySightings(config.environment_height, facts.response) if sightings else None
+        rows = light.light.log_radiance.shape[1]
+        self.sky = SkySightings(rows, facts.response) if sightings else None
 
     @property
     def due(self) -> bool:
@@ -141,10 +142,20 @@ class MapSolver(nn.Module):
             return None
         first, observed = self.memory.age is None, self.memory.recall()
         sky = None if self.sky is None else self.sky.known()
-        objective = Objective(self.response, self.unit, self.config.fit, sky)
-        return solve_light(
+        environment = self.light.light
+        objective = Objective(
+            self.response,
+            self.unit,
+            self.config.fit,
+            None if environment.even else sky,
+            self.config.monochrome,
+        )
+        found = solve_light(
             self.light, observed, brdf(observed.position), self.lobe, scene, objective, self.config, first
         )
+        if environment.even:
+            environment.log_radiance.copy_(environment.log_radiance[:, :1, :1].clone())
+        return found
 
 
 def make_light_solver(

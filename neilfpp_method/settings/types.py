@@ -99,6 +99,8 @@ class BrdfConfig:
     """
     metals: bool = True
     """Whether there may be metal; off, metallic is 0 everywhere."""
+    varying_roughness: bool = True
+    """Whether roughness is a field; off, the whole scene has one, which is learned."""
     layers: int = 8
     """Hidden layers."""
     width: int = 512
@@ -138,7 +140,9 @@ class MapLightConfig:
     them.
     """
     environment_height: int = 32
-    """Rows of the environment map; it has twice as many columns."""
+    """Rows of the environment map; it has twice as many columns. 1: one colour from everywhere."""
+    monochrome: bool = False
+    """One channel for all three colours; lamps keep theirs."""
     map: str | None = None
     """An environment map that is known, a linear EXR in the layout of docs/light.md; none: the map is
     recovered. Lamps before it are sought where `kind` says so.
@@ -165,7 +169,7 @@ class FreeLightConfig:
     width: int = 128
     """Units of a hidden layer."""
     monochrome: bool = False
-    """One channel for all three colours, for LDR input."""
+    """One channel for all three colours; lamps keep theirs."""
 
 
 IncidentLightConfig = Annotated[FreeLightConfig | MapLightConfig, tyro.conf.AvoidSubcommands]
@@ -238,9 +242,7 @@ class VolumeConfig:
     samples: int = 98
     """Samples per ray that are rendered: two thirds where it is stopped, the rest even, ends included."""
     normal_radius: float = 0.0
-    """Surfaces are shaded with the normal of a neighbourhood of this radius, edges kept; 0: with that of the
-    hit alone.
-    """
+    """Surfaces are shaded with the normals within this radius of a hit, edges kept; 0: with its own alone."""
 
 
 # ---------------------------------------------------------------------------------------------------- shading
@@ -254,18 +256,16 @@ class ShadingConfig:
     """Distribution and masking of the specular lobe."""
     specular: bool = True
     """Off: a Lambertian surface; roughness and metallic are not asked for."""
-    sampler: Literal["fibonacci", "cosine", "lobe", "mis"] = "fibonacci"
-    """Who draws the incident directions: the paper's lattice, a cosine, the specular lobe, or cosine, lobe
-    and (where it can be sampled) light together by the balance heuristic.
+    sampler: Literal["fibonacci", "cosine", "lobe", "mis", "no_lobe"] = "fibonacci"
+    """Who draws the incident directions: the paper's lattice, a cosine, the specular lobe; mis: cosine, lobe
+    and (where it can be sampled) light by the balance heuristic; no_lobe: cosine and light.
     """
     train_samples: int = 128
     """Incident directions per point in training."""
     eval_samples: int = 256
     """Incident directions per point in evaluation."""
     hit_share: float = 0.8
-    """Least concentration of a ray's blending weight that makes its hit a surface point; the others are not
-    shaded.
-    """
+    """Least concentration of a ray's blending weight that makes its hit a surface point, which is shaded."""
 
 
 @dataclass(frozen=True)

@@ -194,10 +194,10 @@ def sample_directions(
     stochastic: bool,
     light: Technique | None = None,
 ) -> IncidentSamples:
-    """`count` incident directions per point, in at least float32, by fibonacci, cosine, lobe or mis.
+    """`count` incident directions per point, in at least float32, by fibonacci, cosine, lobe, mis or no_lobe.
 
     mis is cosine and lobe by halves or, where there is a `light` that can be sampled, cosine, lobe and light
-    together.
+    together. no_lobe is cosine and light by halves, or the cosine alone.
 
     Raises:
         UserError: there is no such sampler.
@@ -216,6 +216,10 @@ def sample_directions(
             (specular_lobe(n, wo, roughness, lobe), to_lobe),
         ]
         techniques += [(light, to_light)] if light is not None else []
+    elif kind == "no_lobe":
+        to_light = 0 if light is None else int(LIGHT_SHARE * count)
+        techniques = [(cosine(n), count - to_light)]
+        techniques += [(light, to_light)] if light is not None else []
     else:
-        raise UserError(f"unknown sampler '{kind}'", "choose fibonacci, cosine, lobe or mis")
+        raise UserError(f"unknown sampler '{kind}'", "choose fibonacci, cosine, lobe, mis or no_lobe")
     return combine(techniques, stochastic)

@@ -107,7 +107,7 @@ def run_training(
                 f"{out}: its effects are '{plan.asked}'", "leave --effects out, or start a new run"
             )
         config = plan.config_of_model
-        if _is_finished(out, config):
+        if _is_finished(out, plan.config):
             console.print(f"run folder {out}: finished already, nothing to continue", soft_wrap=True)
             return out
         ledger.add(read_work(out))

@@ -83,17 +83,16 @@ def train(run: Training) -> None:
     run.light_solver.to(run.fabric.device)
     optimizer = make_optimizer(model, run.config.optimizer)
     step = _restore(run, optimizer)
-    total = sum(stage_steps(settings).values())
     optimizer = run.fabric.setup_optimizers(optimizer)
     if step == 0 and model.stages[stage_at(0, settings).stage].moves_material:
         _look_at_effects(run, model, 0)
-    while step < total:
+    while step < _length(run):
         position = stage_at(step, settings)
         step = _train_stage(run, model, optimizer, step, position)
         if run.fabric.is_global_zero:
             with doing("looks", apart=True):
                 run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
-        if step < total:
+        if step < _length(run):
             with doing("looks", apart=True):
                 _look_at_effects(run, model, step)
         _save(run, optimizer, step, also=position.stage.value)
@@ -101,6 +100,11 @@ def train(run: Training) -> None:
             model.eval()
             run.preview(model, position.stage)
             model.train()
+
+
+def _length(run: Training) -> int:
+    """Steps of the training; evidence may take the joint stage away."""
+    return sum(stage_steps(run.plan.config.train).values())
 
 
 def _train_stage(
