@@ -1,5 +1,4 @@
-"""`attach_neilf`: material and light on top of somebody else's geometry and radiance, in somebody else's
-loop.
+"""`attach_neilf`: material and light on top of another system's geometry and radiance, in its own loop.
 
 Three lines, the last one in every step:
 
@@ -88,8 +87,7 @@ class AttachedNeilf(nn.Module):
         return self.losses(batch, step, hits)
 
     def losses(self, batch: PixelBatch, step: int | Stage | str, hits: Rendered | None = None) -> Total:
-        """The weighted sum of what counts in a step, to add to a loss of your own, and each term before its
-        weight.
+        """The weighted sum of the losses of a step, to add to your own loss, and each term before its weight.
 
         Args:
             batch: pixels with their rays in the scene frame; see `pixel_batch`.
@@ -310,9 +308,7 @@ def pixel_batch(origins: Tensor, directions: Tensor, color: Tensor, mask: Tensor
 
 
 def _proxy(host: object, config: NeilfConfig) -> SurfaceProxy | None:
-    """What traces rays between surfaces for a host that does not, or not cheaply, where the settings ask for
-    them.
-    """
+    """What traces rays between surfaces for a host without cheap tracing, where the settings ask for it."""
     settings = config.inter_reflection
     asked = settings.mode != "off" and not answers_secondary_rays(host)
     if isinstance(host, LightsItself) or not (asked or settings.mode == "hard"):

@@ -1,6 +1,4 @@
-"""When evidence is looked at: before a stage that learns a material, at its end, and after each fit of the
-light.
-"""
+"""When evidence is measured: before and after a material stage, and after each fit of the light."""
 
 from __future__ import annotations
 
@@ -22,9 +20,7 @@ from neilfpp_method.structures import Observed, PixelBatch
 __all__ = ["LOOKED_AT", "after_fit", "look_at_surface", "note_facts", "wants_surface"]
 
 LOOKED_AT = 1024
-"""Training pixels whose surface points are looked at: the standard error of a share of 1 % is then 0.3 % at
-most.
-"""
+"""Training pixels whose surface points are measured: the standard error of a 1 % share is 0.3 %."""
 AT_ONCE = 512
 """Rays that are rendered together; bounds the memory."""
 
@@ -83,8 +79,7 @@ def look_at_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: i
 
 
 def after_fit(plan: Plan, found: Evidence | None, lit: int, step: int) -> list[Decision]:
-    """What a fit of the light with and without lamps made of lamps: the solver has chosen, the plan notes
-    what it chose.
+    """What a fit of the light with and without lamps found: the solver chooses, the plan records it.
 
     Nothing is noted where the choice is what it was.
     """

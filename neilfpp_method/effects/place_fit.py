@@ -46,7 +46,7 @@ REWEIGHTED = 4
 """Solves for the base colour, in each of which pixels count by the inverse of their last error."""
 START_BASE_COLOR, START_ROUGHNESS = 0.3, 4
 """What places start as; roughness by its number."""
-DARKEST = 0.01
+MIN_BASE_COLOR = 0.01
 """Of base colours."""
 
 
@@ -167,7 +167,7 @@ def _better_light(
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
-    base_color = (fit.base_color * gain.detach().exp()).clamp(DARKEST, 1)
+    base_color = (fit.base_color * gain.detach().exp()).clamp(MIN_BASE_COLOR, 1)
     return PlaceFit(form(log_radiance).detach(), base_color, fit.roughness, fit.metallic)
 
 
@@ -175,8 +175,7 @@ def _better_light(
 def _best_material(
     fit: PlaceFit, places: Places, transport: Transport, typical: float, metallics: tuple[float, ...]
 ) -> PlaceFit:
-    """Of all pairs of roughness and metallic at a place the one whose best base colour leaves the smallest
-    error.
+    """Of all pairs of roughness and metallic at a place, the one with the least error (best base colour).
 
     Radiance is linear in the base colour, b · slope + rest, so the best is a weighted mean.
     """
@@ -194,7 +193,7 @@ def _best_material(
                 per_place = places.mean(weight * slope * wanted) / places.mean(
                     weight * slope.square()
                 ).clamp_min(1e-12)
-                tried = per_place.clamp(DARKEST, 1)
+                tried = per_place.clamp(MIN_BASE_COLOR, 1)
                 error = tried[places.place] * slope - wanted
                 weight = 1 / error.abs().clamp_min(OUTLIER)
             size = functional.smooth_l1_loss(

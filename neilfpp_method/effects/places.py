@@ -63,8 +63,7 @@ def gather_places(
     normal: Float[Tensor, "P 3"],
     views: int,
 ) -> Places:
-    """The pixels that show given points of the surface, each in at most `views` views that are drawn at
-    random.
+    """The pixels that show given surface points, each in at most `views` randomly drawn views.
 
     Args:
         model: whose host says what a pixel shows.

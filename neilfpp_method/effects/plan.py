@@ -46,8 +46,7 @@ class Decision:
 def decided_settings(settings: NeilfConfig, decisions: Sequence[Decision]) -> NeilfConfig:
     """The settings with the newest decision on each effect.
 
-    What a person asked for is set as asked. Evidence only takes away: an effect that it keeps is as the
-    settings have it.
+    Requested effects are set as asked. Evidence only removes: a kept effect is as the settings have it.
     """
     newest = {decision.effect: decision for decision in decisions}
     for name, decision in newest.items():
@@ -138,9 +137,9 @@ class Plan:
         return decisions
 
     def decide(self, name: str, measured: Measurement, step: int, earned: bool = False) -> Decision:
-        """What evidence makes of an effect that is open; without enough samples it stays as it is. It counts
-        from now on. With `earned`, an effect of which nothing was decided yet must earn its place as if it
-        were off.
+        """Decide an open effect by evidence, from now on; without enough samples it stays as it is.
+
+        With `earned`, an effect of which nothing was decided yet must earn its place as if it were off.
         """
         before = self.is_on(name)
         favoured = measured.favours(before and not (earned and self.newest(name) is None))

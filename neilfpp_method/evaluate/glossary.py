@@ -11,9 +11,7 @@ __all__ = ["Entry", "explain"]
 
 @dataclass(frozen=True)
 class Entry:
-    """A figure for people: its title, how its values are written (`%`-style), which way is better, what it
-    says.
-    """
+    """How a figure is shown: title, number format (`%`-style), which way is better, and its meaning."""
 
     title: str
     pattern: str
@@ -38,7 +36,9 @@ def _log(title: str, meaning: str) -> Entry:
 
 
 def _ratio(title: str) -> Entry:
-    meaning = "Error where the run is surest, over the error elsewhere, half of the pixels each; 1 is no better than chance."
+    meaning = (
+        "Error of the surest half of the pixels over that of the other half; 1 is no better than chance."
+    )
     return Entry(title, "%.2f", "lower", meaning)
 
 
@@ -101,9 +101,7 @@ ENTRIES: Mapping[str, Entry] = {
 
 
 def explain(name: str) -> Entry:
-    """The entry of a figure; a baseline has that of what it stands beside, and an unknown figure its own
-    name.
-    """
+    """The entry of a figure; a baseline has that of its figure, and an unknown figure its own name."""
     if name in ENTRIES:
         return ENTRIES[name]
     base = ENTRIES.get(name.removeprefix("baseline_"))

@@ -1,6 +1,4 @@
-"""At which size views are rendered: by default as large as it takes to look at them and to measure them, not
-larger.
-"""
+"""The size at which views are rendered: by default large enough to look at and to measure."""
 
 from __future__ import annotations
 
@@ -46,9 +44,7 @@ def at_size(run: Run, scale: float | None = None, width: int | None = None) -> R
 
 
 def size_in_words(run: Run) -> str | None:
-    """How large the views of a run are, and how to get larger ones; none where they are as large as their
-    files.
-    """
+    """How large the views of a run are and how to get larger ones; none where they have full size."""
     view = max(run.capture.views, key=lambda view: view.camera.width)
     width, height = view.camera.width, view.camera.height
     if (width, height) == file_size(view):

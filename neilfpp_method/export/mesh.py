@@ -28,10 +28,12 @@ __all__ = ["HasSdf", "export_mesh", "extract_mesh", "has_surface", "materials_in
 
 Sdf = Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]
 
-# Grid points along an edge of a block. A block is skipped when |sdf| at its centre exceeds SLACK half-diagonals of it.
-# With 8 and 1.5 nothing is lost, the edges between blocks included, for every field whose slope stays below 1.29.
 BLOCK = 8
+"""Grid points along an edge of a block."""
 SLACK = 1.5
+"""A block is skipped when |sdf| at its centre exceeds this many of its half-diagonals. With blocks of 8
+points nothing is lost, the edges between blocks included, for every field whose slope stays below 1.29.
+"""
 POINTS_AT_ONCE = 65_536
 """Points at which the material is asked together: bounds the memory."""
 
@@ -51,8 +53,7 @@ def extract_mesh(
 ) -> trimesh.Trimesh:
     """The zero set of a signed distance field within a sphere about the origin; faces are wound outwards.
 
-    The grid is asked for its block centres first, then for every point of the blocks that the surface may
-    cross.
+    The grid is asked for its block centres first, then for all points of blocks that the surface may cross.
 
     Args:
         sdf: signed distance, negative inside; its slope should be about 1.
@@ -71,8 +72,7 @@ def extract_mesh(
     )
     if not volume.min() < 0.0 < volume.max():
         raise _no_surface(radius)
-    # scikit-image counts faces by the left hand: its default winds them towards growing values, which is
-    # outwards.
+    # scikit-image winds faces by the left hand towards growing values by default, which is outwards.
     vertices, faces, _, _ = marching_cubes(volume, 0.0, allow_degenerate=False)
     vertices = vertices * step - radius
     inside = np.linalg.norm(vertices, axis=-1) <= radius

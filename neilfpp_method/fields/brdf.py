@@ -27,8 +27,7 @@ class BrdfSample:
 
 
 class BrdfField(nn.Module):
-    """Every parameter is ½ + ½ tanh of an output of the network; roughness starts close to ½, the others to
-    what is set.
+    """Every parameter is ½ + ½ tanh of a network output; roughness starts near ½, the others as set.
 
     `metals` off: metallic is 0 everywhere, with no gradient. `varying_roughness` off: roughness is the same
     everywhere, and is learned as the bias of its output; switched on again, it goes on from there.
@@ -57,9 +56,7 @@ class BrdfField(nn.Module):
         return self._material(torch.tanh(self.mlp(self.encoding(x))))
 
     def with_gradients(self, x: Float[Tensor, "N 3"]) -> BrdfSample:
-        """The material and the gradients of roughness and metallic. A loss on them needs only first-order
-        autograd.
-        """
+        """The material and the gradients of roughness and metallic; losses on them need first order only."""
         encoded = self.encoding.with_jacobian(x)
         sample = self.mlp.with_gradient(encoded.features, slice(3, 5))
         saturation = torch.tanh(sample.value)

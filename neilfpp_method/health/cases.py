@@ -26,13 +26,9 @@ __all__ = [
 Verdict = Literal["sound", "doubtful", "failed"]
 
 MIN_OPAQUE = 0.05
-"""Share of the object's pixels that must show something; the host of an empty scene shows nothing
-anywhere.
-"""
+"""Share of the object's pixels that must show something; an empty scene shows nothing anywhere."""
 MIN_SHARP = 0.5
-"""Share of the opaque rays that must meet one surface; in fog the weight of a ray is spread, and few or none
-do.
-"""
+"""Share of opaque rays that must meet one surface; in fog a ray's weight spreads, and few do."""
 MAX_AT_BOUND = 0.5
 """Share of the surface that may have a base colour at a bound: a scene of black or white things has less."""
 MAX_EMPTY_STEPS = 50

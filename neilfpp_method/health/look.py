@@ -1,6 +1,4 @@
-"""What a model shows of some training pixels: does a surface stand there, and is its material more than its
-bounds?
-"""
+"""What a model shows at some training pixels: is there a surface, and is its material within bounds?"""
 
 from __future__ import annotations
 

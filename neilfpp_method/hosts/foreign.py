@@ -39,9 +39,7 @@ log = logging.getLogger(__name__)
 
 
 def answers_secondary_rays(host: object) -> bool:
-    """Whether a host renders rays that leave a surface: not one that draws whole images, nor one that says
-    no.
-    """
+    """Whether a host renders rays that leave a surface; not if it draws whole images, or declares no."""
     return hasattr(host, "render") and bool(getattr(host, "answers_secondary_rays", True))
 
 

@@ -1,5 +1,4 @@
-"""A traceable stand-in for the surface of a host that cannot trace cheaply, gathered from the rays of
-training.
+"""A traceable stand-in for the surface of a host without cheap tracing, built from training rays.
 
 Hits of camera rays are oriented points; the newest of them are fused into a grid of distances
 (`volume.fusion`) with the mean of the radiance that was seen there. Rays that leave a surface are
@@ -33,19 +32,13 @@ POINTS = 32_768
 EVERY = 64
 """Steps between two refreshes, once there have been as many; before that at steps 1, 2, 4, 8, …"""
 ROUNDS, ROUND = 16, 512
-"""A look around before the first step, and its rays: from the cameras of the first batch to where its hits
-are.
-"""
+"""Batches of rays rendered before the first step, from the first cameras towards their hits."""
 SPREAD = 0.2
 """How far about a hit the look around aims, scene units: beside it is more of the surface."""
 START = 0.75
-"""Height above the grid's surface at which rays leave it, in cells: the tracing ends at a quarter of a
-cell.
-"""
+"""Height above the grid's surface at which rays leave it, in cells; tracing ends at a quarter cell."""
 APART = 2.0
-"""A ray that goes this much further than the grid lets it, in cells, passes through points that are no longer
-true.
-"""
+"""A ray that goes this much further than the grid allows, in cells, passes through outdated points."""
 CLEAR = 0.01
 """Largest opacity of a ray that meets nothing."""
 GRAZING = 0.2
@@ -93,8 +86,7 @@ class Looks:
 
 
 class SurfaceProxy(nn.Module):
-    """The newest points of a surface, and the grid that they make. The points are part of a checkpoint, the
-    grid follows.
+    """The newest points of a surface, and the grid made of them. A checkpoint holds the points alone.
 
     Args:
         radius: half the edge of the cube that holds the scene, scene units.
@@ -129,9 +121,7 @@ class SurfaceProxy(nn.Module):
 
     @torch.no_grad()
     def observe(self, rays: RayBatch, hits: SurfaceHits) -> None:
-        """One training step's camera rays, and what the host says of them. Refreshes the grid when it is
-        time.
-        """
+        """A training step's camera rays and hits. Refreshes the grid when it is time."""
         self.steps += 1
         self._pending.append((rays.to(rays.origins.device), hits.detach()))
         if self.steps % EVERY == 0 or (self.steps < EVERY and self.steps & (self.steps - 1) == 0):
@@ -141,9 +131,7 @@ class SurfaceProxy(nn.Module):
     def look_around(
         self, render: Callable[[RayBatch], SurfaceHits], rays: RayBatch, hits: SurfaceHits
     ) -> None:
-        """Before the first step, see enough of the surface to trace: from where the first rays start, to
-        about their hits.
-        """
+        """Before the first step, see enough of the surface to trace: from the first rays to their hits."""
         known = hits.position[hits.is_hit(self.hit_share)].detach()
         for _ in range(ROUNDS if len(known) else 0):
             origins = rays.origins[torch.randint(len(rays), (ROUND,), device=known.device)]
@@ -222,8 +210,7 @@ class SurfaceProxy(nn.Module):
 
     @torch.no_grad()
     def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
-        """What the scene sends to surface points (`hosts.base.LightsItself`); nothing, before anything was
-        seen.
+        """What the scene sends to surface points (`hosts.base.LightsItself`); nothing while nothing was seen.
 
         Rays start above the grid's own surface, so that its error shadows nothing.
         """

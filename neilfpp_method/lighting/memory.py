@@ -13,9 +13,7 @@ from neilfpp_method.structures import Observed
 __all__ = ["SurfaceMemory"]
 
 FIRST_WAIT = 4
-"""Steps after which the first fit is due even if the memory is not full: surfaces learn under a light that is
-a guess.
-"""
+"""Steps before the first fit, even if the memory is not full: until then the light is a guess."""
 
 
 class SurfaceMemory(nn.Module):

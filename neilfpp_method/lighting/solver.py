@@ -1,13 +1,11 @@
-"""The light solver: it remembers what training steps showed, and now and then solves for the light that
-explains it.
+"""The light solver: it remembers what training steps showed, and solves for the light behind it.
 
     solver = model.light_solver()
     step = model.step(batch, stage)
     solver.observe(step)
     evidence = solver.solve(model.brdf, model.scene)
 
-A light that is free at every point is learned by gradients instead; `NothingToSolve` then stands in the
-solver's place.
+A light that is free at every point is learned by gradients; `NothingToSolve` stands in its place.
 """
 
 from __future__ import annotations
@@ -34,9 +32,7 @@ __all__ = ["LightSolver", "MapSolver", "NothingToSolve", "make_light_solver"]
 
 @runtime_checkable
 class LightSolver(Protocol):
-    """What a training loop calls after every step. It is an `nn.Module`: what it remembers is part of a
-    checkpoint.
-    """
+    """What a training loop calls after every step; a module, as checkpoints hold what it remembers."""
 
     @property
     def due(self) -> bool:
@@ -107,8 +103,7 @@ class MapSolver(nn.Module):
         self.config, self.response, self.unit = config, facts.response, units.physical
         self.light, self.lobe = light, lobe
         self.memory = SurfaceMemory(config.fit.points, config.fit.every)
-        # Only a background that is no backdrop shows the light, and only a map that is sought has to keep to
-        # it.
+        # Only a background that is no backdrop shows the light, and only an unknown map must match it.
         sightings = config.map is None and facts.background == "inverted_sphere"
         rows = light.light.log_radiance.shape[1]
         self.sky = SkySightings(rows, facts.response) if sightings else None

@@ -1,6 +1,4 @@
-"""`NeilfModel` as a nerfstudio model: its losses, stages and rates are those of the standalone loop, called
-from here.
-"""
+"""`NeilfModel` as a nerfstudio model, with the losses, stages and rates of the standalone loop."""
 
 from __future__ import annotations
 
@@ -64,9 +62,7 @@ class NeilfMethodConfig(ModelConfig):
     trains at its own rate and with its own regularisers.
     """
     host_losses: float = 1.0
-    """Weight of the regularisers of `host`; 0: none of them, and of ours L_Eik where it is a surface
-    model.
-    """
+    """Weight of `host`'s regularisers; 0: none of them, and our L_Eik where it is a surface model."""
     neilf: NeilfConfig = field(default_factory=lambda: preset("fast"))
     """The settings of the method. Of `train` only the seed and the steps of the stages count here."""
 
@@ -210,9 +206,7 @@ class NeilfMethod(Model):
         return {name: weigh({name: term}, weights).loss for name, term in terms.items()}
 
     def _light_found(self) -> dict[str, Tensor]:
-        """What the last fit of the light measured for and against lamps, where the settings leave that
-        open.
-        """
+        """The last fit's evidence for and against lamps, where the settings leave that open."""
         if self.evidence is None:
             return {}
         return {
@@ -223,9 +217,7 @@ class NeilfMethod(Model):
     # ------------------------------------------------------------------------------------------------ outputs
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
-        """In evaluation every map; in training the rays themselves: what must be rendered, the losses
-        decide.
-        """
+        """In evaluation every map; in training the rays: the losses decide what is rendered."""
         rays = RayBatch(ray_bundle.origins, ray_bundle.directions)
         if self.training:
             return {"origins": rays.origins, "directions": rays.directions}
@@ -249,9 +241,7 @@ class NeilfMethod(Model):
 
     @torch.no_grad()
     def _incident_light(self, rays: RayBatch, maps: Maps) -> Float[Tensor, "N 3"]:
-        """Irradiance over π where a ray meets the surface: the mean incident radiance, weighted by the
-        cosine.
-        """
+        """Irradiance over π at surface hits: the mean incident radiance, weighted by cosine."""
         light = torch.zeros_like(maps.rgb)
         rows = torch.nonzero(maps.roughness[:, 0])[
             :, 0
@@ -271,9 +261,7 @@ class NeilfMethod(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """PSNR and SSIM of display values over the object, as `neilfpp eval` has them without true depths,
-        and all maps as pictures.
-        """
+        """PSNR and SSIM of display values over the object, as `neilfpp eval`, and all maps."""
         truth, rgb, volume = (self._display(image.to(self.device)) for image in _images(batch, outputs))
         # Where nothing is known of the object, what is rendered of it chooses the pixels.
         shown = (

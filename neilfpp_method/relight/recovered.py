@@ -33,11 +33,9 @@ def check_material(run: Run) -> None:
 
 @torch.no_grad()
 def surface_of_run(run: Run, resolution: int) -> Surface:
-    """The mesh that the run was given, or the one that its distance field has, as `neilfpp export --what
-    mesh` extracts it.
+    """The given mesh, or the one that `neilfpp export --what mesh` extracts from the distance field.
 
-    Surfaces are shaded with the normals that the material was found with: those of the host, smoothed where
-    it smooths.
+    Surfaces are shaded with the normals of training: the host's, smoothed where it smooths.
 
     Args:
         run: the trained run.

@@ -1,6 +1,4 @@
-"""What lies in a run's folder besides its model: how far it came, figures, times, findings, effects,
-settings.
-"""
+"""A run's folder besides its model: progress, figures, times, findings, effects and settings."""
 
 from __future__ import annotations
 

@@ -52,9 +52,7 @@ class LightPicture:
 
 @dataclass(frozen=True)
 class Shown:
-    """Views by name with their photographs and layers, the light at points, and figures of these views
-    alone.
-    """
+    """Views by name with photographs and layers, the light at points, and figures of these views."""
 
     names: tuple[str, ...]
     photographs: tuple[str, ...]

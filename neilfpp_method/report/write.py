@@ -31,9 +31,7 @@ VIEWS_SHARE = 0.85
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """How much a page shows: views, the longest side of a picture in pixels, and whether expected errors are
-    among the maps.
-    """
+    """How much a page shows: views, longest side of a picture in pixels, and expected errors or not."""
 
     views: int = 2
     size: int = 320
@@ -96,8 +94,7 @@ def _with_model(run: Run, files: Files, options: ReportOptions, on_progress: Cal
     if not run.capture.hdr:
         notes.append(
             "The photographs are display values (LDR): what is brighter than white is lost, and light and "
-            "metallic "
-            "come out low."
+            "metallic come out low."
         )
     if not run.capture.test_views:
         notes.append(
@@ -126,7 +123,7 @@ def _with_model(run: Run, files: Files, options: ReportOptions, on_progress: Cal
 
 def _without_model(files: Files) -> str:
     go_on = f"neilfpp train --out {files.path} --resume"
-    note = f"Training was stopped before its first checkpoint, so there is nothing to show yet; it goes on with: {go_on}"
+    note = f"Training was stopped before its first checkpoint: nothing to show yet. It goes on with: {go_on}"
     sections = [
         ("health", "Health", tables.health_section(files.findings, [note, *files.notes])),
         *_from_files(files),
@@ -178,8 +175,10 @@ def _facts(files: Files) -> dict[str, str]:
     shading, machine = files.config.shading, files.machine
     facts = {
         "Preset": files.config.preset,
-        "Shading": f"{shading.lobe} lobe, {shading.sampler} sampler, {shading.train_samples} directions a point in "
-        f"training and {shading.eval_samples} here",
+        "Shading": (
+            f"{shading.lobe} lobe, {shading.sampler} sampler, {shading.train_samples} directions a point in "
+            f"training and {shading.eval_samples} here"
+        ),
         "Inter-reflection": files.config.inter_reflection.mode,
         "Rays a step": str(files.config.train.rays),
     }

@@ -1,6 +1,4 @@
-"""The findings of a run, in `RUN/health.json`: written with every checkpoint, read by evaluation, report and
-resumed runs.
-"""
+"""The findings of a run, in `RUN/health.json`: written with checkpoints; read by eval and report."""
 
 from __future__ import annotations
 

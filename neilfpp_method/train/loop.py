@@ -43,7 +43,7 @@ from neilfpp_method.train.work_record import write_work
 __all__ = ["Training", "adam", "make_optimizer", "seed_step", "set_rates", "train"]
 
 # So many steps in a row without a finite gradient are no accident.
-MOST_SKIPPED = 10
+MAX_SKIPPED = 10
 LOG_EVERY = 50
 """Steps between TensorBoard scalars: a thousand points of a curve in the longest training."""
 
@@ -146,9 +146,7 @@ def _train_stage(
 
 
 def _solve_light(run: Training, model: NeilfModel, computed: StepResult, step: int) -> None:
-    """Show the light solver what a step showed; when it is time, it sets the light. The first process does it
-    for all.
-    """
+    """Show a step to the light solver, which sets the light when due. The first process does it for all."""
     fabric, solver = run.fabric, run.light_solver
     if fabric.is_global_zero:
         with doing("light_fits"):
@@ -167,9 +165,7 @@ def _solve_light(run: Training, model: NeilfModel, computed: StepResult, step: i
 
 
 def _look_at_effects(run: Training, model: NeilfModel, step: int) -> None:
-    """Let the surface decide what is simulated from here on, where that is open. The first process decides
-    for all.
-    """
+    """Let evidence decide the open effects from here on. The first process decides for all."""
     if not wants_surface(run.plan):
         return
     decisions: list[Decision] = []
@@ -241,12 +237,11 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], step: int) ->
         else f"the gradient of {', '.join(fields) or 'another process'}"
     )
     run.reporter.warn(f"step {step} skipped: {where} is not finite ({run.skipped} skipped so far)")
-    if run.skipped_in_a_row >= MOST_SKIPPED:
+    if run.skipped_in_a_row >= MAX_SKIPPED:
         raise Diverged(
-            f"{MOST_SKIPPED} steps in a row were not finite, the last one in {where}",
+            f"{MAX_SKIPPED} steps in a row were not finite, the last one in {where}",
             f"the last good checkpoint is kept in {run.path / 'checkpoints'}; look at the capture's "
-            "brightest pixels "
-            "or lower the learning rates",
+            "brightest pixels or lower the learning rates",
         )
 
 
@@ -308,8 +303,7 @@ def _gradient_norms(model: NeilfModel) -> dict[str, Tensor]:
 def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
     """PSNR of the pixels that the stage compares, dB, in the capture's own response; NaN where there is none.
 
-    The peak is 1, and no error counts for more: a few HDR highlights would otherwise be all that the figure
-    shows.
+    The peak is 1, and errors are capped there: a few HDR highlights would else dominate the figure.
     """
     term, unit = (
         (terms["physical"], units.physical) if "physical" in terms else (terms["volume"], units.volume)

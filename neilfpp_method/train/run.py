@@ -256,9 +256,7 @@ def _described(kind: type[Part], values: Any, where: str) -> Part:
 def save_checkpoint(
     path: Path, model: nn.Module, light_solver: nn.Module, optimizer: torch.optim.Optimizer, step: int
 ) -> None:
-    """Weights, what the light solver remembers, and the optimiser after `step` steps, in one step: never half
-    a file.
-    """
+    """Weights, solver memory and optimiser after `step` steps, written atomically."""
     parts = {"model": model, "light_solver": light_solver, "optimizer": optimizer}
     contents = {"format": FORMAT, "step": step, **{name: part.state_dict() for name, part in parts.items()}}
     with replacing(path) as temporary, temporary.open("wb") as file:

@@ -17,9 +17,7 @@ from neilfpp_method.train.run import Run, write_json
 __all__ = ["Protocol", "decibels", "missing", "write_figures"]
 
 PERFECT = 1e-10
-"""Least mean squared error: official code gives infinity for a perfect estimate, which JSON cannot hold; here
-it is 100 dB.
-"""
+"""Least mean squared error: a perfect estimate is 100 dB here, infinite (not JSON) in official code."""
 
 
 @dataclass(frozen=True)
