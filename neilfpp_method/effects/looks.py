@@ -35,10 +35,11 @@ def note_facts(plan: Plan, facts: SceneFacts) -> None:
             else "one colour is all that the borders show"
         )
         plan.decisions.append(Decision(0, "background", on, "files", seen))
-    kind = "display values" if facts.response == "srgb" else "linear radiance"
-    plan.decisions.append(
-        Decision(0, "response", facts.response == "srgb", "files", f"the files hold {kind}")
-    )
+    response = plan.newest("response")
+    if response is None or response.by != "files":
+        on = facts.response == "srgb"
+        kind = "display values" if on else "linear radiance"
+        plan.decisions.append(Decision(0, "response", on, "files", f"the files hold {kind}"))
 
 
 def wants_surface(plan: Plan) -> bool:
