@@ -26,6 +26,7 @@ class Effect:
         cost: what it takes while a material is learned.
         risk: what goes wrong where it is left out of a scene that has it.
         unjudged: why no evidence decides with these settings; empty: evidence does.
+        advised: evidence is shown and changes nothing: it cannot tell that the effect is not needed.
         needs: an effect without which there is none of this; empty: nothing.
         solved: the light solver decides it again at each fit, so evidence changes no setting.
     """
@@ -40,6 +41,7 @@ class Effect:
     risk: str
     unjudged: Callable[[NeilfConfig], str] = lambda config: ""
     solved: bool = False
+    advised: bool = False
     needs: str = ""
 
 
@@ -136,6 +138,7 @@ EFFECTS: Mapping[str, Effect] = {
                 else ""
             ),
             risk="shading and reflections of the light become base colour",
+            advised=True,
         ),
         Effect(
             name="coloured-light",
@@ -146,6 +149,7 @@ EFFECTS: Mapping[str, Effect] = {
             obstacle=_given_map,
             cost=lambda config: "three unknowns a texel, not one",
             risk="colours of the light become base colour",
+            advised=True,
             unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
         ),
         Effect(
@@ -160,6 +164,7 @@ EFFECTS: Mapping[str, Effect] = {
                 "matrices in fits of the light, not one"
             ),
             risk="gloss becomes base colour",
+            advised=True,
             unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
         ),
         Effect(

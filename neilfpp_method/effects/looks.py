@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.effects.catalogue import EFFECTS
 from neilfpp_method.effects.disagreement import ShownSurface, shading_disagreement
 from neilfpp_method.effects.material import JUDGED, material_evidence
 from neilfpp_method.effects.measurement import Measurement
@@ -67,12 +66,7 @@ def look_at_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: i
         decisions.append(plan.decide("inter-reflection", measured, step))
     names = frozenset(name for name in JUDGED if plan.is_open(name))
     found = material_evidence(model, pixels, surface.position, surface.normal, names) if names else {}
-    if "reflection" in found:
-        decisions.append(plan.decide("reflection", found.pop("reflection"), step, earned=True))
-        decisions += plan.leave_out_what_needs_others(step)
-    for name, measured in found.items():
-        if not EFFECTS[name].needs or plan.is_on(EFFECTS[name].needs):
-            decisions.append(plan.decide(name, measured, step, earned=True))
+    decisions += [plan.decide(name, measured, step) for name, measured in found.items()]
     if plan.is_open("joint-stage") and has_material(step, plan.settings.train):
         decisions.append(plan.decide("joint-stage", shading_disagreement(model, seen), step))
     model.train(mode)

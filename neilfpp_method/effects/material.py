@@ -3,9 +3,11 @@ show, explained with each of them and without.
 
 A dark gloss under a bright light explains a single view of a metal, and a metal explains a single view of a
 paint. How a place changes from view to view tells them apart. So light and materials are fitted to most
-views, and compared at pixels of the other views. The ladder begins with Lambertian surfaces; what a rung adds
-stays for the next one where it is worth it: one gloss for all, metals, a roughness of its own for each place.
-The light is judged on the rung that is reached. Lamps are no part of these fits.
+views, with something and without it, and compared at pixels of the other views: metals first, and all else
+with metals where they are worth it. Lamps are no part of these fits.
+
+The base colour of every place is free. So a place without gloss says nothing of the light, and what an
+uneven light or its colours save is less than what they are worth.
 """
 
 from __future__ import annotations
@@ -103,7 +105,7 @@ def material_evidence(
 
 @dataclass(frozen=True)
 class Judged:
-    """A measurement for each effect, and the fit of the last rung that reflects."""
+    """A measurement for each effect, and a fit with reflection."""
 
     measured: dict[str, Measurement]
     glossy: PlaceFit
@@ -178,7 +180,7 @@ def judge_material(places: Places, transport: Transport, typical: float, names: 
         places: with linear radiance.
         transport: of the same pixels (`place_transport`).
         typical: radiance of a typical pixel.
-        names: what to judge; a rung that is not judged is not taken.
+        names: what to judge.
     """
     trials = []
     for turn in range(TURNS):
@@ -191,28 +193,22 @@ def judge_material(places: Places, transport: Transport, typical: float, names: 
     def explained(model: Model) -> list[Explained]:
         return [trial.of(model) for trial in trials]
 
-    dull = Model(reflects=False)
-    shared = min(SHARED, key=lambda number: trials[0].of(Model(roughness=number)).fitted_error)
-    glossy = Model(roughness=shared)
-    of_dull, of_glossy = explained(dull), explained(glossy)
-    if "metals" in names:
-        of_metal = explained(replace(glossy, metals=True))
-        counts = [_metallic(one.fit) > METAL for one in of_metal]
-        measured["metals"] = _saved("metals", of_glossy, of_metal, counts)
-        if measured["metals"].favours(False):
-            glossy, of_glossy = replace(glossy, metals=True), of_metal
+    paint = Model()
+    of_paint, of_metal = explained(paint), explained(replace(paint, metals=True))
+    counts = [_metallic(one.fit) > METAL for one in of_metal]
+    measured["metals"] = _saved("metals", of_paint, of_metal, counts)
+    metals = measured["metals"].favours(False) is True
+    glossy, of_glossy = (replace(paint, metals=True), of_metal) if metals else (paint, of_paint)
     if "varying-roughness" in names:
-        several = replace(glossy, roughness=None)
-        of_several = explained(several)
-        counts = [(one.fit.roughness - shared).abs() >= ANOTHER for one in of_several]
-        measured["varying-roughness"] = _saved("varying-roughness", of_glossy, of_several, counts)
-        if measured["varying-roughness"].favours(False):
-            glossy, of_glossy = several, of_several
-    measured["reflection"] = _saved("reflection", of_dull, of_glossy)
-    best, of_best = (glossy, of_glossy) if measured["reflection"].favours(False) else (dull, of_dull)
+        shared = min(SHARED, key=lambda number: trials[0].of(replace(glossy, roughness=number)).fitted_error)
+        of_shared = explained(replace(glossy, roughness=shared))
+        counts = [(one.fit.roughness - shared).abs() >= ANOTHER for one in of_glossy]
+        measured["varying-roughness"] = _saved("varying-roughness", of_shared, of_glossy, counts)
+    if "reflection" in names:
+        measured["reflection"] = _saved("reflection", explained(Model(reflects=False)), of_glossy)
     for name, form in LIGHT_FORMS.items():
         if name in names:
-            measured[name] = _saved(name, explained(replace(best, form=form)), of_best)
+            measured[name] = _saved(name, explained(replace(glossy, form=form)), of_glossy)
     return Judged({name: measured[name] for name in SAVED if name in names}, of_glossy[0].fit)
 
 

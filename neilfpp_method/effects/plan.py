@@ -95,7 +95,7 @@ class Plan:
                 plan.decisions.append(Decision(0, name, False, "settings", "off in the settings"))
             elif effect.unjudged(settings):
                 plan.decisions.append(Decision(0, name, True, "settings", effect.unjudged(settings)))
-        plan.leave_out_what_needs_others(0)
+        plan._leave_out_what_needs_others()
         return plan
 
     @property
@@ -124,27 +124,25 @@ class Plan:
         newest = self.newest(name)
         return newest is None or newest.by == "evidence"
 
-    def leave_out_what_needs_others(self, step: int) -> list[Decision]:
+    def _leave_out_what_needs_others(self) -> None:
         """Decide against what there is none of without an effect that is off."""
-        decisions = []
         for name, effect in EFFECTS.items():
             cause = self.newest(effect.needs) if effect.needs else None
             if cause is None or cause.on or not self.is_on(name) or effect.obstacle(self.settings):
                 continue
             why = f"there is none without {effect.needs}"
-            decisions.append(Decision(step, name, False, cause.by, why))
-        self.decisions += decisions
-        return decisions
+            self.decisions.append(Decision(0, name, False, cause.by, why))
 
-    def decide(self, name: str, measured: Measurement, step: int, earned: bool = False) -> Decision:
+    def decide(self, name: str, measured: Measurement, step: int) -> Decision:
         """Decide an open effect by evidence, from now on; without enough samples it stays as it is.
 
-        With `earned`, an effect of which nothing was decided yet must earn its place as if it were off.
+        Where evidence only advises (`Effect.advised`), it is noted, and the effect stays as it is.
         """
         before = self.is_on(name)
-        favoured = measured.favours(before and not (earned and self.newest(name) is None))
-        on = before if favoured is None else favoured
-        reason = measured.in_words()
+        favoured = measured.favours(before)
+        advised = EFFECTS[name].advised
+        on = before if favoured is None or advised else favoured
+        reason = f"{measured.in_words()}; advice, it stays as it is" if advised else measured.in_words()
         if favoured is None:
             reason = f"{measured.samples} samples are too few to say anything of {measured.what}"
         elif self.newest(name) is not None and on != before:

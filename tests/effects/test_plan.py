@@ -157,16 +157,26 @@ def test_white_light_has_one_channel():
 
 
 def test_without_reflection_there_is_nothing_that_needs_it():
+    plan = Plan.begin(read_asked("auto,-reflection"), preset("fast"))
+    config = plan.config
+    assert not config.shading.specular
+    assert not config.brdf.metals
+    assert not config.brdf.varying_roughness
+    assert config.shading.sampler == "no_lobe"
+    assert not plan.is_open("metals")
+
+
+def test_advice_changes_nothing_and_is_said():
     plan = Plan.begin(read_asked("auto"), preset("fast"))
-    plan.decide("reflection", Measurement("error", 0.0, 0.001, 0.01, 100), 4)
-    left_out = plan.leave_out_what_needs_others(4)
-    assert [decision.effect for decision in left_out] == ["metals", "varying-roughness", "lobe-sampling"]
-    assert not plan.config.shading.specular
-    assert not plan.config.brdf.metals
-    assert plan.is_open("metals")
-    assert plan.leave_out_what_needs_others(5) == []
-    named = Plan.begin(read_asked("auto,-reflection"), preset("fast"))
-    assert not named.is_open("metals")
+    worthless = Measurement("error", 0.0, 0.001, 0.01, 100)
+    assert worthless.favours(True) is False
+    for name in ("reflection", "environment-map", "coloured-light"):
+        decision = plan.decide(name, worthless, 4)
+        assert decision.on
+        assert "advice" in decision.reason
+    assert plan.config == plan.settings
+    assert not plan.decide("varying-roughness", worthless, 4).on
+    assert not plan.config.brdf.varying_roughness
 
 
 def test_nothing_varies_so_no_slope_is_asked():
@@ -252,7 +262,7 @@ def test_names_switch_settings():
         ("", "nothing is given"),
         ("+lamps,-lamps", "lamps is named twice"),
         ("-response", "--response"),
-        ("none,+metals", "there is none without reflection; add +reflection"),
+        ("none,+metals", r"there is none without reflection; add \+reflection"),
     ],
 )
 def test_bad_names_get_one_line(text, complaint):
