@@ -35,12 +35,12 @@ from neilfpp_method.hosts.foreign import ForeignHost, answers_secondary_rays, pr
 from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
-from neilfpp_method.model import Maps, NeilfModel
+from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, stage_at, weigh
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.structures import Material, PixelBatch, RayBatch, Shading, StepResult, SurfaceHits
+from neilfpp_method.structures import Maps, Material, PixelBatch, RayBatch, Shading, StepResult, SurfaceHits
 
 __all__ = ["AttachedNeilf", "CallableHost", "attach_neilf", "missing_capabilities", "pixel_batch"]
 

@@ -210,6 +210,8 @@ def active_losses(
         # A Lambertian surface has neither roughness nor metallic, and sends what it gets times its colour.
         for loss in ("smoothness", "lambertian"):
             weights.pop(loss, None)
+    if not (config.brdf.varying_roughness or config.brdf.metals):
+        weights.pop("smoothness", None)  # There is nothing whose slope it could lower.
     return {loss: weight for loss, weight in weights.items() if weight > 0}
 
 

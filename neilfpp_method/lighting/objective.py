@@ -74,12 +74,14 @@ class Objective:
             this.
         config: the weights.
         sky: what cameras saw of the light itself; none where they saw nothing of it.
+        monochrome: the map has one channel for all three colours.
     """
 
     response: str
     unit: float
     config: LightFitConfig
     sky: KnownSky | None = None
+    monochrome: bool = False
 
     def relative_error(
         self,

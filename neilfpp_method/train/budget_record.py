@@ -1,7 +1,7 @@
 """The plan of a run with a budget, in `RUN/plan.json`: what the trial measured, what was planned, and every
 time that the clock changed it.
 
-format; budget, seconds; size; costs; metals_looked_at; took, seconds, at the end
+format; budget, seconds; size; costs; places_looked_at; took, seconds, at the end
 revisions, in order, of which the first is the plan that the training began with: seconds of the run, step,
 and steps of each stage
 """
@@ -45,7 +45,7 @@ class BudgetPlan:
         budget: seconds of all.
         size: of a step (`budget.sizes`).
         costs: as the trial measured them.
-        metals_looked_at: whether evidence decides about metals, where that is open.
+        places_looked_at: whether evidence of places decides about materials and light, where that is open.
         revisions: in order; the last one counts.
         took: seconds of the whole command, report included; none: it has not come to its end.
     """
@@ -53,7 +53,7 @@ class BudgetPlan:
     budget: float
     size: Literal["small", "usual", "large"]
     costs: Costs
-    metals_looked_at: bool
+    places_looked_at: bool
     revisions: list[Revision] = field(default_factory=list)
     took: float | None = None
 
@@ -93,7 +93,7 @@ def read_budget(run: Path) -> BudgetPlan | None:
 
 def _plan(stored: Mapping[str, Any], where: str) -> BudgetPlan:
     stages = {name: from_dict(StageCost, cost, where) for name, cost in stored["costs"]["stages"].items()}
-    plain = {name: stored[name] for name in ("budget", "size", "metals_looked_at", "took")}
+    plain = {name: stored[name] for name in ("budget", "size", "places_looked_at", "took")}
     revisions = [
         Revision(float(entry["seconds"]), entry["step"], dict(entry["steps"]))
         for entry in stored["revisions"]

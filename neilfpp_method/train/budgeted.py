@@ -13,6 +13,7 @@ from neilfpp_method.budget.plan import MIN_SHARE, share_for, smallest_budget, st
 from neilfpp_method.budget.sizes import Size, next_size, sized
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.effects.asked import Asked
+from neilfpp_method.effects.material import JUDGED
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.types import NeilfConfig
@@ -27,8 +28,8 @@ __all__ = ["close_budget", "outcome", "plan_budget", "planned_effects", "planned
 
 TRIAL_SHARE, MAX_TRIAL = 0.03, 10.0
 """Of the budget, and seconds, that the steps of a trial may take, about."""
-METALS_SHARE = 0.1
-"""Of the budget that evidence for metals may take; else there may be metals, as the settings have it."""
+PLACES_SHARE = 0.1
+"""Of the budget that looks at places may take; else materials and light are as the settings have them."""
 
 
 def plan_budget(
@@ -67,8 +68,8 @@ def plan_budget(
         if size not in trials:
             limit = min(TRIAL_SHARE * budget, MAX_TRIAL)
             changed = sized(config, size)
-            metals = METALS_SHARE * budget
-            trials[size] = try_out(capture, changed, asked, device, limit, metals, report, wait)
+            places = PLACES_SHARE * budget
+            trials[size] = try_out(capture, changed, asked, device, limit, places, report, wait)
         return share_for(trials[size].costs, budget, ledger.total)
 
     size: Size = "usual"
@@ -83,7 +84,7 @@ def plan_budget(
             f"{in_words(trial.costs.once)} go to what does not depend on the number of steps",
             f"the smallest that makes sense on this machine, as it is now, is --budget {in_words(needed)}",
         )
-    plan = BudgetPlan(budget, size, trial.costs, trial.metals > 0.0)
+    plan = BudgetPlan(budget, size, trial.costs, trial.places > 0.0)
     plan.revisions.append(Revision(ledger.total, 0, steps_for(trial.costs, found)))
     say(_in_words(plan))
     return plan
@@ -96,10 +97,11 @@ def planned_settings(plan: BudgetPlan, config: NeilfConfig) -> NeilfConfig:
 
 
 def planned_effects(plan: BudgetPlan, effects: Plan) -> None:
-    """What the budget decides of the effects: whether there is time to look for metals."""
-    if effects.is_open("metals") and not plan.metals_looked_at:
-        reason = f"evidence would take more than {METALS_SHARE:.0%} of the budget"
-        effects.decisions.append(Decision(0, "metals", True, "settings", reason))
+    """What the budget decides of the effects: whether there is time to look at places."""
+    reason = f"evidence would take more than {PLACES_SHARE:.0%} of the budget"
+    for name in JUDGED:
+        if effects.is_open(name) and not plan.places_looked_at:
+            effects.decisions.append(Decision(0, name, effects.is_on(name), "settings", reason))
 
 
 def _in_words(plan: BudgetPlan) -> str:

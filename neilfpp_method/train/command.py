@@ -136,7 +136,7 @@ def run_training(
             was = "no budget" if planned is None else f"a budget of {time_in_words(planned.budget)}"
             raise UserError(f"{out}: the run has {was}", "leave --budget out, or start a new run")
         ledger.add(read_work(out))
-        if _is_finished(out, config):
+        if _is_finished(out, plan.config):
             if planned is not None and planned.took is None:  # it was ended while its report was made
                 close_budget(out, planned, ledger.total)
             console.print(f"run folder {out}: finished already, nothing to continue", soft_wrap=True)

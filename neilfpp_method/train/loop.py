@@ -249,8 +249,12 @@ def _share_decisions(run: Training, model: NeilfModel, decisions: Sequence[Decis
 
 
 def _use(run: Training, model: NeilfModel) -> None:
-    """Compute as the plan says."""
+    """Compute as the plan says; evidence may take the joint stage away."""
     config = run.plan.config
+    if not config.train.joint_steps:
+        run.config = dataclasses.replace(
+            run.config, train=dataclasses.replace(run.config.train, joint_steps=0)
+        )
     model.use(config)
     run.light_solver.use(config.light, model.lobe)
 

@@ -23,7 +23,7 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import PIXELS_OF_A_VIEW, at_scale, scale_for_pixels
 from neilfpp_method.effects.asked import Asked
 from neilfpp_method.effects.looks import look_at_surface, note_facts
-from neilfpp_method.effects.metals import seconds_of_evidence
+from neilfpp_method.effects.material import seconds_of_evidence
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.health.look import look
 from neilfpp_method.health.watch import LOOKED_AT
@@ -58,11 +58,11 @@ class Trial:
 
     Attributes:
         costs: of a training.
-        metals: of them, those of evidence for metals; 0 where that is not looked for.
+        places: of them, those of looks at places; 0 where there are none.
     """
 
     costs: Costs
-    metals: float
+    places: float
 
 
 @dataclass
@@ -77,7 +77,7 @@ def try_out(
     asked: Asked,
     device: torch.device,
     limit: float,
-    most_for_metals: float,
+    most_for_places: float,
     report: bool,
     wait: Callable[[], object] = lambda: None,
 ) -> Trial:
@@ -89,7 +89,7 @@ def try_out(
         asked: which effects are simulated.
         device: where to compute.
         limit: seconds that the steps of all stages may take together, about.
-        most_for_metals: seconds that evidence for metals may take; if it takes more it is not looked for.
+        most_for_places: seconds that looks at places may take; if they take more there are none.
         report: whether the run will end with its page.
         wait: returns when the device has done its work.
     """
@@ -112,9 +112,10 @@ def try_out(
     optimizer = make_optimizer(model, config.optimizer)
 
     lengths = {stage: steps for stage, steps in stage_steps(config.train).items() if steps}
-    metals = seconds_of_evidence(device) if plan.is_open("metals") and model.lobe is not None else 0.0
-    if metals > most_for_metals:
-        metals = 0.0
+    judged = model.lobe is not None and any(plan.is_open(name) for name in JUDGED)
+    places = seconds_of_evidence(device) if judged else 0.0
+    if places > most_for_places:
+        places = 0.0
     surface = _timed(lambda: _look_at_surface(plan, model, pixels), wait)
     costs, picture, fitted = {}, 0.0, False
     for stage, steps in lengths.items():
@@ -132,12 +133,12 @@ def try_out(
             steps,
             step,
             fit=larger * later / every,
-            start=(surface if moves else 0.0) + (metals if moves and not fitted else 0.0),
+            start=(surface if moves else 0.0) + (places if moves and not fitted else 0.0),
             end=picture + 2 * looked,
             first_fit=0.0 if fitted else larger * first,
         )
         fitted = fitted or moves
-    return Trial(Costs(costs, REPORT * picture if report else 0.0), metals)
+    return Trial(Costs(costs, REPORT * picture if report else 0.0), places)
 
 
 def _some(capture: Capture) -> tuple:
@@ -189,8 +190,9 @@ def _steps(
 
 
 def _look_at_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset) -> None:
-    """Evidence of the surface but for that of metals, which takes longer than a trial."""
-    decided = [*plan.decisions, Decision(0, "metals", True, "settings", "not tried out")]
+    """Evidence of the surface but for that of places, which takes longer than a trial."""
+    tried = [Decision(0, name, plan.is_on(name), "settings", "not tried out") for name in JUDGED]
+    decided = [*plan.decisions, *tried]
     if plan.is_open("inter-reflection"):
         look_at_surface(Plan(plan.asked, plan.settings, decided), model, pixels, 0)
 

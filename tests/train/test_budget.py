@@ -48,7 +48,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> None:
     stages = {name.replace("steps", "init").replace("joint_init", "joint"): n for name, n in STEPS.items()}
     costs = Costs({stage: StageCost(steps=n, **cost) for stage, n in stages.items()}, reserve=0.0)
     monkeypatch.setattr(command, "Ledger", ticking)
-    monkeypatch.setattr(budgeted, "try_out", lambda *_: Trial(costs, metals=0.0))
+    monkeypatch.setattr(budgeted, "try_out", lambda *_: Trial(costs, places=0.0))
 
 
 def run(data: Path | None, out: Path, resume: bool = False, **options) -> str:
@@ -136,7 +136,7 @@ def test_a_trial_measures_every_stage_that_has_steps(capture):
     config = solved_light(small_config(sdf_steps=100, material_steps=0, joint_steps=50))
     state = load_capture(capture)
     trial = try_out(
-        state, config, Asked("auto"), torch.device("cpu"), limit=0.2, most_for_metals=1e9, report=True
+        state, config, Asked("auto"), torch.device("cpu"), limit=0.2, most_for_places=1e9, report=True
     )
     costs = trial.costs
     assert {stage: cost.steps for stage, cost in costs.stages.items()} == {"sdf_init": 100, "joint": 50}
@@ -144,7 +144,7 @@ def test_a_trial_measures_every_stage_that_has_steps(capture):
     assert costs.stages["sdf_init"].fit == costs.stages["sdf_init"].start == 0.0
     assert costs.stages["joint"].fit > 0
     assert costs.stages["joint"].first_fit > 0
-    assert costs.stages["joint"].start > trial.metals > 0  # that of the surface, and that of metals
+    assert costs.stages["joint"].start > trial.places > 0  # that of the surface, and that of places
     assert costs.reserve > 0
 
 
@@ -153,7 +153,7 @@ def test_evidence_that_takes_too_long_is_not_looked_for(capture):
     trial = try_out(
         load_capture(capture), config, Asked("auto"), torch.device("cpu"), 0.05, 1e-9, report=False
     )
-    assert trial.metals == 0.0
+    assert trial.places == 0.0
     assert list(trial.costs.stages) == ["material_init", "joint"]
     assert trial.costs.stages["joint"].first_fit == 0.0  # it was in the stage before
 
@@ -165,7 +165,7 @@ def test_what_settings_decide_is_not_tried(capture):
     )
     assert list(trial.costs.stages) == ["sdf_init", "material_init"]
     assert trial.costs.stages["material_init"].fit == 0.0  # a light that is free is not solved for
-    assert trial.costs.reserve == trial.metals == 0.0
+    assert trial.costs.reserve == trial.places == 0.0
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,7 @@ def test_a_damaged_plan_is_named(tmp_path, damage):
         "budget": 60.0,
         "size": "usual",
         "costs": {"stages": {"joint": cost}, "reserve": 1.0},
-        "metals_looked_at": True,
+        "places_looked_at": True,
         "revisions": [{"seconds": 1.0, "step": 0, "steps": {"joint": 10}}],
         "took": None,
     }
