@@ -139,7 +139,7 @@ class AttachedNeilf(nn.Module):
         return Health.of(self.watch.findings.values())
 
     def maps(self, rays: RayBatch | Camera, hits: Rendered | None = None) -> Maps:
-        """Every map of a view, a row per ray: material, shading, normal, depth (`model.Maps`).
+        """Every map of a view, a row per ray: material, shading, normal, depth (`structures.Maps`).
 
         Args:
             rays: in the scene frame; bound the memory by their number. Or a camera, of a host that draws
