@@ -1,4 +1,4 @@
-"""The tables of docs/results.md and docs/performance.md, from the result files in benchmarks/results.
+"""The tables of docs/results.md, performance.md and hosts.md, from the result files in benchmarks/results.
 
     python -m benchmarks.tables            write the tables into the documents
     python -m benchmarks.tables --check    exit status 1 where a document is not what the result files say
@@ -32,7 +32,7 @@ __all__ = ["COLUMNS", "Result", "Row", "filled", "markdown", "read_results", "wr
 
 ROOT = Path(__file__).parent.parent
 RESULTS = Path(__file__).parent / "results"
-DOCUMENTS = (ROOT / "docs" / "results.md", ROOT / "docs" / "performance.md")
+DOCUMENTS = tuple(ROOT / "docs" / name for name in ("results.md", "performance.md", "hosts.md"))
 FORMAT = 1
 MARKED = re.compile(r"(<!-- table: ([\w-]+)((?: \w+)*) -->\n).*?(<!-- end -->)", re.DOTALL)
 
