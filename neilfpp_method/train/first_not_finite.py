@@ -76,16 +76,20 @@ class OriginsOfNotFinite(TorchDispatchMode):
         return None if is_finite(value) else self._origins.get(_memory(value))
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        broken = [t for t in _tensors((args, kwargs)) if not is_finite(t)]
-        known = [self._origins[_memory(t)] for t in broken if _memory(t) in self._origins]
+        broken = [_memory(value) for value in _tensors((args, kwargs)) if not is_finite(value)]
+        known = [self._origins[memory] for memory in broken if memory in self._origins]
         result = func(*args, **(kwargs or {}))
-        if func.__name__.startswith(UNINITIALISED):
-            return result
+        fresh = func.__name__.startswith(UNINITIALISED)
         for value in _tensors(result):
-            if not is_finite(value):
-                self._count += not known
-                origin = min(known, key=lambda o: o.order) if known else _origin(self._count - 1, func, value)
-                self._origins[_memory(value)] = origin
+            if fresh:
+                self._origins.pop(_memory(value), None)
+            elif is_finite(value):
+                continue
+            elif known:
+                self._origins[_memory(value)] = min(known, key=lambda origin: origin.order)
+            elif not broken:  # else it came in as it is: from outside, or out of a compiled loop
+                self._origins[_memory(value)] = _origin(self._count, func, value)
+                self._count += 1
         return result
 
 

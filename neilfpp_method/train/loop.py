@@ -34,7 +34,7 @@ from neilfpp_method.schedule import (
 )
 from neilfpp_method.settings.facts import RadianceUnits
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.structures import LossTerms, PixelBatch, StepResult
+from neilfpp_method.structures import LossTerms, StepResult
 from neilfpp_method.timing.ledger import Ledger, doing
 from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.health_record import read_findings, write_findings
@@ -137,13 +137,10 @@ def _train_stage(
             set_rates(optimizer, run.config.optimizer, at, background_waits=not run.model.facts.far_points)
             with doing("data"):
                 batch = run.pixels.sample(settings.rays, gradients)
-            moment = Moment.before_step(model, keeps_points=not model.stages[stage].moves_host)
-            skipped = run.skipped
+            moment = Moment.before_step(model, batch, at)
             computed = wrapped(batch, stage)
             total = weigh(computed.terms, active_losses(stage, model.config, model.stages, at.share))
-            stop = _update(run, model, optimizer, computed.terms, total, step)
-            if run.skipped > skipped:
-                _keep_skipped(run, model, batch, moment, at, step)
+            stop = _update(run, model, optimizer, computed.terms, total, moment, step)
             _solve_light(run, model, computed, step)
         run.watch.after_step(model.stages[stage], computed, step)
         number, step = number + 1, step + 1
@@ -271,6 +268,7 @@ def _update(
     optimizer: torch.optim.Optimizer,
     terms: LossTerms,
     total: Total,
+    moment: Moment,
     step: int,
 ) -> bool:
     """One step down the gradient; a step whose loss or gradient is not finite is left out, counted and named.
@@ -292,14 +290,14 @@ def _update(
         optimizer.step()
         run.skipped_in_a_row = 0
     else:
-        _skip(run, total, found, step)
+        _skip(run, total, found, _kept(run, model, moment, step), step)
     run.reporter.step(loss, decibels)
     if step % LOG_EVERY == 0:
         _log(run, model, total, decibels, loss, step)
     return asked > 0.0
 
 
-def _skip(run: Training, total: Total, norms: Mapping[str, float], step: int) -> None:
+def _skip(run: Training, total: Total, norms: Mapping[str, float], kept: str, step: int) -> None:
     run.skipped += 1
     run.skipped_in_a_row += 1
     culprits = [name for name, value in total.terms.items() if not math.isfinite(value.item())]
@@ -309,7 +307,7 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], step: int) ->
         if culprits
         else f"the gradient of {', '.join(fields) or 'another process'}"
     )
-    run.reporter.warn(f"step {step} skipped: {where} is not finite ({run.skipped} skipped so far)")
+    run.reporter.warn(f"step {step} skipped: {where} is not finite ({run.skipped} skipped so far){kept}")
     if run.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
         raise Diverged(
             f"{MAX_SKIPPED_IN_A_ROW} steps in a row were not finite, the last one in {where}",
@@ -318,17 +316,15 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], step: int) ->
         )
 
 
-def _keep_skipped(
-    run: Training, model: NeilfModel, batch: PixelBatch, moment: Moment, at: StagePosition, step: int
-) -> None:
-    """Write down what was skipped, for `neilfpp replay`; a full disk is no reason to stop for it."""
+def _kept(run: Training, model: NeilfModel, moment: Moment, step: int) -> str:
+    """Write down what is skipped, and say how it is looked into; a full disk is no reason to stop for it."""
     if not run.fabric.is_global_zero:
-        return
+        return ""
     try:
-        if keep_step(run.path, model, batch, moment, at.stage, at.share, step):
-            run.reporter.warn(f"what made it so: neilfpp replay {shlex.quote(str(run.path))} {step}")
+        kept = keep_step(run.path, model, moment, step)
     except UserError as error:
-        run.reporter.warn(f"the rays of step {step} are not kept: {error.problem}")
+        return f"; its rays are not kept: {error.problem}"
+    return f"; see neilfpp replay {shlex.quote(str(run.path))} {step}" if kept else ""
 
 
 def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:

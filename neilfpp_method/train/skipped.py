@@ -15,7 +15,7 @@ from torch import Tensor
 from neilfpp_method.data.images import replacing
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.schedule import Stage
+from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.structures import PixelBatch
 
 __all__ = ["FOLDER", "Moment", "SkippedStep", "keep_step", "load_step"]
@@ -31,23 +31,26 @@ KEYS = {"format", "step", "stage", "share", "batch", "model", "random"}
 
 @dataclass(frozen=True)
 class Moment:
-    """What a step begins with and changes: the state of the random numbers, and the surface points that are
-    remembered. The weights are changed at its end alone, and not by a step that is skipped.
+    """What a step begins with: its pixels, where in its stage it is, the state of the random numbers, and the
+    surface points that are remembered, which it changes. The weights are changed at its end alone, and not by
+    a step that is skipped.
     """
 
+    batch: PixelBatch
+    position: StagePosition
     random: Tensor
     remembered: dict[str, Any]
 
     @staticmethod
-    def before_step(model: NeilfModel, keeps_points: bool) -> Moment:
-        """The moment after the pixels of a step are drawn. `keeps_points`: the step remembers surface points
-        (some hundred kilobytes are copied).
+    def before_step(model: NeilfModel, batch: PixelBatch, position: StagePosition) -> Moment:
+        """The moment after the pixels of a step are drawn. Where the step shades points of earlier ones too,
+        these are copied, some hundred kilobytes.
         """
         remembered = {}
-        if keeps_points:
+        if not model.stages[position.stage].moves_host:
             state = model.replay.state_dict(prefix="replay.")
             remembered = {name: v.clone() if isinstance(v, Tensor) else dict(v) for name, v in state.items()}
-        return Moment(torch.get_rng_state(), remembered)
+        return Moment(batch, position, torch.get_rng_state(), remembered)
 
 
 @dataclass(frozen=True)
@@ -71,9 +74,7 @@ class SkippedStep:
     random: Tensor
 
 
-def keep_step(
-    run: Path, model: NeilfModel, batch: PixelBatch, moment: Moment, stage: Stage, share: float, step: int
-) -> Path | None:
+def keep_step(run: Path, model: NeilfModel, moment: Moment, step: int) -> Path | None:
     """Write a step down, unless enough of them are kept already; returns the file.
 
     Raises:
@@ -85,9 +86,9 @@ def keep_step(
     contents = {
         "format": FORMAT,
         "step": step,
-        "stage": stage.value,
-        "share": share,
-        "batch": {f.name: getattr(batch, f.name).cpu() for f in dataclasses.fields(batch)},
+        "stage": moment.position.stage.value,
+        "share": moment.position.share,
+        "batch": {f.name: getattr(moment.batch, f.name).cpu() for f in dataclasses.fields(PixelBatch)},
         "model": {**model.state_dict(), **moment.remembered},
         "random": moment.random,
     }

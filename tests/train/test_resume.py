@@ -165,6 +165,16 @@ def test_a_stop_in_the_last_step_has_nothing_left_to_stop(tmp_path, capture, who
     assert differences(state(tmp_path / "run"), state(whole)) == []
 
 
+def test_seed_step_and_process_each_have_random_numbers_of_their_own():
+    def drawn(*place: int) -> float:
+        loop.seed_step(*place)
+        return torch.rand(()).item()
+
+    places = list(itertools.product((0, 1), (0, 1, 2, 1000), (0, 1)))
+    assert len({drawn(*place) for place in places}) == len(places)
+    assert drawn(1, 2, 0) == drawn(1, 2, 0)
+
+
 def test_a_second_ctrl_c_does_not_wait(tmp_path, capture, whole, monkeypatch):
     """Steps since the last checkpoint are lost, and computed again."""
 

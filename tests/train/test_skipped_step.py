@@ -120,7 +120,7 @@ def test_a_rerun_repeats_the_step_bit_for_bit(training, monkeypatch):
     )
     found = rerun_step(training.path, 6)
     assert found.finite
-    assert "finite this time" in in_words(found)
+    assert "finite now" in in_words(found)
     assert training.model.replay.ring.full  # points of earlier steps were shaded
     assert values[6].keys() == again[0].keys()
     for name, value in values[6].items():

@@ -21,11 +21,13 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+import OpenEXR
 import torch
 import trimesh
 
 from neilfpp_method.cli import main as neilfpp
-from neilfpp_method.data.images import read_image
+from neilfpp_method.data.images import read_image, write_exr
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.train.run import load_checkpoint
@@ -110,11 +112,13 @@ def check_files(report: Report, what: str, folder: Path) -> None:
                 load_checkpoint(path)
             elif path.suffix == ".json":
                 json.loads(path.read_text())
-            elif path.suffix in (".png", ".exr"):
+            elif path.suffix == ".png":
                 read_image(path)
+            elif path.suffix == ".exr":  # several layers: not a picture that a capture may have
+                OpenEXR.File(str(path))
             elif path.suffix in (".ply", ".glb", ".obj"):
                 trimesh.load(path)
-        except (UserError, ValueError) as error:
+        except (UserError, ValueError, RuntimeError) as error:
             report.faults.append(f"{what}: {path.name} is not whole: {error}")
 
 
@@ -155,11 +159,13 @@ def attack_training(report: Report, folder: Path, draw: random.Random, kills: in
     return whole
 
 
+SKY = "sky.exr"
+"""An environment map, in the folder of the campaign."""
 COMMANDS = (
     ("eval",),
     ("render", "--overwrite"),
     ("export", "--what", "mesh", "light", "--resolution", "32"),
-    ("relight", "--spp", "2", "--force"),
+    ("relight", "--spp", "2", "--force", "--env", SKY),
     ("report",),
 )
 """Commands that read a run and write into its folder."""
@@ -188,9 +194,11 @@ def main(folder: Path, report_file: Path, seed: int, kills: int) -> None:
     draw, report = random.Random(seed), Report()
     make_capture(folder / "capture", masks=True)
     whole = attack_training(report, folder, draw, kills)
+    write_exr(folder / SKY, {"RGB": np.full((8, 16, 3), 0.5, np.float32)})
     each = kills // 10
     for name, *options in COMMANDS if each else ():
-        attack_command(report, folder, [name, str(whole), *options], draw, each)
+        words = [str(folder / SKY) if option == SKY else option for option in options]
+        attack_command(report, folder, [name, str(whole), *words], draw, each)
     told = {"kills": dict(report.kills), "files": report.files, "faults": report.faults}
     report_file.write_text(json.dumps(told, indent=1))
 
