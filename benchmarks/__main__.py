@@ -2,11 +2,10 @@
 
     python -m benchmarks                    every suite
     python -m benchmarks kernels shading    some of them
-    python -m benchmarks --compare          exit status 1 where a figure is worse than baseline.json by more than its tolerance
+    python -m benchmarks --compare          exit status 1 where a figure is worse than its tolerance allows
     python -m benchmarks --save             these figures become the baseline
 
-A suite is a module with `measurements()`. Curves and tables of docs/performance.md have commands of their
-own.
+A suite is a module with `measurements()`. docs/performance.md has curves and tables with other commands.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 docs/captures.md.
 
     neilfpp prepare DATA/ring_capture/images --out CAPTURE --dense
-    python -m benchmarks.clouds CAPTURE DATA/ring_capture/true_cameras.json DATA/tabletop_env/inputs/model/mesh.ply
+    python -m benchmarks.clouds CAPTURE DATA/ring_capture/true_cameras.json \
+        DATA/tabletop_env/inputs/model/mesh.ply
 
 The capture's frame is its own, so the camera centres are brought to the true ones by a similarity first. The
 mesh of tabletop_env is the surface that ring_capture shows.

@@ -1,7 +1,8 @@
 """What the method recovers on captures whose truth is known: the tables of docs/results.md.
 
     python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results
-    python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results-mesh --host mesh --compare ladder
+    python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results-mesh \
+        --host mesh --compare ladder
 
 For each capture: the preset trained from scratch, beside it the paper's free light field with and without
 L_ref (the paper's Table 2), with `--compare ladder` every light with every inter-reflection that goes with

@@ -5,7 +5,7 @@ what is not empty.
 
 The table of `benchmarks.joint` behind the grid of `fast`, with the samples and rounds of the paper's presets.
 Queries of the cached path include the one per ray that tests the grid's promise, and the ray's share of the
-grid, which is sampled once in `MOST_LIFE` steps of 4096 rays.
+grid, which is sampled once in `MAX_LIFE` steps of 4096 rays.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.kernels.process import computing_fast
 from neilfpp_method.settings.presets import free_light, preset
 from neilfpp_method.structures import RayBatch
-from neilfpp_method.volume.empty_space import MOST_LIFE, RESOLUTION
+from neilfpp_method.volume.empty_space import MAX_LIFE, RESOLUTION
 
 __all__ = ["measurements", "queries_per_ray", "table_host"]
 
@@ -63,7 +63,7 @@ def measurements() -> Iterator[Measurement]:
     random numbers.
     """
     rays = rays_at_the_table(RAYS).rays
-    share_of_grid = RESOLUTION**3 / (MOST_LIFE * preset("paper-ngp").train.rays)
+    share_of_grid = RESOLUTION**3 / (MAX_LIFE * preset("paper-ngp").train.rays)
     hosts = {name: with_cuts(table_host(name != WHOLE), cuts) for name, cuts in WAYS.items()}
     with computing_fast(), torch.no_grad():
         for scale in SCALES:

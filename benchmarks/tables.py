@@ -9,9 +9,9 @@ A result file holds the rows of one command on one machine:
      "machine": "…", "rows": [{"capture": "tabletop_env", "name": "`fast`", "figures": {"seconds": 0.13}}]}
 
 `table` says where the rows go: between `<!-- table: joint-step -->` and `<!-- end -->` of a document, or
-`<!-- table: joint-step seconds -->`, which shows the named figures alone. Several files may have rows of one table;
-they follow one another in the order of the files' names, and rows of one capture stand together. `capture` may be
-missing. `figures` are named as in `COLUMNS`.
+`<!-- table: joint-step seconds -->`, which shows the named figures alone. Several files may have rows of one
+table: they follow one another in the order of the files' names, and rows of one capture stand together.
+`capture` may be missing. `figures` are named as in `COLUMNS`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """What training time buys: the quality of novel views and of the material over seconds, for every preset.
 
     python -m benchmarks.time_to_quality DATA/tabletop_mix --out docs
-    python -m benchmarks.time_to_quality DATA/tabletop_mix --presets paper-ngp --device cuda --cap 600 --out docs
+    python -m benchmarks.time_to_quality DATA/tabletop_mix --presets paper-ngp --out docs \
+        --device cuda --cap 600
 
 Each preset trains from scratch. At marks of time (seconds of the process's own CPU time, or on a GPU of the
 clock), each twice the last, training is held, some test views are rendered and measured, and the time that

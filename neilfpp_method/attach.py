@@ -1,5 +1,4 @@
-"""`attach_neilf`: material and light on top of somebody else's geometry and radiance, in somebody else's
-loop.
+"""`attach_neilf`: material and light on top of another system's geometry and radiance, in its own loop.
 
 Three lines, the last one in every step:
 
@@ -24,10 +23,15 @@ from torch import Tensor, nn
 from neilfpp_method.data.environment_map import read_environment
 from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
+from neilfpp_method.health.cases import Health
+from neilfpp_method.health.guard import StepGuard
+from neilfpp_method.health.look import look_at_hits
+from neilfpp_method.health.watch import Watch
 from neilfpp_method.hosts.answers import Rendered, as_hits
-from neilfpp_method.hosts.base import HasParameterGroups, Host, ImageHost, KnowsRadiance, LightsItself
+from neilfpp_method.hosts.base import HasParameterGroups, Host, ImageHost, LightsItself
+from neilfpp_method.hosts.capabilities import CAPABILITIES
 from neilfpp_method.hosts.first_look import FirstLook, check_batch, check_points, check_rows
-from neilfpp_method.hosts.foreign import ForeignHost, answers_secondary_rays
+from neilfpp_method.hosts.foreign import ForeignHost, answers_secondary_rays, proxy_for
 from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
@@ -36,22 +40,12 @@ from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, 
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.structures import Material, PixelBatch, RayBatch, Shading, SurfaceHits
-from neilfpp_method.volume.distance_grid import GRID_RESOLUTION
+from neilfpp_method.structures import Material, PixelBatch, RayBatch, Shading, StepResult, SurfaceHits
 
 __all__ = ["AttachedNeilf", "CallableHost", "attach_neilf", "missing_capabilities", "pixel_batch"]
 
 RADIANCE_SCALE = {"linear": 3.0, "srgb": 1.0}
 """METHOD §5: how far R's sigmoid reaches for HDR and for LDR images."""
-
-WITHOUT = {
-    "render_regularised": "no losses of its own on the geometry",
-    "surface_width": "rays for L_ref start at a fixed distance from the surface",
-    "parameter_groups": "its own trainer moves it",
-    "sdf": "no mesh to export",
-    "scene_light": "hard inter-reflection is traced by a proxy",
-}
-"""The optional methods of a host, and what is lost without each."""
 
 log = logging.getLogger(__name__)
 
@@ -70,6 +64,8 @@ class AttachedNeilf(nn.Module):
             well. None: the host traces, or the settings ask for no rays between surfaces.
         light_solver: remembers what steps showed, and solves for the light now and then.
         missing: the optional methods that the host does not have, and what is lost without each.
+        step_guard: leaves out steps that are not finite, of optimisers that `guard` has named.
+        watch: what was found to be wrong so far; `health()` sums it up.
     """
 
     def __init__(self, model: NeilfModel, proxy: SurfaceProxy | None = None) -> None:
@@ -81,6 +77,10 @@ class AttachedNeilf(nn.Module):
         facts = model.facts
         hit_share = model.config.shading.hit_share
         self.first_look = FirstLook(host_name(model.host), hit_share, facts.response, facts.median_radiance)
+        self.step_guard = StepGuard(log.warning)
+        self.watch = Watch(None, log.warning)
+        self._steps, self._with_material = 0, False
+        self._shown: tuple[PixelBatch, SurfaceHits] | None = None
         model.observers.append(self._observe)
 
     def forward(self, batch: PixelBatch, step: int | Stage | str, hits: Rendered | None = None) -> Total:
@@ -88,8 +88,7 @@ class AttachedNeilf(nn.Module):
         return self.losses(batch, step, hits)
 
     def losses(self, batch: PixelBatch, step: int | Stage | str, hits: Rendered | None = None) -> Total:
-        """The weighted sum of what counts in a step, to add to a loss of your own, and each term before its
-        weight.
+        """The weighted sum of the losses of a step, to add to your own loss, and each term before its weight.
 
         Args:
             batch: pixels with their rays in the scene frame; see `pixel_batch`.
@@ -111,10 +110,33 @@ class AttachedNeilf(nn.Module):
             return Total(torch.zeros((), device=batch.origins.device, requires_grad=True), {})
         moves_host = self.model.stages[position.stage].moves_host
         computed = self.model(batch, position.stage, self._rendered(batch.rays, hits, moves_host))
+        total = weigh(computed.terms, weights)
         if self.training:
-            self.light_solver.observe(computed)
-            self.light_solver.solve(self.model.brdf, self.model.scene)
-        return weigh(computed.terms, weights)
+            number = self._steps if isinstance(step, str) else int(step)
+            self._steps = number + 1
+            self.step_guard.begin_step(total.terms, number)
+            self._look_after(computed, position, number)
+        return total
+
+    def guard(self, optimizer: torch.optim.Optimizer) -> None:
+        """Leave out the steps of an optimiser in which a loss of ours or any of its gradients is not finite.
+        Each is warned of; ten in a row end the training by `errors.Diverged`, raised by `optimizer.step()`.
+
+        Example:
+            >>> neilf.guard(optimizer)                                                     # doctest: +SKIP
+        """
+        self.step_guard.watch(optimizer)
+
+    def health(self) -> Health:
+        """Whether what was learned is sound, by the pixels of the last step (docs/health.md). It renders
+        nothing.
+        """
+        if self._shown is not None:
+            batch, hits = self._shown
+            on_object = hits[torch.nonzero(batch.mask > 0.5)[:, 0]]
+            seen = look_at_hits(self.model, on_object, self._with_material)
+            self.watch.judge(seen, self.step_guard.skipped, self._steps)
+        return Health.of(self.watch.findings.values())
 
     def maps(self, rays: RayBatch | Camera, hits: Rendered | None = None) -> Maps:
         """Every map of a view, a row per ray: material, shading, normal, depth (`model.Maps`).
@@ -186,6 +208,18 @@ class AttachedNeilf(nn.Module):
 
     # ------------------------------------------------------------------------------------------ inside a step
 
+    def _look_after(self, computed: StepResult, position: StagePosition, number: int) -> None:
+        """What follows a training step: the light, when it is time, and whether all is well."""
+        self.light_solver.observe(computed)
+        if self.light_solver.due:
+            self.watch.after_fit(self.light_solver.points, number)
+        self.light_solver.solve(self.model.brdf, self.model.scene)
+        plan = self.model.stages[position.stage]
+        self._with_material = plan.moves_material
+        self.watch.after_step(plan, computed, number)
+        if position.step + 1 == position.length:
+            self.health()
+
     def _position(self, step: int | Stage | str) -> StagePosition:
         if not isinstance(step, str):
             if step < 0:
@@ -196,7 +230,7 @@ class AttachedNeilf(nn.Module):
             raise UserError(
                 f"'{step}' is no stage", f"give the number of the step, or one of {', '.join(names)}"
             )
-        return StagePosition(Stage(step), 0, 1)
+        return StagePosition(Stage(step), 0, 2)  # a stage without an end
 
     def _check_place(self, rays: RayBatch) -> None:
         own = next(self.model.brdf.parameters())
@@ -219,11 +253,9 @@ class AttachedNeilf(nn.Module):
 
     def _observe(self, batch: PixelBatch, hits: SurfaceHits) -> None:
         self.first_look.hits(batch, hits)
-        if self.proxy is None or len(batch) == 0:
-            return
-        if self.proxy.steps == 0 and answers_secondary_rays(_inner(self.model.host)):
-            self.proxy.look_around(self.model.host.render, batch.rays, hits)
-        self.proxy.observe(batch.rays, hits)
+        self._shown = batch, hits.detach()
+        if isinstance(self.model.host, ForeignHost):
+            self.model.host.show_proxy(batch.rays, hits)
 
 
 def attach_neilf(
@@ -273,7 +305,7 @@ def attach_neilf(
     adapted = _adapt(host, response)
     facts = SceneFacts(response, median_radiance, scale, "inverted_sphere" if open_scene else "constant")
     with torch.random.fork_rng(range(torch.cuda.device_count()) if torch.cuda.is_initialized() else []):
-        proxy = _proxy(adapted, config)
+        proxy = proxy_for(adapted, config)
         whole = adapted if isinstance(adapted, LightsItself) else ForeignHost(adapted, borrowed, proxy)
         attached = AttachedNeilf(NeilfModel(whole, config, facts, borrowed=borrowed), proxy)
     if config.known_map is not None:
@@ -283,8 +315,10 @@ def attach_neilf(
 
 
 def missing_capabilities(host: object) -> Mapping[str, str]:
-    """The optional methods that a host does not have, and what is lost without each."""
-    return {name: loss for name, loss in WITHOUT.items() if not hasattr(host, name)}
+    """The optional methods that most hosts could have and this one does not, and what is lost without each;
+    `hosts.capabilities` has all.
+    """
+    return {c.method: c.without for c in CAPABILITIES if c.told and not hasattr(host, c.method)}
 
 
 def pixel_batch(origins: Tensor, directions: Tensor, color: Tensor, mask: Tensor | None = None) -> PixelBatch:
@@ -307,18 +341,6 @@ def pixel_batch(origins: Tensor, directions: Tensor, color: Tensor, mask: Tensor
         image_gradient=nothing,
         view=nothing.long(),
     )
-
-
-def _proxy(host: object, config: NeilfConfig) -> SurfaceProxy | None:
-    """What traces rays between surfaces for a host that does not, or not cheaply, where the settings ask for
-    them.
-    """
-    settings = config.inter_reflection
-    asked = settings.mode != "off" and not answers_secondary_rays(host)
-    if isinstance(host, LightsItself) or not (asked or settings.mode == "hard"):
-        return None
-    radiance = host.radiance if isinstance(host, KnowsRadiance) else None
-    return SurfaceProxy(config.volume.radius, GRID_RESOLUTION, config.shading.hit_share, radiance)
 
 
 def _what_comes(attached: AttachedNeilf, borrowed: bool) -> str:

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stderr
+from pathlib import Path
 from typing import Any
 
 import tyro
@@ -55,11 +56,20 @@ def _run(name: str, arguments: Sequence[str]) -> None:
         raise UserError(f"unknown command '{name}'", remedy)
     command = COMMANDS[name]
     try:
-        command.run(_parse(name, command, arguments))
+        command.run(_meant(_parse(name, command, arguments)))
     except OSError as error:  # what nobody nearer to it has explained
         where = f"{error.filename}: " if error.filename else ""
         remedy = "see that it is there, can be read or written, and has room"
         raise UserError(f"{where}{error.strerror or error}", remedy) from error
+
+
+def _meant(options: Any) -> Any:
+    """The options of a command, with the folder of a run in place of nerfstudio's file of it."""
+    if isinstance(getattr(options, "run", None), Path) and options.run.suffix == ".yml":
+        from neilfpp_method.train.run import run_folder
+
+        options.run = run_folder(options.run)
+    return options
 
 
 def _parse(name: str, command: Command, arguments: Sequence[str]) -> Any:

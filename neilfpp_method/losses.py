@@ -47,8 +47,7 @@ def mask(
     object_mask: Float[Tensor, " N"],
     known: Float[Tensor, " N"],
 ) -> LossTerm:
-    """On the object what a ray lets through, 1 − opacity; off it ln(1 + τ), τ the optical depth; where the
-    mask is known.
+    """On the object 1 − opacity; off it ln(1 + τ), τ the optical depth; where the mask is known.
 
     Opacity itself has no slope behind a solid, 1 − e^−τ: what stands where nothing may stand would stay there
     for good, painted like the background. The cross-entropy of IDR is τ, and its slope grows without bound as
@@ -68,9 +67,7 @@ def hessian(matrix: Float[Tensor, "P 3 3"]) -> LossTerm:
 
 
 def surface(distance: Float[Tensor, ...], epsilon: float) -> LossTerm:
-    """L_surf = δ_ε(G), δ_ε(z) = ε / (π (ε² + z²)): the area of the zero set, against surfaces that no image
-    asks for.
-    """
+    """L_surf = δ_ε(G), δ_ε(z) = ε / (π (ε² + z²)): the zero set's area, against unseen surfaces."""
     return LossTerm(epsilon / (math.pi * (epsilon**2 + distance**2)))
 
 
@@ -88,8 +85,7 @@ def inter_reflection(
     unit: float = 1.0,
     monochrome: bool = False,
 ) -> LossTerm:
-    """L_ref = ‖L(x₁, ωi) − R(x₂, −ωi)‖₁ for rays that leave x₁ along ωi and meet the surface at x₂, in a unit
-    of radiance.
+    """L_ref = ‖L(x₁, ωi) − R(x₂, −ωi)‖₁ for rays from x₁ along ωi that hit at x₂, in a unit of radiance.
 
     A light without colour is compared by luminance: no L can meet three channels that differ.
     """

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -34,6 +34,7 @@ from neilfpp_method.settings.facts import SceneFacts, radiance_units
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading import LOBES, initial_albedo, shade
 from neilfpp_method.structures import (
+    Incident,
     LossTerm,
     LossTerms,
     Material,
@@ -52,15 +53,14 @@ __all__ = ["Maps", "NeilfModel"]
 CLEAR_OPACITY = 0.01
 """Opacity below which a ray shows what lies beyond the scene."""
 SURFACE_OPACITY = 0.5
-"""Opacity above which a picture shows a surface. A picture has no holes: where a pixel shows two surfaces,
-too blurred to learn from, it shows what lies between them.
-"""
+"""Opacity above which a picture shows a surface, also where a pixel mixes two: a picture has no holes."""
 
 
 @dataclass(frozen=True)
 class Maps:
-    """Everything that a ray shows; one row a ray. Colours are linear. A ray that meets no surface has the
-    host's colour in `rgb`, and zeros for the material.
+    """Everything that rays show, one row a ray; colours are linear.
+
+    Where a ray meets no surface, `rgb` is the host's colour and the material is 0.
     """
 
     rgb: Float[Tensor, "N 3"]
@@ -73,6 +73,24 @@ class Maps:
     normal: Float[Tensor, "N 3"]
     depth: Float[Tensor, "N 1"]
     opacity: Float[Tensor, "N 1"]
+
+    @staticmethod
+    def of_host(rays: RayBatch, hits: SurfaceHits) -> Maps:
+        """What the host alone says: no material anywhere."""
+        color, parameter = torch.zeros_like(hits.color), torch.zeros_like(hits.color[:, :1])
+        depth = ((hits.position - rays.origins) * rays.directions).sum(-1, keepdim=True)
+        return Maps(
+            rgb=hits.color,
+            rgb_volume=hits.color,
+            diffuse=color,
+            specular=color,
+            base_color=color,
+            roughness=parameter,
+            metallic=parameter,
+            normal=hits.normal,
+            depth=depth,
+            opacity=hits.opacity[:, None],
+        )
 
 
 class NeilfModel(nn.Module):
@@ -124,9 +142,7 @@ class NeilfModel(nn.Module):
         self.replay = Replay(config.train.fresh if stands_still else 1.0, config.train.rays)
 
     def use(self, config: NeilfConfig) -> None:
-        """Compute with these settings from now on. They switch effects; sizes of fields stay what they were
-        built with.
-        """
+        """Compute with these settings from now on. Effects change; the sizes of fields stay."""
         self.config = config
         self.lobe = LOBES[config.shading.lobe] if config.shading.specular else None
         self.brdf.metals = config.brdf.metals
@@ -148,41 +164,49 @@ class NeilfModel(nn.Module):
         plan, names = self.stages[stage], active_losses(stage, self.config, self.stages)
         if not names:
             return StepResult.of({}, SurfacePixels.none_of(batch), batch[:0])
+        settings, units = self.config.shading, self.units
         replays = self.training and not plan.moves_host
         if replays:
-            fresh = slice(math.ceil(self.replay.share * len(batch)))
-            batch, hits = batch[fresh], None if hits is None else hits[fresh]
+            batch, hits = self._first_rays(batch, hits)
 
         # 1. The host renders colour, hit position and normal.
         hits, terms = self._render_host(batch, plan, names, hits)
         if "volume" in names:
-            terms["volume"] = losses.photometric(
-                hits.color, batch.color, self.facts.response, self.units.volume
-            )
+            terms["volume"] = losses.photometric(hits.color, batch.color, self.facts.response, units.volume)
         if not plan.moves_material:
             return StepResult.of(terms, SurfacePixels.none_of(batch), batch[:0])
 
-        # 2. Rays that meet one surface, on the object, are shaded; a scaled gradient goes back to where they
-        #   met it.
-        rows = torch.nonzero(hits.is_hit(self.config.shading.hit_share) & (batch.mask > 0.5))[:, 0]
+        # 2. Rays that meet one surface, on the object, are shaded. The gradient to their hits is scaled.
+        rows = torch.nonzero(hits.is_hit(settings.hit_share) & (batch.mask > 0.5))[:, 0]
         rendered = self._surface_pixels(hits[rows], batch[rows])
         surface = self.replay.beside_earlier(rendered) if replays else rendered
 
         # 3. The BRDF field says what the surface is made of.
-        material = self._material_and_priors(surface, names, terms)
+        material, priors = self._material_and_priors(surface, names)
+        terms |= priors
 
-        # 4. Light and scene say what arrives, and 5. the rendering equation what leaves towards the camera.
-        shading = self.shade(
-            surface.position, surface.normal, surface.wo, material, self.config.shading.train_samples
-        )
+        # 4. Light, lamps and scene say what arrives.
+        position, normal, wo = surface.position, surface.normal, surface.wo
+        incident = self._arriving(position, normal, wo, material, settings.train_samples)
+
+        # 5. The rendering equation says what leaves towards the camera.
+        with doing("shading"):
+            shading = shade(material, normal, wo, incident, self.lobe)
         terms["physical"] = losses.photometric(
-            shading.color, surface.pixel, self.facts.response, self.units.physical
+            shading.color, surface.pixel, self.facts.response, units.physical
         )
 
         # 6. What arrives from another surface is what that surface sends.
         if "inter_reflection" in names:
-            terms["inter_reflection"] = self._inter_reflection(surface.position, surface.normal)
+            terms["inter_reflection"] = self._inter_reflection(position, normal)
         return StepResult.of(terms, rendered, self._beyond(batch, hits))
+
+    def _first_rays(
+        self, batch: PixelBatch, hits: SurfaceHits | None
+    ) -> tuple[PixelBatch, SurfaceHits | None]:
+        """The part of a batch that is rendered; points of earlier steps stand in for the rest."""
+        first = slice(math.ceil(self.replay.share * len(batch)))
+        return batch[first], None if hits is None else hits[first]
 
     @doing("rendering")
     def _render_host(
@@ -218,18 +242,34 @@ class NeilfModel(nn.Module):
 
     @doing("shading")
     def _material_and_priors(
-        self, surface: SurfacePixels, names: Mapping[str, float], terms: dict[str, LossTerm]
-    ) -> Material:
+        self, surface: SurfacePixels, names: Mapping[str, float]
+    ) -> tuple[Material, dict[str, LossTerm]]:
+        """The material of surface points, and those of its priors that count."""
+        priors = {}
         if "smoothness" in names:
             with doing("regularisers"):
                 sample = self.brdf.with_gradients(surface.position)
             material, slopes = sample.material, (sample.roughness_gradient, sample.metallic_gradient)
-            terms["smoothness"] = losses.smoothness(*slopes, surface.image_gradient)
+            priors["smoothness"] = losses.smoothness(*slopes, surface.image_gradient)
         else:
             material = self.brdf(surface.position)
         if "lambertian" in names:
-            terms["lambertian"] = losses.lambertian(material)
-        return material
+            priors["lambertian"] = losses.lambertian(material)
+        return material, priors
+
+    @doing("shading")
+    def _arriving(
+        self,
+        position: Float[Tensor, "N 3"],
+        normal: Float[Tensor, "N 3"],
+        wo: Float[Tensor, "N 3"],
+        material: Material,
+        samples: int,
+    ) -> Incident:
+        """What arrives at surface points along `samples` directions each, drawn without gradients."""
+        about, roughness, sampler = normal.detach(), material.roughness.detach(), self.config.shading.sampler
+        drawn = draw_directions(sampler, self.light, about, wo, roughness, samples, self.lobe, self.training)
+        return arriving(self.sources, position, drawn)
 
     @doing("tracing")
     def _inter_reflection(self, position: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]) -> LossTerm:
@@ -251,9 +291,7 @@ class NeilfModel(nn.Module):
 
     @property
     def scene(self) -> SceneTracer | None:
-        """What the scene's own surfaces send, where inter-reflection is traced; none where it is off or a
-        loss.
-        """
+        """What the scene's own surfaces send, where inter-reflection is traced (hard); else none."""
         if self.config.inter_reflection.mode != "hard":
             return None
         return scene_tracer(self.host, self.config.inter_reflection, self.config.shading.hit_share)
@@ -275,9 +313,7 @@ class NeilfModel(nn.Module):
     def shading_normals(
         self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
-        """Unit normals at hits as surfaces are shaded with them; their gradient is that of the hits'
-        normals.
-        """
+        """Unit normals that hits are shaded with; their gradient is that of the hits' normals."""
         if not isinstance(self.host, SmoothsNormals):
             return normal
         smooth = self.host.smooth_normals(position.detach(), normal.detach())
@@ -296,12 +332,9 @@ class NeilfModel(nn.Module):
         material: Material,
         samples: int,
     ) -> Shading:
-        """Outgoing radiance towards wo by the rendering equation, from `samples` incident directions per
-        point.
-        """
-        about, roughness, sampler = normal.detach(), material.roughness.detach(), self.config.shading.sampler
-        drawn = draw_directions(sampler, self.light, about, wo, roughness, samples, self.lobe, self.training)
-        return shade(material, normal, wo, arriving(self.sources, position, drawn), self.lobe)
+        """Outgoing radiance towards wo by the rendering equation, from `samples` directions a point."""
+        incident = self._arriving(position, normal, wo, material, samples)
+        return shade(material, normal, wo, incident, self.lobe)
 
     @torch.no_grad()
     def maps(self, rays: RayBatch, with_material: bool = True, hits: SurfaceHits | None = None) -> Maps:
@@ -311,32 +344,27 @@ class NeilfModel(nn.Module):
         what the host has rendered of the rays already; none: it is asked.
         """
         hits = self.host.render(rays) if hits is None else hits.detach()
-        size = len(rays)
-        surfaces = torch.zeros(size, 11, dtype=hits.color.dtype, device=hits.color.device)
-        rgb, normals = hits.color.clone(), hits.normal.clone()
+        maps = Maps.of_host(rays, hits)
         rows = torch.nonzero(hits.opacity > SURFACE_OPACITY)[:, 0]
-        if with_material and len(rows):
-            position, wo = hits.position[rows], -rays.directions[rows]
-            normal = self.shading_normals(position, hits.normal[rows])
-            normals[rows] = normal
-            material = self.brdf(position)
-            shading = self.shade(position, normal, wo, material, self.config.shading.eval_samples)
-            rgb[rows] = shading.color
-            surfaces[rows] = torch.cat(
-                [
-                    shading.diffuse,
-                    shading.specular,
-                    material.base_color,
-                    material.roughness,
-                    material.metallic,
-                ],
-                dim=-1,
-            )
-        diffuse, specular, base_color, roughness, metallic = surfaces.split([3, 3, 3, 1, 1], dim=-1)
-        depth = ((hits.position - rays.origins) * rays.directions).sum(-1, keepdim=True)
-        opacity = hits.opacity[:, None]
-        return Maps(
-            rgb, hits.color, diffuse, specular, base_color, roughness, metallic, normals, depth, opacity
+        if not with_material or not len(rows):
+            return maps
+        position, wo = hits.position[rows], -rays.directions[rows]
+        normal = self.shading_normals(position, hits.normal[rows])
+        material = self.brdf(position)
+        shading = self.shade(position, normal, wo, material, self.config.shading.eval_samples)
+
+        def on_surface(other: Float[Tensor, "N C"], value: Float[Tensor, "P C"]) -> Float[Tensor, "N C"]:
+            return other.index_put((rows,), value.to(other.dtype))
+
+        return replace(
+            maps,
+            rgb=on_surface(maps.rgb, shading.color),
+            diffuse=on_surface(maps.diffuse, shading.diffuse),
+            specular=on_surface(maps.specular, shading.specular),
+            base_color=on_surface(maps.base_color, material.base_color),
+            roughness=on_surface(maps.roughness, material.roughness),
+            metallic=on_surface(maps.metallic, material.metallic),
+            normal=on_surface(maps.normal, normal),
         )
 
     # --------------------------------------------------------------------------------------------- parameters

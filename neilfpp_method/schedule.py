@@ -53,8 +53,7 @@ LIGHT_FIELD = frozenset({"radiance", "background"})
 GEOMETRY = LIGHT_FIELD | {"geometry", "beta"}
 MATERIAL = frozenset({"brdf", "light"})
 
-# Each loss of the material stages with the setting that weighs it; L_phys is what the others are weighed
-# against, and has 1.
+# Losses of the material stages and the settings that weigh them, relative to L_phys at 1.
 MATERIAL_LOSSES = {name: name for name in ("inter_reflection", "smoothness", "lambertian")}
 
 
@@ -115,8 +114,7 @@ FIXED_GEOMETRY: StageTable = {
     Stage.JOINT: TOGETHER,
 }
 
-# Somebody else trains the host. Nothing is computed before there is a material, so that adding it on costs
-# nothing.
+# Another trainer owns the host. Before there is a material nothing is computed: it costs nothing.
 BORROWED_HOST: StageTable = {
     Stage.SDF_INIT: StagePlan({}, frozenset()),
     Stage.MATERIAL_INIT: STAGES[Stage.MATERIAL_INIT],
@@ -134,9 +132,7 @@ def stage_steps(config: TrainConfig) -> Mapping[Stage, int]:
 
 
 def has_material(steps: int, config: TrainConfig) -> bool:
-    """Whether the first `steps` steps moved the material and the light; before that they are what they start
-    as.
-    """
+    """Whether the first `steps` steps moved material and light, which keep their start before that."""
     return steps > config.sdf_steps
 
 
@@ -155,9 +151,7 @@ class StagePosition:
 
 
 def stage_at(step: int, config: TrainConfig) -> StagePosition:
-    """The stage of a global step (from 0); the last stage that has steps, one past its end, when training is
-    over.
-    """
+    """The stage of a global step (from 0); one past the end of the last stage when training is over."""
     start = 0
     lengths = [(stage, n) for stage, n in stage_steps(config).items() if n > 0]
     for stage, length in lengths:
@@ -173,14 +167,13 @@ WARM_UP_START = 0.1
 
 
 def rate_factor(config: OptimizerConfig, position: StagePosition) -> float:
-    """What a learning rate is multiplied by at a step of a stage: the stage's own factor, its fall, and its
-    warm-up.
+    """The factor on a learning rate at a step of a stage: the stage's own, its decay and its warm-up.
 
     Example:
         >>> halfway = StagePosition(Stage.SDF_INIT, step=50, length=100)
         >>> rate_factor(OptimizerConfig(final=(0.01, 1.0, 1.0)), halfway)
         0.1
-        >>> rate_factor(OptimizerConfig(final=(0.01, 1.0, 1.0), drops=(1, 0, 0)), halfway)  # it drops there, at once
+        >>> rate_factor(OptimizerConfig(final=(0.01, 1.0, 1.0), drops=(1, 0, 0)), halfway)  # at once
         0.01
     """
     stage = list(Stage).index(position.stage)

@@ -38,9 +38,7 @@ __all__ = [
 ]
 
 PDF_FLOOR = 1e-6
-"""Smallest density divided by, per steradian. Less than 2π · 1e-6 of a sampler's directions lie where it
-acts.
-"""
+"""Smallest density divided by, per steradian; it acts on under 2π · 1e-6 of a sampler's directions."""
 
 Structure = TypeVar("Structure", bound="Indexable")
 
@@ -129,9 +127,7 @@ class SurfaceHits(Indexable):
 
 @dataclass(frozen=True)
 class Material(Indexable):
-    """The simplified Disney parameters at a point, each in [0, 1]. `roughness` r has microfacet width α =
-    r².
-    """
+    """Simplified Disney parameters at a point, each in [0, 1]; `roughness` r has microfacet width r²."""
 
     base_color: Float[Tensor, "N 3"]
     roughness: Float[Tensor, "N 1"]
@@ -177,9 +173,7 @@ class Incident(Indexable):
     def of(
         drawn: IncidentSamples, radiance: Float[Tensor, "#N S 3"], source: Int[Tensor, "N S"] | None = None
     ) -> Incident:
-        """What arrives along drawn directions: each stands for 1/(S · pdf). No `source`: all comes from the
-        light.
-        """
+        """What arrives along drawn directions, 1/(S · pdf) each. No `source`: all from the light."""
         weight = 1 / (drawn.pdf.clamp_min(PDF_FLOOR) * drawn.pdf.shape[1])
         if source is None:
             source = torch.zeros((), dtype=torch.long, device=weight.device).expand(weight.shape)
@@ -194,9 +188,7 @@ class Incident(Indexable):
 
 @dataclass(frozen=True)
 class Shading(Indexable):
-    """Outgoing radiance of a point towards the viewer, and its two parts: `color` = `diffuse` +
-    `specular`.
-    """
+    """Outgoing radiance of a point to the viewer and its parts: `color` = `diffuse` + `specular`."""
 
     color: Float[Tensor, "N 3"]
     diffuse: Float[Tensor, "N 3"]
@@ -220,11 +212,9 @@ SceneTracer = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N S 3"]], SceneLigh
 
 
 class LossTerm(NamedTuple):
-    """One loss before reduction: `values` of any shape and, where not all count alike, `weights` that
-    broadcast to it.
+    """A loss before reduction: `values` of any shape, and optional `weights` that broadcast to it.
 
-    A named tuple, because the wrappers of data-parallel training look for tensors in those and not in frozen
-    dataclasses.
+    A named tuple: wrappers of data-parallel training find tensors there, not in frozen dataclasses.
     """
 
     values: Float[Tensor, ...]
@@ -243,9 +233,7 @@ LossTerms = Mapping[str, LossTerm]
 
 @dataclass(frozen=True)
 class Observed(Indexable):
-    """Surface points and what an image holds of each: `pixel` in the capture's response, `wo` towards the
-    camera.
-    """
+    """Surface points and their pixels: `pixel` in the capture's response, `wo` towards the camera."""
 
     position: Float[Tensor, "N 3"]
     normal: Float[Tensor, "N 3"]
@@ -269,8 +257,7 @@ class SurfacePixels(Observed):
 class StepResult(NamedTuple):
     """What a training step computed: its losses, and constants for those who solve for the light.
 
-    Wrappers of data-parallel training change no frozen dataclass, so points and pixels travel as the rows of
-    tensors.
+    Wrappers of data-parallel training skip frozen dataclasses, so points travel as rows of tensors.
 
     Attributes:
         terms: the losses that count in the stage, before their weights.

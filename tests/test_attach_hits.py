@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from neilfpp_method import attach
 from neilfpp_method.attach import attach_neilf, pixel_batch
 from neilfpp_method.data.views import Camera, camera_rays
 from neilfpp_method.errors import UserError
+from neilfpp_method.hosts import foreign
 from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.image import image_hits
 from neilfpp_method.schedule import Stage
@@ -28,7 +28,7 @@ from tests.scenes import tiny_config
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
     """A grid that few rays fill."""
-    monkeypatch.setattr(attach, "GRID_RESOLUTION", 40)
+    monkeypatch.setattr(foreign, "GRID_RESOLUTION", 40)
 
 
 def pixels(rays: RayBatch) -> PixelBatch:

@@ -146,7 +146,8 @@ def test_what_is_no_command_is_refused(line):
 
 
 def test_commands_are_quoted_in_three_ways():
-    text = "Run `neilfpp\neval RUN`:\n\n    make demo\n\n```sh\nneilfpp train --data A \\\n    --out B   # why\nls\n```\n"
+    text = "Run `neilfpp\neval RUN`:\n\n    make demo\n\n"
+    text += "```sh\nneilfpp train --data A \\\n    --out B   # why\nls\n```\n"
     assert list(quoted(text)) == ["make demo", "neilfpp train --data A --out B # why", "neilfpp eval RUN"]
     assert words_of("neilfpp completion bash > FILE  # once") == ["neilfpp", "completion", "bash"]
 

@@ -20,6 +20,7 @@ from neilfpp_method.plugin.foreign import build_foreign
 from neilfpp_method.schedule import Stage
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.train.loop import seed_step
+from neilfpp_method.train.run import run_folder
 from tests.data.make_capture import make_capture
 from tests.scenes import sphere_batch
 from tests_nerfstudio.runs import checkpoint, ns_train, small_settings, trainer_config, weights
@@ -188,11 +189,11 @@ def test_a_host_that_does_not_render_rays_or_does_not_exist_is_refused() -> None
 
 @pytest.mark.parametrize("name", ["neus", "nerfacto"])
 def test_the_stages_run_on_a_method_of_nerfstudio(name: str, tmp_path: Path) -> None:
-    settings = small_settings(sdf_steps=2, material_steps=2, joint_steps=1)
+    settings = small_settings(sdf_steps=2, material_steps=4, joint_steps=1)
     settings = dataclasses.replace(settings, shading=dataclasses.replace(settings.shading, hit_share=0.05))
     data = make_capture(tmp_path / "capture", size=(8, 6), test=(0, 1))
     ends = []
-    for stage, steps in ((Stage.SDF_INIT, 2), (Stage.MATERIAL_INIT, 4), (Stage.JOINT, 5)):
+    for stage, steps in ((Stage.SDF_INIT, 2), (Stage.MATERIAL_INIT, 6), (Stage.JOINT, 7)):
         config = trainer_config(data, tmp_path / stage.value, settings, host=name)
         config.max_num_iterations = steps
         run = ns_train(config)
@@ -204,11 +205,27 @@ def test_the_stages_run_on_a_method_of_nerfstudio(name: str, tmp_path: Path) -> 
 
     first, second, third = ends
     # Material init leaves the host where SDF init brought it; the joint stage moves both.
-    assert not moved(first, second, "host.model.field")
+    assert not moved(first, second, "host.inner.model.field")
     assert moved(first, second, "brdf.")
-    assert moved(first, second, "light.")
-    assert moved(second, third, "host.model.field")
+    assert moved(first, second, "light.log_radiance"), "a map is solved for, as on our own hosts"
+    assert moved(second, third, "host.inner.model.field")
     assert moved(second, third, "brdf.")
     boxes = [key for key in first if key.endswith("field.aabb")]
     assert boxes
     assert all(torch.equal(first[key], third[key]) for key in boxes), "what the model never trains stays"
+    kept = checkpoint(run)["pipeline"]
+    assert kept["_model.proxy.points._extra_state"]["filled"] > 0, "rays between surfaces go to a proxy"
+    assert kept["_model.proxy._extra_state"]["steps"] == 7
+
+
+def test_a_foreign_host_says_what_traces_its_rays_and_where_neilfpp_cannot_follow(
+    tmp_path: Path, capsys
+) -> None:
+    settings = small_settings(sdf_steps=1, material_steps=1, joint_steps=0)
+    data = make_capture(tmp_path / "capture", size=(8, 6), test=(0, 1))
+    run = ns_train(trainer_config(data, tmp_path / "run", settings, host="neus"))
+    said = " ".join(capsys.readouterr().out.split())
+    assert "a proxy of its surface, gathered from the training rays" in said
+    assert "no run folder for neilfpp's own commands: the host neus is nerfstudio's own" in said
+    with pytest.raises(UserError, match="no run folder neilfpp/ beside it"):
+        run_folder(run / "config.yml")

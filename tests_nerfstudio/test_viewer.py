@@ -31,7 +31,8 @@ def free_port() -> int:
 @contextmanager
 def ns_viewer(config: Path, port: int) -> Iterator[None]:
     """The command in a process of its own: it never ends by itself."""
-    code = "import tests_nerfstudio.conftest; from nerfstudio.scripts.viewer.run_viewer import entrypoint; entrypoint()"
+    code = "import tests_nerfstudio.conftest; from nerfstudio.scripts.viewer import run_viewer"
+    code += "; run_viewer.entrypoint()"
     options = [
         "--load-config",
         str(config),

@@ -6,6 +6,7 @@ What a command needs to run is imported when it runs, so that help and a mistype
 from __future__ import annotations
 
 from neilfpp_method.commands import (
+    compare,
     completion,
     demo,
     evaluate,
@@ -31,6 +32,7 @@ COMMANDS = {
     "export": export.COMMAND,
     "relight": relight.COMMAND,
     "report": report.COMMAND,
+    "compare": compare.COMMAND,
     "view": view.COMMAND,
     "completion": completion.COMMAND,
 }

@@ -52,9 +52,7 @@ def terminal() -> Console:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
-    """A bar that takes the share of the work that is done; at the first share it says how long all of it will
-    take.
-    """
+    """A progress bar of the share done; at the first share it says how long the whole work will take."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     share = TextColumn("{task.percentage:3.0f} %")

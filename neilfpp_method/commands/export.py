@@ -15,8 +15,7 @@ __all__ = ["COMMAND"]
 
 @dataclass
 class Export:
-    """Write a run's surface, its light, or a textured asset for other programs, in the capture's frame and
-    scale."""
+    """Write a run's surface, its light, or a textured asset for other programs, in the capture's frame."""
 
     run: tyro.conf.Positional[Path]
     """The run's folder."""
@@ -35,11 +34,9 @@ class Export:
     faces: int = 30_000
     """Most triangles of the asset."""
     error: float = 0.001
-    """Scene units by which the asset's triangles may be off, to be fewer than that; a normal map makes up for
-    the rest."""
+    """Largest error of the asset's simplified triangles, scene units; a normal map keeps finer relief."""
     confidence: bool = False
-    """Add a texture of how far off the asset's base colour, roughness and metallic may be; takes about twice
-    as long."""
+    """Add a texture of the expected error of base colour, roughness and metallic; takes twice as long."""
     checkpoint: Checkpoint = "last"
     """Which weights."""
     device: Device = "auto"

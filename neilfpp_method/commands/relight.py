@@ -20,11 +20,9 @@ class Relight:
     run: tyro.conf.Positional[Path]
     """The run's folder."""
     env: tuple[Path, ...] = ()
-    """Environment maps (EXR, HDR, PNG, JPEG), a folder of pictures each; none: the light that the run has
-    found."""
+    """Environment maps (EXR, HDR, PNG, JPEG), a folder of pictures each; none: the run's own light."""
     env_layout: Literal["ours", "common"] = "ours"
-    """ours: as `neilfpp export` writes maps. common: as Blender reads them, rows at pixel centres and a
-    quarter turn away."""
+    """ours: as `neilfpp export` writes maps. common: as Blender reads them, a quarter turn away."""
     rotate: float = 0.0
     """Degrees by which the map is turned about +z, counter-clockwise seen from above."""
     exposure: float = 0.0
@@ -43,8 +41,7 @@ class Relight:
     edits: Annotated[
         tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="NAME=VALUE")
     ] = ()
-    """Change the material: roughness=0.2, metallic=1 or base_color=0.8,0.1,0.1 (linear); can be given several
-    times."""
+    """Change the material: roughness=0.2, metallic=1 or base_color=0.8,0.1,0.1 (linear); repeatable."""
     box: tuple[float, float, float, float, float, float] | None = None
     """Change it in this box alone: two corners, x y z x y z, in the capture's world frame."""
     mask: tuple[Path, ...] = ()

@@ -16,18 +16,14 @@ __all__ = ["COMMAND"]
 
 @dataclass
 class Render:
-    """Write every map of a run's views as PNG and EXR, and a picture of the light that arrives at four
-    points.
-    """
+    """Write every map of a run's views as PNG and EXR, and a picture of the incident light at four points."""
 
     run: tyro.conf.Positional[Path]
     """The run's folder."""
     out: Path | None = None
     """Where the pictures go; none: RUN/renders."""
     what: tuple[Literal["maps", "light"], ...] = ("maps", "light")
-    """maps: a folder each, and an EXR a view. light: incident_light.png, beside the truth where that is at
-    hand.
-    """
+    """maps: a folder each, and an EXR a view. light: incident_light.png, beside the truth where known."""
     views: Literal["test", "train", "all"] = "test"
     """Which views."""
     checkpoint: Checkpoint = "last"
@@ -35,9 +31,7 @@ class Render:
     overwrite: bool = False
     """Render again what is there already."""
     confidence: bool = False
-    """Add maps of how far off base colour, roughness and metallic may be (base_color_std, …); takes about
-    twice as long.
-    """
+    """Add maps of the expected error of the material (base_color_std, …); takes about twice as long."""
     scale: float | None = None
     """Size of the views over that of their files; 1: every pixel. None: 131 thousand pixels a view, about
     420×310, and no more than the run was trained at.

@@ -12,16 +12,12 @@ from neilfpp_method.commands.command import Command, Device, progress_bar, termi
 __all__ = ["COMMAND", "after_training"]
 
 TELLING = 0.1
-"""Share of the work that must be done before the time of all of it can be told: loading and compiling come
-first.
-"""
+"""Share of the work done before the total time is estimated: loading and compiling come first."""
 
 
 @dataclass
 class Report:
-    """Write a page that shows a run: its views beside the truth, its surface in 3-D, light, figures,
-    health.
-    """
+    """Write a page that shows a run: its views beside the truth, its surface in 3-D, light, figures."""
 
     run: tyro.conf.Positional[Path]
     """The run's folder."""

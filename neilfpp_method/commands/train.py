@@ -37,13 +37,9 @@ class Train:
     fast.
     """
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
-    """Settings from a .yaml or .json file, all or some; a run folder's config.json is one. Options here win
-    over it.
-    """
+    """Settings from a .yaml or .json file, such as a run folder's config.json; options here override it."""
     host: Literal["volsdf", "mesh"] = "volsdf"
-    """Where geometry comes from: volsdf recovers it; mesh takes it as given and recovers material and
-    light.
-    """
+    """Where geometry comes from: volsdf recovers it; mesh is given, and material and light are recovered."""
     mesh: Path | None = None
     """The mesh of --host mesh, in the capture's world frame; none: the capture's inputs/model/mesh.ply."""
     light: Path | None = None
@@ -59,9 +55,7 @@ class Train:
     response: Literal["auto", "linear", "srgb"] = "auto"
     """What the pixels are: linear radiance (HDR) or sRGB (LDR); auto: told from the files."""
     scale: float | None = None
-    """Size of the images over that of their files, 1: as they are; none: as large as the training's rays can
-    use.
-    """
+    """Image size over that of the files; 1: full size; none: as large as the training's rays can use."""
     effects: str | None = None
     """auto, all, none, as-set, or as auto,-lamps."""
     strict: bool = False

@@ -20,17 +20,13 @@ class View:
     run: tyro.conf.Positional[Path]
     """The run's folder."""
     env: tuple[Path, ...] = ()
-    """Environment maps to choose from beside the run's own light (EXR, HDR, PNG, JPEG), or folders of
-    them.
-    """
+    """Environment maps to choose from beside the run's own light (EXR, HDR, PNG, JPEG), or folders."""
     env_layout: Literal["ours", "common"] = "ours"
     """ours: as `neilfpp export` writes maps. common: as Blender reads them."""
     follow: bool = False
     """Wait for a run that trains, and show every new checkpoint."""
     host: str = "127.0.0.1"
-    """The address that is listened on; 127.0.0.1: this machine alone. 0.0.0.0 lets everybody in who reaches
-    it.
-    """
+    """Address to listen on. 127.0.0.1: this machine alone; 0.0.0.0: everybody who can reach it."""
     port: int = 8080
     """The port that is listened on."""
     resolution: int = 256

@@ -18,16 +18,16 @@ from neilfpp_method.data.silhouettes import AGREEMENT, Outline, agreement
 from neilfpp_method.data.views import Normalisation
 from neilfpp_method.structures import RayBatch
 
-__all__ = ["MOST_RAYS", "leaves_room"]
+__all__ = ["MAX_RAYS", "leaves_room"]
 
-MOST_RAYS = 1000
-"""Rays that are asked."""
+MAX_RAYS = 1000
+"""Rays that are tested."""
 PLACES = 65
-"""Places on each, evenly within the sphere about the scene's box."""
+"""Points on each ray, evenly within the sphere around the scene box."""
 RADIUS = math.sqrt(3.0)
-"""Of that sphere, scene units."""
+"""Of that sphere, scene units: it passes through the corners of the box."""
 ROOM = 0.9
-"""Share of the rays that must find a place."""
+"""Share of the rays that must have a point which nothing contradicts."""
 
 
 def leaves_room(outlines: Sequence[Outline], rays: RayBatch, normalisation: Normalisation) -> bool:

@@ -1,5 +1,4 @@
-"""Brackets taken by hand: the photographs of a pose are brought onto its middle exposure before they are
-merged.
+"""Hand-held brackets: the photographs of a pose are aligned with its middle exposure before merging.
 
 Neighbours in exposure are compared, as these share most levels of light that neither clips, and the motions
 are chained. No response is needed: the levels of one image are first mapped to those of the other by their
@@ -17,29 +16,31 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from neilfpp_method.data.brackets import BRIGHTEST, DARKEST, Bracket
+from neilfpp_method.data.brackets import MAX_VALUE, MIN_VALUE, Bracket
 
 __all__ = ["Aligned", "align"]
 
 SIDES = (128, 256, 512, 1024)
-"""Of the reduced images that are compared, the longer ones."""
+"""Longer sides, pixels, of the reduced images that are aligned, coarse to fine."""
 ROUNDS = 20
-SETTLED = 0.01
-"""Pixels of a reduced image: no round goes on below."""
-STILL = 0.25
-"""Pixels: what moves less in all corners is left as it is, and not resampled."""
-WORTH_IT = 0.8
-"""A motion counts where no more than this share of what differs is left."""
-LARGEST_SHARE = 0.15
-"""Of the longer side: what a hand does between two exposures stays below."""
-FEWEST_SEEN = 0.02
+"""Largest number of Gauss–Newton steps per size."""
+CONVERGED = 0.01
+"""Motion of a step, pixels of the reduced image, below which the search ends."""
+MIN_SHIFT = 0.25
+"""Pixels: an image whose corners move less is used as it is, without resampling."""
+MAX_RESIDUAL = 0.8
+"""A motion is accepted if it leaves at most this share of the difference."""
+MAX_SHIFT = 0.15
+"""Share of the longer side that no hand moves between two exposures."""
+MIN_OVERLAP = 0.02
+"""Least share of the pixels that both images must show unclipped."""
 SHIFT_BITS = 5
+"""Power of two that bounds the shift of the coarse alignment, pixels."""
 
 
 @dataclass(frozen=True)
 class Aligned:
-    """A bracket whose images lie on one another, and the largest motion that was undone, in pixels; 0: a
-    tripod's.
+    """An aligned bracket, and the largest motion that was undone, in pixels; 0 for a bracket on a tripod.
 
     What an image does not show after its motion, and what it had clipped, is 1 there: no evidence.
     """
@@ -62,11 +63,11 @@ def align(bracket: Bracket) -> Aligned:
     size = bracket.pixels[0].shape[:2]
     moved = {i: _corner_shift(motion, size) for i, motion in motions.items()}
     pixels = tuple(
-        _moved(image, motions[i]) if moved[i] > STILL else image for i, image in enumerate(bracket.pixels)
+        _moved(image, motions[i]) if moved[i] > MIN_SHIFT else image for i, image in enumerate(bracket.pixels)
     )
     return Aligned(
         Bracket(pixels, bracket.exposures),
-        max((shift for shift in moved.values() if shift > STILL), default=0.0),
+        max((shift for shift in moved.values() if shift > MIN_SHIFT), default=0.0),
     )
 
 
@@ -76,13 +77,11 @@ def align(bracket: Bracket) -> Aligned:
 def _motion(
     fixed: Float32[np.ndarray, "H W 3"], moving: Float32[np.ndarray, "H W 3"]
 ) -> Float64[np.ndarray, "3 3"]:
-    """The homography from pixels of `fixed` to those of `moving`; the identity where none explains the images
-    better.
-    """
+    """The homography from pixels of `fixed` to those of `moving`; the identity where none fits better."""
     size = fixed.shape[:2]
     still = np.eye(3)
     pair = _pair(fixed, moving, SIDES[1])
-    if min(pair.moving_seen.mean(), pair.fixed_seen.mean()) < FEWEST_SEEN:
+    if min(pair.moving_seen.mean(), pair.fixed_seen.mean()) < MIN_OVERLAP:
         return still
     starts = [still, _first_shift(pair)]
     motion = min(starts, key=lambda start: _difference(pair, start))
@@ -91,8 +90,9 @@ def _motion(
         motion = _refined(pair, motion)
         if side >= max(size):
             break
-    far = not np.isfinite(motion).all() or _corner_shift(motion, size) > LARGEST_SHARE * max(size)
-    return still if far or _difference(pair, motion) > WORTH_IT * _difference(pair, still) else motion
+    far = not np.isfinite(motion).all() or _corner_shift(motion, size) > MAX_SHIFT * max(size)
+    useless = _difference(pair, motion) > MAX_RESIDUAL * _difference(pair, still)
+    return still if far or useless else motion
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def _pair(fixed: Float32[np.ndarray, "H W 3"], moving: Float32[np.ndarray, "H W 
     share = min(1.0, side / max(height, width))
     size = (max(2, round(share * width)), max(2, round(share * height)))
     small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (fixed, moving)]
-    seen = [(image.max(axis=2) < BRIGHTEST) & (image.max(axis=2) > DARKEST) for image in small]
+    seen = [(image.max(axis=2) < MAX_VALUE) & (image.max(axis=2) > MIN_VALUE) for image in small]
     first, second = (image.mean(axis=2) for image in small)
     steps = np.linspace(0, 1, 256)
     matched = np.interp(second, np.quantile(second, steps), np.quantile(first, steps)).astype(np.float32)
@@ -144,8 +144,7 @@ def _first_shift(pair: _Pair) -> Float64[np.ndarray, "3 3"]:
 def _refined(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
     """The motion, from one that is nearly right, under which the images differ least but for gain and offset.
 
-    Inverse compositional Gauss–Newton: the small motion is one of the fixed image, whose derivatives are
-    taken once.
+    Inverse compositional Gauss–Newton: the derivatives are those of the fixed image, computed once.
     """
     height, width = pair.fixed.shape
     unit = max(height, width) / 2
@@ -159,7 +158,7 @@ def _refined(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> Float64[np.ndar
     centred = pair.scale @ np.array([[unit, 0, (width - 1) / 2], [0, unit, (height - 1) / 2], [0, 0, 1]])
     for _ in range(ROUNDS):
         warped, seen = pair.warped(motion)
-        if seen.mean() < FEWEST_SEEN:
+        if seen.mean() < MIN_OVERLAP:
             break
         off, known = (warped - pair.fixed)[seen], slopes[:, seen]
         typical = 1.5 * np.median(np.abs(off - np.median(off))) + 1e-4
@@ -171,7 +170,7 @@ def _refined(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> Float64[np.ndar
         change = centred @ np.linalg.inv(small) @ np.linalg.inv(centred)
         motion = motion @ change
         motion = motion / motion[2, 2]
-        if _corner_shift(change, (height, width)) < SETTLED:
+        if _corner_shift(change, (height, width)) < CONVERGED:
             break
     return motion
 
@@ -179,7 +178,7 @@ def _refined(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> Float64[np.ndar
 def _difference(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> float:
     """How unlike the images are after a motion: 1 − their correlation where both are seen."""
     warped, seen = pair.warped(motion)
-    if seen.mean() < FEWEST_SEEN:
+    if seen.mean() < MIN_OVERLAP:
         return 1.0
     a, b = pair.fixed[seen] - pair.fixed[seen].mean(), warped[seen] - warped[seen].mean()
     return 1.0 - float((a * b).mean() / max(a.std() * b.std(), 1e-12))
@@ -195,14 +194,12 @@ def _corner_shift(motion: Float64[np.ndarray, "3 3"], size: tuple[int, int]) -> 
 def _moved(
     image: Float32[np.ndarray, "H W 3"], motion: Float64[np.ndarray, "3 3"]
 ) -> Float32[np.ndarray, "H W 3"]:
-    """The image seen from where the middle exposure was; 1 where a clipped pixel, or none, has a part in
-    it.
-    """
+    """The image warped to the middle exposure, and 1 where a clipped or missing pixel contributes."""
     size, flags = image.shape[1::-1], cv2.WARP_INVERSE_MAP
     moved = cv2.warpPerspective(
         image, motion, size, flags=cv2.INTER_CUBIC | flags, borderMode=cv2.BORDER_REPLICATE
     )
-    clipped = cv2.dilate((image >= BRIGHTEST).astype(np.float32), np.ones((3, 3), np.uint8))
+    clipped = cv2.dilate((image >= MAX_VALUE).astype(np.float32), np.ones((3, 3), np.uint8))
     unseen = cv2.warpPerspective(
         clipped, motion, size, flags=cv2.INTER_LINEAR | flags, borderValue=(1.0, 1.0, 1.0)
     )

@@ -29,9 +29,9 @@ Brackets = Mapping[str, Mapping[Path, float]]
 GROUPS = "brackets.json"
 NUMBERED = re.compile(r"[_-]\d+$")
 CALIBRATED = 6
-"""Most brackets that a response is calibrated from."""
+"""Largest number of brackets that a response is calibrated from."""
 CALIBRATION_SIDE = 1024
-"""Most pixels a side that it is calibrated from."""
+"""Longest side, pixels, of the images that a response is calibrated from."""
 
 
 def find_brackets(folder: Path, exposures: Path | None = None, unreadable: Collection[Path] = ()) -> Brackets:
@@ -133,8 +133,7 @@ def merge_brackets(
     response: Literal["auto", "linear", "srgb"] = "auto",
     on_merged: Callable[[str, float | None], None] = lambda name, moved: None,
 ) -> None:
-    """Write linear float `images/NAME.exr`, and `valid/NAME.png`, white where the radiance is known, for
-    every pose.
+    """For every pose, write linear float `images/NAME.exr` and `valid/NAME.png`, white: radiance is known.
 
     All are on one radiance scale, in which 1 is about the white of the middle exposure; photographs taken by
     hand are brought onto the middle one. A pose whose two files are there is passed over, so that a call that
@@ -182,9 +181,7 @@ def _response(brackets: Brackets, response: str) -> Response:
 
 
 def _thin(bracket: Bracket) -> Bracket:
-    """Some of the pixels, enough to calibrate from; all photographs of a camera at once would fill the
-    memory.
-    """
+    """A subset of the pixels, enough to calibrate from: all photographs at once would fill the memory."""
     step = -(-max(bracket.pixels[0].shape[:2]) // CALIBRATION_SIDE)
     return Bracket(tuple(pixels[::step, ::step].copy() for pixels in bracket.pixels), bracket.exposures)
 

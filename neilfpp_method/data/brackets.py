@@ -23,12 +23,14 @@ __all__ = ["Bracket", "Merged", "Response", "calibrate", "linear_response", "mer
 Response = Callable[[Float32[np.ndarray, "H W 3"]], Float32[np.ndarray, "H W 3"]]
 """From pixels in [0, 1] to the light that they took in, up to one factor."""
 
-DARKEST, BRIGHTEST = 4 / 255, 250 / 255
+MIN_VALUE, MAX_VALUE = 4 / 255, 250 / 255
+"""Encoded values that are used; outside them a pixel is too dark or clipped."""
 SAMPLES_SIDE = 16
+"""Pixels per side of the grid that the response is calibrated from."""
 SMOOTHNESS = 30.0
-"""Of the response; OpenCV's own 10 follows the errors of photographs that were taken by hand."""
+"""Weight of the response's smoothness; OpenCV's default, 10, follows errors of hand-held photographs."""
 NOISE = 3
-"""Of 255 levels: a longer exposure is not darker than this."""
+"""Levels of 255 by which a longer exposure may be darker than a shorter one."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +43,7 @@ class Bracket:
 
 @dataclass(frozen=True)
 class Merged:
-    """Linear radiance, and where it is known: a pixel that is clipped at every exposure holds only a lower
-    bound.
-    """
+    """Linear radiance, and where it is known: a pixel clipped at every exposure holds only a lower bound."""
 
     radiance: Float32[np.ndarray, "H W 3"]
     valid: Bool[np.ndarray, "H W"]
@@ -87,7 +87,7 @@ def calibrate(brackets: Sequence[Bracket]) -> Response:
     samples = [np.ascontiguousarray(image[chosen].reshape(SAMPLES_SIDE, SAMPLES_SIDE, 3)) for image in levels]
     times = np.array(brackets[0].exposures, dtype=np.float32)
     curve = cv2.createCalibrateDebevec(SAMPLES_SIDE**2, SMOOTHNESS).process(samples, times).reshape(256, 3)
-    inner = curve[round(255 * DARKEST) : round(255 * BRIGHTEST) : 16]
+    inner = curve[round(255 * MIN_VALUE) : round(255 * MAX_VALUE) : 16]
     if not np.isfinite(curve).all() or (np.diff(inner, axis=0) <= 0).any():
         raise UserError(
             "the camera's response cannot be told from these brackets: it would not increase",
@@ -119,10 +119,10 @@ def merge(bracket: Bracket, response: Response) -> Merged:
     for i in order:
         z, t = bracket.pixels[i], np.float32(bracket.exposures[i])
         estimate = response(z) / t
-        fallback = np.where((z < BRIGHTEST) | (i == first), estimate, fallback)
-        weight = t * np.minimum(z - DARKEST, BRIGHTEST - z).clip(0)
+        fallback = np.where((z < MAX_VALUE) | (i == first), estimate, fallback)
+        weight = t * np.minimum(z - MIN_VALUE, MAX_VALUE - z).clip(0)
         total += weight * estimate
         weights += weight
     known = weights > 0
     radiance = np.where(known, total / np.where(known, weights, 1), fallback)
-    return Merged(radiance.astype(np.float32), (np.min(bracket.pixels, axis=0) < BRIGHTEST).all(axis=-1))
+    return Merged(radiance.astype(np.float32), (np.min(bracket.pixels, axis=0) < MAX_VALUE).all(axis=-1))

@@ -1,7 +1,6 @@
 """A capture: posed images of a scene, found by one of several readers, checked, normalised and split.
 
-Everything that the headers can tell is checked here, before a run starts; pixels are checked where they are
-loaded.
+All that the headers tell is checked here, before a run starts; pixels are checked when they are loaded.
 """
 
 from __future__ import annotations

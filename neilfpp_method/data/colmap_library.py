@@ -21,7 +21,8 @@ from neilfpp_method.errors import UserError
 
 __all__ = ["pycolmap"]
 
-OLDEST, END = (4, 2), (5, 0)
+MIN_VERSION, END_VERSION = (4, 2), (5, 0)
+"""Versions of pycolmap that are supported: from the first, before the second."""
 
 with suppress(ValueError):  # signals are the main thread's
     if (
@@ -29,7 +30,7 @@ with suppress(ValueError):  # signals are the main thread's
     ) is not None:  # Python knows of no other handlers than its own
         signal.signal(signal.SIGTERM, before)
 
-if not OLDEST <= tuple(int(part) for part in pycolmap.__version__.split(".")[:2]) < END:
+if not MIN_VERSION <= tuple(int(part) for part in pycolmap.__version__.split(".")[:2]) < END_VERSION:
     raise UserError(
         f"pycolmap {pycolmap.__version__} is installed, of another interface",
         "pip install 'pycolmap>=4.2,<5'",

@@ -1,5 +1,4 @@
-"""Which pixels a step learns from: most of them on the object or near its outline, where masks tell the
-object.
+"""Which pixels a step learns from: with masks, most of them on the object or near its outline.
 
 What a pixel far off the object shows is known after a few steps, so a step that draws uniformly from pictures
 of one object under a sky spends most of its rays on nothing. Where the object is known, `NEAR_SHARE` of a
@@ -21,9 +20,7 @@ from torch import Tensor
 __all__ = ["BLOCK", "KNOWN", "MASK", "NEAR", "VALID", "PixelDraws", "PixelSet", "near_object"]
 
 VALID, MASK, KNOWN, NEAR = 1, 2, 4, 8
-"""Bits of a pixel: it counts; it is on the object; whether it is, is known; it is on the object or near its
-outline.
-"""
+"""Bits of a pixel: valid; on the object; whether that is known; on the object or near its outline."""
 NEAR_SHARE = 0.85
 """Share of a step's pixels that are on the object or near its outline, where masks tell it."""
 NEAR_DISTANCE = 0.08
@@ -31,11 +28,9 @@ NEAR_DISTANCE = 0.08
 SMALL_SIDE = 256
 """Longest side, pixels, at which nearness is decided."""
 BLOCK = 1024
-"""Pixels of a block, whose chosen pixels are counted; planes of pixels are padded to a whole number of
-blocks.
-"""
+"""Pixels of a block, whose chosen pixels are counted; pixel planes are padded to whole blocks."""
 COUNTED = 2**14
-"""Blocks that are counted at once."""
+"""Blocks that are counted together."""
 
 
 class PixelSet:
@@ -90,9 +85,7 @@ class PixelDraws:
             self._parts = (near, PixelSet(bits, VALID | NEAR, VALID))
 
     def draw(self, count: int) -> Int[Tensor, " count"]:
-        """`count` numbers of valid pixels, with repetition, by torch's global generator on the CPU; in random
-        order.
-        """
+        """`count` indices of valid pixels, with repetition, from torch's global CPU generator; unordered."""
         if self._parts is None:
             return torch.randint(self.valid.count, (count,)) if self._all else self.valid.draw(count)
         near, rest = self._parts

@@ -13,8 +13,10 @@ from neilfpp_method.errors import UserError
 
 __all__ = ["check_environment", "read_environment"]
 
-FEWEST_ROWS, FEWEST_COLUMNS = 4, 8
-MOST_ROWS, MOST_COLUMNS = 2048, 4096
+MIN_ROWS, MIN_COLUMNS = 4, 8
+"""Smallest map, texels."""
+MAX_ROWS, MAX_COLUMNS = 2048, 4096
+"""Largest map, texels: bounds the memory."""
 
 
 def check_environment(path: Path) -> None:
@@ -26,11 +28,11 @@ def check_environment(path: Path) -> None:
     if path.suffix.lower() != ".exr":
         raise UserError(f"{path}: an environment map is linear radiance in an EXR file", "convert it to EXR")
     header = image_header(path)
-    small = header.height < FEWEST_ROWS or header.width < FEWEST_COLUMNS
-    if small or header.height > MOST_ROWS or header.width > MOST_COLUMNS:
+    small = header.height < MIN_ROWS or header.width < MIN_COLUMNS
+    if small or header.height > MAX_ROWS or header.width > MAX_COLUMNS:
         raise UserError(
             f"{path}: an environment map of {header.height} rows and {header.width} columns",
-            f"scale it to between {FEWEST_ROWS}×{FEWEST_COLUMNS} and {MOST_ROWS}×{MOST_COLUMNS}",
+            f"scale it to between {MIN_ROWS}×{MIN_COLUMNS} and {MAX_ROWS}×{MAX_COLUMNS}",
         )
 
 

@@ -17,26 +17,22 @@ from neilfpp_method.data.views import View
 __all__ = ["Axes", "Focus", "axes_of", "find_focus", "meeting_point"]
 
 ITERATIONS = 50
-"""Rounds of reweighting; the place moves no more after some twenty."""
-FLOOR = 1e-3
-"""Share of the median distance below which an axis counts as passing through the place: it has no weight
-without bound.
-"""
-MIDDLE = 0.5
-"""A camera looks at what lies in this part of its picture, along both sides, about the middle."""
-MOST = 2 / 3
+"""Rounds of reweighted least squares; it converges in about twenty."""
+MIN_DISTANCE = 1e-3
+"""Share of the median distance below which an axis passes through the centre: it bounds the weights."""
+CENTRAL_SHARE = 0.5
+"""Central part of a picture, along both sides, that counts as what its camera looks at."""
+MIN_SHARE = 2 / 3
 """Share of the cameras that must look at the place."""
-LEAST_SPREAD_DEG = 10.0
-"""Least angle, root mean square, of the axes from their common plane or line. Aim is true to a few degrees:
-the depth at which axes meet that are nearer to parallel is that of chance.
+MIN_SPREAD_DEG = 10.0
+"""Least root mean square angle of the axes from their common plane or line. Cameras are aimed to a few
+degrees, so the intersection of axes closer to parallel is random.
 """
 
 
 @dataclass(frozen=True)
 class Axes:
-    """Optical axes: where the cameras stand and the unit vectors along which they look, in the world
-    frame.
-    """
+    """Optical axes: camera centres and unit viewing directions, in the world frame."""
 
     eyes: Float64[np.ndarray, "V 3"]
     ahead: Float64[np.ndarray, "V 3"]
@@ -81,12 +77,12 @@ def find_focus(views: Sequence[View]) -> Focus | None:
             return None
         to = centre - axes.eyes
         beside = np.linalg.norm(np.einsum("vij,vj->vi", axes.across, to), axis=1)
-        weights = 1.0 / np.maximum(beside, FLOOR * np.median(np.linalg.norm(to, axis=1)) + 1e-12)
+        weights = 1.0 / np.maximum(beside, MIN_DISTANCE * np.median(np.linalg.norm(to, axis=1)) + 1e-12)
     looking = np.array([_looks_at(view, centre) for view in views])
-    if looking.mean() < MOST:
+    if looking.mean() < MIN_SHARE:
         return None
     spread = np.linalg.eigvalsh(axes.across[looking].mean(axis=0))[0]
-    if spread < np.sin(np.radians(LEAST_SPREAD_DEG)) ** 2:
+    if spread < np.sin(np.radians(MIN_SPREAD_DEG)) ** 2:
         return None
     return Focus(centre, looking, float(np.median(np.linalg.norm(to[looking], axis=1))))
 
@@ -107,4 +103,4 @@ def _looks_at(view: View, place: Float64[np.ndarray, " 3"]) -> bool:
         return False
     column, row = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
     across, down = abs(column / camera.width - 0.5), abs(row / camera.height - 0.5)
-    return bool(max(across, down) <= MIDDLE / 2)
+    return bool(max(across, down) <= CENTRAL_SHARE / 2)

@@ -35,9 +35,11 @@ __all__ = [
 ]
 
 MAX_SIDE = 65_536
+"""Longest side of an image, pixels."""
 MAX_PIXELS = 2**30
+"""Largest image: bounds the memory."""
 RADIANCE_HEADER = 4096
-"""Bytes; longer ones are not written."""
+"""Longest header of a Radiance HDR file that is read, bytes."""
 
 
 @dataclass(frozen=True)
@@ -102,9 +104,7 @@ def _radiance_header(path: Path) -> ImageHeader:
 
 
 def _radiance_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
-    """Radiance: what is stored has been multiplied by every exposure that the header names, and OpenCV leaves
-    it so.
-    """
+    """Radiance: stored values include every exposure of the header, and OpenCV does not undo that."""
     exposures = [
         float(line.split(b"=")[1]) for line in _radiance_lines(path) if line.startswith(b"EXPOSURE=")
     ]
@@ -253,8 +253,7 @@ def _check_size(path: Path, width: int, height: int) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place in one step when the block ends, and vanishes when
-    it fails.
+    """A temporary path beside `path`: renamed to it when the block ends, removed when the block fails.
 
     A reader, or a run that is killed, never meets half a file. Folders that are missing are made.
 

@@ -1,6 +1,4 @@
-"""JSON in and out: values that know where they stand, so that every complaint can say so, and files written
-in one step.
-"""
+"""JSON in and out: values that know their place, so that errors can name it, and atomic writing."""
 
 from __future__ import annotations
 
@@ -101,8 +99,6 @@ class Entry:
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """Write an object, in one step; numbers that are not finite have no place in JSON and are a
-    `ValueError`.
-    """
+    """Write an object atomically; numbers that are not finite do not exist in JSON: a `ValueError`."""
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n", "utf-8")

@@ -31,8 +31,7 @@ STRAIGHT_AT_ZERO = frozenset(
 class Lens:
     """A COLMAP camera model without its focal length and principal point.
 
-    `model` is COLMAP's name ("OPENCV", "OPENCV_FISHEYE", …), `coefficients` are the model's parameters after
-    these, in COLMAP's order.
+    `model` is COLMAP's name ("OPENCV", "OPENCV_FISHEYE", …), `coefficients` its further parameters in order.
     """
 
     model: str

@@ -1,6 +1,4 @@
-"""How much memory is free, and a word before more than that is taken: a process that takes too much is killed
-without one.
-"""
+"""How much memory is free, and a warning before a process takes more and is killed without a word."""
 
 from __future__ import annotations
 
@@ -12,7 +10,7 @@ from neilfpp_method.errors import UserError
 __all__ = ["available_memory", "check_memory"]
 
 UNLIMITED = 2**60
-"""What a control group of version 1 says that has no limit is above this."""
+"""Bytes above which the limit of a version 1 control group means no limit."""
 
 
 def available_memory(proc: Path = Path("/proc"), groups: Path = Path("/sys/fs/cgroup")) -> int | None:

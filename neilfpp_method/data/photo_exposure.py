@@ -49,8 +49,7 @@ def exposures_of(folder: Path, images: Sequence[Path], table: Path | None = None
 
 
 def photo_exposure(path: Path) -> float | None:
-    """Exposure time, seconds, times ISO/100, over the f-number squared, from EXIF; none where no time is
-    said.
+    """Exposure time in seconds times ISO/100 over the squared f-number, from EXIF; none without a time.
 
     An entry that is missing counts as 1: it is the same in all pictures of a lens or a camera that does not
     say it. An ISO of 0 or an f-number of 0, which adapted lenses write, is such an entry.
@@ -80,8 +79,7 @@ def _positive(entry: object) -> float | None:
 
 
 def read_exposures(path: Path) -> Mapping[str, float]:
-    """Seconds by image name: a JSON object, or lines `NAME SECONDS`, seconds also as `1/60`; `#` starts a
-    comment.
+    """Seconds by image name: a JSON object, or lines `NAME SECONDS` (also `1/60`); `#` starts a comment.
 
     Raises:
         UserError: the file is malformed, or an exposure is not a positive number.

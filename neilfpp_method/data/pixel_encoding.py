@@ -17,14 +17,12 @@ from jaxtyping import Float, Float32, Shaped
 
 __all__ = ["BYTES", "ENCODINGS", "Encoded", "Encoding", "encodings_for"]
 
-TOP = 32_768.0
-"""What the brightest value of a view comes to in half precision, at most; half ends at 65 504."""
-LEAST_MEDIAN = 2.0**-4
-"""Median of a view's values that half precision is good for: a thousandth of it then still has all 11 bits,
-which end at 2⁻¹⁴.
-"""
-LOOKED_AT = 2**20
-"""Values of which the median is taken."""
+MAX_VALUE = 32_768.0
+"""Largest encoded value of a view in half precision, which ends at 65 504."""
+MIN_MEDIAN = 2.0**-4
+"""Least median of a view in half precision: a thousandth of it still has 11 bits (they end at 2⁻¹⁴)."""
+MEDIAN_SAMPLES = 2**20
+"""Values of a view that its median is taken of."""
 
 
 @dataclass(frozen=True)
@@ -75,10 +73,10 @@ def _levels(bits: int) -> Encoding:
 
 def _half(color: Float32[np.ndarray, "H W 3"]) -> Encoded | None:
     brightest = float(color.max(initial=0.0))
-    scale = 2.0 ** math.floor(math.log2(TOP / brightest)) if brightest > 0 else 1.0
-    some = color.reshape(-1)[:: -(-color.size // LOOKED_AT)]
+    scale = 2.0 ** math.floor(math.log2(MAX_VALUE / brightest)) if brightest > 0 else 1.0
+    some = color.reshape(-1)[:: -(-color.size // MEDIAN_SAMPLES)]
     lit = some[some > 0]
-    if len(lit) and (not np.isfinite(np.float32(scale)) or float(np.median(lit)) * scale < LEAST_MEDIAN):
+    if len(lit) and (not np.isfinite(np.float32(scale)) or float(np.median(lit)) * scale < MIN_MEDIAN):
         return None
     return Encoded((color * np.float32(scale)).astype(np.float16), scale)
 

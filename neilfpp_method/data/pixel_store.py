@@ -1,7 +1,6 @@
-"""The pixels of many views, one after another and row by row: in memory, or in a folder of memory-mapped
-files.
+"""The pixels of many views, view after view, row by row: in memory, or in memory-mapped files.
 
-    color.npy    (P, 3) codes of `pixel_encoding`: 3 bytes a pixel for 8-bit images, 6 for 16 bits and for radiance
+    color.npy    (P, 3) codes of `pixel_encoding`: 3 bytes a pixel for 8-bit images, else 6
     bits.npy     (P,) one byte: valid, mask, mask known, near the object (`drawing`); padded to whole blocks
     store.json   what they were made from, written last: a folder without it holds no store
 
@@ -38,13 +37,13 @@ __all__ = ["PixelStore", "border", "expect_draws", "load_pixels", "store_bytes"]
 
 FORMAT, VERSION = "neilfpp-pixels", 1
 BORDER_SHARE = 0.5
+"""Share of the border pixels of one colour from which that colour is the background."""
 REPAIR = "repair the images, or mark the pixels in a validity mask"
-MOST_MAPPED = 2**29
-"""Bytes of the files that draws may leave mapped; a page that holds one drawn pixel brings 16 of them
-along.
-"""
+MAX_MAPPED = 2**29
+"""Bytes of the files that draws may leave mapped; a page with one drawn pixel maps 16 pages."""
 BYTES_OF_A_DRAW = 2 * 16 * 4096
-SPARE = 2**28
+"""Bytes that reading one pixel maps: 16 pages of each of two files."""
+MIN_FREE_BYTES = 2**28
 """Bytes that a disk should keep free."""
 
 
@@ -83,7 +82,7 @@ class PixelStore:
     ) -> Float32[np.ndarray, "*N 3"]:
         """Colours of single pixels of views; kept in a folder, only the pages that hold them are read."""
         self._drawn += numbers.size
-        if self._drawn * BYTES_OF_A_DRAW > MOST_MAPPED:
+        if self._drawn * BYTES_OF_A_DRAW > MAX_MAPPED:
             self.release()
         return self.encoding.decode(self.codes[numbers], self.scales[view])
 
@@ -166,9 +165,7 @@ def _in_any_encoding(
     paths: dict[str, Path] | None,
     on_view: Callable[[str], None] | None,
 ) -> PixelStore:
-    """In the smallest encoding that holds every view; when one turns out to need more, all are read once
-    more.
-    """
+    """In the smallest encoding that holds every view; if one needs more, all views are read again."""
     if ladder[0] is BYTES and any(view.file_size is not None for view in views):
         ladder = ladder[1:]  # means of bytes are no bytes
     told: set[str] = set()
@@ -235,11 +232,9 @@ def _near(mask: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, " N"]:
 
 
 def _mask_from_background(store: PixelStore) -> None:
-    """Without masks, pixels of exactly the colour of most of the border are off the object; of the others
-    nothing is known.
+    """Without masks, pixels of exactly the border's most common colour are off the object; others unknown.
 
-    Rendered captures, and clipped backdrops, have such pixels; in front of a noisy backdrop hardly any pixel
-    is exact.
+    Rendered captures and clipped backdrops have such pixels; a noisy backdrop has hardly any.
     """
     numbers, view = border(store)
     colors = store.colors(numbers, view)
@@ -281,9 +276,7 @@ def border(store: PixelStore) -> tuple[Int[np.ndarray, " B"], Int[np.ndarray, " 
 
 
 def _plane(path: Path | None, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """An array of zeros, in memory or in a file whose room is taken at once: a full disk would kill who
-    writes to a map.
-    """
+    """An array of zeros, in memory or in a preallocated file: writing to a map on a full disk would crash."""
     if path is None:
         return np.zeros(shape, dtype)
     array = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
@@ -296,7 +289,7 @@ def _plane(path: Path | None, shape: tuple[int, ...], dtype: np.dtype) -> np.nda
 def _check_room(folder: Path, needed: int) -> None:
     above = next(place for place in (folder, *folder.absolute().parents) if place.exists())
     free = shutil.disk_usage(above).free
-    if needed + SPARE > free:
+    if needed + MIN_FREE_BYTES > free:
         raise UserError(
             f"{folder}: the pixels of the training views take {needed / 1e9:.1f} GB, and {free / 1e9:.1f} GB "
             "are free there",
@@ -344,9 +337,7 @@ def _open(folder: Path, views: Sequence[View], made_from: str) -> PixelStore | N
 
 
 def expect_draws(store: PixelStore) -> None:
-    """Tell the system that single pixels will be asked for: it then reads pages, and not what follows
-    them.
-    """
+    """Tell the system that single pixels will be read, so that it does not read ahead of each page."""
     for array in (store.codes, store.bits):
         _advise(array, "MADV_RANDOM")
 

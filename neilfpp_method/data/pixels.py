@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int
 from torch import Tensor
 
-from neilfpp_method.data.backdrop import MOST_RAYS, leaves_room
+from neilfpp_method.data.backdrop import MAX_RAYS, leaves_room
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.drawing import KNOWN, MASK, NEAR, VALID, PixelDraws
 from neilfpp_method.data.pixel_store import PixelStore, border, expect_draws, load_pixels
-from neilfpp_method.data.silhouettes import MOST_VIEWS, Outline
+from neilfpp_method.data.silhouettes import MAX_VIEWS, Outline
 from neilfpp_method.data.views import CameraRays, View
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.color import luminance, srgb_to_linear, tone_map
@@ -29,13 +29,12 @@ DARK = 1e-3
 MIDDLE_GREY = 0.18
 NEIGHBOURS = np.array([(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1)])
 """Rows and columns of the nine values about a pixel."""
-MOST_COUNTED = 2**20
-"""Pixels of the object, evenly over all views, that statistics are taken of; all where there are no more."""
+MAX_COUNTED = 2**20
+"""Pixels of the object, evenly over all views, from which statistics are computed."""
 
 
 class PixelDataset:
-    """P pixels of the chosen views, view after view, row by row. `len` is P; `PixelBatch.view` counts in
-    `views`.
+    """P pixels of the chosen views, view after view, row by row. `PixelBatch.view` indexes `views`.
 
     Colours, masks and validity are kept in a `PixelStore`, 4 to 13 bytes a pixel, in a folder or in memory;
     rays and image gradients are computed when asked for. Colours of a linear capture are radiance on the
@@ -86,8 +85,7 @@ class PixelDataset:
         return len(self.store)
 
     def sample(self, count: int, gradients: bool = True) -> PixelBatch:
-        """`count` valid pixels drawn by torch's global generator as `data.drawing` says: most on the object
-        or near it.
+        """`count` valid pixels from torch's global generator, most on or near the object (`data.drawing`).
 
         Image gradients take nine reads a pixel; without `gradients` they are 0.
         """
@@ -101,9 +99,7 @@ class PixelDataset:
         return self._draws.draw(count)
 
     def view(self, i: int, gradients: bool = True) -> PixelBatch:
-        """All pixels of `views[i]`, row by row; those that are not `valid` as well. Image gradients as in
-        `sample`.
-        """
+        """All pixels of `views[i]`, row by row, invalid ones included. Image gradients as in `sample`."""
         rows, camera = self.store.rows(i), self.views[i].camera
         numbers, colors = np.arange(rows.start, rows.stop), self.store.view_colors(i)
         shape = camera.height, camera.width
@@ -121,9 +117,7 @@ class PixelDataset:
         return self._bit(self.store.bits[self.store.rows(i)], VALID)
 
     def near(self, i: int) -> Bool[Tensor, " N"]:
-        """Which pixels of `views[i]` are on the object or near its outline; none where nothing is known of
-        the object.
-        """
+        """Which pixels of `views[i]` are on or near the object; none where nothing is known of it."""
         return self._bit(self.store.bits[self.store.rows(i)], NEAR)
 
     def _views_of(self, numbers: Int[np.ndarray, " N"]) -> Int[np.ndarray, " N"]:
@@ -185,7 +179,7 @@ class PixelDataset:
     def median_radiance(self) -> float:
         """The median luminance, linear, of the object: of valid pixels within the mask that are not black.
 
-        Of more than `MOST_COUNTED` pixels so many are counted, evenly over the views.
+        Of more than `MAX_COUNTED` pixels so many are counted, evenly over the views.
 
         Raises:
             UserError: there is no such pixel.
@@ -198,9 +192,7 @@ class PixelDataset:
         return float(lit.median())
 
     def radiance_quantile(self, share: float) -> float:
-        """The linear value that `share` of the values of the valid object pixels and channels do not
-        exceed.
-        """
+        """The linear value that `share` of the values of valid object pixels and channels stay below."""
         values = self._of_the_object().flatten()
         return float(values.kthvalue(max(1, round(share * len(values)))).values)
 
@@ -211,7 +203,7 @@ class PixelDataset:
 
     def _of_the_object(self) -> Float[Tensor, "S 3"]:
         """The linear colours of valid pixels within the mask: all, or every so many-th."""
-        step = -(-len(self) // MOST_COUNTED)
+        step = -(-len(self) // MAX_COUNTED)
         colors = []
         for i in range(len(self.views)):
             rows = self.store.rows(i)
@@ -257,16 +249,14 @@ class PixelDataset:
         views: Int[np.ndarray, " N"],
         other: Callable[[Float32[np.ndarray, "V 3"]], Bool[Tensor, " V"]],
     ) -> bool:
-        """Whether what some pixels show can lie within the scene, as the views have it by which of their
-        pixels are `other`.
-        """
+        """Whether what these pixels show can lie in the scene, judged by which pixels are `other`."""
         if not len(numbers):
             return True
-        step = -(-len(numbers) // MOST_RAYS)
+        step = -(-len(numbers) // MAX_RAYS)
         number, view = numbers[::step], torch.from_numpy(np.ascontiguousarray(views[::step])).to(self.device)
         rays = self._rays(view, torch.from_numpy(number - self.store.starts[views[::step]]).to(self.device))
         outlines = []
-        for i in range(0, len(self.views), -(-len(self.views) // MOST_VIEWS)):
+        for i in range(0, len(self.views), -(-len(self.views) // MAX_VIEWS)):
             inside = other(self.store.view_colors(i)).view(self.views[i].camera.height, -1)
             outlines.append(Outline(self.views[i], inside.numpy()))
             self.store.release()

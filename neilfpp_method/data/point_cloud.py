@@ -30,6 +30,7 @@ CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 TYPES = dict(zip(OLD_NAMES + NEW_NAMES, CODES + CODES, strict=True))
 BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": None}
 HEADER_LIMIT = 65_536
+"""Longest header of a PLY file, bytes."""
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
 
@@ -96,7 +97,8 @@ def has_normals(path: Path) -> bool:
 def write_oriented_ply(path: Path, points: WorldPoints) -> Path:
     """Write points as binary PLY, in single precision; returns the path."""
     properties = "".join(f"property float {name}\n" for name in POSITION + NORMAL)
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points.position)}\n{properties}end_header\n"
+    vertices = f"element vertex {len(points.position)}\n"
+    head = f"ply\nformat binary_little_endian 1.0\n{vertices}{properties}end_header\n"
     rows = np.concatenate([points.position, points.normal], axis=1).astype("<f4")
     with replacing(path) as temporary:
         temporary.write_bytes(head.encode("ascii") + rows.tobytes())
@@ -120,9 +122,7 @@ def _columns(path: Path, vertices: np.ndarray, names: tuple[str, str, str]) -> F
 
 
 def _vertices(data: bytes) -> np.ndarray:
-    """The vertex table as a structured array; the vertices have to come first, as they do in every common
-    writer.
-    """
+    """The vertex table as a structured array; the vertices must come first, as all common writers do."""
     head, separator, _ = data[:HEADER_LIMIT].partition(b"end_header")
     if not separator or not head.startswith(b"ply"):
         raise ValueError("it has no PLY header")

@@ -20,7 +20,7 @@ __all__ = ["RAW_SUFFIXES", "Developed", "develop"]
 
 RAW_SUFFIXES = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 INTERPOLATION_REACH = 5
-"""Side of the square of sensor pixels, around each one, from which its missing colours are interpolated."""
+"""Side of the square of sensor pixels that demosaicing reads around each pixel."""
 
 
 @dataclass(frozen=True)

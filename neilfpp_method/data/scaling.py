@@ -35,15 +35,13 @@ __all__ = [
 ]
 
 PIXELS_OF_A_VIEW = 2**17
-"""Pixels of a view that are enough to look at it and to measure it, where nobody asks for more: about 420 ×
-310.
-"""
+"""Pixels of a view that suffice to look at and to measure it, unless more are asked for: 420 × 310."""
 PIXELS_OF_A_RAY = 4
-"""Pixels of the training views to a ray of the whole training. With more, most pixels are never drawn, and a
-smaller image holds what they had to say, with less noise.
+"""Training pixels per ray of the whole training. With more, most are never drawn; a smaller image holds their
+means, with less noise.
 """
 SAME = 0.98
-"""A scale this close to 1 is 1: what is left out is not worth resampling for."""
+"""Scales from here to 1 count as 1: so small a reduction is not worth resampling."""
 
 
 def file_size(view: View) -> tuple[int, int]:
@@ -131,9 +129,7 @@ def scale_for_width(views: Sequence[View], width: int) -> float:
 def area_average(
     values: Float32[np.ndarray, "H W *C"], width: int, height: int
 ) -> Float32[np.ndarray, "h w *C"]:
-    """Means over the areas of fewer pixels; parts of pixels count in part. The image itself where the size is
-    the same.
-    """
+    """Area means at a smaller size, partial pixels weighted; the image itself where the size is the same."""
     if values.shape[:2] == (height, width):
         return values
     averaged = cv2.resize(np.ascontiguousarray(values), (width, height), interpolation=cv2.INTER_AREA)

@@ -1,5 +1,4 @@
-"""Where the scene is, for captures that do not say it: told by points, by silhouettes, or else by the cameras
-alone.
+"""Where the scene is, for captures that do not say: from points, from silhouettes, or from the cameras.
 
 The scene frame has the object in the unit sphere; a box gives its centre and half of its largest extent
 (METHOD's normalisation). What is known best decides: points on the surface, then the masks, whose visual hull
@@ -25,13 +24,16 @@ from neilfpp_method.errors import UserError
 __all__ = ["SceneBox", "box_of_cameras", "box_of_focus", "box_of_points", "find_box"]
 
 OUTLIERS = 0.01
+"""Share of the points on each side of an axis that the box leaves out."""
 MARGIN = 1.1
-FEWEST_POINTS = 20
+"""Size of the box over that of its points."""
+MIN_POINTS = 20
+"""Points from which a box is computed."""
 CELLS = 32
 REFINEMENTS = 3
 REACH = 0.55
-"""Radius of the box about what the cameras look at, in their median distance from it: half of them are 1.8
-scene units away or more, and none that stands at three quarters of the median comes nearer than 1.36.
+"""Radius of the box around what the cameras look at, over their median distance from it. Half of the cameras
+are then at least 1.8 scene units away, and one at three quarters of the median is 1.36 away.
 """
 
 
@@ -57,7 +59,7 @@ def find_box(views: Sequence[View], points: Float64[np.ndarray, "P 3"] | None = 
     outlines = read_outlines(views)
     if points is not None and outlines:
         points = points[agreement(outlines, points) >= AGREEMENT]
-    if points is not None and len(points) >= FEWEST_POINTS:
+    if points is not None and len(points) >= MIN_POINTS:
         box = box_of_points(points)
         # Points within masks are the object's own.
         focus = None if outlines else box_of_focus(views)
@@ -93,8 +95,7 @@ def box_of_focus(views: Sequence[View]) -> Normalisation | None:
 def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalisation:
     """A guess: what the cameras look at, as large as the circle that fits into their images, times `fill`.
 
-    The centre is the place that most cameras look at, or else the point nearest to all optical axes, by least
-    squares.
+    The centre is where most cameras look, or else the least-squares point nearest to all optical axes.
 
     Raises:
         UserError: the axes do not come near one point in front of the cameras.

@@ -13,23 +13,19 @@ from jaxtyping import Bool, Float64, Int64
 from neilfpp_method.data.images import read_image
 from neilfpp_method.data.views import Camera, View, project
 
-__all__ = ["AGREEMENT", "MOST_VIEWS", "Outline", "Sightings", "agreement", "read_outlines", "sightings"]
+__all__ = ["AGREEMENT", "MAX_VIEWS", "Outline", "Sightings", "agreement", "read_outlines", "sightings"]
 
 AGREEMENT = 0.9
-"""A place is held where so many of the views that can tell have it in their silhouette."""
-MOST_VIEWS = 32
-"""Views that are asked, evenly chosen."""
-LONGEST = 512
-"""Pixels along the longer side of a silhouette: places are told to a cell of some hundredths of the scene, no
-closer.
-"""
+"""Share of the views that see a place which must have it in their silhouette."""
+MAX_VIEWS = 32
+"""Evenly chosen views whose silhouettes are read."""
+MAX_SIDE = 512
+"""Pixels along the longer side of a silhouette: places are resolved to hundredths of the scene only."""
 
 
 @dataclass(frozen=True)
 class Outline:
-    """A view with its silhouette; where that does not touch the border, what lies out of the image is beside
-    it, too.
-    """
+    """A view with its silhouette; where that misses the border, places beyond the image are outside it."""
 
     view: View
     inside: Bool[np.ndarray, "H W"]
@@ -40,9 +36,8 @@ class Outline:
         return not (mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
 
 
-def read_outlines(views: Sequence[View], most: int = MOST_VIEWS, longest: int = LONGEST) -> list[Outline]:
-    """The silhouettes, by mask or alpha channel, of at most `most` views, evenly chosen, and their cameras to
-    match.
+def read_outlines(views: Sequence[View], most: int = MAX_VIEWS, longest: int = MAX_SIDE) -> list[Outline]:
+    """The silhouettes, by mask or alpha, of at most `most` evenly chosen views, with matching cameras.
 
     None where fewer than half of these have one. An alpha channel that is opaque all over is none. The masks
     are read one after the other, and those with more than `longest` pixels along a side are made smaller: a
@@ -103,8 +98,7 @@ def sightings(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -
 
 
 def agreement(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, " P"]:
-    """The share of the views that can tell of a point, in whose silhouette it lies; 0 where fewer than half
-    of them can.
+    """Share of the views that see a point with it in their silhouette; 0 where under half of them see it.
 
     Points are in the frame of the views' cameras.
     """

@@ -5,11 +5,11 @@ Everything is optional and read when asked for. What belongs to a view is flat, 
 does; its depth is that at its centre, all else the mean over its area. All positions, lengths and directions
 are in the scene frame.
 
-    <inputs>/depth_maps/<stem>.exr                     depth along the camera's axis, world units, 0: background
-    <inputs>/normal_maps/<stem>.exr                    unit normals, world axes, 0: background
-    <inputs>/model/mesh.ply                            the surface, world frame
-    ground_truths/materials/{kd,roughness,metallic}/   <stem>.png, linear, usually for the test views alone
-    light/light_field_gt.npz                           incident and outgoing radiance at surface points
+    <inputs>/depth_maps/<stem>.exr                    depth along the camera's axis, world units; 0: none
+    <inputs>/normal_maps/<stem>.exr                   unit normals, world axes; 0: none
+    <inputs>/model/mesh.ply                           the surface, world frame
+    ground_truths/materials/{kd,roughness,metallic}/  <stem>.png, linear, usually for the test views alone
+    light/light_field_gt.npz                          incident and outgoing radiance at surface points
 """
 
 from __future__ import annotations

@@ -15,8 +15,7 @@ __all__ = ["resample", "straight_camera"]
 
 
 def straight_camera(camera: Camera) -> Camera:
-    """The pinhole, of the same pose, that shows as much as possible of what a camera with a lens shows, and
-    no more.
+    """The pinhole of the same pose that shows as much as possible of what a camera with a lens shows.
 
     A pinhole is returned as it is.
     """

@@ -19,9 +19,9 @@ from neilfpp_method.shading.color import linear_to_srgb, srgb_to_linear
 __all__ = ["ViewPixels", "pixel_colors", "read_colors", "read_mask", "read_view"]
 
 HALF = 0.5
-"""A pixel of a smaller image is on the object where at least so much of its area is."""
+"""Share of the area of a reduced pixel that must be on the object."""
 ROWS = 256
-"""Rows of an image that are made linear at once."""
+"""Rows of an image that are made linear together: bounds the memory."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,7 @@ def read_colors(view: View, hdr: bool) -> Float32[np.ndarray, "H W 3"]:
 
 
 def pixel_colors(view: View, image: ImageFile, hdr: bool) -> Float32[Tensor, "H W 3"]:
-    """The pixels of a view's image, at its own size; linear ones without the view's exposure and white
-    balance.
+    """The pixels of a view's image at its own size; linear images keep neither exposure nor white balance.
 
     Raises:
         UserError: display values with an exposure or a white balance.
@@ -85,8 +84,7 @@ def pixel_colors(view: View, image: ImageFile, hdr: bool) -> Float32[Tensor, "H 
     if (factors == 1.0).all():
         return color
     if not hdr:
-        # What is clipped at display values stays so at any exposure: no render could be compared with the
-        # quotient.
+        # Values clipped for display stay clipped at any exposure: no render compares with the quotient.
         raise UserError(
             f"{view.image}: an exposure or white balance for display values (sRGB)",
             "develop the images linearly, or expose them all alike and leave out the factors",
@@ -115,9 +113,7 @@ def _read(view: View) -> ImageFile:
 
 
 def _object_mask(view: View, image: ImageFile) -> Bool[np.ndarray, "H W"] | None:
-    """The object: where the mask file, or without one the image's alpha, is above one half; none without
-    either.
-    """
+    """The object: where the mask file, or else the image's alpha, is above one half; none without either."""
     if view.mask is None and image.alpha is None:
         return None
     mask = read_mask(view.mask, view) if view.mask else image.alpha > 0.5

@@ -36,14 +36,12 @@ __all__ = [
     "project",
 ]
 
-MOST_BLIND = 0.6
-"""A fisheye's circle fills 44 % of a picture of 16:9. A lens that shows less was calibrated for other
-images.
-"""
-MOST_LOOKED_UP = 2**26
-"""Pixels of different lenses whose rays are kept: half a gigabyte."""
+MAX_BLIND_SHARE = 0.6
+"""Share of an image that a lens may leave dark: a fisheye's circle fills 44 % of 16:9."""
+MAX_TABULATED = 2**26
+"""Pixels of different lenses whose rays are kept in memory: half a gigabyte."""
 PLANE_PART = 2**20
-"""Pixels whose rays are computed at once."""
+"""Pixels whose rays are computed together: bounds the memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,9 +123,7 @@ class View:
 
 @dataclass(frozen=True)
 class Normalisation:
-    """scene = (world − centre) / scale: no rotation, so that directions and normals are the same in both
-    frames.
-    """
+    """scene = (world − centre) / scale: without rotation, directions are the same in both frames."""
 
     scale: float
     centre: tuple[float, float, float]
@@ -198,17 +194,14 @@ def plain_name(name: str) -> bool:
 
 @dataclass(frozen=True)
 class Projection:
-    """Image points (column + ½ at a pixel's centre) and depth along the camera's axis, in the units of the
-    pose.
-    """
+    """Image points (column + ½ at a pixel's centre) and depth along the camera's axis, in pose units."""
 
     pixel: Float[Tensor, "N 2"]
     depth: Float[Tensor, " N"]
 
 
 def project(camera: Camera, points: Float[Tensor, "N 3"]) -> Projection:
-    """Where the camera sees points: u = fx·x/z + cx, v = fy·y/z + cy, with x/z and y/z bent by a lens where
-    there is one.
+    """Where the camera sees points: u = fx·x/z + cx, v = fy·y/z + cy, with x/z and y/z bent by its lens.
 
     A depth ≤ 0 means the point is behind the camera. Differentiable without a lens.
     """
@@ -233,7 +226,7 @@ class CameraRays:
 
     The rays of a pinhole are computed when asked for; those of a lens are looked up, as its equations have no
     closed inverse: 8 bytes a pixel, shared by cameras that differ in their pose alone. Where lenses have more
-    than `MOST_LOOKED_UP` pixels together, as when every photograph has been calibrated by itself, they are
+    than `MAX_TABULATED` pixels together, as when every photograph has been calibrated by itself, they are
     computed when asked for, too, which takes longer. A pixel at which a lens shows nothing, as in the corners
     of a fisheye, has a ray that leads backwards, away from what the camera sees.
 
@@ -255,7 +248,7 @@ class CameraRays:
         sizes = [camera.width * camera.height for camera in kinds.values()]
         self._bent = torch.tensor([camera.lens is not None for camera in cameras], device=device)
         self._lens_plane: Float[Tensor, "P 2"] | None = None
-        if kinds and sum(sizes) <= MOST_LOOKED_UP:
+        if kinds and sum(sizes) <= MAX_TABULATED:
             starts = dict(zip(kinds, itertools.accumulate(sizes, initial=0), strict=False))
             self._lens_start = torch.tensor(
                 [starts.get(_shape(camera), 0) for camera in cameras], device=device
@@ -264,9 +257,7 @@ class CameraRays:
             self._lens_plane = torch.from_numpy(planes).to(device)
 
     def shown(self, i: int) -> Bool[Tensor, " P"]:
-        """Which pixels of camera `i`, row by row, have a ray of their own; all but those where its lens shows
-        nothing.
-        """
+        """Which pixels of camera `i`, row by row, have a ray; all but those where its lens shows nothing."""
         camera = self._cameras[i]
         size = camera.width * camera.height
         if camera.lens is None:
@@ -315,16 +306,14 @@ def _shape(camera: Camera) -> tuple[Lens | None, float, float, float, float, int
 
 
 def _whole_plane(camera: Camera, dtype: torch.dtype) -> Float[np.ndarray, "P 2"]:
-    """`_straight_plane` of all pixels of a camera, in the precision of rays; in parts, which take several
-    times as much.
-    """
+    """`_straight_plane` of all pixels of a camera, at ray precision; in parts, to bound the memory."""
     count = camera.width * camera.height
     parts = np.split(np.arange(count), range(PLANE_PART, count, PLANE_PART))
     plane = np.concatenate(
         [torch.from_numpy(_straight_plane(camera, part)).to(dtype).numpy() for part in parts]
     )
     blind = int(np.isnan(plane).any(axis=1).sum())
-    if blind > MOST_BLIND * count:
+    if blind > MAX_BLIND_SHARE * count:
         raise UserError(
             f"a camera of the lens {camera.lens.model} shows nothing at {blind} of its {count} pixels",
             "crop or undistort the images, or calibrate the camera again",

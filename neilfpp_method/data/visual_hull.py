@@ -1,5 +1,4 @@
-"""The visual hull of silhouettes: all places that no silhouette rules out, and the signed distance of its
-surface.
+"""The visual hull of silhouettes: all places that no silhouette excludes, and its signed distance.
 
 Every view with a mask says of each place that it sees whether the object can be there. What is left is the
 smallest body that the masks alone can tell (Laurentini 1994): it holds the object, and has its outline from
@@ -22,31 +21,24 @@ from neilfpp_method.data.silhouettes import Outline, sightings
 __all__ = ["HULL_RADIUS", "RESOLUTION", "DistanceCube", "find_hull", "signed_distance", "visual_hull"]
 
 HULL_RADIUS = 1.3
-"""Half an edge of the cube that is carved, scene units: the unit sphere, which holds the object, and some
-room about it.
-"""
+"""Half an edge of the carved cube, scene units: the unit sphere, which holds the object, and a margin."""
 RESOLUTION = 96
-"""Cells along an edge; a cell is 0.027 scene units wide. Training knows better soon."""
-CONTRADICTED = 0.05
-"""Share of the views that see a place that may leave it out of their mask, rounded down: a few masks are
-wrong.
-"""
-SEEN = 0.25
-"""Least share of all views that must see a place for it to be in the hull, and never fewer than two of
-them.
-"""
-LEAST_CELLS = 64
-"""Fewer cells are no body that a field could start as."""
+"""Cells along an edge, 0.027 scene units each: a start that training refines."""
+MAX_EXCLUDING_SHARE = 0.05
+"""Share of the views of a place that may exclude it, rounded down: a few masks are wrong."""
+MIN_SEEN_SHARE = 0.25
+"""Share of all views, and at least two views, that must see a place in the hull."""
+MIN_CELLS = 64
+"""Cells of the smallest hull that a field is started from."""
 SMOOTHING = 1.5
-"""Standard deviation, in cells, of the blur that takes the steps of the cells from the distance. A ball of
-0.6 scene units then has normals that are 2° off, in place of 8°, and is 0.004 units smaller.
+"""Standard deviation, cells, of the blur that removes the steps of the cells. A ball of radius 0.6 then has
+normals that are 2° off instead of 8°, and a radius that is 0.004 too small.
 """
 
 
 @dataclass(frozen=True)
 class DistanceCube:
-    """Signed distance, scene units and negative inside, at the centres of cells of the cube [−radius,
-    radius]³.
+    """Signed distance, scene units, negative inside, at the cell centres of the cube [−radius, radius]³.
 
     `distance[i, j, k]` belongs to x = −radius + (i + ½) · 2 radius / R, and y and z by j and k alike.
     """
@@ -84,10 +76,9 @@ def find_hull(
         >>> hull if isinstance(hull, str) else hull.at(torch.zeros(1, 3))  # negative: the origin is inside
     """
     hull = visual_hull(outlines, radius, resolution)
-    if hull.sum() < LEAST_CELLS:
+    if hull.sum() < MIN_CELLS:
         return "the masks have next to no place in common"
-    # A body that leaves the cube has no surface there: the masks show a ground, or the box is that of
-    # something smaller.
+    # A body that leaves the cube has no surface there: masks show a ground, or the box is too small.
     faces = np.ones_like(hull)
     faces[1:-1, 1:-1, 1:-1] = False
     if hull[faces].any():
@@ -96,8 +87,7 @@ def find_hull(
 
 
 def visual_hull(outlines: Sequence[Outline], radius: float, resolution: int) -> Bool[np.ndarray, "R R R"]:
-    """Which cells of the cube [−radius, radius]³ hold their centre within the silhouettes of nearly all views
-    that see it.
+    """Which cells of the cube [−radius, radius]³ have centres in nearly all silhouettes of views that see it.
 
     A view sees what is in its image, and what is beside its image where its silhouette does not touch the
     border (`Outline.complete`): a close-up says nothing of what lies outside it. A place that too few views
@@ -117,15 +107,15 @@ def visual_hull(outlines: Sequence[Outline], radius: float, resolution: int) -> 
         found = sightings([outline], points[left])
         seen[left] += found.seen
         outside[left] += found.seen - found.inside
-        left = left[outside[left] <= CONTRADICTED * len(outlines)]
+        left = left[outside[left] <= MAX_EXCLUDING_SHARE * len(outlines)]
     hull = np.zeros(len(points), bool)
-    hull[left] = (seen[left] >= max(2, SEEN * len(outlines))) & (outside[left] <= CONTRADICTED * seen[left])
+    known = seen[left] >= max(2, MIN_SEEN_SHARE * len(outlines))
+    hull[left] = known & (outside[left] <= MAX_EXCLUDING_SHARE * seen[left])
     return hull.reshape(resolution, resolution, resolution)
 
 
 def signed_distance(inside: Bool[np.ndarray, "R R R"], cell: float) -> Float32[np.ndarray, "R R R"]:
-    """The Euclidean distance of every cell's centre from the surface between cells in and out, smoothed,
-    negative inside.
+    """Smoothed Euclidean distance of cell centres from the surface of the body, negative inside.
 
     The surface lies half a cell from the centres next to it. `cell` is the width of a cell; without a cell
     inside, or outside, there is no surface and no distance.

@@ -42,9 +42,7 @@ def demo_config(short: bool) -> NeilfConfig:
 
 
 def run_demo(out: Path, *, short: bool, resume: bool, device: str, console: Console) -> Path:
-    """Train, evaluate, and write `report.html` and `contact_sheet.png` into `out`. Returns the report's
-    path.
-    """
+    """Train, evaluate, write `report.html` and `contact_sheet.png` into `out`; returns the report's path."""
     run_training(
         data=demo_scene(),
         out=out,

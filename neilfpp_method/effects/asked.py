@@ -13,9 +13,7 @@ from neilfpp_method.settings.types import NeilfConfig
 __all__ = ["BASES", "Asked", "check_asked", "read_asked"]
 
 BASES = ("auto", "all", "none", "as-set")
-"""Who decides an effect that is not named: evidence; nobody, all are on; nobody, all are off; the
-settings.
-"""
+"""Who decides an effect that is not named: evidence; nobody (all on or all off); the settings."""
 ELSEWHERE = {
     "response": "what pixels are of radiance is told from the files; say it with --response linear or srgb",
 }

@@ -109,6 +109,19 @@ EFFECTS: Mapping[str, Effect] = {
             ),
         ),
         Effect(
+            name="long-tails",
+            title="the long tails of highlights (GGX)",
+            is_on=lambda config: config.shading.lobe == "ggx",
+            on=lambda config: {"shading.lobe": "ggx"},
+            off={"shading.lobe": "spherical_gaussian"},
+            obstacle=lambda config: (
+                "" if config.shading.specular else "a surface without reflection has no highlights"
+            ),
+            cost=lambda config: "none",
+            risk="the glow about highlights becomes roughness",
+            unjudged=_free_light("not judged: a light that is free at every point explains both lobes alike"),
+        ),
+        Effect(
             name="background",
             title="an open background",
             is_on=lambda config: config.background.kind != "constant",

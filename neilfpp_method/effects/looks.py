@@ -1,6 +1,4 @@
-"""When evidence is looked at: before a stage that learns a material, at its end, and after each fit of the
-light.
-"""
+"""When evidence is measured: before and after a material stage, and after each fit of the light."""
 
 from __future__ import annotations
 
@@ -11,8 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.effects.first_light import FirstLight, find_first_light
+from neilfpp_method.effects.lobes import lobe_evidence
 from neilfpp_method.effects.measurement import Measurement
 from neilfpp_method.effects.metals import metal_evidence
+from neilfpp_method.effects.places import gather_places
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.visibility import self_visibility
 from neilfpp_method.lighting.fit import MIN_GAIN, Evidence
@@ -20,11 +21,15 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.structures import PixelBatch
 
-__all__ = ["LOOKED_AT", "after_fit", "look_at_surface", "note_facts", "wants_surface"]
+__all__ = ["LOOKED_AT", "after_fit", "look_at_light", "look_at_surface", "note_facts", "wants_surface"]
 
 LOOKED_AT = 1024
-"""Training pixels whose surface points are looked at: the standard error of a share of 1 % is then 0.3 % at
-most.
+"""Training pixels whose surface points are measured: the standard error of a 1 % share is 0.3 %."""
+LIGHT_PIXELS = 4096
+"""Training pixels among which places are looked for that many views show."""
+PLACES, VIEWS, MIN_VIEWS = 1200, 20, 4
+"""How many places the light starts from at most, and how many views of each; fewer views than these do not
+tell materials apart. 10,000 pixels take 200 MB.
 """
 AT_ONCE = 512
 """Rays that are rendered together; bounds the memory."""
@@ -56,6 +61,31 @@ def wants_surface(plan: Plan) -> bool:
 
 
 @torch.no_grad()
+def look_at_light(
+    plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int
+) -> tuple[list[Decision], FirstLight | None]:
+    """Decide on the lobe of highlights where that is open, and find the light that training starts with.
+
+    Arguments as of `look_at_surface`; the model computes as the plan says afterwards.
+    """
+    mode = model.training
+    model.eval()
+    surface = _surface_points(model, pixels.sample(LIGHT_PIXELS, gradients=False))
+    position, normal = surface.position[:PLACES], surface.normal[:PLACES]
+    places = gather_places(model, pixels, position, normal, VIEWS).in_views(MIN_VIEWS)
+    typical, decisions = model.facts.median_radiance, []
+    if plan.is_open("long-tails") and plan.newest("long-tails") is None:
+        measured = lobe_evidence(places, model.scene, typical, model.brdf.metals)
+        decisions.append(plan.decide("long-tails", measured, step, must_be_earned=True))
+        model.use(plan.config)
+    found = None
+    if model.lobe is not None:
+        found = find_first_light(places, model.lobe, model.scene, typical, model.brdf.metals)
+    model.train(mode)
+    return decisions, found
+
+
+@torch.no_grad()
 def look_at_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int) -> list[Decision]:
     """Decide what a surface tells, before a material is learned on it and again when it has moved.
 
@@ -81,8 +111,7 @@ def look_at_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: i
 
 
 def after_fit(plan: Plan, found: Evidence | None, lit: int, step: int) -> list[Decision]:
-    """What a fit of the light with and without lamps made of lamps: the solver has chosen, the plan notes
-    what it chose.
+    """What a fit of the light with and without lamps found: the solver chooses, the plan records it.
 
     Nothing is noted where the choice is what it was.
     """

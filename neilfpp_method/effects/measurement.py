@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["LEAST_SAMPLES", "Measurement", "mean_of"]
+__all__ = ["MIN_SAMPLES", "Measurement", "mean_of"]
 
-LEAST_SAMPLES = 20
+MIN_SAMPLES = 20
 """Independent samples from which something is concluded."""
 
 
@@ -32,14 +32,13 @@ class Measurement:
     samples: int
 
     def favours(self, chosen: bool) -> bool | None:
-        """Whether to simulate the effect; `chosen`: it is simulated so far. None: too few samples to say
-        anything.
+        """Whether to simulate the effect, given whether it is now (`chosen`). None: too few samples.
 
         An effect that is off must be worth more than the threshold, and more than chance brings about once in
         forty times. One that is on stays unless it is worth less than the threshold, as surely. So nothing
         goes back and forth by chance.
         """
-        if self.samples < LEAST_SAMPLES:
+        if self.samples < MIN_SAMPLES:
             return None
         if chosen:
             return self.value + 2 * self.deviation > self.threshold

@@ -1,5 +1,4 @@
-"""Evidence for metals: places that are fitted as metal, with views kept back, against the same places as
-paint.
+"""Evidence for metals: places fitted as metal and as paint, compared on views kept back.
 
 A dark gloss under a bright light explains a single view of a metal, and a metal explains a single view of a
 paint. How a place changes from view to view tells them apart. So light and materials are fitted to most views
@@ -37,8 +36,7 @@ METAL = 0.5
 def metal_evidence(
     model: NeilfModel, pixels: PixelDataset, position: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]
 ) -> Measurement:
-    """How much lower the relative error of kept-back pixels is with metals, at places that are taken for
-    metal.
+    """How much lower metals make the relative error of kept-back pixels, at places taken for metal.
 
     Args:
         model: its surface, and what it sends (R), are taken as they are; its material and its light play no
@@ -49,9 +47,7 @@ def metal_evidence(
     what = "error that metals save in views kept back, at places taken for metal"
     if model.lobe is None:
         return Measurement(what, 0.0, 0.0, WORTH, 0)
-    places = gather_places(model, pixels, position[:PLACES], normal[:PLACES], VIEWS)
-    views = torch.bincount(places.place, minlength=places.count)
-    places = places.where(torch.nonzero(views[places.place] >= MIN_VIEWS)[:, 0])
+    places = gather_places(model, pixels, position[:PLACES], normal[:PLACES], VIEWS).in_views(MIN_VIEWS)
     if not len(places.place):
         return Measurement(what, 0.0, 0.0, WORTH, 0)
     transport = place_transport(places, model.lobe, model.scene)

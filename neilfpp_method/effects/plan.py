@@ -46,8 +46,7 @@ class Decision:
 def decided_settings(settings: NeilfConfig, decisions: Sequence[Decision]) -> NeilfConfig:
     """The settings with the newest decision on each effect.
 
-    What a person asked for is set as asked. Evidence only takes away: an effect that it keeps is as the
-    settings have it.
+    Requested effects are set as asked. Evidence only removes: a kept effect is as the settings have it.
     """
     newest = {decision.effect: decision for decision in decisions}
     for name, decision in newest.items():
@@ -124,12 +123,13 @@ class Plan:
         newest = self.newest(name)
         return newest is None or newest.by == "evidence"
 
-    def decide(self, name: str, measured: Measurement, step: int) -> Decision:
-        """What evidence makes of an effect that is open; without enough samples it stays as it is. It counts
-        from now on.
+    def decide(self, name: str, measured: Measurement, step: int, must_be_earned: bool = False) -> Decision:
+        """Decide an open effect by evidence, from now on; without enough samples it stays as it is.
+
+        `must_be_earned`: it counts as off so far, whatever the settings say.
         """
         before = self.is_on(name)
-        favoured = measured.favours(before)
+        favoured = measured.favours(before and not must_be_earned)
         on = before if favoured is None else favoured
         reason = measured.in_words()
         if favoured is None:

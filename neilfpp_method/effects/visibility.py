@@ -22,9 +22,7 @@ from neilfpp_method.structures import RayBatch
 __all__ = ["WORTH", "blocked_share", "self_visibility"]
 
 WORTH = 0.01
-"""Share of the hemisphere below which nothing is traced: the relative error that lamps must save as well
-(`lighting.fit`).
-"""
+"""Share of the hemisphere below which nothing is traced; lamps must save as much (`lighting.fit`)."""
 DIRECTIONS = 16
 """Per point, by the cosine. The standard error is mostly that of the choice of points."""
 RAYS_AT_ONCE = 2048

@@ -1,5 +1,4 @@
-"""How far off a run's material may be at points of its surface, from how well what the training views saw
-determines it.
+"""Expected error of a run's material at surface points, from how well the training views determine it.
 
 Two things stand between the images and the material. Noise, and what no model explains, is different in every
 view; its size is that of the run's own residuals. Errors of the light are the same for all views of a point:
@@ -44,30 +43,29 @@ __all__ = [
 ]
 
 VIEWS = 16
-"""Views of a point that count. Those that lie between them add little that is new."""
+"""Largest number of views of a point. Views between these add little information."""
 DIRECT, REFLECTED, OVERALL = 0.3, 0.2, 1.0
-"""Relative standard deviations of the light of a patch, or a lamp: from outside the scene, from its own
-surfaces, whose radiance the cameras see, and of all light from outside together, whose scale nothing but the
-latter ties down.
+"""Relative standard deviations of light from outside the scene, of light from its surfaces (which the cameras
+see), and of a common factor on all light from outside, which nothing else fixes.
 """
 KNOWN = 0.05
-"""The same of a light that was given."""
+"""Relative standard deviation of a light that was given."""
 PIXELS = 1024
-"""Training pixels whose points say how well the run explains its images, and what light a typical point
-receives.
-"""
+"""Training pixels that measure how well the run explains its images, and the light at typical points."""
 TYPICAL_LOOKS = 1
-"""Looks at a point that is explained as well as a typical one, which count beside those that there are."""
+"""Prior views of a point: as many of typical error are added to the observed ones."""
 POINTS_AT_ONCE, SIGHTED_AT_ONCE = 512, 2**16
+"""Points that are shaded together, and points whose views are found together: bounds the memory."""
 NEIGHBOURS, NEAR, TURN = 9, 0.1, 0.1
-"""Most points that tell how sure one is, itself among them; how near they are, in scene units; and how far a
-radian between normals puts two of them apart.
+"""Largest neighbourhood of a point, itself included; its radius, scene units; what a radian between
+normals adds to a distance, scene units.
 """
 MIN_NOISE = 1e-3
-"""No image is better than this."""
+"""Least typical relative error of the images."""
 STEP = 1e-3
-"""Of a pixel, for the slope of radiance over it."""
+"""Difference of display values from which the slope of radiance over them is taken."""
 TINY = 1e-9
+"""Least divisor."""
 
 
 @dataclass(frozen=True)
@@ -167,8 +165,7 @@ def deviations_at(run: Run, points: OrientedPoints) -> Float[Tensor, "N 3"]:
 
 
 def with_deviation(run: Run, evidence: Evidence, view: RenderedView, step: int = 1) -> RenderedView:
-    """A rendered view with the maps base_color_std, roughness_std and metallic_std, 0 where it shows no
-    surface.
+    """A rendered view with the maps base_color_std, roughness_std and metallic_std, 0 off the surface.
 
     With a `step` of k only every k-th pixel of every k-th row is asked, and the k × k about it take after it.
     A Lambertian run has the first map alone.
@@ -272,9 +269,7 @@ def _light_deviations(model: NeilfModel) -> Float[Tensor, " E"]:
 
 
 def _unit_error(model: NeilfModel, pixel: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
-    """The radiance that a relative error of 1 stands for at a pixel, as fits of the light have it
-    (`Objective`).
-    """
+    """The radiance that a relative error of 1 means at a pixel, as in fits of the light (`Objective`)."""
     response = model.facts.response
     typical = apply_response(torch.tensor(model.facts.median_radiance), response)
     unit = error_unit(pixel, response, response_slope(typical, response).item())

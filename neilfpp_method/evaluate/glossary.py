@@ -11,13 +11,11 @@ __all__ = ["Entry", "explain"]
 
 @dataclass(frozen=True)
 class Entry:
-    """A figure for people: its title, how its values are written (`%`-style), which way is better, what it
-    says.
-    """
+    """How a figure is shown: title, number format (`%`-style), which way is better, and its meaning."""
 
     title: str
     pattern: str
-    better: Literal["higher", "lower"]
+    better: Literal["higher", "lower", "neither"]
     meaning: str
 
     def format(self, value: float) -> str:
@@ -33,12 +31,22 @@ def _length(title: str, meaning: str) -> Entry:
     return Entry(title, "%.4f", "lower", meaning)
 
 
+def _millimetres(title: str, meaning: str) -> Entry:
+    return Entry(title, "%.3f mm", "lower", meaning)
+
+
+def _similar(title: str) -> Entry:
+    return Entry(title, "%.4f", "higher", "Likeness of local structure; 1 is the same.")
+
+
 def _log(title: str, meaning: str) -> Entry:
     return Entry(title, "%.3f", "lower", meaning)
 
 
 def _ratio(title: str) -> Entry:
-    meaning = "Error where the run is surest, over the error elsewhere, half of the pixels each; 1 is no better than chance."
+    meaning = (
+        "Error of the surest half of the pixels over that of the other half; 1 is no better than chance."
+    )
     return Entry(title, "%.2f", "lower", meaning)
 
 
@@ -94,6 +102,30 @@ ENTRIES: Mapping[str, Entry] = {
     "incident_light_log_mae_occluded_scaled": _log(
         "Light from surfaces, scaled", "As above, with one factor per channel taken out."
     ),
+    "render_psnr": _decibels("Image", "New views, as the protocol shows them."),
+    "render_ssim": _similar("Structure of the image"),
+    "render_psnr_h": _decibels(
+        "Image, linear", "New views, linear, brought to the level of a display, up to 4."
+    ),
+    "render_psnr_l": _decibels("Image, as displayed", "New views as a display shows them."),
+    "albedo_psnr": _decibels("Albedo, scaled", "After the factor per channel that the protocol takes."),
+    "albedo_ssim": _similar("Structure of the albedo, scaled"),
+    "albedo_single_psnr": _decibels("Albedo, one factor", "After one factor for all channels."),
+    "albedo_single_ssim": _similar("Structure of the albedo, one factor"),
+    "roughness_mse": Entry("Roughness", "%.4f", "lower", "Mean squared error over the frame."),
+    "normal_distance": Entry("Normals, 1 − cosine", "%.4f", "lower", "Mean over the eroded mask."),
+    "depth_mse": Entry(
+        "Depth, scaled", "%.4g", "lower", "Mean squared error after one factor for all views."
+    ),
+    "chamfer_mm": _millimetres("Surface", "Mean of the two below."),
+    "chamfer_accuracy_mm": _millimetres("Surface, accuracy", "From the estimate to the truth."),
+    "chamfer_completeness_mm": _millimetres("Surface, completeness", "From the truth to the estimate."),
+    "base_color_gamma": Entry(
+        "Gamma of base colour",
+        "%.3f",
+        "neither",
+        "The power that matches the medians; 1 would change nothing.",
+    ),
     "confidence_base_color_ratio": _ratio("Confidence, base colour"),
     "confidence_roughness_ratio": _ratio("Confidence, roughness"),
     "confidence_metallic_ratio": _ratio("Confidence, metallic"),
@@ -101,9 +133,7 @@ ENTRIES: Mapping[str, Entry] = {
 
 
 def explain(name: str) -> Entry:
-    """The entry of a figure; a baseline has that of what it stands beside, and an unknown figure its own
-    name.
-    """
+    """The entry of a figure; a baseline has that of its figure, and an unknown figure its own name."""
     if name in ENTRIES:
         return ENTRIES[name]
     base = ENTRIES.get(name.removeprefix("baseline_"))
@@ -111,4 +141,7 @@ def explain(name: str) -> Entry:
         return replace(
             base, title=f"{base.title}, without a method", meaning="A constant, or the mean image."
         )
+    whole = ENTRIES.get(name.removesuffix("_frame"))
+    if whole is not None:
+        return replace(whole, title=f"{whole.title}, whole frame", meaning="The background counts as right.")
     return Entry(name.replace("_", " ").capitalize(), "%.4g", "higher", "")

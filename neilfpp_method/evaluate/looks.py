@@ -1,6 +1,4 @@
-"""What surface points send to those who look at them, by a model's material and light: in all, and with other
-materials.
-"""
+"""Radiance that surface points send to their viewers by a model: as found, and with other materials."""
 
 from __future__ import annotations
 

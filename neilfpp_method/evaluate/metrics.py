@@ -1,7 +1,6 @@
 """Numbers that compare an estimate with the truth: pure functions on arrays.
 
-Image metrics take one view each, so that views may differ in size; a protocol averages them over its views,
-as published tables do.
+Image metrics take one view each: views may differ in size, and published tables average over views.
 """
 
 from __future__ import annotations
@@ -32,24 +31,16 @@ __all__ = [
 ]
 
 PERFECT = 1e-10
-"""Least mean squared error, relative to the peak's square: a perfect estimate scores 100 dB, which JSON can
-hold.
-"""
+"""Least mean squared error over the squared peak: a perfect estimate scores 100 dB, valid in JSON."""
 
 SSIM_WINDOW = 11
-"""Side of the SSIM window, pixels (Wang et al. 2004): a Gaussian of σ = 1.5 cut off at 3.5 σ. Least image
-side.
-"""
+"""Side of the SSIM window, pixels (Wang et al. 2004): Gaussian, σ = 1.5, to 3.5 σ. Least image side."""
 
 LOG_FLOOR = 1e-3
-"""Radiance added before a logarithm: true radiance can be 0, and differences far below it are of no visible
-effect.
-"""
+"""Radiance added before a logarithm: true radiance can be 0, and far smaller differences are invisible."""
 
 QUERIES = 20_000
-"""Points of a surface that look for their neighbour on the other. Two surfaces far apart make one query
-slow.
-"""
+"""Points of one nearest-neighbour query: one of all points is slow where two surfaces are far apart."""
 
 
 # ----------------------------------------------------------------------------------------------------- images
@@ -106,8 +97,7 @@ def ssim(
 def angular_error(
     estimate: Float[np.ndarray, "H W 3"], truth: Float[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]
 ) -> float:
-    """Mean angle between normals, degrees, over the masked pixels where both are non-zero; NaN where there is
-    none.
+    """Mean angle between normals, degrees, over masked pixels where both are non-zero; NaN without any.
 
     Normals need not be unit. atan2(‖a × b‖, a · b) keeps its digits at small angles, where acos loses them.
     """
@@ -158,8 +148,7 @@ def align_scale(
 class Chamfer:
     """Mean distances between two surfaces, in the unit of their points.
 
-    `accuracy` is from the estimate to the truth, `completeness` from the truth to the estimate, `mean` half
-    their sum.
+    `accuracy` is from estimate to truth, `completeness` from truth to estimate, `mean` half their sum.
     """
 
     accuracy: float
@@ -197,9 +186,7 @@ def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int = 0) -> Float[np
 def log_ratio(
     estimate: Float[np.ndarray, "P C"], truth: Float[np.ndarray, "P C"]
 ) -> Float[np.ndarray, "P C"]:
-    """ln(estimate + LOG_FLOOR) − ln(truth + LOG_FLOOR): radiance spans orders of magnitude, and its ratios
-    show.
-    """
+    """ln(estimate + LOG_FLOOR) − ln(truth + LOG_FLOOR): radiance spans orders of magnitude."""
     return np.log(estimate.astype(np.float64) + LOG_FLOOR) - np.log(truth.astype(np.float64) + LOG_FLOOR)
 
 
@@ -212,9 +199,7 @@ def log_error(ratio: Float[np.ndarray, "P C"]) -> float:
 
 
 def confidence_ratio(error: Float[np.ndarray, " P"], expected: Float[np.ndarray, " P"]) -> float | None:
-    """The mean error of the half with the smallest expected error over that of the other; none where that is
-    0.
-    """
+    """Mean error of the half with the smallest expected error over that of the other; none if that is 0."""
     order = np.argsort(expected, kind="stable")
     sure, unsure = np.split(error[order], [len(order) // 2])
     return float(sure.mean() / unsure.mean()) if len(sure) and unsure.mean() > 0 else None

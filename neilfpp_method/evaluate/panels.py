@@ -1,6 +1,4 @@
-"""What the report shows: the views of a run beside the truth, and the light that arrives at points of its
-surface.
-"""
+"""What the report shows: views of a run beside the truth, and incident light at surface points."""
 
 from __future__ import annotations
 
@@ -36,10 +34,13 @@ from neilfpp_method.train.run import Run
 __all__ = ["ComparedMap", "Comparison", "albedo_scale", "compared_maps", "light_sections", "view_sections"]
 
 POINTS = 4
+"""Surface points whose light is shown."""
 POINTS_PER_SECTION = 2
+"""Of these, side by side in a row."""
 LIGHT_HEIGHT = 120
+"""Of a picture of light, pixels."""
 SHADE = (232, 232, 229)
-"""The directions below a surface."""
+"""Colour of directions below the surface."""
 
 
 # ------------------------------------------------------------------------------------------------------ views
@@ -47,9 +48,7 @@ SHADE = (232, 232, 229)
 
 @dataclass(frozen=True)
 class Comparison:
-    """One map of one view, ready to be shown; where the estimate and the truth have a surface, if not all of
-    it counts.
-    """
+    """One map of a view for display, and where estimate and truth have a surface, if not all counts."""
 
     estimate: UInt8[np.ndarray, "H W 3"]
     truth: UInt8[np.ndarray, "H W 3"] | None = None
@@ -232,9 +231,7 @@ def albedo_scale(
 
 @dataclass(frozen=True)
 class LightPoint:
-    """A surface point, and the light that is known to arrive there along the pixels of an unrolled
-    picture.
-    """
+    """A surface point, and the light known to arrive there along the pixels of an unrolled picture."""
 
     position: Float[np.ndarray, " 3"]
     normal: Float[np.ndarray, " 3"]
@@ -244,8 +241,7 @@ class LightPoint:
 def light_sections(
     run: Run, rendered: Sequence[RenderedView], scale: Float[np.ndarray, " 3"] | None
 ) -> list[Section]:
-    """Incident light: the truth, the estimate, and the estimate divided by what the base colour is scaled
-    with.
+    """Incident light: the truth, the estimate, and the estimate over the base colour's scale factor.
 
     What is scaled out of the one is scaled into the other: their product is what the images see. The points
     are from the capture's light field where it has one, else from the first view; no section where that shows
@@ -304,9 +300,7 @@ def _known_points(run: Run, directions: Float[np.ndarray, "H W 3"]) -> list[Ligh
 
 
 def _seen_points(run: Run, rendered: RenderedView) -> list[LightPoint]:
-    """Surface points of a rendered view, spread from the top of the picture to its foot; none where it shows
-    none.
-    """
+    """Surface points of a rendered view, spread from its top to its foot; none without a surface."""
     view = next(view for view in run.capture.views if view.name == rendered.name)
     rays = camera_rays(run.capture.normalisation.camera(view.camera))
     hits = np.flatnonzero(_hit(rendered))

@@ -1,6 +1,4 @@
-"""The light that arrives at surface points, by the part of the sphere, the scene or the lamp that it comes
-from.
-"""
+"""Incident light at surface points, by its origin: part of the sphere, part of the scene, or lamp."""
 
 from __future__ import annotations
 
@@ -19,13 +17,12 @@ from neilfpp_method.structures import Indexable, Material, Source
 __all__ = ["PATCHES", "PatchLight", "by_patch", "light_by_patch", "patch_count"]
 
 PATCHES = 32
-"""Parts of the sphere, about 40° wide."""
+"""Parts that the sphere is divided into, each about 40° wide."""
 
 
 @dataclass(frozen=True)
 class PatchLight(Indexable):
-    """Light that arrives at N points along S directions, times cosine and solid angle, and the patch that it
-    comes from.
+    """Incident light of N points along S directions, times cosine and solid angle, with its patch.
 
     Patches are the `PATCHES` parts of the sphere, for light from outside the scene; the same again, for light
     from its own surfaces; and one for each lamp.
@@ -44,9 +41,7 @@ def light_by_patch(
     wo: Float[Tensor, "N V 3"],
     material: Material,
 ) -> PatchLight:
-    """Light along directions that serve all viewers of a point: each is traced once, the same at every
-    call.
-    """
+    """Light along directions shared by all viewers of a point: each is traced once, always the same."""
     drawn = directions_for_viewers(model.light, normal, wo, material.roughness, model.lobe)
     incident = arriving(model.sources, position, drawn)
     weight = incident.weight * dot(incident.wi, normal).clamp_min(0)

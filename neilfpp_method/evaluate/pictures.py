@@ -1,5 +1,4 @@
-"""Pictures for people: maps as 8-bit displays, incident light unrolled, and a sheet that lays pictures side
-by side.
+"""Pictures to look at: maps as 8-bit displays, unrolled incident light, and contact sheets.
 
 Pure functions on arrays. Nothing here is measured: what a metric reads is never what a picture shows.
 """
@@ -43,8 +42,7 @@ PALE_INK = (112, 116, 124)
 
 
 def display(name: str, values: Float[np.ndarray, "H W C"]) -> UInt8[np.ndarray, "H W C"]:
-    """A map by its name in `Maps`: normals as colours, depth normalised, one channel as linear grey, else
-    tone-mapped.
+    """A map by its name in `Maps`: normals as colours, depth normalised, one channel grey, else tone-mapped.
 
     Depths that are not finite belong to no surface: they are black and do not count in the range.
     """
@@ -110,9 +108,7 @@ def ring(
     directions: Float[np.ndarray, "K 3"],
     color: tuple[int, int, int] = (255, 64, 64),
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A latitude-longitude picture with a ring about each of some unit directions; the inverse of
-    `lat_long_directions`.
-    """
+    """A latitude-longitude picture with rings about unit directions; inverse of `lat_long_directions`."""
     height, width, _ = picture.shape
     marked = np.ascontiguousarray(picture).copy()
     for x, y, z in directions:
@@ -123,9 +119,7 @@ def ring(
 
 
 def auto_exposure(radiance: Float[np.ndarray, "P 3"]) -> float:
-    """The factor that brings the 90th percentile of luminance to 0.7: lamps clip, all else shows. 1 for no
-    radiance.
-    """
+    """The factor that brings the 90th percentile of luminance to 0.7 (lamps clip); 1 for no radiance."""
     if not len(radiance):
         return 1.0
     level = np.percentile(luminance(torch.from_numpy(np.asarray(radiance, dtype=np.float32))).numpy(), 90)
@@ -147,8 +141,7 @@ class Group:
 class Row:
     """Pictures, one a column, with a title and a note to their left; none leaves a cell empty.
 
-    `scale` is the error at the bright end of the error pictures, with its unit; the row then shows the
-    colours' legend.
+    `scale` is the error at the bright end of the error pictures, with unit; the row shows the legend.
     """
 
     title: str
@@ -178,8 +171,7 @@ TITLE, HEADING, TEXT, NOTE = 34, 24, 20, 16
 def contact_sheet(
     title: str, subtitle: str, sections: Sequence[Section], cell_width: int = 240
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Lay sections out below one another; every picture is scaled to the width of a cell and keeps its
-    proportions.
+    """Lay sections out below one another; every picture is scaled to the cell's width, proportions kept.
 
     A sheet without a title has no head.
     """

@@ -1,5 +1,4 @@
-"""How far a material may be off, given what views saw of it: the posterior of base colour, roughness and
-metallic.
+"""Expected error of a material given its views: the posterior of base colour, roughness and metallic.
 
 What a point sends to a viewer is linear in its base colour once roughness and metallic are given:
 
@@ -24,17 +23,16 @@ from neilfpp_method.structures import Indexable, Material
 __all__ = ["ROUGHNESS_NODES", "Deviation", "Looks", "Sights", "expected_error", "guessed_error"]
 
 ROUGHNESS_NODES = (0.05, 0.15, 0.25, 0.35, 0.5, 0.65, 0.8, 1.0)
-"""Roughnesses at which F and G are known; between them both are linear."""
+"""Roughnesses at which F and G are computed; between them both are interpolated linearly."""
 ROUGHNESS_CELLS, METALLIC_CELLS = 20, 9
+"""Cells of the grid over which the posterior is summed."""
 PRIOR_PRECISION = 1e-2
-"""Of a channel of base colour that nothing depends on; the cut at 0 and 1 makes an even prior of it."""
+"""Precision of the prior on a channel of base colour: nearly uniform within [0, 1]."""
 
 
 @dataclass(frozen=True)
 class Deviation(Indexable):
-    """The expected root mean square error of an estimate, in its own units; of base colour the mean over the
-    channels.
-    """
+    """Expected root mean square error of an estimate in its own units; base colour: channel mean."""
 
     base_color: Float[Tensor, "N 1"]
     roughness: Float[Tensor, "N 1"]
@@ -43,9 +41,7 @@ class Deviation(Indexable):
 
 @dataclass(frozen=True)
 class Looks(Indexable):
-    """What N points send to V viewers: `diffuse` is D, the others are F and G at each of the
-    `ROUGHNESS_NODES`.
-    """
+    """What N points send to V viewers: `diffuse` is D, the others F and G at each of `ROUGHNESS_NODES`."""
 
     diffuse: Float[Tensor, "N 3"]
     facing: Float[Tensor, "N V R 3"]
@@ -154,9 +150,7 @@ class _Products:
 
 @dataclass(frozen=True)
 class _BaseColor:
-    """Base colour where roughness and metallic are given, and the log of how well both then explain the
-    views.
-    """
+    """Base colour given roughness and metallic, and the log likelihood of both given the views."""
 
     mean: Float[Tensor, "N 3 Q M"]
     variance: Float[Tensor, "N 3 Q M"]
@@ -164,9 +158,7 @@ class _BaseColor:
 
 
 def _solve(products: _Products, m: Float[Tensor, " M"]) -> _BaseColor:
-    """Least squares for b in R − k F = b A, with A = (1 − m) D + m F and k = 0.04 (1 − m), cut off at 0 and
-    1.
-    """
+    """Least squares for b in R − k F = b A, A = (1 − m) D + m F, k = 0.04 (1 − m), clamped to [0, 1]."""
     p, k = products, 0.04 * (1 - m)
     aa = (1 - m).square() * p.dd + 2 * m * (1 - m) * p.df + m.square() * p.ff
     ar = (1 - m) * p.dr + m * p.fr - k * ((1 - m) * p.df + m * p.ff)
@@ -181,8 +173,7 @@ def _solve(products: _Products, m: Float[Tensor, " M"]) -> _BaseColor:
     below = torch.special.log_ndtr(torch.where(mirrored, -high, low))
     above = torch.special.log_ndtr(torch.where(mirrored, -low, high))
     log_mass = above + (-torch.expm1(below - above)).clamp_min(1e-7).log()
-    # No density at an end exceeds what bounds it here; far out, where exponents have lost their digits, the
-    # bound holds.
+    # No density at an end exceeds its bound here; far out, where exponents lose digits, the bound holds.
     at_low, at_high = (
         torch.exp(-end.square() / 2 - math.log(2 * math.pi) / 2 - log_mass).minimum(
             end.abs() + 1 + 1 / (high - low)

@@ -4,17 +4,17 @@ An image metric is taken per view and averaged over the test views. A figure is 
 hand and the run has an estimate of it. Alignments are never silent: each has a key of its own beside the
 figure without it.
 
-    volume_psnr, pbr_psnr, *_ssim     R and the rendering equation against the image, both clipped and sRGB-encoded
+    volume_psnr, pbr_psnr, *_ssim     R and the rendering equation against the image, clipped, sRGB-encoded
     *_psnr_linear                     the same on linear radiance, peak 1, HDR captures
-    base_color_psnr, _gamma, _scaled  as estimated; with one global gamma; with a least-squares factor per channel
+    base_color_psnr, _gamma, _scaled  as estimated; with one gamma; with a least-squares factor per channel
     roughness_psnr, metallic_psnr     as estimated
     *_frame                           the same over the whole frame, the background counted as free of error
     normal_mae_deg                    mean angle where the truth and the estimate have a normal, degrees
     chamfer, _accuracy, _completeness scene units
-    incident_light_log_mae            mean |ln L − ln L_true| over points and directions of the true light field
-      _occluded, _scaled              over directions that meet the scene again; without the scale of each channel
-    confidence_*_ratio                mean error of the half of the pixels with the smallest expected error over that of the
-                                      other half; base colour scaled
+    incident_light_log_mae            mean |ln L − ln L_true| over points and directions of the true field
+      _occluded, _scaled              over directions that meet the scene; up to a factor per channel
+    confidence_*_ratio                mean error of the half of the pixels with the smallest expected error,
+                                      over that of the other half; base colour scaled
     baseline_*                        what needs no method, on the same pixels
 """
 
@@ -34,6 +34,7 @@ from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.data.truth import LightField, Truth
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.evaluate.confidence import gather_evidence, material_deviation, shown_surface
+from neilfpp_method.evaluate.size import what_is_measured
 from neilfpp_method.evaluate.views import (
     KnownView,
     RenderedView,
@@ -43,8 +44,9 @@ from neilfpp_method.evaluate.views import (
     render_test_views,
     surface_points,
 )
-from neilfpp_method.export.mesh import HasSdf, extract_mesh
+from neilfpp_method.export.mesh import extract_mesh
 from neilfpp_method.health.cases import verdict_of
+from neilfpp_method.hosts.base import HasSdf
 from neilfpp_method.hosts.volsdf import HIT_RADIUS
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.train.health_record import read_findings
@@ -53,20 +55,19 @@ from neilfpp_method.train.run import Run, write_json
 __all__ = ["evaluate", "protocol", "write_metrics"]
 
 RENDERING = 0.9
-"""Share of the work that rendering the test views is, for the progress bar."""
+"""Share of the work that is rendering the test views, for the progress bar."""
 SURFACE_POINTS = 500_000
-"""Points on each surface for Chamfer distances. Sampling alone gives a mean distance of about ½ √(area /
-points).
-"""
+"""Points on each surface for Chamfer distances. Sampling alone gives a mean of ½ √(area / points)."""
 MESH_RESOLUTION = 256
+"""Cells along an edge of the grid from which the estimated surface is extracted."""
 CONFIDENCE_PIXELS = 8192
-"""Test pixels, evenly spread, whose error is compared with the one that is expected there."""
+"""Evenly spread test pixels whose error is compared with the expected error."""
 MARGIN = 0.05
-"""The estimate counts up to this share of the diagonal of the truth's bounding box around that box: beyond
-it, where no image looks, a distance field closes its surface as it likes.
+"""Share of the diagonal of the truth's bounding box by which the box is enlarged. The estimate counts within
+it; beyond, where no image looks, a distance field closes its surface arbitrarily.
 """
 OFFSET = 1e-3
-"""How far off the surface a ray starts that asks whether a direction meets the scene, scene units."""
+"""Height above the surface, scene units, at which visibility rays start."""
 
 Pairs = Sequence[tuple[RenderedView, KnownView]]
 
@@ -114,12 +115,13 @@ def protocol(run: Run) -> dict[str, str]:
 def write_metrics(path: Path, run: Run, figures: Mapping[str, float]) -> None:
     """Write the figures and the verdict on the run's health as a flat JSON object.
 
-    Beside it, as `<stem>-protocol.json`, stands how to read them.
+    Beside it, as `<stem>-protocol.json`, stands how to read them, and what was measured.
     """
     findings = read_findings(run.path)
     health = {} if findings is None else {"health": verdict_of(findings)}
     write_json(path, {**figures, **health})
-    write_json(path.with_name(f"{path.stem}-protocol.json"), protocol(run))
+    described = {**protocol(run), "measured": what_is_measured(run)}
+    write_json(path.with_name(f"{path.stem}-protocol.json"), described)
 
 
 # ---------------------------------------------------------------------------------- images, material, normals
@@ -233,8 +235,7 @@ def _pooled(pairs: Pairs, name: str) -> Float[np.ndarray, "P C"]:
 def chamfer_metrics(run: Run, truth: Mesh) -> dict[str, float]:
     """Chamfer distance between the run's surface and the true mesh, scene units.
 
-    Both are sampled by area; of the estimate only what lies within `MARGIN` of the truth's box counts. Absent
-    where none does.
+    Both are sampled by area; the estimate within `MARGIN` of the truth's box. Absent where none is.
     """
     true = trimesh.Trimesh(truth.vertices.numpy(), truth.faces.numpy(), process=False)
     margin = MARGIN * np.linalg.norm(true.extents)
@@ -242,8 +243,7 @@ def chamfer_metrics(run: Run, truth: Mesh) -> dict[str, float]:
     volume = run.config.volume
     corner = np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))
     device = next(run.model.parameters()).device
-    # The sphere that may close the scene is no surface of the object, and what lies far from the truth is cut
-    # anyway.
+    # The sphere that may close the scene is no surface of the object; far parts are cut anyway.
     radius = min(float(corner), volume.radius - HIT_RADIUS)
     surface = extract_mesh(run.model.host.sdf, radius, MESH_RESOLUTION, device=device)
     points = metrics.sample_surface(surface, SURFACE_POINTS)

@@ -20,7 +20,7 @@ __all__ = ["render_run"]
 
 LAYERS = {"normal": "XYZ"}
 PART = 0.95
-"""Of the work on a view that rendering is."""
+"""Share of the work on a view that is rendering; the rest is writing."""
 
 
 def render_run(
@@ -31,8 +31,7 @@ def render_run(
     confidence: bool = False,
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> list[Path]:
-    """Render views of a run: `<out>/<map>/<view>.png` to look at, `<out>/<view>.exr` with all maps as they
-    are.
+    """Render views of a run: `<out>/<map>/<view>.png` to look at, and `<out>/<view>.exr` with all maps.
 
     A view is written with its EXR last, and one whose EXR is there is skipped: a render that was stopped goes
     on where it was. In the EXR a map is a layer (`base_color.R`, `normal.X`), or one channel by its own name;

@@ -1,6 +1,4 @@
-"""Pictures of a run for documents: a contact sheet of views and light beside the truth, and the light
-alone.
-"""
+"""Pictures of a run for documents: a contact sheet beside the truth, and the light alone."""
 
 from __future__ import annotations
 
@@ -21,8 +19,9 @@ from neilfpp_method.train.run import Run
 __all__ = ["write_contact_sheet", "write_light_picture"]
 
 SHOWN_VIEWS = 3
+"""Views on a contact sheet."""
 CONFIDENCE_STEP = 2
-"""One pixel in so many by so many is asked how far off it may be."""
+"""Expected errors are computed for every n-th pixel of every n-th row."""
 
 
 def write_contact_sheet(run: Run, path: Path, rendered: Sequence[RenderedView] = ()) -> None:
@@ -65,9 +64,7 @@ def write_light_picture(run: Run, path: Path) -> bool:
 
 
 def _with_shown_views(run: Run) -> Run:
-    """The run with up to three views held out, spread over those that are, or over the training views where
-    none is.
-    """
+    """The run with up to three views held out, spread over the test views, or else the training views."""
     views = run.capture.test_views or run.capture.train_views
     rows = np.linspace(0, len(views) - 1, SHOWN_VIEWS).round().astype(int)
     return replace(run, capture=replace(run.capture, test=frozenset(views[row].name for row in rows)))

@@ -18,16 +18,14 @@ from neilfpp_method.structures import Indexable, PixelBatch, RayBatch
 __all__ = ["Sightings", "TrainingViews"]
 
 TOLERANCE = 0.05
-"""Surfaces this close to one another count as one, scene units, as they do for a hit."""
+"""Distance, scene units, within which two surfaces count as one, as for a hit."""
 MIN_COSINE = 0.05
-"""Flatter looks see a pixel's width of surface, and a bend of the normal."""
+"""Flatter views are left out: a pixel then covers much surface."""
 
 
 @dataclass(frozen=True)
 class Sightings(Indexable):
-    """N points as up to V views see them; `wo` of a place that no view fills is the normal, its pixel
-    black.
-    """
+    """N points as up to V views see them; without a view `wo` is the normal and the pixel black."""
 
     seen: Bool[Tensor, "N V"]
     wo: Float[Tensor, "N V 3"]
@@ -104,9 +102,7 @@ def _nothing_between(
     direction: Float[Tensor, "N 3"],
     distance: Float[Tensor, " N"],
 ) -> Bool[Tensor, " N"]:
-    """Whether a camera sees surface points that lie in its picture: traced as light is, or else rendered from
-    there.
-    """
+    """Whether a camera sees surface points within its picture: traced as light is, or rendered."""
     scene, share = model.scene, model.config.shading.hit_share
     if scene is not None:
         return scene(position, direction[:, None]).distance[:, 0] >= distance - TOLERANCE

@@ -91,8 +91,7 @@ def render_test_views(
 
 @dataclass(frozen=True)
 class KnownView:
-    """What is known of a view: `image` as the capture holds it, the pixels that count, and the truth that is
-    at hand.
+    """What is known of a view: `image` as captured, the pixels that count, and the truth where known.
 
     `depth` is along the camera's axis, scene units; `material` maps base_color, roughness and metallic.
     """
@@ -189,8 +188,7 @@ def surface_points(capture: Capture, known: KnownView) -> Float[Tensor, "P 3"]:
 
 
 def mean_observed_color(capture: Capture, points: Float[Tensor, "P 3"]) -> Float[np.ndarray, "P 3"] | None:
-    """The mean linear colour of surface points over the training views that see them; none without true
-    depths.
+    """The mean linear colour of surface points over training views that see them; none without true depths.
 
     A view sees a point when its depth map, at the point's pixel, agrees within `VISIBLE`. A point that no
     view sees takes the mean over the others.

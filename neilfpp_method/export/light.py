@@ -1,5 +1,4 @@
-"""The light of a run as files for other programs: the environment map, the lamps before it, and light probes
-(docs/light.md).
+"""The light of a run as files: environment map, lamps before it, and light probes (docs/light.md).
 
 <out>/environment.exr    radiance from far away, where the run has an environment map <out>/lamps.json
 lamps close to the scene, in the world frame of the capture; beside every environment map <out>/probes/<k>.exr
@@ -57,8 +56,7 @@ def check_light(run: Run, probes: int | None) -> None:
 
 
 def export_light(run: Run, out: Path, probes: int | None = None) -> ExportedLight:
-    """Write the light of a run. Radiance is in the units of the images, lengths in those of the capture's
-    world.
+    """Write the light of a run. Radiance is in image units, lengths in those of the capture's world.
 
     Args:
         run: the run.
@@ -83,11 +81,9 @@ def export_light(run: Run, out: Path, probes: int | None = None) -> ExportedLigh
 
 
 def lamps_in_world(run: Run) -> list[dict[str, Any]]:
-    """The lamps of a run as `lamps.json` has them (docs/light.md), in the capture's world; none where the
-    light has none.
+    """The lamps of a run as in `lamps.json` (docs/light.md), in the capture's world; none without lamps.
 
-    Radiance is the same in every frame; intensity, radiance times the area of a disc, scales as that area
-    does.
+    Radiance is the same in every frame; intensity, radiance times a disc's area, scales as the area.
     """
     lamps = run.model.lamps
     frame = run.capture.normalisation

@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -18,31 +17,25 @@ from torch import Tensor
 
 from neilfpp_method.data.images import replacing
 from neilfpp_method.errors import UserError
+from neilfpp_method.hosts.base import HasSdf
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.hosts.volsdf import HIT_RADIUS
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.structures import Material
 from neilfpp_method.train.run import Run
 
-__all__ = ["HasSdf", "export_mesh", "extract_mesh", "has_surface", "materials_in_parts", "surface_mesh"]
+__all__ = ["export_mesh", "extract_mesh", "has_surface", "materials_in_parts", "surface_mesh"]
 
 Sdf = Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]
 
-# Grid points along an edge of a block. A block is skipped when |sdf| at its centre exceeds SLACK half-diagonals of it.
-# With 8 and 1.5 nothing is lost, the edges between blocks included, for every field whose slope stays below 1.29.
 BLOCK = 8
+"""Grid points along an edge of a block."""
 SLACK = 1.5
+"""A block is skipped when |sdf| at its centre exceeds this many of its half-diagonals. With blocks of 8
+points nothing is lost, the edges between blocks included, for every field whose slope stays below 1.29.
+"""
 POINTS_AT_ONCE = 65_536
 """Points at which the material is asked together: bounds the memory."""
-
-
-@runtime_checkable
-class HasSdf(Protocol):
-    """A host whose surface is the zero set of a distance field. Without: there is no mesh to export."""
-
-    def sdf(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-        """Signed distance at points of the scene frame, negative inside."""
-        ...
 
 
 @torch.no_grad()
@@ -51,8 +44,7 @@ def extract_mesh(
 ) -> trimesh.Trimesh:
     """The zero set of a signed distance field within a sphere about the origin; faces are wound outwards.
 
-    The grid is asked for its block centres first, then for every point of the blocks that the surface may
-    cross.
+    The grid is asked for its block centres first, then for all points of blocks that the surface may cross.
 
     Args:
         sdf: signed distance, negative inside; its slope should be about 1.
@@ -71,8 +63,7 @@ def extract_mesh(
     )
     if not volume.min() < 0.0 < volume.max():
         raise _no_surface(radius)
-    # scikit-image counts faces by the left hand: its default winds them towards growing values, which is
-    # outwards.
+    # scikit-image winds faces by the left hand towards growing values by default, which is outwards.
     vertices, faces, _, _ = marching_cubes(volume, 0.0, allow_degenerate=False)
     vertices = vertices * step - radius
     inside = np.linalg.norm(vertices, axis=-1) <= radius

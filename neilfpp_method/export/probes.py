@@ -1,6 +1,4 @@
-"""Light probes: all the light that arrives at points of the surface, unrolled; and points where it
-differs.
-"""
+"""Light probes: all light that arrives at surface points, unrolled; at points where it differs."""
 
 from __future__ import annotations
 
@@ -43,8 +41,7 @@ def spread_over_surface(run: Run, count: int) -> OrientedPoints:
 
 @torch.no_grad()
 def spread(points: OrientedPoints, count: int) -> Int[Tensor, " N"]:
-    """Rows of up to `count` points unlike one another: each the farthest from those before it, the first from
-    their mean.
+    """Rows of up to `count` points by farthest-point sampling, the first the farthest from their mean.
 
     What arrives depends on the place and on which way the surface faces, so both count, in scene units and by
     the normal: else the corners of a floor come before anything that stands on it.
@@ -62,9 +59,7 @@ def spread(points: OrientedPoints, count: int) -> Int[Tensor, " N"]:
 def probe(
     run: Run, position: Float[Tensor, " 3"], normal: Float[Tensor, " 3"], height: int
 ) -> Float[Tensor, "height width 3"]:
-    """Linear radiance that arrives at a surface point, in the layout of environment maps; 0 from below the
-    surface.
-    """
+    """Linear radiance that arrives at a surface point, laid out as environment maps; 0 below the surface."""
     directions = map_directions(height, 2 * height).to(position)
     radiance = torch.zeros_like(directions)
     above = directions @ normal > 0

@@ -1,3 +1,1 @@
-"""The four fields of the method and the background, and the encodings and networks they are made of (METHOD
-§5).
-"""
+"""The four fields of the method and the background, with their encodings and networks (METHOD §5)."""

@@ -16,10 +16,8 @@ __all__ = ["InvertedSphere", "field_beyond"]
 
 POSITION_OCTAVES = 10
 DIRECTION_OCTAVES = 4
-DARKEST = 1e-2
-"""Share of the largest radiance that the field starts as at least, and stays below the largest by: a sigmoid
-has no ends.
-"""
+MIN_START = 1e-2
+"""Share of the largest radiance that the field starts away from both ends of its sigmoid, at least."""
 START_SCALE = 1e-3
 """Of the weights that make it vary at the start."""
 
@@ -64,7 +62,7 @@ class InvertedSphere(nn.Module):
         self.head = Mlp(width + self.direction.width, 3, 1, width // 2, "relu", output_scale=START_SCALE)
         if start is not None:
             with torch.no_grad():
-                self.head.layers[-1].bias.copy_(torch.logit(start / scale, eps=DARKEST))
+                self.head.layers[-1].bias.copy_(torch.logit(start / scale, eps=MIN_START))
 
     def forward(
         self, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]
@@ -79,8 +77,7 @@ class InvertedSphere(nn.Module):
         points = _on_sphere(origins, directions, 1 / inverse)
         chart = torch.cat((points, inverse[None, :, None].expand(len(points), -1, 1)), -1)
         trunk = self.trunk(self.position(chart))
-        # In units of 1/radius, the length of the chart: a fresh field stops half of the light, so all samples
-        # are seen.
+        # In units of 1/radius, the chart's length: a fresh field stops half the light, so all samples count.
         density = self.radius * functional.softplus(trunk[..., 0])
         towards_viewer = self.direction(-directions)[:, None].expand(-1, self.samples, -1)
         color = self.scale * torch.sigmoid(self.head(torch.cat((trunk[..., 1:], towards_viewer), -1)))

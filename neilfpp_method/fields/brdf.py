@@ -16,6 +16,9 @@ from neilfpp_method.structures import Material
 
 __all__ = ["BrdfField", "BrdfSample"]
 
+START_RANGE = (0.05, 0.95)
+"""Where every parameter starts: at 0 and at 1 it would have no slope."""
+
 
 @dataclass(frozen=True)
 class BrdfSample:
@@ -27,8 +30,7 @@ class BrdfSample:
 
 
 class BrdfField(nn.Module):
-    """Every parameter is ½ + ½ tanh of an output of the network; roughness starts close to ½, the others to
-    what is set.
+    """Every parameter is ½ + ½ tanh of a network output; roughness starts near ½, the others as set.
 
     `metals` off: metallic is 0 everywhere, with no gradient.
     """
@@ -52,9 +54,7 @@ class BrdfField(nn.Module):
         return self._material(torch.tanh(self.mlp(self.encoding(x))))
 
     def with_gradients(self, x: Float[Tensor, "N 3"]) -> BrdfSample:
-        """The material and the gradients of roughness and metallic. A loss on them needs only first-order
-        autograd.
-        """
+        """The material and the gradients of roughness and metallic; losses on them need first order only."""
         encoded = self.encoding.with_jacobian(x)
         sample = self.mlp.with_gradient(encoded.features, slice(3, 5))
         saturation = torch.tanh(sample.value)
@@ -63,6 +63,12 @@ class BrdfField(nn.Module):
         return BrdfSample(
             self._material(saturation), roughness, metallic if self.metals else torch.zeros_like(metallic)
         )
+
+    @torch.no_grad()
+    def start_at(self, material: Material) -> None:
+        """Be of one material everywhere, up to what the untrained network adds; N is 1."""
+        values = torch.cat((material.base_color, material.roughness, material.metallic), -1)[0]
+        self.mlp.layers[-1].bias.copy_(torch.atanh(2 * values.clamp(*START_RANGE) - 1))
 
     def _material(self, saturation: Float[Tensor, "N 5"]) -> Material:
         base_color, roughness, metallic = (0.5 + 0.5 * saturation).split((3, 1, 1), -1)

@@ -32,9 +32,7 @@ POSITION_OCTAVES = 6
 
 
 def pull_back(gradient: Float[Tensor, "N K F"], encoded: Encoded) -> Float[Tensor, "N K 3"]:
-    """The chain rule: from the gradient of K outputs with respect to the encoding to that with respect to
-    x.
-    """
+    """The chain rule: from the gradient of K outputs with respect to the encoding to that of x."""
     return torch.einsum("nkf,nfj->nkj", gradient, encoded.jacobian)
 
 
@@ -129,8 +127,7 @@ def position_encoding(
 
 
 class SphericalHarmonics(nn.Module):
-    """The first `degree` bands of the real spherical harmonics, without the Condon–Shortley phase; unit
-    directions.
+    """The first `degree` bands of the real spherical harmonics, without Condon–Shortley phase; unit vectors.
 
     Bands follow one another, each by rising order m. They are orthonormal over the sphere.
 
@@ -150,8 +147,7 @@ class SphericalHarmonics(nn.Module):
         return torch.stack([value for band in BANDS[: self.degree] for value in band(x, y, z)], -1)
 
 
-# In powers of x, y, z with x² + y² + z² = 1; the constants make the square of each integrate to 1 over the
-# sphere.
+# In powers of x, y, z with x² + y² + z² = 1; the square of each integrates to 1 over the sphere.
 BANDS: tuple[Callable[[Tensor, Tensor, Tensor], list[Tensor]], ...] = (
     lambda x, y, z: [torch.full_like(x, 0.28209479177387814)],
     lambda x, y, z: [0.4886025119029199 * y, 0.4886025119029199 * z, 0.4886025119029199 * x],

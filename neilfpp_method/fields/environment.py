@@ -22,14 +22,10 @@ from neilfpp_method.structures import IncidentSamples
 __all__ = ["EnvironmentLight", "TexelDirections"]
 
 UNIFORM_SHARE = 0.1
-"""Share of the samples that is spread evenly over the sphere, so that no direction is left out of the
-density.
-"""
+"""Share of the samples spread evenly over the sphere, so that every direction has a density."""
 MEAN_OF_CELL = (1 / 8, 3 / 4)
-"""What is linear between the middles of cells has this mean in one: shares of each neighbour, and of the cell
-itself.
-"""
-DARKEST = 1e-6
+"""Mean over a cell of what is linear between cell middles: shares of each neighbour, and of the cell."""
+MIN_RADIANCE = 1e-6
 """Of the mean of a map that is shown: what is darker counts as this, as radiance is kept as its logarithm."""
 
 
@@ -42,8 +38,7 @@ class TexelDirections:
 
 
 class EnvironmentLight(nn.Module):
-    """A grid of log radiance; between the texels radiance is bilinear, so that it brings what the texels hold
-    together.
+    """A grid of log radiance; bilinear between the texels in radiance, so that power is conserved.
 
     The map is no parameter: what surfaces send is linear in it, so `lighting` solves for it.
 
@@ -63,13 +58,11 @@ class EnvironmentLight(nn.Module):
     def show(self, radiance: Float[Tensor, "3 H W"]) -> None:
         """Be this map, of any size from 2 rows on, and not all black; its device stays."""
         self._resize(*radiance.shape[1:])
-        self.log_radiance.copy_(radiance.clamp_min(DARKEST * radiance.mean()).log())
+        self.log_radiance.copy_(radiance.clamp_min(MIN_RADIANCE * radiance.mean()).log())
 
     @torch.no_grad()
     def at_most(self, height: int) -> EnvironmentLight:
-        """This map; where it has more rows, one of so many, whose texels are the means of what lies in
-        each.
-        """
+        """This map; where it has more rows, one of so many, whose texels are area means."""
         _, rows, columns = self.log_radiance.shape
         if rows <= height:
             return self
@@ -92,16 +85,12 @@ class EnvironmentLight(nn.Module):
         return interpolate(self.log_radiance.exp(), wi)
 
     def technique(self, normal: Float[Tensor, "N 3"]) -> Technique:
-        """Directions in proportion to the radiance, for the points of these normals; some fall below their
-        horizons.
-        """
+        """Directions in proportion to the radiance, for points of these normals; some below horizons."""
         return Technique(lambda count, stochastic: self.sample(normal, count, stochastic).wi, self.pdf)
 
     @torch.no_grad()
     def sample(self, like: Float[Tensor, "N 3"], count: int, stochastic: bool) -> IncidentSamples:
-        """`count` directions for each row of `like`, in proportion to the radiance; half of them may be below
-        a horizon.
-        """
+        """`count` directions a row of `like`, in proportion to the radiance; half may be below a horizon."""
         shape = (len(like), count)
         strata = torch.arange(count, device=like.device, dtype=like.dtype)
         within = (
@@ -115,9 +104,7 @@ class EnvironmentLight(nn.Module):
 
     @torch.no_grad()
     def texel_directions(self, like: Float[Tensor, "N 3"]) -> TexelDirections:
-        """A random direction within every texel, row by row, for each row of `like`: the sphere in T
-        strata.
-        """
+        """A random direction in every texel, row by row, for each row of `like`: the sphere in T strata."""
         _, height, width = self.log_radiance.shape
         cell = torch.arange(height * width, device=like.device).expand(len(like), -1)
         within = torch.rand(2, *cell.shape, device=like.device, dtype=like.dtype)
@@ -138,9 +125,7 @@ class EnvironmentLight(nn.Module):
     def _within(
         self, cell: Int[Tensor, "N S"], down: Float[Tensor, "N S"], across: Float[Tensor, "N S"]
     ) -> Float[Tensor, "N S 3"]:
-        """Directions in texels, by number, at shares of their height and width; even shares spread evenly
-        over the texel.
-        """
+        """Directions in texels by number, at shares of height and width; even shares spread evenly."""
         _, height, width = self.log_radiance.shape
         cell = cell.clamp_max(height * width - 1)
         row, column = cell // width, cell % width
@@ -155,9 +140,7 @@ class EnvironmentLight(nn.Module):
         return rows[:, None].expand(-1, width).reshape(-1)
 
     def _texel_shares(self) -> Float[Tensor, " T"]:
-        """The probability of each texel: of what bilinear radiance brings within it, also next to a lamp of
-        one texel.
-        """
+        """The probability of each texel: of its bilinear radiance, also beside a lamp of one texel."""
         solid_angles = self._texel_solid_angles()
         mean = luminance(self.log_radiance.detach().permute(1, 2, 0).exp())
         mean = MEAN_OF_CELL[0] * (mean.roll(1, 1) + mean.roll(-1, 1)) + MEAN_OF_CELL[1] * mean

@@ -18,7 +18,7 @@ from neilfpp_method.settings.types import FreeLightConfig, FrequencyConfig, Hash
 __all__ = ["IncidentLightField", "exponential"]
 
 
-LARGEST_EXPONENT = 20.0  # radiance stays within e^±20 of its start
+MAX_EXPONENT = 20.0  # radiance stays within e^±20 of its start
 DIRECTION_OCTAVES, DIRECTION_BANDS = 6, 5
 """Of the encoding of directions: light is sharper in direction than what surfaces send (NeILF++ §5)."""
 
@@ -57,8 +57,7 @@ class IncidentLightField(nn.Module):
             width, outputs, config.layers - middle - 1, width, config.activation, output_scale=0.1
         )
         nn.init.zeros_(self.tail.layers[-1].bias)
-        # Position and direction meet in one layer: its weights start alike. So do those of the tail, a hidden
-        # layer's.
+        # Position and direction meet in one layer, so its weights start alike; those of the tail as well.
         bound = self.direction_part.layers[-1].weight.abs().max().item()
         nn.init.uniform_(self.position_part.weight, -bound, bound)
         self.tail.activation.init_(self.tail.layers[0])
@@ -84,5 +83,5 @@ def exponential(exponent: Float[Tensor, "*B C"], initial_radiance: float) -> Flo
 
     The exponent is clamped, with derivative 1 everywhere: a value beyond the limit still feels the loss.
     """
-    limited = exponent.clamp(-LARGEST_EXPONENT, LARGEST_EXPONENT).detach() + (exponent - exponent.detach())
+    limited = exponent.clamp(-MAX_EXPONENT, MAX_EXPONENT).detach() + (exponent - exponent.detach())
     return (initial_radiance * limited.exp()).expand(*exponent.shape[:-1], 3)

@@ -35,9 +35,7 @@ class LampRays:
     emission: Float[Tensor, "N K"]
 
     def samples(self) -> IncidentSamples:
-        """One direction per lamp as samples of an estimator: the mean over K of f/pdf is the sum over the
-        lamps.
-        """
+        """One direction per lamp as an estimator's samples: the mean of f/pdf over K is the sum of lamps."""
         return IncidentSamples(self.wi, 1 / (self.wi.shape[1] * self.solid_angle))
 
 
@@ -70,8 +68,7 @@ class Lamps(nn.Module):
     ) -> None:
         """These lamps and no others, the first of them where they are too many.
 
-        `intensity` is power per solid angle, on the axis where there is one; no `axis`: alike in all
-        directions.
+        `intensity` is power per solid angle, on the axis where there is one; no `axis`: isotropic.
         """
         self.lit = min(len(position), len(self.position))
         self.position.zero_()[: self.lit] = position[: self.lit]
@@ -95,9 +92,7 @@ class Lamps(nn.Module):
     def met(
         self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"], before: Float[Tensor, "N S"]
     ) -> Float[Tensor, "N S 3"]:
-        """Radiance of the lamps that directions meet nearer than a distance; where they overlap, all of
-        them.
-        """
+        """Radiance of the lamps that directions meet nearer than a distance; overlapping lamps add."""
         total = torch.zeros_like(wi)
         towards = self.position[: self.lit] - x[:, None]
         for offset, axis, radiance in zip(
@@ -121,9 +116,7 @@ class Lamps(nn.Module):
 def rays_towards(
     x: Float[Tensor, "N 3"], position: Float[Tensor, "K 3"], axis: Float[Tensor, "K 3"], radius: float
 ) -> LampRays:
-    """Towards lamps at `position`; from within two radii of its middle, a lamp looks as from two radii
-    away.
-    """
+    """Towards lamps at `position`; within two radii of its middle, a lamp looks as from two radii away."""
     offset = position - x[:, None]
     distance = offset.square().sum(-1).clamp_min((2 * radius) ** 2).sqrt()
     wi = safe_normalize(offset)

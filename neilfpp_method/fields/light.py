@@ -19,12 +19,10 @@ __all__ = ["Light", "LightModel", "make_light"]
 
 FREE_BASE = {"linear": 10.0, "srgb": math.e}
 """Base of the exponential at the end of a free field, by what the pixels are (METHOD §5)."""
-MOST_LAMPS = 8
+MAX_LAMPS = 8
 """Lamps close by: more than photographs of one object tell apart."""
 LAMP_RADIUS = 0.06
-"""Of every lamp, scene units: a bulb beside an object of a metre. Only how sharp its reflections are depends
-on it.
-"""
+"""Of every lamp, scene units: a bulb beside a 1 m object. It decides how sharp its reflections are."""
 
 
 @runtime_checkable
@@ -42,9 +40,7 @@ class Light(Protocol):
 
 @dataclass(frozen=True)
 class LightModel:
-    """The light of a scene: `light` from far away or free at every point, and `lamps` close by, perhaps
-    none.
-    """
+    """The light of a scene: `light`, distant or free at every point, and near `lamps`, perhaps none."""
 
     light: nn.Module
     lamps: Lamps
@@ -56,5 +52,5 @@ def make_light(config: NeilfConfig, response: str, initial_radiance: float) -> L
     if isinstance(settings, FreeLightConfig):
         field = IncidentLightField(settings, config.encoding, FREE_BASE[response], initial_radiance)
         return LightModel(field, Lamps(0, LAMP_RADIUS))
-    lamps = Lamps(0 if settings.kind == "distant" else MOST_LAMPS, LAMP_RADIUS)
+    lamps = Lamps(0 if settings.kind == "distant" else MAX_LAMPS, LAMP_RADIUS)
     return LightModel(EnvironmentLight(settings.environment_height, initial_radiance), lamps)

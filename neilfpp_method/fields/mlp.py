@@ -166,8 +166,7 @@ class Mlp(nn.Module):
 
 @torch.no_grad()
 def geometric_init_(mlp: Mlp, radius: float, extent: float, encoded: float) -> None:
-    """Start a softplus network as the signed distance to a sphere: output 0 ≈ ‖x‖ − radius where ‖x‖ ≤
-    extent.
+    """Start a softplus network as the signed distance to a sphere: ≈ ‖x‖ − radius where ‖x‖ ≤ extent.
 
     The start of SAL (Atzmon & Lipman 2020, theorem 1) is exact for infinite width; at 64 units it is off by
     tens of per cent. So the output row is then corrected by the smallest change that fits the distance: a
@@ -198,9 +197,7 @@ def geometric_init_(mlp: Mlp, radius: float, extent: float, encoded: float) -> N
 
 
 def weight_normalise_(mlp: Mlp) -> None:
-    """Split every weight row into length and direction (Salimans & Kingma 2016); the function stays as it
-    is.
-    """
+    """Split every weight row into length and direction (Salimans & Kingma 2016); same function."""
     for layer in mlp.layers:
         parametrizations.weight_norm(layer)
 

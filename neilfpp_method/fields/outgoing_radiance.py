@@ -20,11 +20,9 @@ DIRECTION_OCTAVES, DIRECTION_BANDS = 4, 4
 
 
 class OutgoingRadianceField(nn.Module):
-    """A sigmoid times `scale`, the largest radiance it reaches; starts near the radiance `start`, at most at
-    scale/2.
+    """A sigmoid times `scale`, the largest radiance; starts near the radiance `start`, at most scale/2.
 
-    Positions may enter raw (`config.positions`) where there is a feature of G, which has seen their encoding
-    (NeILF++ §5).
+    Positions may enter raw (`config.positions`) beside a feature of G, which encodes them (NeILF++ §5).
     """
 
     def __init__(

@@ -16,9 +16,7 @@ from neilfpp_method.settings.types import FrequencyConfig, HashGridConfig, SdfCo
 __all__ = ["SdfField", "SdfSample"]
 
 FIRST_RADIUS = 0.6
-"""Of the sphere that the field starts as, scene units: within the unit sphere that holds the object, and most
-of it.
-"""
+"""Of the sphere that the field starts as, scene units: most of the unit sphere that holds the object."""
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from neilfpp_method.health.look import Look
 
 __all__ = [
     "Finding",
+    "Health",
     "Verdict",
     "few_light_points",
     "material_findings",
@@ -26,13 +27,9 @@ __all__ = [
 Verdict = Literal["sound", "doubtful", "failed"]
 
 MIN_OPAQUE = 0.05
-"""Share of the object's pixels that must show something; the host of an empty scene shows nothing
-anywhere.
-"""
+"""Share of the object's pixels that must show something; an empty scene shows nothing anywhere."""
 MIN_SHARP = 0.5
-"""Share of the opaque rays that must meet one surface; in fog the weight of a ray is spread, and few or none
-do.
-"""
+"""Share of opaque rays that must meet one surface; in fog a ray's weight spreads, and few do."""
 MAX_AT_BOUND = 0.5
 """Share of the surface that may have a base colour at a bound: a scene of black or white things has less."""
 MAX_EMPTY_STEPS = 50
@@ -72,6 +69,28 @@ def verdict_of(findings: Iterable[Finding]) -> Verdict:
     """The worst of all findings."""
     severe = [finding.severe for finding in findings]
     return "failed" if any(severe) else "doubtful" if severe else "sound"
+
+
+@dataclass(frozen=True)
+class Health:
+    """A verdict and what it rests on.
+
+    Attributes:
+        verdict: the worst of all findings.
+        findings: what is wrong, a case each; none where the verdict is "sound".
+    """
+
+    verdict: Verdict
+    findings: tuple[Finding, ...]
+
+    @staticmethod
+    def of(findings: Iterable[Finding]) -> Health:
+        """The health that findings come to."""
+        found = tuple(findings)
+        return Health(verdict_of(found), found)
+
+    def __str__(self) -> str:
+        return self.verdict + (": " + "; ".join(f.what for f in self.findings) if self.findings else "")
 
 
 def surface_findings(seen: Look, step: int) -> list[Finding]:

@@ -1,6 +1,4 @@
-"""What a model shows of some training pixels: does a surface stand there, and is its material more than its
-bounds?
-"""
+"""What a model shows at some training pixels: is there a surface, and is its material within bounds?"""
 
 from __future__ import annotations
 
@@ -9,9 +7,9 @@ from dataclasses import dataclass
 import torch
 
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.structures import Material, PixelBatch
+from neilfpp_method.structures import Material, PixelBatch, SurfaceHits
 
-__all__ = ["Look", "look"]
+__all__ = ["Look", "look", "look_at_hits"]
 
 OPAQUE = 0.5
 """Opacity above which a ray shows something."""
@@ -48,13 +46,21 @@ def look(model: NeilfModel, pixels: PixelBatch, with_material: bool) -> Look:
     """
     mode = model.training
     model.eval()
-    hits = model.host.render(pixels[torch.nonzero(pixels.mask > 0.5)[:, 0]].rays)
+    seen = look_at_hits(
+        model, model.host.render(pixels[torch.nonzero(pixels.mask > 0.5)[:, 0]].rays), with_material
+    )
+    model.train(mode)
+    return seen
+
+
+@torch.no_grad()
+def look_at_hits(model: NeilfModel, hits: SurfaceHits, with_material: bool) -> Look:
+    """As `look`, of pixels on the object that the host has rendered already."""
     opaque = hits.opacity > OPAQUE
     sharp = opaque & hits.is_hit(model.config.shading.hit_share)
     at_bound = None
     if with_material and sharp.any():
         at_bound = _share_at_bound(model.materials(hits.position[sharp]))
-    model.train(mode)
     return Look(len(hits), _share(opaque), _share(sharp[opaque]), at_bound)
 
 

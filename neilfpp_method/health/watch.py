@@ -16,7 +16,7 @@ from neilfpp_method.health.cases import (
     surface_findings,
     verdict_of,
 )
-from neilfpp_method.health.look import look
+from neilfpp_method.health.look import Look, look
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import StagePlan
 from neilfpp_method.structures import PixelBatch, StepResult
@@ -34,11 +34,11 @@ class Watch:
     """The findings of a training so far, by case; what a later look finds mended is dropped.
 
     Attributes:
-        pixels: of training views, on the device of the model.
+        pixels: of training views, on the device of the model; none where looks are handed in (`judge`).
         warn: says a line to the person.
     """
 
-    pixels: PixelBatch
+    pixels: PixelBatch | None
     warn: Callable[[str], None]
     findings: dict[str, Finding] = field(default_factory=dict)
     empty_steps: int = 0
@@ -56,7 +56,10 @@ class Watch:
 
     def after_stage(self, model: NeilfModel, plan: StagePlan, skipped: int, step: int) -> None:
         """A look at the surface, and at its material where there is one."""
-        seen = look(model, self.pixels, plan.moves_material)
+        self.judge(look(model, self.pixels, plan.moves_material), skipped, step)
+
+    def judge(self, seen: Look, skipped: int, step: int) -> None:
+        """What a look says, and so many skipped steps."""
         self._replace(("no_surface", "fog"), surface_findings(seen, step))
         self._replace(("material_at_bounds",), material_findings(seen, step))
         self._replace(("skipped_steps",), skipped_steps(skipped, step))

@@ -6,13 +6,13 @@
 | a dictionary              | by the host's own `read_outputs`, or by the names below |
 | (color, position, normal) | as the answer of a function: a zero normal is a miss    |
 
-| of a dictionary | names                                                                                      |
-|-----------------|--------------------------------------------------------------------------------------------|
-| color           | `color`, `rgb`: linear radiance                                                            |
-| position        | `position`; or `depth`, a distance along the unit ray                                      |
-| normal          | `normal`, `normals`: vectors of any length                                                 |
-| opacity         | `opacity`, `accumulation`, `alpha`, (N,) or (N, 1); without one, 1 where there is a normal |
-| concentration   | `concentration`; without one, the opacity                                                  |
+| of a dictionary | names                                                                              |
+|-----------------|------------------------------------------------------------------------------------|
+| color           | `color`, `rgb`: linear radiance                                                    |
+| position        | `position`; or `depth`, a distance along the unit ray                              |
+| normal          | `normal`, `normals`: vectors of any length                                         |
+| opacity         | `opacity`, `accumulation`, `alpha`, (N,) or (N, 1); else 1 where there is a normal |
+| concentration   | `concentration`; else the opacity                                                  |
 """
 
 from __future__ import annotations

@@ -20,6 +20,7 @@ from neilfpp_method.structures import LossTerms, PixelBatch, RayBatch, SceneLigh
 
 __all__ = [
     "HasParameterGroups",
+    "HasSdf",
     "HasStages",
     "HasSurfaceWidth",
     "Host",
@@ -41,9 +42,7 @@ class Host(Protocol):
     """
 
     def render(self, rays: RayBatch) -> SurfaceHits:
-        """Colour, hit position and normal of each ray, differentiable with respect to the host's
-        parameters.
-        """
+        """Colour, hit position and normal of each ray, differentiable in the host's parameters."""
         ...
 
 
@@ -55,9 +54,7 @@ class ImageHost(Protocol):
     """
 
     def render_image(self, camera: Camera) -> SurfaceHits:
-        """What the camera sees in the scene frame, a row per pixel, row by row; `hosts.image.image_hits`
-        makes it from maps.
-        """
+        """What the camera sees, scene frame, a row per pixel; `hosts.image.image_hits` makes it."""
         ...
 
 
@@ -74,22 +71,16 @@ class Regularised(Protocol):
     """A host with losses of its own. Without: L_vol alone moves the geometry."""
 
     def render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
-        """As `render`, and those of the named losses that the host has. A loss that is not named is not
-        computed.
-        """
+        """As `render`, and the named losses that the host has; losses not named are not computed."""
         ...
 
 
 @runtime_checkable
 class LightsItself(Protocol):
-    """A host that traces many rays cheaply. Without: hard inter-reflection renders every ray, at the price of
-    rendering.
-    """
+    """A host that traces many rays cheaply. Without: hard inter-reflection renders every ray, slowly."""
 
     def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
-        """What arrives at surface points x from the scene's own surfaces in the directions wi; constants, no
-        gradient.
-        """
+        """What arrives at surface points x from the scene's own surfaces along wi; no gradient."""
         ...
 
 
@@ -115,9 +106,7 @@ class KnowsRadiance(Protocol):
 
 @runtime_checkable
 class ReadsOutputs(Protocol):
-    """A host whose renderer returns a dictionary of its own. Without: the names of `hosts.answers` are looked
-    for.
-    """
+    """A host whose renderer returns its own dictionary. Without: the names of `hosts.answers` apply."""
 
     def read_outputs(self, rays: RayBatch, outputs: Mapping[str, Tensor]) -> SurfaceHits:
         """The hits of the rays, from what the host's renderer returned for them."""
@@ -126,9 +115,7 @@ class ReadsOutputs(Protocol):
 
 @runtime_checkable
 class HasSurfaceWidth(Protocol):
-    """A host whose surface is a soft layer. Without: rays for L_ref start at a fixed distance from the
-    surface.
-    """
+    """A host whose surface is a soft layer. Without: rays for L_ref start at a fixed distance from it."""
 
     def surface_width(self) -> Float[Tensor, ""]:
         """Scale of the layer, scene units (VolSDF's β)."""
@@ -137,9 +124,7 @@ class HasSurfaceWidth(Protocol):
 
 @runtime_checkable
 class SmoothsNormals(Protocol):
-    """A host whose normals are wavy, and which knows better ones. Without: surfaces are shaded with the
-    normals of the hits.
-    """
+    """A host with wavy normals that knows better ones. Without: surfaces are shaded with hit normals."""
 
     def smooth_normals(
         self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
@@ -154,6 +139,15 @@ class HasParameterGroups(Protocol):
 
     def parameter_groups(self) -> Mapping[str, list[Parameter]]:
         """Parameters by field: geometry, beta, radiance, background."""
+        ...
+
+
+@runtime_checkable
+class HasSdf(Protocol):
+    """A host whose surface is the zero set of a distance field. Without: there is no mesh to export."""
+
+    def sdf(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
+        """Signed distance at points of the scene frame, negative inside."""
         ...
 
 

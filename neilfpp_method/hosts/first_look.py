@@ -1,5 +1,4 @@
-"""What goes wrong when a host meets the method for the first time, looked for in the first batches and said
-once.
+"""What goes wrong when a host first meets the method: looked for in the first batches, said once.
 
 An error where nothing right can come of it; a warning where it may be meant.
 """
@@ -24,12 +23,10 @@ UNIT = 1e-3
 """Most that the length of a direction may differ from 1."""
 OFF_RAY = 0.02
 """How far a hit may lie beside its ray, in shares of its distance."""
-MOST_OFF = 0.5
+MAX_OFF = 0.5
 """Share of hits that may be off their rays or turned away: blended hits at edges are, a few."""
 REACH = 1.5
-"""Where positions are far outside the unit sphere, scene units: a little room for what an object stands
-on.
-"""
+"""Distance from the centre at which positions are outside the scene, scene units; a ground has room."""
 SIZES = 30.0
 """Factor between the median of the pixels and `median_radiance` that no exposure explains."""
 
@@ -112,8 +109,7 @@ class FirstLook:
                 "no hit",
                 f"none of {len(batch)} rays meets a surface, so nothing is learned of them",
                 "is the frame of the rays the host's, the object in the unit sphere? A hit has a "
-                "concentration of "
-                f"{self.hit_share} or more (of a function: a normal)",
+                f"concentration of {self.hit_share} or more (of a function: a normal)",
             )
 
     def _look_at_colors(self, color: Tensor) -> None:
@@ -145,14 +141,14 @@ class FirstLook:
         depth = (offset * directions).sum(-1)
         beside = (offset - depth[:, None] * directions).norm(dim=-1)
         off = ((beside > OFF_RAY * offset.norm(dim=-1)) | (depth <= 0)).float().mean().item()
-        if off > MOST_OFF:
+        if off > MAX_OFF:
             raise UserError(
                 f"{self.name}: {off:.0%} of its hits do not lie on their rays",
                 "return positions in the frame of the rays, origin + distance · direction, with unit "
                 "directions",
             )
         away = ((hits.normal[hit] * directions).sum(-1) > 0).float().mean().item()
-        if away > MOST_OFF:
+        if away > MAX_OFF:
             raise UserError(
                 f"{self.name}: {away:.0%} of its normals point away from the viewer",
                 "turn them outwards: normal = -normal",

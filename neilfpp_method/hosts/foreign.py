@@ -15,13 +15,15 @@ from torch import Tensor, nn
 from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.answers import as_hits, in_precision, no_hits
-from neilfpp_method.hosts.base import ImageHost, RegularisedHits
+from neilfpp_method.hosts.base import ImageHost, KnowsRadiance, LightsItself, RegularisedHits
 from neilfpp_method.hosts.image import rays_like
 from neilfpp_method.hosts.outputs import check_tensors, host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import PixelBatch, RayBatch, SurfaceHits
+from neilfpp_method.volume.distance_grid import GRID_RESOLUTION
 
-__all__ = ["ForeignHost", "answers_secondary_rays"]
+__all__ = ["ForeignHost", "answers_secondary_rays", "proxy_for"]
 
 PASSED_ON = (
     "may_meet",
@@ -39,10 +41,20 @@ log = logging.getLogger(__name__)
 
 
 def answers_secondary_rays(host: object) -> bool:
-    """Whether a host renders rays that leave a surface: not one that draws whole images, nor one that says
-    no.
-    """
+    """Whether a host renders rays that leave a surface; not if it draws whole images, or declares no."""
     return hasattr(host, "render") and bool(getattr(host, "answers_secondary_rays", True))
+
+
+def proxy_for(host: object, config: NeilfConfig) -> SurfaceProxy | None:
+    """What traces rays between surfaces for a host that does not, or not cheaply, where the settings ask for
+    them; none: nobody needs to.
+    """
+    settings = config.inter_reflection
+    asked = settings.mode != "off" and not answers_secondary_rays(host)
+    if isinstance(host, LightsItself) or not (asked or settings.mode == "hard"):
+        return None
+    radiance = host.radiance if isinstance(host, KnowsRadiance) else None
+    return SurfaceProxy(config.volume.radius, GRID_RESOLUTION, config.shading.hit_share, radiance)
 
 
 class ForeignHost(nn.Module):
@@ -119,6 +131,14 @@ class ForeignHost(nn.Module):
             UserError: it cannot be read.
         """
         return self._precise(rays, as_hits(self.inner, rays, rendered))
+
+    def show_proxy(self, rays: RayBatch, hits: SurfaceHits) -> None:
+        """Let the proxy learn from a training step's camera rays; before the first it looks around."""
+        if self.proxy is None or len(rays) == 0:
+            return
+        if self.proxy.steps == 0 and answers_secondary_rays(self.inner):
+            self.proxy.look_around(self.render, rays, hits)
+        self.proxy.observe(rays, hits)
 
     def _render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
         if len(batch) == 0:

@@ -19,9 +19,7 @@ from neilfpp_method.structures import RayBatch, SurfaceHits
 __all__ = ["depth_normals", "image_hits", "rays_like"]
 
 JUMP = 0.1
-"""Neighbouring pixels whose distances from the eye differ by more than this share of it are on two
-surfaces.
-"""
+"""Neighbouring pixels whose distances differ by more than this share of them are on two surfaces."""
 SOLID = 0.5
 """Least opacity of a pixel that has a surface."""
 
@@ -99,9 +97,7 @@ def depth_normals(position: Float[Tensor, "H W 3"], eye: Float[Tensor, " 3"]) ->
 def _nearer_step(
     position: Float[Tensor, "H W 3"], distance: Float[Tensor, "H W"], axis: int
 ) -> tuple[Tensor, Tensor]:
-    """The step to the neighbour along an axis whose depth differs least, and whether that is on the same
-    surface.
-    """
+    """The step along an axis to the neighbour of nearest depth, and whether it is on the same surface."""
     forward, backward = (position.roll(-1, axis) - position), (position - position.roll(1, axis))
     rise = (distance.roll(-1, axis) - distance).abs()
     edge = torch.arange(position.shape[axis], device=position.device).view(-1, *([1] * (1 - axis)))

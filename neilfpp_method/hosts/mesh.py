@@ -36,9 +36,7 @@ RADIANCE_AT_ONCE = 2**16
 
 @dataclass(frozen=True)
 class Crossings:
-    """The rays that meet the mesh: their rows, where they meet it, its normal there, and whether on its
-    outside.
-    """
+    """The rays that meet the mesh: their rows, hit positions, normals, and whether on its outside."""
 
     rows: Int[Tensor, " K"]
     position: Float[Tensor, "K 3"]
@@ -49,8 +47,7 @@ class Crossings:
 class MeshHost(nn.Module):
     """A mesh and R on it. Positions and normals are constants; the colour moves R.
 
-    Faces are wound outwards: their inside stops a ray, but is no surface point. Geometry is no part of the
-    weights.
+    Faces are wound outwards: their inside stops a ray, but is no surface point. Weights hold no geometry.
 
     Args:
         mesh: triangles in the scene frame.
@@ -130,9 +127,7 @@ class MeshHost(nn.Module):
     def smooth_normals(
         self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
-        """For meshes that are noisy, the normals of `volume.normal_radius` about hits, edges kept; at 0 those
-        of the hits.
-        """
+        """For noisy meshes, normals of `volume.normal_radius` about hits, edges kept; 0: the hits' own."""
         if self.normal_radius == 0:
             return normal
         up = normal.repeat_interleave(NEIGHBOURS, 0)
@@ -162,8 +157,7 @@ class MeshHost(nn.Module):
         smooth = safe_normalize(
             (meeting.weights[..., None] * self.corner_normals[numbers].to(origins.dtype)).sum(1)
         )
-        # Seen along the surface, the interpolated normal can point away from the viewer; the triangle's does
-        # not.
+        # At grazing angles the interpolated normal can point away from the viewer; the triangle's cannot.
         faces_viewer = (smooth * directions).sum(-1, keepdim=True) < 0.0
         return Crossings(
             rows=rows,

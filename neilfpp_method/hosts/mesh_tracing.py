@@ -68,8 +68,7 @@ class Boxes:
 
 @dataclass(frozen=True)
 class BoxTree:
-    """Triangles along a space-filling curve, and boxes around every 8, 64, 512, … neighbours on it, the root
-    first.
+    """Triangles along a space-filling curve, and boxes around every 8, 64, 512, … of them, the root first.
 
     Node i of a level holds the nodes 8 i … 8 i + 7 of the next one, and of the last level the triangles.
     Levels are filled up to eights with boxes that are inside out, and the triangles with ones that are not
@@ -127,8 +126,7 @@ def _descend(
     inside = (meeting.weights >= -SLACK).all(-1) & (meeting.distance > 0.0)
     distance = torch.where(inside, meeting.distance, torch.inf)
     nearest = distance.new_full((count,), torch.inf).scatter_reduce(0, rays, distance, "amin")
-    # Of triangles that a ray meets at the same distance, the one that comes last in the mesh: the same in
-    # every run.
+    # Of triangles at the same distance along a ray, the last in the mesh: the same in every run.
     winner = torch.where(inside & (distance == nearest[rays]), tree.numbers[nodes], -1)
     return torch.full_like(nearest, -1, dtype=torch.int64).scatter_reduce(0, rays, winner, "amax")
 
@@ -139,9 +137,7 @@ def _meets_box(
     low: Float[Tensor, "K 3"],
     high: Float[Tensor, "K 3"],
 ) -> Bool[Tensor, " K"]:
-    """Whether rays pass through boxes. The direction chooses the sides, so that a box that is inside out is
-    never met.
-    """
+    """Whether rays pass through boxes. The direction chooses the sides, so an inverted box is never met."""
     forward = inverse > 0.0
     enter = ((torch.where(forward, low, high) - origins) * inverse).amax(-1)
     leave = ((torch.where(forward, high, low) - origins) * inverse).amin(-1)

@@ -1,5 +1,4 @@
-"""Any ray-based nerfstudio `Model` as a host: NeuS, nerfacto with normals, or one of your own. The model is
-not touched.
+"""Any ray-based nerfstudio `Model` as a host, unchanged: NeuS, nerfacto with normals, or your own.
 
 | of the host | output of the model, the first that it has                                       |
 |-------------|----------------------------------------------------------------------------------|
@@ -36,8 +35,7 @@ OWN_LOSSES = "own"
 DEPTHS = ("expected_depth", "depth")
 NORMALS = ("normal", "pred_normals", "normals")
 COLOR_CODED = ("pred_normals", "normals")
-# Cone-casting samplers read a pixel's area at distance 1; traced rays have none. That of a pixel of a
-# 1000-pixel view.
+# Cone-casting samplers read a pixel's area at distance 1; traced rays get that of a 1000-pixel view.
 PIXEL_AREA = 1e-6
 SAME_FRAME = Normalisation(1.0, (0.0, 0.0, 0.0))
 
@@ -76,8 +74,7 @@ class NerfstudioHost(nn.Module):
         self.radiance_scale = radiance_scale
         self.frame = frame
         self.own_losses = own_losses
-        # Told now: a stage that freezes the host lets its parameters move again, and a model has some that
-        # never do.
+        # Noted now: a stage that freezes the host unfreezes it later, and some parameters never move.
         self._moving = [p for group in model.get_param_groups().values() for p in group if p.requires_grad]
 
     # -------------------------------------------------------------------------------------- the host contract

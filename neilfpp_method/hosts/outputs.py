@@ -94,8 +94,7 @@ def check_normals(name: str, hits: SurfaceHits, hit_share: float) -> bool:
             "divide by the length with a floor under it, and return zeros where a ray meets nothing",
         )
     length = normal[hits.is_hit(hit_share)].norm(dim=-1)
-    # Where a ray meets both faces of a thin sheet, their blended normals may cancel: a zero is excused,
-    # unless most are.
+    # Where a ray meets both faces of a thin sheet, normals may cancel: zeros are excused unless most are.
     off = (length - 1.0).abs()
     wrong = off.where(length > 0.0, off.median()) if len(length) else off
     if len(length) and wrong.max() > UNIT:

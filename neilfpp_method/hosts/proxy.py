@@ -1,5 +1,4 @@
-"""A traceable stand-in for the surface of a host that cannot trace cheaply, gathered from the rays of
-training.
+"""A traceable stand-in for the surface of a host without cheap tracing, built from training rays.
 
 Hits of camera rays are oriented points; the newest of them are fused into a grid of distances
 (`volume.fusion`) with the mean of the radiance that was seen there. Rays that leave a surface are
@@ -13,8 +12,9 @@ that they pass through. A host that moves is followed in that way, a few dozen s
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -33,19 +33,13 @@ POINTS = 32_768
 EVERY = 64
 """Steps between two refreshes, once there have been as many; before that at steps 1, 2, 4, 8, …"""
 ROUNDS, ROUND = 16, 512
-"""A look around before the first step, and its rays: from the cameras of the first batch to where its hits
-are.
-"""
+"""Batches of rays rendered before the first step, from the first cameras towards their hits."""
 SPREAD = 0.2
 """How far about a hit the look around aims, scene units: beside it is more of the surface."""
 START = 0.75
-"""Height above the grid's surface at which rays leave it, in cells: the tracing ends at a quarter of a
-cell.
-"""
+"""Height above the grid's surface at which rays leave it, in cells; tracing ends at a quarter cell."""
 APART = 2.0
-"""A ray that goes this much further than the grid lets it, in cells, passes through points that are no longer
-true.
-"""
+"""A ray that goes this much further than the grid allows, in cells, passes through outdated points."""
 CLEAR = 0.01
 """Largest opacity of a ray that meets nothing."""
 GRAZING = 0.2
@@ -93,8 +87,7 @@ class Looks:
 
 
 class SurfaceProxy(nn.Module):
-    """The newest points of a surface, and the grid that they make. The points are part of a checkpoint, the
-    grid follows.
+    """The newest points of a surface, and the grid made of them. A checkpoint holds the points alone.
 
     Args:
         radius: half the edge of the cube that holds the scene, scene units.
@@ -129,9 +122,7 @@ class SurfaceProxy(nn.Module):
 
     @torch.no_grad()
     def observe(self, rays: RayBatch, hits: SurfaceHits) -> None:
-        """One training step's camera rays, and what the host says of them. Refreshes the grid when it is
-        time.
-        """
+        """A training step's camera rays and hits. Refreshes the grid when it is time."""
         self.steps += 1
         self._pending.append((rays.to(rays.origins.device), hits.detach()))
         if self.steps % EVERY == 0 or (self.steps < EVERY and self.steps & (self.steps - 1) == 0):
@@ -141,9 +132,7 @@ class SurfaceProxy(nn.Module):
     def look_around(
         self, render: Callable[[RayBatch], SurfaceHits], rays: RayBatch, hits: SurfaceHits
     ) -> None:
-        """Before the first step, see enough of the surface to trace: from where the first rays start, to
-        about their hits.
-        """
+        """Before the first step, see enough of the surface to trace: from the first rays to their hits."""
         known = hits.position[hits.is_hit(self.hit_share)].detach()
         for _ in range(ROUNDS if len(known) else 0):
             origins = rays.origins[torch.randint(len(rays), (ROUND,), device=known.device)]
@@ -168,7 +157,7 @@ class SurfaceProxy(nn.Module):
         ]
         points, distance, hit, clear = joined
         self._pending.clear()
-        if self._surface is not None:
+        if self._known_surface() is not None:
             told = torch.nonzero(hit | clear)[:, 0]
             self._measure(Looks(rays[told], distance[told]))
         stamp = torch.full_like(points[:, :1], float(self.steps))
@@ -222,8 +211,7 @@ class SurfaceProxy(nn.Module):
 
     @torch.no_grad()
     def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
-        """What the scene sends to surface points (`hosts.base.LightsItself`); nothing, before anything was
-        seen.
+        """What the scene sends to surface points (`hosts.base.LightsItself`); nothing while nothing was seen.
 
         Rays start above the grid's own surface, so that its error shadows nothing.
         """
@@ -308,11 +296,25 @@ class SurfaceProxy(nn.Module):
 
     # -------------------------------------------------------------------------------------------- checkpoints
 
-    def get_extra_state(self) -> dict[str, int]:
-        """Steps that were observed."""
-        return {"steps": self.steps}
+    def get_extra_state(self) -> dict[str, Any]:
+        """Steps that were observed, and the rays that came since the last refresh."""
+        pending = [{**_tensors(rays), **_tensors(hits)} for rays, hits in self._pending]
+        return {"steps": self.steps, "pending": pending}
 
-    def set_extra_state(self, state: dict[str, int]) -> None:
+    def set_extra_state(self, state: dict[str, Any]) -> None:
         """The inverse of `get_extra_state`; the grid is made of the points again when it is asked."""
         self.steps, self._surface, self._report = state["steps"], None, None
-        self._pending.clear()
+        self._pending = [
+            (_made(RayBatch, tensors), _made(SurfaceHits, tensors)) for tensors in state["pending"]
+        ]
+
+
+Part = TypeVar("Part", RayBatch, SurfaceHits)
+
+
+def _tensors(part: RayBatch | SurfaceHits) -> dict[str, Tensor]:
+    return {f.name: getattr(part, f.name) for f in fields(part)}
+
+
+def _made(kind: type[Part], tensors: Mapping[str, Tensor]) -> Part:
+    return kind(**{f.name: tensors[f.name] for f in fields(kind)})

@@ -40,9 +40,7 @@ FAR = 100.0
 
 @dataclass(frozen=True)
 class HostReport:
-    """A host that kept the contract: how many rays hit, what was checked, and whether its geometry is
-    trained.
-    """
+    """A host that kept the contract: how many rays hit, what was checked, and whether geometry is trained."""
 
     host: str
     hits: int

@@ -1,6 +1,4 @@
-"""Checks of the contract suite on how a host behaves: the same for every batch, and leaving alone what is not
-its own.
-"""
+"""Checks of how a host behaves: the same for every batch, and leaving alone what is not its own."""
 
 from __future__ import annotations
 

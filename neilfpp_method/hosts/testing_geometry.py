@@ -1,7 +1,6 @@
 """Checks of the contract suite that look at a surface twice: from elsewhere, from close by, and beside.
 
-A surface stays where it is, whoever looks. That tells a depth that is none, a normal that is none, and rays
-that do not arrive.
+A surface stays where it is for every viewer. That exposes wrong depths, wrong normals and lost rays.
 """
 
 from __future__ import annotations
@@ -16,13 +15,9 @@ from neilfpp_method.structures import RayBatch
 __all__ = ["GEOMETRY_CHECKS"]
 
 APART = 0.01
-"""How far the hits of two views of one place may lie apart, scene units; a soft layer adds twice its
-width.
-"""
+"""Largest distance of the hits of two views of one place, scene units, plus twice a layer's width."""
 AGREE = 0.6
-"""Least share of places that look the same from elsewhere. Others may be hidden from there, or lie on a
-silhouette.
-"""
+"""Least share of places that look the same from elsewhere. Others may be hidden or on a silhouette."""
 NEAR = 0.05
 """Distance from which light between surfaces may see a place, scene units."""
 ASIDE = 0.6

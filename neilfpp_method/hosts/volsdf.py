@@ -34,9 +34,7 @@ POINTS_ABOUT_OBJECT = 2
 and 4096 in the published code.
 """
 HIT_RADIUS = 0.05
-"""Scene units: the blending weight within this distance of the blended hit is its concentration (METHOD
-§2).
-"""
+"""Scene units: the blending weight this near to the blended hit is its concentration (METHOD §2)."""
 SURFACE_WIDTH = {"scene": 10.0, "rays": 0.05}
 """Scene units, by `loss.points`: width of the smoothed delta of L_surf. The former is the published one."""
 GRID_LIFE = 100
@@ -110,8 +108,7 @@ class VolSdfHost(nn.Module):
         # Kept in checkpoints, with its age: a resumed run must trace the very same grid.
         self.register_buffer("distance_grid", torch.zeros(resolution, resolution, resolution))
         self.grid_age: int | None = None
-        # Of pictures, not of training, so no part of a checkpoint: the versions of G's parameters, and their
-        # grid.
+        # For pictures only, so in no checkpoint: the versions of G's parameters, and their grid.
         self._pictured: tuple[list[tuple[int, int]], EmptySpace] | None = None
 
     # -------------------------------------------------------------------------------------- the host contract
@@ -155,8 +152,7 @@ class VolSdfHost(nn.Module):
 
     @torch.no_grad()
     def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
-        """What arrives at surface points from the scene: rays are traced on a grid of the SDF, and read R
-        where they hit.
+        """What arrives at surface points from the scene: rays are traced on a grid of the SDF and read R.
 
         A ray starts one cell of the grid above the surface, along the normal. The grid is sampled when first
         asked for, and again after `GRID_LIFE` steps in which the geometry moved.
@@ -181,9 +177,7 @@ class VolSdfHost(nn.Module):
     def smooth_normals(
         self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
-        """The normals of `volume.normal_radius` about hits, edges kept; where that is 0, those of the
-        hits.
-        """
+        """The normals of `volume.normal_radius` about hits, edges kept; at 0, those of the hits."""
         radius = self.config.volume.normal_radius
         return (
             smooth_normals(lambda x: self._surface(x).gradient, position, normal, radius)
@@ -193,9 +187,7 @@ class VolSdfHost(nn.Module):
 
     @torch.no_grad()
     def may_meet(self, rays: RayBatch) -> Bool[Tensor, " N"]:
-        """Which rays that leave a surface may meet one, as the grid of empty space has it; all, where there
-        is none.
-        """
+        """Which rays that leave a surface may meet one, by the grid of empty space; all without one."""
         if self.empty_space is None:
             return torch.ones(len(rays), dtype=torch.bool, device=rays.origins.device)
         interval = sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
@@ -322,8 +314,7 @@ class VolSdfHost(nn.Module):
     def _beyond(
         self, rays: RayBatch, transmittance: Float[Tensor, " N"], at_far: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
-        """What still arrives from the scene sphere: from beyond it, or where there is no background from R on
-        the sphere.
+        """What arrives from the scene sphere: from the background, or without one from R on the sphere.
 
         The published code makes the sphere a surface of the distance field that nothing passes; a ray that
         reaches it shows R there, `at_far`. It is no surface of the object: opacity and hit leave it out.

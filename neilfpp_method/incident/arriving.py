@@ -1,6 +1,4 @@
-"""What arrives along incident directions: the light, the scene where it stands before the light, and the
-lamps.
-"""
+"""What arrives along incident directions: the light, the scene that stands before it, and the lamps."""
 
 from __future__ import annotations
 
@@ -85,9 +83,7 @@ def _from_lamps(sources: Sources, x: Float[Tensor, "N 3"]) -> Incident:
 def _behind_scene(
     scene: SceneLight, light: Light, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]
 ) -> Float[Tensor, "N S 3"]:
-    """The scene's radiance where a direction meets it, elsewhere that of the light, which is asked there
-    alone.
-    """
+    """The scene's radiance where a direction meets it, elsewhere the light's, which is asked only there."""
     point, direction = torch.nonzero(~scene.hit, as_tuple=True)
     beyond = light.radiance(x[point], wi[point, direction][:, None])[:, 0]
     return scene.radiance.index_put((point, direction), beyond)

@@ -13,9 +13,7 @@ from neilfpp_method.structures import IncidentSamples
 __all__ = ["directions_for_viewers", "draw_directions"]
 
 BY_COSINE, BY_LIGHT, BY_LOBE = 24, 24, 3
-"""Incident directions of `directions_for_viewers`: by the cosine, towards the light, and by the lobe of each
-viewer.
-"""
+"""Incident directions of `directions_for_viewers`: by cosine, by the light, and by each viewer's lobe."""
 
 WITHOUT_LOBE = {"mis": "cosine", "lobe": "cosine"}
 """A Lambertian surface has no lobe to sample: the cosine then leaves no variance but that of the light."""
@@ -55,8 +53,7 @@ def directions_for_viewers(
 ) -> IncidentSamples:
     """Incident directions that serve all V viewers of a point together, the same at every call.
 
-    Cosine, light and the lobe of every viewer are joined by the balance heuristic. Arguments as of
-    `draw_directions`.
+    Cosine, light and all viewers' lobes, by the balance heuristic. Arguments as of `draw_directions`.
     """
     techniques = [(cosine(normal), BY_COSINE)]
     towards_light = light.technique(normal)

@@ -68,9 +68,7 @@ def scene_light(
 def off_surface(
     host: Host, x: Float[Tensor, "K 3"], normal: Float[Tensor, "K 3"], w: Float[Tensor, "K 3"], offset: float
 ) -> Float[Tensor, "K 3"]:
-    """Points along w above the soft layer that a host's surface is, at a height of `offset` and four widths
-    of it.
-    """
+    """Points along w above the soft layer of a host's surface, at `offset` plus four of its widths."""
     width = host.surface_width() if isinstance(host, HasSurfaceWidth) else 0.0
     cosine = (w * normal).sum(-1, keepdim=True).clamp_min(MIN_COSINE)
     return x + ((offset + HEIGHT_IN_WIDTHS * width) / cosine) * w

@@ -20,7 +20,7 @@ __all__ = ["TracedLight", "trace_light"]
 
 MAX_ANGLE_DEG = 80.0
 """From the normal: a flatter ray stays within the soft layer of its own surface, and brings little light."""
-FARTHEST_START = 0.2
+MAX_START = 0.2
 """Distance from its point, scene units, beyond which no ray starts (published code). Further out it could
 start behind a neighbouring surface, and nearer than its angle asks for it would meet the layer that it
 leaves: it is left out.
@@ -29,8 +29,7 @@ leaves: it is left out.
 
 @dataclass(frozen=True)
 class TracedLight:
-    """Rays that left the surface: where from, which way, the radiance that arrives along them, and which ones
-    hit.
+    """Rays that left the surface: origin, direction, the radiance that arrives, and which ones hit.
 
     Rays that start too far away, or of which the host knows at once that they meet nothing, are left out.
     """
@@ -52,7 +51,7 @@ def trace_light(
 
     Directions are uniform in solid angle within `MAX_ANGLE_DEG` of the normal. A ray starts off the surface:
     at a height of `config.offset` and four widths of the host's surface, so the displacement along the ray
-    grows as 1/cos. A ray that would have to start further than `FARTHEST_START` from its point is left out.
+    grows as 1/cos. A ray that would have to start further than `MAX_START` from its point is left out.
     Positions are constants: L_ref says what arrives at a point, not where the point is.
 
     Args:
@@ -68,7 +67,7 @@ def trace_light(
     position, normal = position[rows], normal[rows]
     wi = _cone_directions(normal, math.cos(math.radians(MAX_ANGLE_DEG)))
     start = off_surface(host, position, normal, wi, config.offset)
-    worth = (start - position).norm(dim=-1) <= FARTHEST_START
+    worth = (start - position).norm(dim=-1) <= MAX_START
     if isinstance(host, KnowsMisses):
         worth &= host.may_meet(RayBatch(start, wi))
     kept = torch.nonzero(worth)[:, 0]

@@ -1,3 +1,1 @@
-"""What is in a capture, and what is wrong with it: figures of each view, of views together, findings and a
-verdict.
-"""
+"""What is in a capture, and what is wrong with it: figures of views, findings and a verdict."""

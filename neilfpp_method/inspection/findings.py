@@ -1,6 +1,4 @@
-"""What is wrong with a capture: the figures held against limits, each finding with its remedy, and a
-verdict.
-"""
+"""What is wrong with a capture: figures held against limits, findings with remedies, a verdict."""
 
 from __future__ import annotations
 
@@ -22,24 +20,35 @@ Severity = Literal["problem", "warning"]
 Quality = Literal["good", "limited", "poor"]
 
 JUMP = 1.5
+"""Brightness of a view over that of its neighbours, or its inverse, that counts as a jump."""
 BLURRED = 0.4
+"""Sharpness over the usual one, below which a view is blurred."""
 CLIPPED_VIEW, CLIPPED_A_BIT, CLIPPED_MUCH = 0.01, 0.001, 0.02
+"""Clipped share of a view, and of all views, that is worth a note or a warning."""
 INVALID_VIEW = 0.5
-MIN_COUNT, FEW_COUNT = 3, 16
+"""Share of invalid pixels from which a view is reported."""
+MIN_COUNT, ADVISED_COUNT = 3, 16
+"""Fewer views than the first are a problem, fewer than the second a warning."""
 SPARSE_GAP = 25.0
+"""Median angle to the nearest view, degrees, above which views are sparse."""
 MIN_COVERAGE = 0.25
+"""Share of the directions around the object that views should cover."""
 EDGE, STRAY_POINTS, SMALL_CLOUD = 1.05, 0.1, 0.2
-FEW_LEVELS = 256
-ENOUGH = 16
-"""Pixels a level, that their number means something."""
+"""Scene units beyond which a point is outside the box; share of points outside that is
+reported; extent below which an object is small.
+"""
+DISPLAY_LEVELS = 256
+"""Levels of 8 bits: radiance of no more levels was not recorded as such."""
+PIXELS_PER_LEVEL = 16
+"""Pixels needed per level for their number to mean anything."""
 BETTER_WITHOUT: Mapping[str, str] = {
     "black": "black",
     "blurred": "blurred",
     "duplicate": "the same picture as another",
 }
 """Findings whose views a capture is better without, and why, in a word or two."""
-SHOWN = 6
-"""Views that a line names; the others are counted."""
+MAX_NAMED = 6
+"""Views that a finding names; more are counted."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +67,8 @@ class Finding:
 
     def line(self) -> str:
         """For the terminal, without its severity."""
-        rest = f" and {len(self.views) - SHOWN} more" if len(self.views) > SHOWN else ""
-        named = f" [{', '.join(self.views[:SHOWN])}{rest}]" if self.views else ""
+        rest = f" and {len(self.views) - MAX_NAMED} more" if len(self.views) > MAX_NAMED else ""
+        named = f" [{', '.join(self.views[:MAX_NAMED])}{rest}]" if self.views else ""
         return f"{self.text}{named}; {self.remedy}"
 
 
@@ -111,8 +120,7 @@ def problems(inspection: Inspection) -> tuple[str, ...]:
 
 
 def to_leave_out(inspection: Inspection) -> Mapping[str, str]:
-    """The views that the capture is better without, and why: those that are black or blurred, and pictures
-    that it has twice.
+    """The views that a capture is better without, and why: black ones, blurred ones, and duplicates.
 
     None where too few would remain.
 
@@ -189,8 +197,8 @@ def _of_views(views: Sequence[ViewFigures], factors: Sequence[float], capture: C
     if invalid := tuple(view.name for view in views if view.invalid > INVALID_VIEW):
         text = "more than half of the pixels are marked as invalid"
         yield Finding("mostly_invalid", "warning", text, "check the validity masks: white is valid", invalid)
-    large = [view.levels for view in readable if view.pixels > ENOUGH * FEW_LEVELS]
-    if capture.hdr and large and max(large) <= FEW_LEVELS:
+    large = [view.levels for view in readable if view.pixels > PIXELS_PER_LEVEL * DISPLAY_LEVELS]
+    if capture.hdr and large and max(large) <= DISPLAY_LEVELS:
         text = f"linear files with {max(large)} levels a channel: 8-bit images in disguise"
         yield Finding("few_levels", "problem", text, "develop the RAW files linearly, or merge brackets")
 
@@ -207,11 +215,10 @@ def _of_cameras(capture: Capture, where: Stand) -> Iterator[Finding]:
             "camera_inside", "warning", text, "make the scene box smaller", tuple(names[where.within])
         )
     count = len(names)
-    if count < FEW_COUNT:
+    if count < ADVISED_COUNT:
         severity: Severity = "problem" if count < MIN_COUNT else "warning"
-        yield Finding(
-            "few_views", severity, f"{count} views", f"take {FEW_COUNT} or more, better 50, from all around"
-        )
+        remedy = f"take {ADVISED_COUNT} or more, better 50, from all around"
+        yield Finding("few_views", severity, f"{count} views", remedy)
     if count >= MIN_COUNT and where.coverage < MIN_COVERAGE:
         text = f"the views cover {100 * where.coverage:.0f} % of the directions around the object"
         yield Finding("coverage", "warning", text, "add views from other sides, and from other heights")
@@ -239,8 +246,8 @@ def _of_scene(capture: Capture) -> Iterator[Finding]:
         remedy = "make the scene box larger, or cut the cloud to the object"
         yield Finding("scale", "problem" if outside > 0.5 else "warning", text, remedy)
     elif np.quantile(reach, 0.95) < SMALL_CLOUD:
-        text = f"the object is small: 95 % of the point cloud lies within {100 * SMALL_CLOUD:.0f} % of the scene's box"
-        yield Finding("scale", "warning", text, "make the scene box smaller")
+        text = f"95 % of the point cloud lies within {100 * SMALL_CLOUD:.0f} % of the scene's box"
+        yield Finding("scale", "warning", f"the object is small: {text}", "make the scene box smaller")
 
 
 def _verdict(capture: Capture, views: Sequence[ViewFigures], findings: Sequence[Finding]) -> Verdict:

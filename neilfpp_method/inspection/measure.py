@@ -17,25 +17,24 @@ from neilfpp_method.shading.color import linear_to_srgb, luminance, srgb_to_line
 
 __all__ = ["ViewFigures", "measure"]
 
-SMALL = 160
+THUMBNAIL_SIDE = 160
 """Longest side, pixels, of the picture that is kept of a view."""
-SHARP = 1600
-"""Longest side, pixels, at which sharpness is measured: demosaicing blurs what is finer."""
+SHARPNESS_SIDE = 1600
+"""Longest side, pixels, at which sharpness is measured: demosaicing blurs finer detail."""
 MIDDLE_GREY = 0.18
 BORDER_SHARE = 0.5
 DARK = 1e-3
 FULL = 254.5 / 255
 PLATEAU_WIDTH = 1e-4
 MIN_CLIPPED = 16
-"""Fewest pixels at the very maximum of an image that are more than a coincidence."""
-SOME = 200_000
+"""Pixels at the very maximum of an image that cannot be a coincidence."""
+LEVEL_SAMPLES = 200_000
 """Pixels of which the levels are counted."""
 
 
 @dataclass(frozen=True)
 class ViewFigures:
-    """What an image holds. Shares are of the object's pixels, where a mask, the alpha channel or an even
-    background tells it.
+    """Figures of an image. Shares are of the object's pixels, by mask, alpha or an even background.
 
     Attributes:
         name: the view's.
@@ -102,7 +101,7 @@ def measure(view: View, hdr: bool) -> ViewFigures:
         broken=float((valid & ~sound).mean()),
         pixels=int(shown.sum()),
         levels=_levels(color[shown]),
-        small=_fitted(linear, SMALL),
+        small=_fitted(linear, THUMBNAIL_SIDE),
     )
 
 
@@ -134,7 +133,7 @@ def _sharpness(light: Float32[np.ndarray, "H W"], shown: Bool[np.ndarray, "H W"]
     if typical <= 0:
         return 0.0
     grey = linear_to_srgb(torch.from_numpy(light * np.float32(MIDDLE_GREY / typical)).clamp(0, 1)).numpy()
-    grey, kept = _fitted(grey, SHARP), _fitted(shown.astype(np.float32), SHARP) > 0.5
+    grey, kept = _fitted(grey, SHARPNESS_SIDE), _fitted(shown.astype(np.float32), SHARPNESS_SIDE) > 0.5
     if not kept.any():
         return 0.0
     spread = float(grey[kept].var())
@@ -154,7 +153,7 @@ def _clipped(image: ImageFile, color: Float32[np.ndarray, "H W 3"], shown: Bool[
 
 
 def _levels(pixels: Float32[np.ndarray, "N 3"]) -> int:
-    some = pixels[:: max(1, len(pixels) // SOME)]
+    some = pixels[:: max(1, len(pixels) // LEVEL_SAMPLES)]
     return max(len(np.unique(channel)) for channel in some.T)
 
 

@@ -1,6 +1,4 @@
-"""The picture of an inspection: where the cameras stand, along two axes, and all views, flagged ones
-first.
-"""
+"""The picture of an inspection: the cameras along two axes, and all views, flagged ones first."""
 
 from __future__ import annotations
 
@@ -18,11 +16,13 @@ PAPER, INK, PALE_INK = (250, 250, 248), (28, 30, 34), (150, 154, 160)
 PROBLEM, WARNING, FINE = (200, 40, 40), (225, 150, 20), (70, 130, 180)
 CELL, LABEL, GAP, MARGIN = 160, 40, 12, 32
 COLUMNS = 7
+"""Views in a row."""
 PLAN = 420
+"""Side of a plan of the cameras, pixels."""
 MAX_DRAWN = 210
-"""Views that are shown at most: a picture of more is too long to look at."""
+"""Largest number of views in the picture."""
 KEY = 0.25
-"""What the median luminance of the capture is shown as, linear."""
+"""Linear value at which the capture's median luminance is shown."""
 
 
 def draw(inspection: Inspection) -> UInt8[np.ndarray, "H W 3"]:
@@ -61,9 +61,7 @@ def _colors(inspection: Inspection) -> list[tuple[int, int, int]]:
 def _plan(
     inspection: Inspection, axes: tuple[int, int], colors: list[tuple[int, int, int]], title: str
 ) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Cameras as dots with their viewing directions, seen along an axis of the world; the circle is the unit
-    sphere.
-    """
+    """Cameras as dots with viewing directions, seen along a world axis; the circle is the unit sphere."""
     plan = Image.new("RGB", (PLAN, PLAN), (255, 255, 255))
     pen = ImageDraw.Draw(plan)
     centres, forward = inspection.stand.centres[:, axes], inspection.stand.axes[:, axes]

@@ -16,10 +16,14 @@ from neilfpp_method.data.views import project
 __all__ = ["Stand", "duplicates", "exposure_factors", "stand"]
 
 NEIGHBOURS = 6
+"""Views nearest in pose that a view is compared with."""
 THUMBNAIL = (32, 32)
 SAME = 0.02
+"""Root mean square difference of standardised thumbnails below which two views are one picture."""
 SEEN_ANGLE = 30.0
+"""Degrees around a view within which directions count as covered."""
 SPHERE = 1000
+"""Directions that the sphere is sampled by."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +75,7 @@ def _lattice() -> Float64[np.ndarray, "S 3"]:
 
 
 def exposure_factors(luminances: Sequence[float], where: Stand) -> Float64[np.ndarray, " V"]:
-    """How much brighter each view is than the median of the views nearest in pose; 1 where that cannot be
-    told.
+    """How much brighter each view is than the median of the views nearest in pose; 1 where unknown.
 
     Near is what stands near and looks the same way: the distance of the centres, in their median distance
     from the scene's, and the angle of the axes count alike.
@@ -93,8 +96,7 @@ def exposure_factors(luminances: Sequence[float], where: Stand) -> Float64[np.nd
 def duplicates(pictures: Sequence[Float[np.ndarray, "_ _ 3"]]) -> tuple[tuple[int, int], ...]:
     """Pairs of pictures that are the same but for compression and brightness.
 
-    Their thumbnails, standardised, differ by less than 2 % of their spread. Pictures without any contrast are
-    left out.
+    Their standardised thumbnails differ by under 2 % of their spread. Pictures of one colour are left out.
     """
     thumbnails = np.stack(
         [cv2.resize(np.sqrt(p.mean(axis=-1)), THUMBNAIL, interpolation=cv2.INTER_AREA) for p in pictures]

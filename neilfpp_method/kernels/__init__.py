@@ -1,5 +1,4 @@
-"""What is worth code of its own: hash-grid encoding, rays through a sampled distance field, and softplus
-units (`softplus`).
+"""What has kernels of its own: hash-grid encoding, rays through a distance grid, softplus units.
 
 Every backend of the encoding computes what `reference.encode` computes, which the tests hold it to.
 `GridSpec.backend` names one; "auto" takes the compiled loops on a CPU, Triton's kernels on a GPU, and the

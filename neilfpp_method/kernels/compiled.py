@@ -1,5 +1,4 @@
-"""The loops of the CPU, of hash grids, rays and softplus units, compiled by Numba on first use and kept on
-disk from then on.
+"""The CPU's loops for hash grids, rays and softplus, compiled by Numba on first use and cached on disk.
 
 They hold no lock of the interpreter, start no threads and add up in a fixed order. All compiled code stands
 in this one file, because what is kept on disk is renewed when its own file changes, and for no other.
@@ -48,9 +47,7 @@ def compiled(function: Callable) -> Callable:
 
 @compiled
 def _locate(points, n, axis, cells):
-    """Along one axis: the cell, the fraction of it, and d(position in cells) / d(coordinate), which is 0 off
-    the cube.
-    """
+    """Along one axis: the cell, the fraction of it, and d(cells) / d(coordinate), 0 off the cube."""
     number = points.dtype.type
     free = points[n, axis] * number(cells)
     position = min(max(free, number(0)), number(cells))
@@ -146,9 +143,7 @@ def _interpolate_level(points, rows, level, cells, dense, features, jacobian, wi
 
 @compiled
 def add_to_table(points, offsets, cells, dense, features, jacobian, with_jacobian, table, first, last):
-    """Add to the table what the gradients of features and Jacobian ask of it, for the levels from `first` to
-    `last`.
-    """
+    """Add the gradients of features and Jacobian to the table, for the levels from `first` to `last`."""
     width = table.shape[1]
     number = points.dtype.type
     for level in range(first, last):
@@ -217,9 +212,7 @@ def pull_to_points(
 
 @compiled
 def sphere_trace(grid, radius, origins, directions, least, most_steps, distance, hit, start, stop):
-    """Write how far the rays from `start` to `stop` go, and whether they come closer to a surface than
-    `least`.
-    """
+    """Write how far rays `start` to `stop` go, and whether they come closer to a surface than `least`."""
     number = grid.dtype.type
     cells = len(grid) - 1
     edge, reach = number(2 * radius / cells), number(radius)
@@ -241,9 +234,7 @@ def sphere_trace(grid, radius, origins, directions, least, most_steps, distance,
 
 @compiled
 def _at_vertices(grid, x, y, z, cells):
-    """Trilinear interpolation at a place in units of cells; what is not a number takes the first cell, and
-    stays none.
-    """
+    """Trilinear interpolation at a place in units of cells; NaN takes the first cell and stays NaN."""
     number = grid.dtype.type
     last = number(cells - 1)
     low_x, low_y, low_z = min(np.floor(x), last), min(np.floor(y), last), min(np.floor(z), last)
@@ -282,7 +273,7 @@ def _from_bits(_context, _bits):
 def _falling_exponential(t):
     """e^−t for t ≥ 0, to the last digit or two; t counts for FAINT at most.
 
-    e^−t = 2^−n e^r with |r| ≤ ½ ln 2, where e^r is its Taylor series and ln 2 is taken off in two parts (Cody & Waite 1980).
+    e^−t = 2^−n e^r with |r| ≤ ½ ln 2: e^r by its Taylor series, ln 2 in two parts (Cody & Waite 1980).
     """
     t = FAINT if t > FAINT else t  # what is not a number stays none
     n = np.int32(t * np.float32(1.4426950408889634) + HALF)
@@ -296,9 +287,7 @@ def _falling_exponential(t):
 
 @compiled
 def _log_of_one_and(e):
-    """ln(1 + e) for 0 ≤ e ≤ 1, off by 2e-8 at most: e times the Chebyshev approximation of ln(1 + e) / e of
-    degree 8.
-    """
+    """ln(1 + e), 0 ≤ e ≤ 1, to 2e-8: e times the degree-8 Chebyshev approximation of ln(1 + e) / e."""
     tail = np.float32(0.07836167) + e * (np.float32(-0.029588507) + e * np.float32(0.005253458))
     tail = np.float32(-0.24844369) + e * (np.float32(0.19111431) + e * (np.float32(-0.1367477) + e * tail))
     return e * (UNIT + e * (np.float32(-0.49999502) + e * (np.float32(0.3331927) + e * tail)))

@@ -1,6 +1,4 @@
-"""Where a backend's kernels meet autograd: first order by the kernels, every higher order by the
-reference.
-"""
+"""Where kernels meet autograd: first order by the backend, every higher order by the reference."""
 
 from __future__ import annotations
 

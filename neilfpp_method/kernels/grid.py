@@ -26,9 +26,7 @@ FEATURES = 2
 
 @dataclass(frozen=True)
 class GridSpec:
-    """Levels, coarse to fine, of a grid over the unit cube. All levels lie one after the other in one
-    table.
-    """
+    """Levels, coarse to fine, of a grid over the unit cube, all one after the other in one table."""
 
     resolutions: tuple[int, ...]
     """Cells along an edge, per level."""
@@ -37,9 +35,7 @@ class GridSpec:
     features: int
     """Length of a table row."""
     backend: str = "auto"
-    """Who computes it: auto (the fastest that runs on the device), reference (plain torch), cpu (Numba) or
-    triton (CUDA).
-    """
+    """The backend: auto (the fastest for the device), reference (torch), cpu (Numba) or triton (CUDA)."""
 
     @cached_property
     def offsets(self) -> tuple[int, ...]:

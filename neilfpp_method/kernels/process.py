@@ -1,7 +1,6 @@
 """How a process computes: without denormal numbers, and with memory that it keeps.
 
-Both are settings of the whole process, so a command makes them and a library does not. docs/performance.md
-has what they gain.
+Both are process-wide, so commands set them and a library does not. docs/performance.md: the gain.
 """
 
 from __future__ import annotations
@@ -14,8 +13,7 @@ import torch
 
 __all__ = ["computing_fast"]
 
-# Options of glibc's allocator (malloc.h), and the values that it comes to by itself in a process with large
-# arrays.
+# Options of glibc's allocator (malloc.h), and its own values in a process with large arrays.
 TRIM_THRESHOLD, MMAP_THRESHOLD, MMAP_MAX = -1, -3, -4
 OWN_TRIM, OWN_MMAP, OWN_MAPS = 64 << 20, 32 << 20, 65_536
 NEVER = 2**31 - 1

@@ -48,9 +48,7 @@ def encode(x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpe
 def _vertex_rows(
     cell: Int[Tensor, "3 N"], resolution: int, entries: int, dense: bool
 ) -> Int[Tensor, "2 2 2 N"]:
-    """The table rows of a cell's eight vertices; the first three axes say which end of the cell in x, y,
-    z.
-    """
+    """The table rows of a cell's eight vertices; the first three axes choose its end in x, y, z."""
     factors = (1, resolution + 1, (resolution + 1) ** 2) if dense else PRIMES
     x, y, z = (torch.stack((c, c + 1)) * factor for c, factor in zip(cell, factors, strict=True))
     x, y = x[:, None, None], y[:, None]

@@ -1,6 +1,4 @@
-"""Softplus units, and their slope with them: compiled loops on a CPU, where torch takes ten passes over
-memory.
-"""
+"""Softplus units and their slope: compiled loops on a CPU, where torch makes ten passes over memory."""
 
 from __future__ import annotations
 

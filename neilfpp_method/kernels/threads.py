@@ -18,9 +18,7 @@ __all__ = ["for_each", "shares"]
 
 
 def shares(count: int, least: int) -> list[tuple[int, int]]:
-    """`count` things cut into equal runs, (start, stop) each: one per thread, and none shorter than
-    `least`.
-    """
+    """`count` things in equal runs, (start, stop) each: one per thread, none shorter than `least`."""
     parts = max(1, min(torch.get_num_threads(), count // max(least, 1)))
     edges = [count * part // parts for part in range(parts + 1)]
     return list(itertools.pairwise(edges))

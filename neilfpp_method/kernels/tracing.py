@@ -26,8 +26,7 @@ def sphere_trace(
     distance: Float[Tensor, " P"],
     hit: Bool[Tensor, " P"],
 ) -> None:
-    """Write how far each ray goes, and whether it comes closer to a surface than `least`, in at most `steps`
-    steps.
+    """Write how far each ray goes, and whether it comes closer to a surface than `least`, in `steps` steps.
 
     A step is as long as the distance allows, and no shorter than `least`. The grid has the distances at the
     vertices z, y, x of the cube [−radius, radius]³, beyond which a ray ends. All are of one float type.

@@ -37,9 +37,7 @@ def kernel(function: Callable) -> triton.runtime.KernelInterface:
 
 @kernel
 def _locate(points, n, here, axis, cells):
-    """Along one axis: the cell, the fraction of it, and d(position in cells) / d(coordinate), which is 0 off
-    the cube.
-    """
+    """Along one axis: the cell, the fraction of it, and d(cells) / d(coordinate), 0 off the cube."""
     scale = cells.to(points.dtype.element_ty)
     free = tl.load(points + 3 * n + axis, mask=here, other=0.0) * scale
     inner = tl.maximum(free, 0.0, propagate_nan=tl.PropagateNan.ALL)
@@ -166,7 +164,8 @@ def _add_to_table(
 
 @kernel
 def _pull_to_points(
-    points, table, grid, features, jacobian, gradient, count, levels, f_point, f_column, j_point, j_column, j_axis,
+    points, table, grid, features, jacobian, gradient, count, levels,
+    f_point, f_column, j_point, j_column, j_axis,
     width: tl.constexpr, with_jacobian: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
     n = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
@@ -243,7 +242,8 @@ def table_gradient(
     features, jacobian = gradients.features, _jacobian(gradients)
     with torch.cuda.device_of(x01):
         _add_to_table[_blocks(count), levels](
-            x01, _grid(spec, x01.device), features, jacobian, table, count, levels, *features.stride(), *jacobian.stride(),
+            x01, _grid(spec, x01.device), features, jacobian, table, count, levels,
+            *features.stride(), *jacobian.stride(),
             spec.features, gradients.jacobian is not None, BLOCK, **FUSED,
         )  # fmt: skip
     return table
@@ -259,7 +259,8 @@ def point_gradient(
     with torch.cuda.device_of(x01):
         _pull_to_points[(_blocks(count),)](
             x01, table, _grid(spec, x01.device), features, jacobian, found, count, levels,
-            *features.stride(), *jacobian.stride(), spec.features, gradients.jacobian is not None, BLOCK, **FUSED,
+            *features.stride(), *jacobian.stride(),
+            spec.features, gradients.jacobian is not None, BLOCK, **FUSED,
         )  # fmt: skip
     return found
 
@@ -275,9 +276,7 @@ def _jacobian(gradients: OutputGradients) -> Float[Tensor, "M F 3"]:
 
 @lru_cache(maxsize=32)
 def _grid(spec: GridSpec, device: torch.device) -> Int[Tensor, "4 L"]:
-    """Per level: its first table row, its cells along an edge, its rows, and whether each vertex has its own
-    row.
-    """
+    """Per level: first table row, cells along an edge, rows, and whether each vertex has its own row."""
     dense = [spec.is_dense(level) for level in range(len(spec.resolutions))]
     rows = [spec.offsets[:-1], spec.resolutions, spec.entries_per_level, dense]
     return torch.tensor([list(map(int, row)) for row in rows], device=device)

@@ -47,9 +47,7 @@ class FoundLamps:
 
 @torch.no_grad()
 def propose(lamps: Lamps, surface: Float[Tensor, "N 3"], count: int) -> LampPlaces:
-    """Up to `count` places: the lit lamps as they are, first and in order, others close to each, and the rest
-    anywhere.
-    """
+    """Up to `count` places: the lit lamps first and in order, others close to each, and random ones."""
     lit, axis = lamps.position[: lamps.lit], lamps.axis[: lamps.lit]
     moved = lit.repeat_interleave(CLONES, 0)
     moved = moved + STEP * torch.randn_like(moved)
@@ -67,11 +65,9 @@ def propose(lamps: Lamps, surface: Float[Tensor, "N 3"], count: int) -> LampPlac
 def merge(
     places: LampPlaces, intensity: Float[Tensor, "M 3"], reach: Float[Tensor, " M"], most: int
 ) -> FoundLamps:
-    """Neighbours made one, in their middle by power and of their joint intensity; those that bring little are
-    left out.
+    """Neighbours merged at their middle by power with their joint intensity; weak lamps are left out.
 
-    `reach` is the light that a lamp of intensity 1 brings to the scene: a strong one that reaches nothing
-    counts for nothing.
+    `reach` is the light that a lamp of intensity 1 brings to the scene: unreachable lamps count nothing.
     """
     power = intensity.sum(-1) * reach
     left = torch.ones_like(power, dtype=torch.bool)

@@ -1,5 +1,4 @@
-"""Light is solved for, not descended to: a map and lamps under which remembered points look as the images
-show them.
+"""Light is solved for: a map and lamps under which remembered points look as the images show them.
 
 With the transport of these points at hand (`lighting.transport`), a hundred steps on the light cost less than
 as many steps of training. They find lamps that stochastic descent, through few and noisy samples of every
@@ -21,13 +20,9 @@ from neilfpp_method.lighting.transport import Transport
 __all__ = ["MIN_POINTS", "Evidence", "Light", "compare", "evidence", "fit_light"]
 
 RATE = 0.1
-"""Of log radiance at the start of a fit; roots of lamps and gains of base colour move at these shares of
-it:
-"""
+"""Of log radiance at the start of a fit; lamps and base colour move at these shares of it:"""
 ROOT_RATE, GAIN_RATE = 0.5, 0.1
-"""Rates of the roots of what lamps bring, and of the logarithms of the factors on base colour, over that of
-log radiance.
-"""
+"""Rates of the roots of lamp contributions, and of log factors on base colour, over log radiance's."""
 MIN_REACH = 0.05
 """A lamp that brings less than this share of the mean over all lamps, at equal intensity, is not sought:
 behind a wall any intensity fits.
@@ -37,9 +32,7 @@ MIN_GAIN = 0.01
 MIN_POINTS = 20
 """Points kept back from which something is concluded."""
 MIN_VISIBLE_SHARE = 0.05
-"""Share of the points that must see a texel for the images to set it. Texels seen by few points follow the
-smoothness prior only.
-"""
+"""Share of points that must see a texel for images to set it; below, the smoothness prior alone does."""
 FIRST_SHARE = 0.1
 """Of the light that typical points receive, what all lamps that are not yet lit start with together."""
 
@@ -67,8 +60,7 @@ class Evidence:
     points: int
 
     def favours(self, chosen: bool) -> bool:
-        """Whether to take the more complicated light; `chosen`: it is what surfaces have learned under so
-        far.
+        """Whether to take the more complicated light; `chosen`: the one that surfaces learn under now.
 
         To be chosen it must gain more than chance brings about once in forty times, and enough to be worth
         it; to stay, it may well do so.
@@ -109,8 +101,7 @@ def fit_light(start: Light, carried: Transport, target: Target, objective: Objec
     config, unit = objective.config, objective.unit
     texels = start.log_radiance[0].numel()
     log_radiance = start.log_radiance.clone().requires_grad_()
-    # In units of what a lamp brings to a white surface in the mean over the points: its unknowns are then of
-    # one size.
+    # In units of a lamp's mean contribution to a white surface, so that its unknowns have one size.
     brought = carried.sources[0, :, texels:].mean(0)[:, None] / unit
     reaches = brought > MIN_REACH * brought.mean()
     first = FIRST_SHARE / max(1, len(brought))
@@ -144,9 +135,7 @@ def fit_light(start: Light, carried: Transport, target: Target, objective: Objec
 def compare(
     lights: tuple[Light, Light], carried: tuple[Transport, Transport], target: Target, objective: Objective
 ) -> Float[Tensor, " N"]:
-    """How much lower the relative error of the second of two lights is, at points that neither was fitted
-    to.
-    """
+    """How much lower the second of two lights makes the relative error, at points kept from both fits."""
     one, other = (
         objective.relative_error(light.strength(), transport, target, 1.0).abs().clamp_max(1).mean(-1)
         for light, transport in zip(lights, carried, strict=True)

@@ -13,9 +13,7 @@ from neilfpp_method.structures import Observed
 __all__ = ["SurfaceMemory"]
 
 FIRST_WAIT = 4
-"""Steps after which the first fit is due even if the memory is not full: surfaces learn under a light that is
-a guess.
-"""
+"""Steps before the first fit, even if the memory is not full: until then the light is a guess."""
 
 
 class SurfaceMemory(nn.Module):
@@ -50,6 +48,10 @@ class SurfaceMemory(nn.Module):
         self.points.keep(rows[:share])
         if self.age is not None:
             self.age += 1
+
+    def wait(self) -> None:
+        """Let the first fit be due after `every` steps, as the light that there is needs none before."""
+        self.age = 0
 
     def recall(self) -> Observed:
         """Everything that is remembered, for a fit that is done now."""

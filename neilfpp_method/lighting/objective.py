@@ -1,5 +1,4 @@
-"""The objective of a light fit: the error of remembered points against their pixels, and priors on light and
-base colour.
+"""The objective of a light fit: errors of remembered points, and priors on light and base colour.
 
 The priors are of ratios, so that none prefers a dimmer light and brighter surfaces: the total variation of
 the map's log radiance, differences of log base colour, lamps by their share of all light, and the tint. A
@@ -33,13 +32,9 @@ __all__ = [
 ]
 
 FLOOR = 0.1
-"""Errors are relative to the pixel and this share of a typical one, so that dark pixels do not count for
-their noise.
-"""
+"""Errors are relative to the pixel plus this share of a typical one: dark pixels are mostly noise."""
 OUTLIER = 0.1
-"""Relative errors beyond this count by their size rather than by their square: some points no light
-explains.
-"""
+"""Relative errors beyond this count linearly, not squared: no light explains some of the points."""
 SKY = 1.0
 """Weight of the difference between the map's log radiance and what cameras saw beyond the scene, per texel,
 against the relative error: that much is certain, and the scale of light and base colour hangs on it.
@@ -109,20 +104,16 @@ class Objective:
         return functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER)
 
     def unlikely(self, log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, ""]:
-        """What speaks against a map by itself: that it is uneven, and that it is not what cameras saw of
-        it.
-        """
+        """Priors on a map alone: smoothness, and agreement with what cameras saw of it."""
         uneven = self.config.smoothness * total_variation(log_radiance)
         if self.sky is None or not log_radiance.numel():
             return uneven
         return uneven + SKY * self.sky.misfit(log_radiance)
 
     def price(self, brought: Float[Tensor, " M"], all_light: Float[Tensor, " 3"]) -> Float[Tensor, ""]:
-        """Of lamps, by the light that each brings to the points, and of the tint of all light that reaches
-        them.
+        """Priors on lamps, by the light that each brings to the points, and on the tint of all light.
 
-        Σ ln(1 + share/s) over the lamps' shares of all light is concave: one strong lamp is cheaper than two
-        half as strong.
+        Σ ln(1 + share/s) over lamps is concave: one strong lamp is cheaper than two half as strong.
         """
         share = brought / all_light.mean()
         lamps = SPARSITY * (share / LINEAR_SHARE).log1p().sum()
@@ -155,7 +146,7 @@ def nearest_points(position: Float[Tensor, "N 3"]) -> Int[Tensor, "N K"]:
 
 
 def unevenness(base_color: Float[Tensor, "N 3"], nearest: Int[Tensor, "N K"]) -> Float[Tensor, ""]:
-    """Mean |difference of log base colour| between neighbours: an edge costs what it is, in however many steps it comes."""
+    """Mean |difference of log base colour| between neighbours: sharp and gradual edges cost the same."""
     logarithm = base_color.clamp_min(DARK_FLOOR).log()
     apart = logarithm[:, None] - logarithm[nearest]
     return _size(apart).sum() / max(1, apart.numel())

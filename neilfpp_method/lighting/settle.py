@@ -35,13 +35,9 @@ AXIS_RATE = 0.06
 GAIN_RATE = 0.1
 """Per step, at the start, of the logarithms of the factors on base colour."""
 PANEL_GAIN = 0.01
-"""Share of the loss that a panel must save over a bulb: its axis is one more unknown, and any unknown lowers
-the loss.
-"""
+"""Share of the loss that a panel must save over a bulb: its axis alone lowers the loss a little."""
 FAINT_SHARE = 1e-3
-"""Share of the strongest channel to which darker ones are raised at the start, where the logarithm has a
-slope.
-"""
+"""Share of the strongest channel to which darker ones are raised first: the logarithm needs a slope."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +84,7 @@ def settle_lamps(
         return misfit + objective.price(brought.mean(-1), all_light)
 
     def settle(lamps: FoundLamps) -> _Settled:
-        # A shadow's edge has no derivative here: what is hidden at the start stays so, and the next fit looks
-        # again.
+        # A shadow's edge has no derivative here: what is hidden at the start stays hidden in this fit.
         sight = in_sight(lamps.places, radius, observed.position, scene)
         return _descend(lamps, target, objective, lambda moved, gain: loss_of(moved, sight, gain))
 
@@ -132,9 +127,7 @@ def _descend(
     objective: Objective,
     loss_of: Callable[[FoundLamps, Float[Tensor, "#N 3"]], Float[Tensor, ""]],
 ) -> _Settled:
-    """To the nearest minimum of a loss over place, axis and intensity. Where that leads to what is not
-    finite: the start.
-    """
+    """The nearest minimum of a loss over place, axis and intensity; the start if that is not finite."""
     bare = start.places.axis.square().sum(-1, keepdim=True) == 0
     position = start.places.position.clone().requires_grad_()
     axis = start.places.axis.clone().requires_grad_()

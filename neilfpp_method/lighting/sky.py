@@ -28,9 +28,7 @@ DARK_FLOOR = 1e-3
 
 @dataclass(frozen=True)
 class KnownSky:
-    """Log radiance of the texels of a map as cameras saw them, and how much that counts: 0 where none looked,
-    at most 1.
-    """
+    """Log radiance of map texels as cameras saw them, and its weight: 0 where none looked, at most 1."""
 
     log_radiance: Float[Tensor, "3 H W"]
     weight: Float[Tensor, "H W"]

@@ -1,6 +1,4 @@
-"""The light of a scene from what was observed of it: the map, and lamps where the points that were kept back
-ask for them.
-"""
+"""The light of a scene from observations: the map, and lamps where points kept back support them."""
 
 from __future__ import annotations
 
@@ -23,18 +21,14 @@ __all__ = ["solve_light"]
 CANDIDATES = 256
 """Places for lamps that one fit tries."""
 FOLDS = 5
-"""One part in so many of the points is not fitted to, and decides between two lights; the first time each
-part in turn.
-"""
+"""Number of parts. One part is not fitted to, and decides between two lights; at first, each in turn."""
 BLOCKS_OF_FOLD = 6
 """Blocks of neighbouring points that make a part. Neighbours share the errors of their material, and a lamp
 that makes up for those would be confirmed by a neighbour that was kept back; so a block is kept back
 whole.
 """
 KNOWN_ROWS = 32
-"""Rows of a known map as the fit of the lamps before it sees it: that fit traces every texel from every
-point.
-"""
+"""Rows of a known map in fits of the lamps before it: such a fit traces every texel from every point."""
 
 
 @torch.no_grad()
@@ -47,9 +41,9 @@ def solve_light(
     objective: Objective,
     config: MapLightConfig,
     first: bool,
+    benefit_of_doubt: bool = False,
 ) -> Evidence | None:
-    """Set the map, and the lamps where there may be any, to what explains the points. A map that is known
-    stays.
+    """Set the map, and lamps where allowed, to what explains the points. A known map stays.
 
     Args:
         light: what is set; the search starts from what it is.
@@ -59,6 +53,9 @@ def solve_light(
         config: with "auto" the lamps must earn their place: the fit is done with and without, and they stay
             where they lower the error at points kept back from both (`Evidence.favours`).
         first: nothing has been decided yet.
+        benefit_of_doubt: lamps stay out only where it is sure that they are not worth it. Surfaces learn the
+            light that they are under: a lamp too many goes out at a later fit, as surfaces then show; a lamp
+            that is missing has left its glow on them, and no later fit asks for it.
 
     Returns:
         What was measured for and against lamps; none where the settings had decided.
@@ -88,8 +85,7 @@ def solve_light(
     if config.kind != "auto":
         found, measured = fit_light(start, both, target, objective), None
     else:
-        # A wrong first choice would last, as surfaces then learn what suits it: so it is made on all points
-        # in turn.
+        # Surfaces then learn under the first choice and confirm it, so it is made on all parts in turn.
         fold = _folds(observed.position)
         gains = []
         for number in range(FOLDS if first else 1):
@@ -99,7 +95,7 @@ def solve_light(
             carried = (texels[kept_back], both[kept_back])
             gains.append(compare((plain, found), carried, target[kept_back], objective))
         measured = evidence(torch.cat(gains))
-        if not measured.favours(chosen=lamps.lit > 0):
+        if not measured.favours(chosen=benefit_of_doubt or lamps.lit > 0):
             sought.copy_(plain.log_radiance)
             lamps.place(dark, dark)
             return measured
@@ -107,8 +103,7 @@ def solve_light(
     lit = merge(places, found.intensity, near.sources[0].mean(0), len(lamps.position))
     beside = texels.lit(sought.exp().flatten(1).t())
     lit = settle_lamps(lit, lamps.radius, beside, observed, target, lobe, scene, objective)
-    # The map was found beside lamps in pieces; what it had to make up for, or left to them, is theirs or its
-    # own now.
+    # The map was found beside temporary lamps: light between the two may now belong to the other.
     near = from_lamps(lit.places, lamps.radius, observed, material.roughness, lobe, scene)
     found = fit_light(Light(sought, lit.intensity), texels.beside(near), target, objective)
     sought.copy_(found.log_radiance)
@@ -117,8 +112,6 @@ def solve_light(
 
 
 def _folds(position: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
-    """Of each point the number of its part: that of the block about the nearest of some points drawn at
-    random.
-    """
+    """Each point's part number: that of its block, about the nearest of some randomly drawn points."""
     drawn = torch.randperm(len(position), device=position.device)[: BLOCKS_OF_FOLD * FOLDS]
     return torch.cdist(position, position[drawn]).argmin(1) % FOLDS

@@ -1,9 +1,9 @@
-"""How light travels to a surface and on to its viewer, as matrices: what a surface sends is linear in the
-light.
+"""Light transport to a surface and on to its viewer as matrices: radiance is linear in the light.
 
 With geometry and roughness fixed, a map of T texels of radiance E and M lamps of intensity I,
 
-    L_o = k_d (D E + D' I + d) + F0 (F E + F' I + f) + (G E + G' I + g),   k_d = (1 − m) b,   F0 = 0.04 (1 − m) + b m
+    L_o = k_d (D E + D' I + d) + F0 (F E + F' I + f) + (G E + G' I + g)
+    k_d = (1 − m) b,   F0 = 0.04 (1 − m) + b m
 
 D, F, G hold cosine, visibility, solid angle, and the diffuse, the facing and the grazing part of the BRDF; d,
 f, g are what the scene's own surfaces add.
@@ -59,9 +59,7 @@ class Transport:
         return Transport(self.sources[..., :0], self.scene + self.sources @ strength)
 
     def outgoing(self, material: Material, strength: Float[Tensor, "T 3"]) -> Float[Tensor, "N 3"]:
-        """L_o under sources of this strength; `material` brings the colours, its roughness is in the
-        matrices.
-        """
+        """L_o under sources of this strength, with the colours of `material` (roughness is fixed)."""
         diffuse, *reflected = _SumOverSources.apply(self.sources, strength) + self.scene
         color = diffuse_reflectance(material, bool(reflected)) * diffuse
         if reflected:
@@ -125,11 +123,9 @@ def from_texels_at(
     lobe: Lobe,
     scene: SceneTracer | None,
 ) -> Transport:
-    """As `from_texels`, at several roughnesses for which each direction is traced once; `sources` in half
-    precision.
+    """As `from_texels`, at several roughnesses; directions are traced once; half-precision `sources`.
 
-    Layer 0 is the diffuse part, layers 1 + 2k and 2 + 2k are the facing and the grazing part at roughness
-    number k.
+    Layer 0 is diffuse, layers 1 + 2k and 2 + 2k the facing and grazing parts at roughness number k.
     """
     texels = environment.log_radiance[0].numel()
     parts = []
@@ -169,8 +165,7 @@ def _texel_rays(environment: EnvironmentLight, observed: Observed, scene: SceneT
     drawn = environment.texel_directions(observed.position)
     texels = len(drawn.solid_angle)
     weight = dot(drawn.wi, observed.normal).clamp_min(0) * drawn.solid_angle
-    # The map is even about every plane through its middle: half of its texels are above a horizon, up to
-    # grazing ones.
+    # The map is symmetric about its centre: half of its texels are above any horizon, grazing ones aside.
     weight, number = weight.topk(texels // 2, dim=1)
     wi = drawn.wi.gather(1, number[..., None].expand(-1, -1, 3))
     met = None if scene is None else scene(observed.position, wi)
@@ -192,9 +187,7 @@ def from_lamps(
     lobe: Lobe | None,
     scene: SceneTracer | None,
 ) -> Transport:
-    """From small lamps, per unit of intensity: the direction to their middle is traced. Arguments as of
-    `from_texels`.
-    """
+    """From small lamps, per unit intensity, tracing to their middles. Arguments as of `from_texels`."""
     sources = []
     for part, rough in _chunks(observed, roughness, len(lamps.position)):
         sight = in_sight(lamps, radius, part.position, scene)
@@ -222,9 +215,7 @@ def lamp_kernel(
     roughness: Float[Tensor, "N 1"],
     lobe: Lobe | None,
 ) -> Float[Tensor, "K N M"]:
-    """`sources` of a transport from lamps; differentiable in where they are and which way they send, up to
-    `sight`.
-    """
+    """`sources` of a transport from lamps; differentiable in place and axis, but not in visibility."""
     rays = rays_towards(observed.position, lamps.position, lamps.axis, radius)
     weight = sight * rays.emission * dot(rays.wi, observed.normal).clamp_min(0) / rays.distance.square()
     return _kernel(observed, roughness, rays.wi, weight, lobe)

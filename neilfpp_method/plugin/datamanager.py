@@ -1,6 +1,4 @@
-"""Pixels for nerfstudio's own data manager: float images, and with each pixel its ray and what the losses ask
-of it.
-"""
+"""Pixels for nerfstudio's own data manager: float images, and per pixel its ray and loss inputs."""
 
 from __future__ import annotations
 

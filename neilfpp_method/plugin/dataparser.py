@@ -1,7 +1,6 @@
 """`neilfpp-data`: every capture that `neilfpp train` reads, HDR included, for nerfstudio's data managers.
 
-Nerfstudio's frame is then the scene frame: the object lies in the unit sphere. No data manager is imported
-here; they import this.
+Nerfstudio's frame is then the scene frame (unit sphere). Data managers import this module.
 """
 
 from __future__ import annotations
@@ -44,9 +43,7 @@ class CaptureParserConfig(DataParserConfig):
     test_every: Optional[int] = None  # noqa: UP045  (tyro reads it at run time on every Python)
     """Hold out every k-th view; none: as the capture says, else every 8th."""
     response: Literal["auto", "linear", "srgb"] = "auto"
-    """Whether pixels are linear radiance or display values; auto: as the capture says, else floating-point
-    files are linear.
-    """
+    """Whether pixels are linear radiance or display values; auto: as captured, else floats are linear."""
 
 
 @dataclass
@@ -58,8 +55,7 @@ class CaptureParser(DataParser):
     def _generate_dataparser_outputs(self, split: str = "train", **_) -> DataparserOutputs:
         chosen = self.config
         capture = load_capture(chosen.data, chosen.format, chosen.test_every, response=chosen.response)
-        # Nerfstudio cannot do without a view to evaluate; where none is held out it gets one from the
-        # training set.
+        # Nerfstudio needs a view to evaluate; where none is held out it gets a training view.
         views = capture.train_views if split == "train" else capture.test_views or capture.train_views[:1]
         frame = capture.normalisation
         transform = torch.eye(4)[:3]
@@ -111,8 +107,7 @@ def _distortion(camera: Camera) -> list[float]:
 
 
 def capture_of(outputs: DataparserOutputs) -> Capture:
-    """The capture behind a dataparser's outputs: that of `neilfpp-data`, or one made of what another
-    dataparser found.
+    """The capture behind a dataparser's outputs: `neilfpp-data`'s, or one made of another's outputs.
 
     Raises:
         UserError: a camera has no image plane: it is a panorama, or orthographic.

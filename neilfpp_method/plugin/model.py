@@ -1,6 +1,4 @@
-"""`NeilfModel` as a nerfstudio model: its losses, stages and rates are those of the standalone loop, called
-from here.
-"""
+"""`NeilfModel` as a nerfstudio model, with the losses, stages and rates of the standalone loop."""
 
 from __future__ import annotations
 
@@ -23,18 +21,25 @@ from torch import Tensor, nn
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import metrics
+from neilfpp_method.health.cases import Health
+from neilfpp_method.health.guard import StepGuard
+from neilfpp_method.health.watch import LOOKED_AT, Watch
+from neilfpp_method.hosts.foreign import ForeignHost, proxy_for
 from neilfpp_method.hosts.nerfstudio import OWN_LOSSES, NerfstudioHost
+from neilfpp_method.hosts.proxy import SurfaceProxy
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.model import Maps, NeilfModel
 from neilfpp_method.plugin.datamanager import PIXELS, VALID, pixel_batch
 from neilfpp_method.plugin.foreign import build_foreign
+from neilfpp_method.plugin.record import RunRecord, no_record
 from neilfpp_method.schedule import Stage, active_losses, has_material, stage_at, stage_steps, weigh
-from neilfpp_method.settings.presets import free_light, preset
+from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.color import apply_response, tone_map
 from neilfpp_method.shading.sampling import sample_directions
 from neilfpp_method.structures import RayBatch, StepResult
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
+from neilfpp_method.train.health_record import write_findings
 from neilfpp_method.train.loop import adam, seed_step, set_rates
 
 __all__ = ["FieldAdamConfig", "NeilfMethod", "NeilfMethodConfig"]
@@ -64,9 +69,7 @@ class NeilfMethodConfig(ModelConfig):
     trains at its own rate and with its own regularisers.
     """
     host_losses: float = 1.0
-    """Weight of the regularisers of `host`; 0: none of them, and of ours L_Eik where it is a surface
-    model.
-    """
+    """Weight of `host`'s regularisers; 0: none of them, and our L_Eik where it is a surface model."""
     neilf: NeilfConfig = field(default_factory=lambda: preset("fast"))
     """The settings of the method. Of `train` only the seed and the steps of the stages count here."""
 
@@ -89,12 +92,7 @@ class NeilfMethod(Model):
                 "the data manager is not ours", "leave --pipeline.datamanager as `ns-train neilfpp` sets it"
             )
         settings = self.config.neilf
-        if self.config.host is not None and settings.inter_reflection.mode == "hard":
-            CONSOLE.log(
-                f"{self.config.host} traces no rays cheaply: a free light field and L_ref replace hard "
-                "tracing"
-            )
-            settings = free_light(settings)
+        self.proxy: SurfaceProxy | None = None
         facts = scene_facts(pixels.capture, pixels, settings)
         seed_step(settings.train.seed, step=-1)
         self.rates = settings.optimizer
@@ -110,8 +108,20 @@ class NeilfMethod(Model):
                 radiance_scale=facts.radiance_scale,
                 own_losses=self.config.host_losses > 0.0,
             )
-            self.neilf = NeilfModel(host, settings, facts)
+            self.proxy = proxy_for(host, settings)
+            whole = ForeignHost(host, borrowed=False, proxy=self.proxy)
+            self.neilf = NeilfModel(whole, settings, facts)
+            self.neilf.observers.append(lambda batch, hits: whole.show_proxy(batch.rays, hits))
+            if self.proxy is not None:
+                CONSOLE.log(
+                    f"{self.config.host} traces no rays cheaply: a proxy of its surface, gathered from the "
+                    "training rays, traces shadows and light between surfaces"
+                )
         self.light_solver = self.neilf.light_solver()
+        seed_step(settings.train.seed, step=-2)
+        self.watch = Watch(pixels.sample(LOOKED_AT, gradients=False), CONSOLE.log)
+        self.guard = StepGuard(CONSOLE.log)
+        self.record: RunRecord | None = None
         self.computed: StepResult | None = None
         self.evidence: Evidence | None = None
         self.step = -1
@@ -144,18 +154,25 @@ class NeilfMethod(Model):
             )
         if self.step < 0:  # no checkpoint was loaded, which would hold the map
             show_known_light(self.neilf)
-        host = self.neilf.host
         theirs = (
-            host.model.get_training_callbacks(training_callback_attributes)
-            if isinstance(host, NerfstudioHost)
+            self.neilf.host.inner.model.get_training_callbacks(training_callback_attributes)
+            if isinstance(self.neilf.host, ForeignHost)
             else []
         )
+        for optimizer in optimizers.optimizers.values():
+            self.guard.watch(optimizer)
+        obstacle = no_record(trainer, self.config.host)
+        if obstacle:
+            CONSOLE.log(f"no run folder for neilfpp's own commands: {obstacle}")
+        else:
+            self.record = RunRecord.of(trainer, self.config.neilf, self.neilf.facts)
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
         return [
             *theirs,
             TrainingCallback(before, self._begin_step, args=[optimizers]),
             TrainingCallback(after, self._solve_light),
+            TrainingCallback(after, self._look_and_save, args=[trainer]),
             TrainingCallback(after, self._end_after_last, args=[trainer]),
         ]
 
@@ -175,8 +192,28 @@ class NeilfMethod(Model):
         if self.computed is None:
             return
         self.light_solver.observe(self.computed)
+        self.watch.after_step(self.neilf.stages[self.stage], self.computed, step)
+        if self.light_solver.due:
+            self.watch.after_fit(self.light_solver.points, step)
         self.evidence = self.light_solver.solve(self.neilf.brdf, self.neilf.scene) or self.evidence
         self.computed = None
+
+    def _look_and_save(self, trainer: Trainer, step: int) -> None:
+        """At the end of a stage see whether all is well; there, and where nerfstudio saves, keep the run."""
+        done = step + 1
+        position = stage_at(step, self.config.neilf.train)
+        ends = position.step + 1 == position.length
+        if ends:
+            self.watch.pixels = self.watch.pixels.to(self.device)
+            self.watch.after_stage(self.neilf, self.neilf.stages[position.stage], self.guard.skipped, done)
+            CONSOLE.log(f"health after {position.stage.value}: {Health.of(self.watch.findings.values())}")
+            if self.proxy is not None and self.proxy.report() is not None:
+                CONSOLE.log(str(self.proxy.report()))
+        saves = step > 0 and step % trainer.config.steps_per_save == 0  # as nerfstudio has it
+        if ends or saves or done == trainer._start_step + trainer.config.max_num_iterations:
+            write_findings(trainer.base_dir, self.watch)
+            if self.record is not None:
+                self.record.save(self.neilf, self.light_solver, self.watch, trainer, done)
 
     def _end_after_last(self, trainer: Trainer, step: int) -> None:
         """Nerfstudio counts iterations from where it resumes; the stages end where they end."""
@@ -204,15 +241,15 @@ class NeilfMethod(Model):
             **active_losses(self.stage, self.neilf.config, self.neilf.stages, share),
             OWN_LOSSES: self.config.host_losses,
         }
+        total = weigh(terms, weights)
+        self.guard.begin_step(total.terms, self.step)
         if metrics_dict is not None:
             # Known only now, and logged after this: the terms before their weights.
-            metrics_dict |= weigh(terms, weights).terms | self._light_found()
+            metrics_dict |= total.terms | self._light_found()
         return {name: weigh({name: term}, weights).loss for name, term in terms.items()}
 
     def _light_found(self) -> dict[str, Tensor]:
-        """What the last fit of the light measured for and against lamps, where the settings leave that
-        open.
-        """
+        """The last fit's evidence for and against lamps, where the settings leave that open."""
         if self.evidence is None:
             return {}
         return {
@@ -223,9 +260,7 @@ class NeilfMethod(Model):
     # ------------------------------------------------------------------------------------------------ outputs
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
-        """In evaluation every map; in training the rays themselves: what must be rendered, the losses
-        decide.
-        """
+        """In evaluation every map; in training the rays: the losses decide what is rendered."""
         rays = RayBatch(ray_bundle.origins, ray_bundle.directions)
         if self.training:
             return {"origins": rays.origins, "directions": rays.directions}
@@ -249,9 +284,7 @@ class NeilfMethod(Model):
 
     @torch.no_grad()
     def _incident_light(self, rays: RayBatch, maps: Maps) -> Float[Tensor, "N 3"]:
-        """Irradiance over π where a ray meets the surface: the mean incident radiance, weighted by the
-        cosine.
-        """
+        """Irradiance over π at surface hits: the mean incident radiance, weighted by cosine."""
         light = torch.zeros_like(maps.rgb)
         rows = torch.nonzero(maps.roughness[:, 0])[
             :, 0
@@ -271,9 +304,7 @@ class NeilfMethod(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """PSNR and SSIM of display values over the object, as `neilfpp eval` has them without true depths,
-        and all maps as pictures.
-        """
+        """PSNR and SSIM of display values over the object, as `neilfpp eval`, and all maps."""
         truth, rgb, volume = (self._display(image.to(self.device)) for image in _images(batch, outputs))
         # Where nothing is known of the object, what is rendered of it chooses the pixels.
         shown = (

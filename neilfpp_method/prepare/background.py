@@ -1,6 +1,4 @@
-"""Native calls that take minutes: they run beside the main thread, which shows their progress and can stop
-them.
-"""
+"""Native calls that take minutes run beside the main thread, which shows progress and can stop them."""
 
 from __future__ import annotations
 
@@ -55,9 +53,7 @@ def in_background(
 
 @contextmanager
 def sigterm_as_ctrl_c() -> Iterator[None]:
-    """SIGTERM, by which schedulers and containers end a command, is a person's stop: a
-    `KeyboardInterrupt`.
-    """
+    """SIGTERM, by which schedulers end a command, acts like a person's stop: a `KeyboardInterrupt`."""
     try:
         before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     except ValueError:  # not the main thread: somebody else handles signals

@@ -3,8 +3,7 @@
 merged ──► copies ──► matches ──► model ──► views ──► cloud ──► capture       each a step in CAPTURE/work,
 done once
 
-The capture's own files are laid out from the steps' results at the end, `capture.json` last: a folder without
-it is no capture yet.
+The capture's files are laid out at the end, `capture.json` last: a folder without it is unfinished.
 """
 
 from __future__ import annotations
@@ -40,8 +39,7 @@ __all__ = ["run_prepare"]
 
 
 def run_prepare(options: Prepare, console: Console) -> Path:
-    """Make a capture and return its folder. One that is finished, of the same images and options, is left as
-    it is.
+    """Make a capture and return its folder. A finished one, of the same images and options, is kept.
 
     Raises:
         UserError: bad input, or images that do not make a scene.

@@ -20,8 +20,8 @@ from neilfpp_method.prepare.depth_planes import OrientedDepth, fit_planes
 __all__ = ["fuse"]
 
 AGREEMENT = 1.5
-LEAST_COSINE = 0.7
-FEWEST_WITNESSES = 2
+MIN_COSINE = 0.7
+MIN_WITNESSES = 2
 
 
 def fuse(
@@ -45,7 +45,7 @@ def fuse(
         advance: called once per view.
     """
     agreed = [
-        _witnesses(cameras, depths, i, grains[i], others) >= FEWEST_WITNESSES
+        _witnesses(cameras, depths, i, grains[i], others) >= MIN_WITNESSES
         for i, others in enumerate(neighbours)
     ]
     trusted = [np.where(sure, depth, np.float32(0)) for sure, depth in zip(agreed, depths, strict=True)]
@@ -59,12 +59,12 @@ def fuse(
         total, direction, count = position.copy(), normal.copy(), np.ones(len(rows))
         for j in neighbours[i]:
             seen = _lookup(cameras[j], maps[j], position, grains[i])
-            agrees = seen.agrees & ((seen.normal * normal).sum(axis=1) >= LEAST_COSINE)
+            agrees = seen.agrees & ((seen.normal * normal).sum(axis=1) >= MIN_COSINE)
             total[agrees] += seen.position[agrees]
             direction[agrees] += seen.normal[agrees]
             count += agrees
             taken[j][seen.row[agrees], seen.column[agrees]] = True
-        kept = count > FEWEST_WITNESSES
+        kept = count > MIN_WITNESSES
         positions.append(total[kept] / count[kept, None])
         normals.append(direction[kept] / np.linalg.norm(direction[kept], axis=1, keepdims=True))
         advance()

@@ -18,15 +18,13 @@ from neilfpp_method.data.views import Camera
 __all__ = ["OrientedDepth", "fit_planes"]
 
 WINDOW = 13
-LEAST_SHARE = 0.4
-STEEPEST = 0.17
+MIN_SHARE = 0.4
+MIN_FACING = 0.17
 
 
 @dataclass(frozen=True)
 class OrientedDepth:
-    """Depth along the camera's axis, 0 where it is not known, and unit normals of the world, towards the
-    camera.
-    """
+    """Depth along the camera's axis, 0 where unknown, and unit world normals towards the camera."""
 
     depth: Float32[np.ndarray, "H W"]
     normal: Float32[np.ndarray, "H W 3"]
@@ -74,7 +72,7 @@ def fit_planes(camera: Camera, depth: Float32[np.ndarray, "H W"], grain: float) 
     ray = np.stack([u, v, np.ones_like(u)], axis=-1)
     facing = -(normal * ray).sum(axis=-1) / np.linalg.norm(ray, axis=-1)
     good = (
-        known & (share >= LEAST_SHARE) & solvable & (residual <= grain) & (fitted > 0) & (facing >= STEEPEST)
+        known & (share >= MIN_SHARE) & solvable & (residual <= grain) & (fitted > 0) & (facing >= MIN_FACING)
     )
     smooth = np.where(good, 1.0 / np.where(good, fitted, 1.0), 0.0)
     world = normal @ camera.w2c[:3, :3]

@@ -38,9 +38,7 @@ WRITERS = {"nerfstudio": write_transforms, "neilf": write_sfm_scene}
 
 @dataclass(frozen=True)
 class Source:
-    """What a capture is made from: views with poses, the step that found them, and what is known about
-    how.
-    """
+    """What a capture is made from: views with poses, the step that found them, and how, where known."""
 
     posed: Posed
     step: Step
@@ -52,8 +50,7 @@ class Source:
 
 
 def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
-    """Write the capture's folder and say what it came to; none where it is there already, of the same source
-    and options.
+    """Write the capture's folder and its summary; none where it exists for the same source and options.
 
     Raises:
         UserError: an image cannot be read, or nothing tells where the scene is.

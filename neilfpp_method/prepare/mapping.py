@@ -12,11 +12,14 @@ from neilfpp_method.prepare.background import in_background
 from neilfpp_method.prepare.photos import Photo
 from neilfpp_method.prepare.upright import turn_upright
 
-__all__ = ["LEAST_SHARE", "map_scene", "refuse_partial"]
+__all__ = ["MIN_SHARE", "map_scene", "refuse_partial"]
 
-LEAST_SHARE = 0.6
+MIN_SHARE = 0.6
 SEED = 7
-SHOT_ADVICE = "take more photographs between those that are there, so that neighbours differ by 15° at most, with texture in sight"
+SHOT_ADVICE = (
+    "take more photographs between those that are there, so that neighbours differ by 15° at most, "
+    "with texture in sight"
+)
 
 
 def map_scene(
@@ -71,7 +74,7 @@ def map_scene(
 
 
 def refuse_partial(missing: Sequence[str], sizes: Sequence[int]) -> None:
-    """Refuse a largest model with less than `LEAST_SHARE` of the images.
+    """Refuse a largest model with less than `MIN_SHARE` of the images.
 
     Args:
         missing: the images that it does not place.
@@ -81,7 +84,7 @@ def refuse_partial(missing: Sequence[str], sizes: Sequence[int]) -> None:
         UserError: says how many are placed, in how many pieces, and some that are not.
     """
     placed, count = sizes[0], sizes[0] + len(missing)
-    if placed >= LEAST_SHARE * count:
+    if placed >= MIN_SHARE * count:
         return
     pieces = f", others in models of {', '.join(map(str, sizes[1:]))}" if len(sizes) > 1 else ""
     named = ", ".join(missing[:3]) + (", …" if len(missing) > 3 else "")

@@ -25,8 +25,7 @@ BRIGHT, SHOWN_AT = 90.0, 0.7
 
 
 def write_copies(photos: Photos, folder: Path, advance: Callable[[], None]) -> tuple[str, ...]:
-    """Write `folder/NAME.png` for every photograph that has none yet; returns what is wrong with those that
-    cannot be read.
+    """Write `folder/NAME.png` for photographs without one; returns what is wrong with unreadable ones.
 
     Args:
         photos: the photographs.
@@ -53,9 +52,7 @@ def write_copies(photos: Photos, folder: Path, advance: Callable[[], None]) -> t
 
 
 def relative_exposures(photos: Photos) -> dict[str, float]:
-    """The exposure of each photograph in units of their median, by name; all 1 unless EXIF says it for every
-    one.
-    """
+    """Each photograph's exposure over their median, by name; all 1 unless EXIF has it for every one."""
     known = [photo.exposure for photo in photos.items if photo.exposure is not None]
     if not photos.linear or len(known) < len(photos.items):
         return {photo.name: 1.0 for photo in photos.items}

@@ -1,6 +1,4 @@
-"""Exposure brackets among the photographs: each becomes one linear image, which then stands for its
-photographs.
-"""
+"""Exposure brackets among the photographs: each becomes one linear image, which replaces them."""
 
 from __future__ import annotations
 
@@ -14,7 +12,7 @@ from neilfpp_method.data.bracket_folder import GROUPS, Brackets, find_brackets, 
 from neilfpp_method.data.json_entry import Entry, write_json
 from neilfpp_method.data.photo_exposure import LISTS
 from neilfpp_method.errors import UserError
-from neilfpp_method.prepare.photos import FEWEST, Photos, check_names
+from neilfpp_method.prepare.photos import MIN_PHOTOS, Photos, check_names
 from neilfpp_method.prepare.progress import Bar, Bars
 from neilfpp_method.prepare.steps import Step, begin, stamp
 
@@ -57,13 +55,13 @@ def brackets_among(photos: Photos, wanted: Literal["auto", "off"]) -> Brackets |
     if listed is not None:
         if strange := sorted(used - photographs):
             raise UserError(f"{listed}: {strange[0]} is no photograph that can be read", "correct the list")
-        if len(found) < FEWEST:
+        if len(found) < MIN_PHOTOS:
             problem = f"{listed}: {len(found)} bracket{'s' * (len(found) != 1)}"
             raise UserError(
-                problem, f"give at least {FEWEST}, better 30, from all around the object, {AS_THEY_ARE}"
+                problem, f"give at least {MIN_PHOTOS}, better 30, from all around the object, {AS_THEY_ARE}"
             )
         return found
-    return found if used == photographs and len(found) >= FEWEST and _same_steps(found) else None
+    return found if used == photographs and len(found) >= MIN_PHOTOS and _same_steps(found) else None
 
 
 def _same_steps(brackets: Brackets) -> bool:
@@ -118,16 +116,15 @@ def merge_photos(
     if unused := len(photos.items) - len(set(used)):
         remark += f"; {unused} in no bracket left out"
     if by_hand := [shift for shift in step.result["moved"].values() if shift]:
-        remark += f"; taken by hand: those of {len(by_hand)} were moved onto one another, by up to {max(by_hand):.1f} pixels"
+        remark += f"; taken by hand: those of {len(by_hand)} were moved onto one another, "
+        remark += f"by up to {max(by_hand):.1f} pixels"
     return Merged(replace(photos, root=folder, items=tuple(items), linear=True), step, remark)
 
 
 def _merge(
     brackets: Brackets, folder: Path, response: Literal["auto", "linear", "srgb"], bar: Bar
 ) -> dict[str, float]:
-    """Merge what is not merged yet; returns by how many pixels the photographs of each pose were moved, now
-    or before.
-    """
+    """Merge the remaining brackets; returns each pose's largest shift in pixels, earlier ones included."""
     known = folder / MOVED
     moved = dict(Entry.load(known).entries()) if known.is_file() else {}
 

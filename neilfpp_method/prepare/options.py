@@ -18,9 +18,7 @@ class Prepare:
     images: tyro.conf.Positional[Path]
     """The folder of photographs; sub-folders count. A capture with poses keeps them."""
     out: Path
-    """The capture's folder. Steps that are done are kept in its folder work, so that a stopped command
-    continues.
-    """
+    """The capture's folder. Finished steps are kept in its folder work, so a stopped command continues."""
     matching: Literal["auto", "exhaustive", "sequential", "vocabulary"] = "auto"
     """Which pairs are compared: all, neighbours in the order of the names, or look-alikes; auto: all up to
     200 images, look-alikes beyond.
@@ -34,9 +32,7 @@ class Prepare:
     ] = "SIMPLE_RADIAL"
     """COLMAP's model of the lens that is estimated."""
     response: Literal["auto", "linear", "srgb"] = "auto"
-    """What the pixels are: linear radiance (HDR) or sRGB (LDR); auto: floating-point and RAW files are
-    linear.
-    """
+    """Pixels are linear radiance (HDR) or sRGB (LDR); auto: floating-point and RAW files are linear."""
     brackets: Literal["auto", "off"] = "auto"
     """Merge exposure brackets into linear images first; auto: where the folder is one of brackets."""
     undistort: bool = False
@@ -44,13 +40,9 @@ class Prepare:
     dense: bool = False
     """Compute a dense oriented cloud by plane-sweep stereo; otherwise the sparse points are used."""
     test_every: int | None = None
-    """Hold out every k-th view for testing, 0 none; none given: the split that poses came with, or every
-    8th.
-    """
+    """Hold out every k-th view for testing, 0 none; by default the poses' own split, or every 8th."""
     auto: bool = False
-    """Leave out the views that `neilfpp inspect` proposes to: black or blurred ones, and pictures that are
-    there twice.
-    """
+    """Leave out the views that `neilfpp inspect` rejects: black or blurred ones, and duplicates."""
     allow_partial: bool = False
     """Leave out images that cannot be read or placed, however many."""
     also: tuple[Literal["nerfstudio", "neilf"], ...] = ()

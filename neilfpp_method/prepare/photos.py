@@ -1,6 +1,4 @@
-"""The photographs of a folder: which files, under which names, and what their headers and EXIF entries
-say.
-"""
+"""The photographs of a folder: files, names, and what their headers and EXIF entries say."""
 
 from __future__ import annotations
 
@@ -21,9 +19,9 @@ from neilfpp_method.data.raw import RAW_SUFFIXES, develop
 from neilfpp_method.data.views import plain_name
 from neilfpp_method.errors import UserError
 
-__all__ = ["FEWEST", "Photo", "Photos", "Picture", "check_names", "read_photo", "survey", "unreadable"]
+__all__ = ["MIN_PHOTOS", "Photo", "Photos", "Picture", "check_names", "read_photo", "survey", "unreadable"]
 
-FEWEST = 3
+MIN_PHOTOS = 3
 EXIF_FOLDER, MAKE, MODEL, ORIENTATION, FOCAL, FOCAL_35MM = 0x8769, 0x010F, 0x0110, 0x0112, 0x920A, 0xA405
 FILM_WIDTH = 36.0
 
@@ -50,9 +48,7 @@ class Photo:
 
 @dataclass(frozen=True)
 class Photos:
-    """The photographs of a folder in the order of their paths; all of one kind. `unreadable`: what is wrong
-    with others.
-    """
+    """A folder's photographs in path order, all of one kind. `unreadable`: what is wrong with others."""
 
     root: Path
     items: tuple[Photo, ...]
@@ -74,8 +70,7 @@ class Picture:
 
 
 def survey(root: Path, response: Literal["auto", "linear", "srgb"]) -> Photos:
-    """Find the photographs under a folder and read their headers; hidden files and other files are passed
-    over.
+    """Find the photographs under a folder and read their headers; hidden and other files are skipped.
 
     Args:
         root: the folder.
@@ -94,13 +89,13 @@ def survey(root: Path, response: Literal["auto", "linear", "srgb"]) -> Photos:
             kinds[path] = path.suffix.lower() in RAW_SUFFIXES or image_header(path).hdr
         except UserError as error:
             problems[path] = error.problem
-    if len(kinds) < FEWEST:
+    if len(kinds) < MIN_PHOTOS:
         count = f"{len(kinds) or 'no'} image{'s' * (len(kinds) != 1)}"
         also = (
             f", and {len(problems)} that cannot be read ({next(iter(problems.values()))})" if problems else ""
         )
         raise UserError(
-            f"{root}: {count}{also}", f"give at least {FEWEST}, better 30, from all around the object"
+            f"{root}: {count}{also}", f"give at least {MIN_PHOTOS}, better 30, from all around the object"
         )
     if response == "auto" and len(set(kinds.values())) > 1:
         hdr, ldr = (next(path for path, kind in kinds.items() if kind is wanted) for wanted in (True, False))

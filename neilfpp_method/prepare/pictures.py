@@ -1,6 +1,4 @@
-"""A picture of what was found: cameras and points from above and from the side, and how well each image
-fits.
-"""
+"""A picture of what was found: cameras and points from two sides, and how well each image fits."""
 
 from __future__ import annotations
 
@@ -22,7 +20,7 @@ PAPER, INK, PALE = (250, 250, 248), (28, 30, 34), (176, 180, 186)
 TRAIN, TEST, BAD = (42, 92, 170), (222, 128, 20), (190, 40, 50)
 PANEL, MARGIN, TITLE, NOTE = 720, 40, 24, 16
 FINE = 2
-MOST_POINTS = 40_000
+MAX_POINTS = 40_000
 FRUSTUM = 0.18
 FIT_HEIGHT, AXIS, TICK = 190, 60, 0.5
 
@@ -45,8 +43,7 @@ def write_picture(
 def draw_scene(
     views: Sequence[View], test: Collection[str], points: WorldPoints, box: Normalisation
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Cameras as pyramids, points coloured by their normals and the scene's unit sphere, from above and from
-    the side.
+    """Cameras as pyramids, points coloured by normals, and the unit sphere, from above and the side.
 
     Args:
         views: in the world frame; +z is up in the picture.
@@ -57,7 +54,7 @@ def draw_scene(
     pyramids = np.stack([_pyramid(view.camera, box.scale) for view in views])
     centre = np.array(box.centre)
     reach = 1.08 * float(np.abs(pyramids - centre).max(initial=1.2 * box.scale))
-    rows = np.random.default_rng(0).permutation(len(points.position))[:MOST_POINTS]
+    rows = np.random.default_rng(0).permutation(len(points.position))[:MAX_POINTS]
     sheet = Image.new("RGB", (2 * PANEL + 3 * MARGIN, PANEL + 2 * MARGIN + TITLE), PAPER)
     sides = {"from above": (0, 1, 2), "from the side": (0, 2, 1)}
     for i, (title, (right, up, depth)) in enumerate(sides.items()):
@@ -87,9 +84,7 @@ def draw_scene(
 
 
 def draw_fit(placed: Sequence[Placement], width: int) -> UInt8[np.ndarray, "H W 3"]:
-    """A bar per image: its reprojection error in pixels; an image that is not placed has a red bar of full
-    height.
-    """
+    """A bar per image: its reprojection error in pixels; a full red bar where it has no pose."""
     sheet = Image.new("RGB", (width, FIT_HEIGHT + AXIS + MARGIN), PAPER)
     draw = ImageDraw.Draw(sheet)
     _write(draw, (MARGIN, 0), "reprojection error of each image, pixels", NOTE)

@@ -20,22 +20,20 @@ from neilfpp_method.shading.color import luminance
 
 __all__ = ["GreyView", "choose_sources", "grain", "grey_view", "sweep"]
 
-MOST_PIXELS_A_SIDE = 640
+MAX_SIDE = 640
 WINDOW = 7
-WIDEST_ANGLE, BEST_ANGLE, NARROWEST_ANGLE = 35.0, 12.0, 3.0
-FEWEST_PLANES, MOST_PLANES = 32, 224
-LEAST_SCORE = 0.6
+MAX_ANGLE, BEST_ANGLE, MIN_ANGLE = 35.0, 12.0, 3.0
+MIN_PLANES, MAX_PLANES = 32, 224
+MIN_SCORE = 0.6
 FLAT = 1e-5
 """Variance below which a window shows nothing; grey values run from 0 to 1."""
 ROOM = 1.15
-NEAREST = 0.05
+MIN_DEPTH = 0.05
 
 
 @dataclass(frozen=True)
 class GreyView:
-    """A view as it is compared: a pinhole, small enough to be searched densely, and its grey values from 0 to
-    1.
-    """
+    """A view as it is compared: a pinhole, small enough for a dense search, with grey values in [0, 1]."""
 
     camera: Camera
     grey: Float32[np.ndarray, "H W"]
@@ -55,7 +53,7 @@ def grey_view(view: View, linear: bool) -> GreyView:
         color = resample(color, view.camera, camera)
     grey = luminance(torch.from_numpy(color)).numpy()
     grey = np.sqrt(grey / max(float(np.quantile(grey, 0.99)), 1e-9)).clip(0.0, 1.0) if linear else grey
-    share = min(1.0, MOST_PIXELS_A_SIDE / max(camera.width, camera.height))
+    share = min(1.0, MAX_SIDE / max(camera.width, camera.height))
     width, height = round(camera.width * share), round(camera.height * share)
     if (width, height) != (camera.width, camera.height):
         grey = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
@@ -73,8 +71,7 @@ def grey_view(view: View, linear: bool) -> GreyView:
 def choose_sources(
     cameras: Sequence[Camera], centre: Float64[np.ndarray, " 3"], count: int
 ) -> list[list[int]]:
-    """For each camera at most `count` others to compare it with: those whose angle to it, at the scene's
-    centre, is best.
+    """For each camera at most `count` others to compare with: those at the best angles to it.
 
     Wider angles tell depth better, narrower ones show the same picture. A camera may have none.
     """
@@ -82,15 +79,13 @@ def choose_sources(
     directions = (eyes - centre) / np.linalg.norm(eyes - centre, axis=1, keepdims=True)
     angles = np.degrees(np.arccos(np.clip(directions @ directions.T, -1.0, 1.0)))
     fit = np.abs(np.log(np.maximum(angles, 1e-3) / BEST_ANGLE))
-    fit[(angles < NARROWEST_ANGLE) | (angles > WIDEST_ANGLE)] = np.inf
+    fit[(angles < MIN_ANGLE) | (angles > MAX_ANGLE)] = np.inf
     order = np.argsort(fit, axis=1)[:, :count]
     return [[int(j) for j in row if np.isfinite(fit[i, j])] for i, row in enumerate(order)]
 
 
 def grain(camera: Camera, sources: Sequence[Camera]) -> float:
-    """The difference of inverse depth that moves the picture of the farthest source by a pixel; without
-    sources 0.
-    """
+    """The step of inverse depth that moves the farthest source's picture by a pixel; 0 without sources."""
     return (
         1.0 / (camera.fx * max(float(np.linalg.norm(s.c2w[:, 3] - camera.c2w[:, 3])) for s in sources))
         if sources
@@ -117,7 +112,7 @@ def sweep(reference: GreyView, sources: Sequence[GreyView], box: Normalisation) 
     curve = below - 2 * peak + above
     offset = np.where(curve < -1e-6, (below - above) / (2 * np.minimum(curve, -1e-6)), 0.0).clip(-0.5, 0.5)
     refined = inverse[0] + (inner + offset) * (inverse[1] - inverse[0])
-    known = (best == inner) & (peak >= LEAST_SCORE) & ours.textured
+    known = (best == inner) & (peak >= MIN_SCORE) & ours.textured
     return np.where(known, 1.0 / refined, 0.0).astype(np.float32)
 
 
@@ -140,9 +135,9 @@ def _planes(
     camera = reference.camera
     middle = float(camera.w2c[2, :3] @ np.array(box.centre) + camera.w2c[2, 3])
     far = middle + ROOM * box.scale
-    near = max(middle - ROOM * box.scale, NEAREST * far)
+    near = max(middle - ROOM * box.scale, MIN_DEPTH * far)
     count = int((1 / near - 1 / far) / grain(camera, [source.camera for source in sources]))
-    return np.linspace(1 / far, 1 / near, min(max(count, FEWEST_PLANES), MOST_PLANES))
+    return np.linspace(1 / far, 1 / near, min(max(count, MIN_PLANES), MAX_PLANES))
 
 
 def _score(

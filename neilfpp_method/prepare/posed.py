@@ -1,6 +1,4 @@
-"""Photographs with poses: what every later step works on, whether the poses were found here or came with the
-images.
-"""
+"""Photographs with poses, found here or given: what every later step works on."""
 
 from __future__ import annotations
 
@@ -25,9 +23,7 @@ __all__ = ["Posed", "posed_by_capture", "posed_by_model", "write_views"]
 
 @dataclass(frozen=True)
 class Posed:
-    """Views whose files lie where they were taken from; `normalisation`, with what told it, and `cloud` where
-    the source knows them.
-    """
+    """Views with files where they came from; `normalisation` and its origin, and `cloud` where known."""
 
     views: tuple[View, ...]
     linear: bool

@@ -1,6 +1,4 @@
-"""The points of structure from motion as an oriented cloud: outliers out, normals by the neighbours, turned
-to the cameras.
-"""
+"""Points of structure from motion as an oriented cloud: outliers removed, normals towards cameras."""
 
 from __future__ import annotations
 
@@ -16,8 +14,8 @@ from neilfpp_method.data.point_cloud import WorldPoints
 __all__ = ["SparsePoints", "estimate_normals", "oriented", "reliable", "sparse_points", "without_outliers"]
 
 NEIGHBOURS = 12
-LARGEST_ERROR = 2.0
-SHORTEST_TRACK = 3
+MAX_ERROR = 2.0
+MIN_TRACK = 3
 FAR = 3.0
 FLAT = 0.1
 
@@ -59,13 +57,9 @@ def sparse_points(model: pycolmap.Reconstruction) -> SparsePoints:
 
 
 def reliable(points: SparsePoints) -> Bool[np.ndarray, " P"]:
-    """Which points can be trusted: seen in at least 3 images, within 2 pixels of where they should be, and
-    not alone.
-    """
+    """Which points to trust: seen in at least 3 images, with errors of at most 2 pixels, not alone."""
     good = (
-        (points.error <= LARGEST_ERROR)
-        & (points.track >= SHORTEST_TRACK)
-        & np.isfinite(points.position).all(axis=1)
+        (points.error <= MAX_ERROR) & (points.track >= MIN_TRACK) & np.isfinite(points.position).all(axis=1)
     )
     good[good] = _in_company(points.position[good])
     return good
@@ -103,8 +97,7 @@ def estimate_normals(
 
 
 def _in_company(position: Float64[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
-    """Which points have neighbours no farther away, in the mean, than is common among all: by 3 deviations of
-    the logarithm.
+    """Which points have a mean neighbour distance within 3 deviations of its logarithm over all points.
 
     The median and the median deviation tell what is common, so that outliers have no say in it.
     """

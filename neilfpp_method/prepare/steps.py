@@ -1,5 +1,4 @@
-"""Steps that are done once: each has a folder, and a marker that says of what it was made and that it is
-complete.
+"""Steps that are done once: each has a folder, and a marker of its inputs and its completion.
 
 A marker is written in one step when the work is done. A step whose inputs have changed since starts from an
 empty folder, one that was interrupted goes on with what its folder holds.
@@ -27,9 +26,7 @@ VERSION = 2
 
 @dataclass(frozen=True)
 class Step:
-    """A step of the work. `result` is what it left when it was completed; none: it is still to do, or to go
-    on with.
-    """
+    """A step of the work. `result` is what it left when complete; none: it is to be done or continued."""
 
     folder: Path
     inputs: str

@@ -17,8 +17,8 @@ from neilfpp_method.data.views import SceneSource
 
 __all__ = ["Placement", "Summary", "describe_cameras", "placements", "remarks_on", "write_summary"]
 
-FEW_FEATURES = 100
-LARGE_ERROR = 1.5
+MIN_FEATURES = 100
+MAX_ERROR = 1.5
 
 
 @dataclass(frozen=True)
@@ -123,10 +123,10 @@ def remarks_on(
             f"the images fell into {len(models)} models of {', '.join(map(str, models))} images; the first "
             "is used"
         )
-    if poor := [p.name for p in placed if p.features < FEW_FEATURES]:
-        remarks.append(f"fewer than {FEW_FEATURES} features in {', '.join(poor)}")
-    if off := [p.name for p in placed if (p.error or 0.0) > LARGE_ERROR]:
-        remarks.append(f"reprojection error above {LARGE_ERROR} pixels in {', '.join(off)}")
+    if poor := [p.name for p in placed if p.features < MIN_FEATURES]:
+        remarks.append(f"fewer than {MIN_FEATURES} features in {', '.join(poor)}")
+    if off := [p.name for p in placed if (p.error or 0.0) > MAX_ERROR]:
+        remarks.append(f"reprojection error above {MAX_ERROR} pixels in {', '.join(off)}")
     if not all(camera["focal_from_exif"] for camera in cameras):
         remarks.append("EXIF does not tell the focal length; it is estimated from the images")
     return remarks

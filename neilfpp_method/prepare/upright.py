@@ -17,9 +17,7 @@ HELD = {
     6: np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
     8: np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
 }
-"""By EXIF's orientation, where the camera was not held level: from its axes to those of the picture as people
-look at it.
-"""
+"""By EXIF's orientation, for cameras not held level: from camera axes to the picture's axes."""
 
 
 def upright_rotation(rotations: Float64[np.ndarray, "N 3 3"]) -> Float64[np.ndarray, "3 3"]:

@@ -1,3 +1,1 @@
-"""A finished run under other light, by path tracing on the surface and with the material that it has
-found.
-"""
+"""A finished run under other light, path-traced on the surface and material that it has found."""

@@ -16,11 +16,11 @@ from neilfpp_method.data.views import Camera, View
 from neilfpp_method.errors import UserError
 from neilfpp_method.structures import RayBatch
 
-__all__ = ["MOST_WIDTH", "Shot", "rays_through", "resized", "turntable", "view_shots"]
+__all__ = ["MAX_WIDTH", "Shot", "rays_through", "resized", "turntable", "view_shots"]
 
-MOST_WIDTH = 800
+MAX_WIDTH = 800
 """Pixels: photographs are larger than anybody wants to wait for, so this is where the default size ends."""
-MOST_SIDE = 8192
+MAX_SIDE = 8192
 """Pixels of a picture's side: larger ones do not fit into memory together with what a denoiser needs."""
 
 
@@ -35,7 +35,7 @@ class Shot:
 
 
 def view_shots(capture: Capture, views: Sequence[View], scale: float | None, width: int | None) -> list[Shot]:
-    """Views of a capture; neither a scale nor a width: their own size, up to `MOST_WIDTH`.
+    """Views of a capture; neither a scale nor a width: their own size, up to `MAX_WIDTH`.
 
     Raises:
         UserError: there are no views, or a size that is not possible.
@@ -52,8 +52,7 @@ def view_shots(capture: Capture, views: Sequence[View], scale: float | None, wid
 
 
 def turntable(capture: Capture, frames: int, scale: float | None, width: int | None) -> list[Shot]:
-    """Cameras on a circle about the scene's +z, which look at its centre; height, distance and lens are those
-    of the capture.
+    """Cameras on a circle about the scene's +z, facing its centre; height, distance, lens as captured.
 
     Distance and elevation are the medians of the capture's cameras; the lens is that of the view whose
     distance is nearest to the median, straightened.
@@ -87,9 +86,9 @@ def resized(camera: Camera, factor: float) -> Camera:
         UserError: the size is below 1 or above 8192 pixels a side.
     """
     width, height = round(camera.width * factor), round(camera.height * factor)
-    if not (1 <= width <= MOST_SIDE and 1 <= height <= MOST_SIDE):
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise UserError(
-            f"a picture of {width}×{height} pixels", f"choose --scale or --width for 1 to {MOST_SIDE} a side"
+            f"a picture of {width}×{height} pixels", f"choose --scale or --width for 1 to {MAX_SIDE} a side"
         )
     x, y = width / camera.width, height / camera.height
     sizes = {"fx": camera.fx * x, "cx": camera.cx * x, "fy": camera.fy * y, "cy": camera.cy * y}
@@ -118,7 +117,7 @@ def _factor(camera: Camera, scale: float | None, width: int | None) -> float:
         return width / camera.width
     if scale is not None:
         return scale
-    return min(1.0, MOST_WIDTH / camera.width)
+    return min(1.0, MAX_WIDTH / camera.width)
 
 
 def _looking_in(distance: float, elevation: float, azimuth: float) -> Float64[np.ndarray, "4 4"]:

@@ -31,8 +31,7 @@ __all__ = ["Compared", "TrueImage", "compare", "find_truth", "read_truth"]
 
 @dataclass(frozen=True)
 class TrueImage:
-    """The true image of a view, linear; the pixels that count, and what decided that; the capture's image,
-    linear."""
+    """The true image of a view, linear; its counted pixels and their origin; the capture's image."""
 
     name: str
     image: Float[np.ndarray, "H W 3"]
@@ -74,8 +73,7 @@ def find_truth(folder: Path, views: Sequence[View]) -> dict[str, Path]:
 
 
 def read_truth(capture: Capture, view: View, path: Path) -> TrueImage:
-    """A true image, and which of its pixels count: by its alpha, else by true depth, else by the mask of the
-    view.
+    """A true image and its counted pixels: by alpha, else by true depth, else by the view's mask.
 
     Raises:
         UserError: an image cannot be read, or has values that are not finite.

@@ -1,5 +1,4 @@
-"""Open Image Denoise (Áfra, Intel), where `pyoidn` is installed: it takes the noise of few samples for a
-little blur."""
+"""Open Image Denoise (Áfra, Intel), if `pyoidn` is installed: less noise for a little blur."""
 
 from __future__ import annotations
 

@@ -43,8 +43,7 @@ class Box:
 
 
 def parse_edits(texts: Sequence[str]) -> list[Edit]:
-    """Edits as a person writes them: a name, `=`, and one number in [0, 1], or three by commas for a colour
-    (linear).
+    """Edits as written: a name, `=`, and one number in [0, 1], or three with commas for a linear colour.
 
     Raises:
         UserError: no such parameter, or no such value.

@@ -16,8 +16,7 @@ from neilfpp_method.shading.frame import local_frame, safe_normalize
 __all__ = ["LampSample", "Lamplight", "lamps_of_run"]
 
 EVEN_SHARE = 0.05
-"""Of the probability of lamps, without regard to where they send: an axis is asked at the middle of a lamp
-alone."""
+"""Share of the lamps' probability without regard to axes: an axis is asked at a lamp's middle only."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +41,7 @@ class Lamplight:
     radius: float
 
     def sample(self, x: Float[Tensor, "N 3"], u: Float[Tensor, "N 3"]) -> LampSample:
-        """A direction within the cone of one lamp, for numbers in [0, 1); the lamp by about what it
-        brings."""
+        """A direction within one lamp's cone, for numbers in [0, 1); lamps drawn by contribution."""
         chosen = self._shares(x)
         lamp = torch.searchsorted(chosen.cumsum(-1), u[:, 2:].contiguous()).clamp_max(len(self.position) - 1)
         offset = self.position[lamp[:, 0]] - x
@@ -59,13 +57,11 @@ class Lamplight:
         return LampSample(wi, torch.where(distance.isfinite(), pdf, 0.0), distance, radiance)
 
     def pdf(self, x: Float[Tensor, "N 3"], lamp: int) -> Float[Tensor, " N"]:
-        """Density of `sample` at directions that meet one of the lamps, per steradian, when it is this lamp
-        that is drawn."""
+        """Density of `sample` at directions that meet one of the lamps, per steradian, for this lamp."""
         return self._shares(x)[:, lamp] * _density(self._one_less_cosine(self.position[lamp] - x))
 
     def meet(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N 3"], lamp: int) -> tuple[Tensor, Tensor]:
-        """The distance (N,) at which directions meet a lamp, infinite where they do not, and the radiance
-        (N, 3) from there."""
+        """Distance (N,) at which directions meet a lamp, else infinite, and radiance (N, 3) from it."""
         return self._met(x, wi, torch.full_like(x[:, 0], lamp, dtype=torch.int64))
 
     def _met(

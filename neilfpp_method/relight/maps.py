@@ -1,5 +1,4 @@
-"""Environment maps in, as people have them: EXR, Radiance HDR, or a picture, in this package's layout or in
-the common one."""
+"""Environment maps in: EXR, Radiance HDR, or a picture, in this package's or the common layout."""
 
 from __future__ import annotations
 
@@ -21,12 +20,11 @@ __all__ = ["Layout", "LightMap", "check_map", "map_names", "read_map"]
 
 Layout = Literal["ours", "common"]
 
-FEWEST_ROWS, MOST_ROWS = 4, 4096
+MIN_ROWS, MAX_ROWS = 4, 4096
 RINGING = 0.01
 """Of a map's mean: filters that sharpen leave negative texels as small as this; they count as 0."""
 QUARTER_TURN = math.pi / 2
-"""The common layout has +x in the middle of its columns and goes to −y on the right; ours has +y at its left
-edge."""
+"""The common layout's middle column is +x, with −y on its right; ours has +y at its left edge."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +42,10 @@ def check_map(path: Path) -> None:
         UserError: no such file, no image, or not of the shape of a whole sphere.
     """
     header = image_header(path)
-    if not FEWEST_ROWS <= header.height <= MOST_ROWS:
+    if not MIN_ROWS <= header.height <= MAX_ROWS:
         raise UserError(
             f"{path}: an environment map of {header.height} rows",
-            f"scale it to between {FEWEST_ROWS} and {MOST_ROWS} rows",
+            f"scale it to between {MIN_ROWS} and {MAX_ROWS} rows",
         )
     # Twice as many columns as rows; a map with rows at both poles may have one row more.
     if abs(header.width - 2 * header.height) > 2:
@@ -93,8 +91,7 @@ def read_map(path: Path, layout: Layout, rotate: float = 0.0, exposure: float = 
 
 
 def map_names(paths: Sequence[Path]) -> list[str]:
-    """A folder name for each map: its stem, and before it the name of its folder where two maps have one
-    stem.
+    """A folder name per map: its stem, preceded by its folder's name where two maps share a stem.
 
     Raises:
         UserError: two maps cannot be told apart, or a name cannot be that of a folder.

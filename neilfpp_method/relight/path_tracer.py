@@ -1,5 +1,4 @@
-"""Light along paths, from the camera over the surface to the lights (Kajiya 1986), all paths of a block side
-by side.
+"""Light along paths from the camera to the lights (Kajiya 1986), all paths of a block side by side.
 
 At every vertex the light is asked in two ways, and both are weighed by the power heuristic (Veach 1997,
 §9.2): a direction drawn by the light (the map, and one lamp), and the direction in which the path goes on,
@@ -27,11 +26,10 @@ from neilfpp_method.structures import Material, RayBatch
 __all__ = ["DIMENSIONS", "Scene", "Traced", "power_heuristic", "trace_paths"]
 
 DIMENSIONS = 9
-"""Numbers of a vertex: three for the next direction, two for the map, three for a lamp, one for the
-roulette."""
+"""Numbers per vertex: three for the next direction, two for the map, three for a lamp, one roulette."""
 ROULETTE_FROM = 3
 """Vertices of a path before it may end by chance: the first ones carry most of the light."""
-LONGEST_LIFE = 0.95
+MAX_SURVIVAL = 0.95
 """The largest probability of going on: a path between white walls ends, too."""
 
 
@@ -66,10 +64,8 @@ class Traced:
 
 
 def power_heuristic(own: Float[Tensor, " N"], other: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """The weight of a direction that one of two techniques has drawn, own² / (own² + other²); 0 where `own`
-    is."""
-    # By the quotient: the square of the density of a smooth lobe is beyond float32's precision, not its
-    # range.
+    """Weight of a direction drawn by one of two techniques, own² / (own² + other²); 0 where `own` is."""
+    # By the quotient: the squared density of a smooth lobe exceeds float32's precision, not its range.
     ratio = other / torch.where(own > 0, own, 1.0)
     return torch.where(own > 0, 1 / (1 + ratio.square()), 0.0)
 
@@ -120,7 +116,7 @@ def trace_paths(
         radiance[paths] += throughput * _met_light(scene, at, origins, directions, pdf, met)
 
         if bounce + 1 >= ROULETTE_FROM:
-            life = throughput.amax(-1).clamp_max(LONGEST_LIFE)
+            life = throughput.amax(-1).clamp_max(MAX_SURVIVAL)
             throughput = throughput / life[:, None]
             met = met[torch.nonzero((u[:, 8] < life)[met.rows])[:, 0]]
     return Traced(radiance, alpha, albedo, normal)

@@ -34,8 +34,7 @@ class StoredPicture:
 class PictureFolder:
     """A folder of pictures that are made with the same `settings`, as JSON has them.
 
-    Of each there is an EXR, a PNG, and a JSON record, which is written last: without it a picture was not
-    finished.
+    Each is an EXR, a PNG and a JSON record, which is written last: without it the picture is unfinished.
     """
 
     path: Path

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.export.mesh import HasSdf, extract_mesh
-from neilfpp_method.hosts.base import SmoothsNormals
+from neilfpp_method.export.mesh import extract_mesh
+from neilfpp_method.hosts.base import HasSdf, SmoothsNormals
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.hosts.volsdf import HIT_RADIUS
 from neilfpp_method.relight.surface import Surface
@@ -33,11 +33,9 @@ def check_material(run: Run) -> None:
 
 @torch.no_grad()
 def surface_of_run(run: Run, resolution: int) -> Surface:
-    """The mesh that the run was given, or the one that its distance field has, as `neilfpp export --what
-    mesh` extracts it.
+    """The given mesh, or the one that `neilfpp export --what mesh` extracts from the distance field.
 
-    Surfaces are shaded with the normals that the material was found with: those of the host, smoothed where
-    it smooths.
+    Surfaces are shaded with the normals of training: the host's, smoothed where it smooths.
 
     Args:
         run: the trained run.

@@ -1,5 +1,4 @@
-"""Where a path goes on at a surface: the package's BRDF (METHOD §1), and directions drawn in proportion to
-its parts.
+"""Where paths go on at a surface: the package's BRDF (METHOD §1), and directions in proportion to it.
 
 A direction comes from the specular lobe with the probability `share`, else in proportion to the cosine; its
 density is that of the mixture, so every direction of the BRDF can be drawn and weights stay bounded.
@@ -21,9 +20,8 @@ from neilfpp_method.structures import Indexable, Material
 
 __all__ = ["Vertices", "scatter", "scattered", "scattering_pdf", "vertices"]
 
-LEAST_SHARE = 0.1
-"""Of either technique: what the estimate of the lobe's share has wrong costs no more than ten times the
-variance."""
+MIN_SHARE = 0.1
+"""Of either technique: an error in the lobe's share costs at most ten times the variance."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +51,7 @@ def vertices(
     material: Material,
     lobe: Lobe | None,
 ) -> Vertices:
-    """Points of paths with their `share`: what the lobe sends of constant light, about, over what both parts
-    do."""
+    """Points of paths; `share`: what the lobe sends of constant light over what both parts send, about."""
     if lobe is None:
         share = torch.zeros_like(position[:, 0])
     else:
@@ -62,7 +59,7 @@ def vertices(
         reflectance = normal_reflectance(material)
         specular = (reflectance + (1 - reflectance) * (1 - cosine).pow(5)).mean(-1)
         diffuse = diffuse_reflectance(material).mean(-1)
-        share = (specular / (specular + diffuse).clamp_min(1e-6)).clamp(LEAST_SHARE, 1 - LEAST_SHARE)
+        share = (specular / (specular + diffuse).clamp_min(1e-6)).clamp(MIN_SHARE, 1 - MIN_SHARE)
     return Vertices(
         position, normal, flat, wo, material.base_color, material.roughness, material.metallic, share
     )

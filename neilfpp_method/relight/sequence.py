@@ -1,5 +1,4 @@
-"""The numbers in [0, 1) that paths are made of: a Sobol sequence, shifted by chance for every pixel and
-dimension.
+"""Numbers in [0, 1) for paths: a Sobol sequence, randomly shifted for every pixel and dimension.
 
 The samples of a pixel cover the square of each pair of dimensions evenly, which brings down noise faster than
 independent numbers do; the shift (Cranley and Patterson 1976) makes each estimate unbiased and the errors of

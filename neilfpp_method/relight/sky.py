@@ -1,8 +1,6 @@
-"""Light from far away for path tracing: radiance of a latitude-longitude map, and directions in proportion to
-it.
+"""Distant light for path tracing: a latitude-longitude map, and directions in proportion to it.
 
-Two layouts of rows, and any azimuth of the first column, so that a map is never resampled: its texels are the
-    light.
+Two layouts of rows and any azimuth of the first column: a map is used as it is, never resampled.
 """
 
 from __future__ import annotations
@@ -22,14 +20,12 @@ from neilfpp_method.shading.color import luminance
 __all__ = ["Sky", "SkySample", "sky_of_run"]
 
 MEAN_OF_CELL = (1 / 8, 3 / 4)
-"""Bilinear radiance has this mean within a texel: shares of either neighbour, and of the texel itself, along
-an axis."""
+"""Bilinear radiance has this mean in a texel: shares of each neighbour and of itself, per axis."""
 
 
 @dataclass(frozen=True)
 class SkySample:
-    """Unit directions towards the light, away from the surface, and their density per steradian of the
-    sphere."""
+    """Unit directions towards the light, and their density per steradian of the sphere."""
 
     wi: Float[Tensor, "N 3"]
     pdf: Float[Tensor, " N"]
@@ -39,8 +35,7 @@ class SkySample:
 class Sky:
     """An environment map about +z, bilinear between its texels; linear RGB ≥ 0, not black.
 
-    Column i shows the azimuth φ = start + 2π(i + ½)/W, and the direction there is (sin φ sin θ, cos φ sin θ,
-    cos θ).
+    Column i has the azimuth φ = start + 2π(i + ½)/W and the direction (sin φ sin θ, cos φ sin θ, cos θ).
 
     Attributes:
         radiance: the texels, rows from +z down.
@@ -69,8 +64,7 @@ class Sky:
         return found[0, :, 0].T
 
     def sample(self, u: Float[Tensor, "N 2"]) -> SkySample:
-        """Directions for numbers in [0, 1), in proportion to the luminance of texels and their solid
-        angle."""
+        """Directions for numbers in [0, 1), in proportion to luminance and solid angle of texels."""
         height, width = self.radiance.shape[:2]
         by_row, by_texel = self._cumulated
         u = u.double()
@@ -117,8 +111,7 @@ class Sky:
 
     @cached_property
     def _mass(self) -> Float[Tensor, "H W"]:
-        """What texels bring: the mean luminance of bilinear radiance within each, times its solid angle;
-        float64."""
+        """What texels bring: mean luminance of bilinear radiance times solid angle; float64."""
         mean = luminance(self.radiance.double())
         mean = MEAN_OF_CELL[0] * (mean.roll(1, 1) + mean.roll(-1, 1)) + MEAN_OF_CELL[1] * mean
         above, below = torch.cat((mean[:1], mean[:-1])), torch.cat((mean[1:], mean[-1:]))
@@ -131,8 +124,7 @@ class Sky:
 
     @cached_property
     def _cumulated(self) -> tuple[Float[Tensor, " H"], Float[Tensor, " T"]]:
-        """Cumulated masses of rows and of texels, in float64: a float32 has no room for a map's eight million
-        texels."""
+        """Cumulated masses of rows and texels in float64: float32 cannot sum eight million texels."""
         texels = self._mass.reshape(-1).cumsum(0)
         return texels[self.radiance.shape[1] - 1 :: self.radiance.shape[1]].contiguous(), texels
 

@@ -15,8 +15,7 @@ from neilfpp_method.structures import Indexable
 __all__ = ["OFFSET", "Crossings", "Surface"]
 
 OFFSET = 1e-4
-"""How far above a triangle a ray leaves it, scene units: far above the rounding of a hit, 1e-6, and far below
-any relief."""
+"""Height above a triangle at which rays leave, scene units: above rounding (1e-6), below relief."""
 TINY = 1e-18
 """Length under which a sum of edge products has no direction."""
 

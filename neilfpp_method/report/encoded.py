@@ -16,9 +16,7 @@ QUALITY = 88
 
 
 def encoded(picture: UInt8[np.ndarray, "H W 3"], shown: Bool[np.ndarray, "H W"] | None = None) -> str:
-    """A picture as a data address; where `shown` is False it is transparent, so that it suits a light page
-    and a dark one.
-    """
+    """A picture as a data address, transparent where `shown` is False, for light and dark pages."""
     if shown is not None and not shown.all():
         alpha = np.where(shown, 255, 0).astype(np.uint8)[..., None]
         picture = np.concatenate([picture, alpha], axis=-1)

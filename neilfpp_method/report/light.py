@@ -14,20 +14,18 @@ from neilfpp_method.train.run import Run
 
 __all__ = ["lamps_of", "picture_of_map"]
 
-LEAST_HEIGHT = 192
+MIN_HEIGHT = 192
 """Pixels of the picture: each texel is so large that it is seen."""
 
 
 def picture_of_map(run: Run) -> tuple[str, float] | None:
-    """The environment map as a data address, +z at the top, and its exposure; none where the light has no
-    map.
-    """
+    """The environment map as a data address, +z at the top, and its exposure; none without a map."""
     light = run.model.light
     if not run.has_material or not isinstance(light, EnvironmentLight):
         return None
     radiance = light.log_radiance.detach().exp().permute(1, 2, 0).cpu().numpy()
     exposure = auto_exposure(radiance.reshape(-1, 3))
-    times = max(1, -(-LEAST_HEIGHT // len(radiance)))
+    times = max(1, -(-MIN_HEIGHT // len(radiance)))
     return encoded(np.kron(display_color(radiance, exposure), np.ones((times, times, 1), np.uint8))), exposure
 
 

@@ -60,9 +60,7 @@ def cell(text: str) -> Html:
 
 
 def data_block(name: str, value: Any) -> Html:
-    """A value that scripts of the page read as JSON, by the identifier of the element; nothing in it ends the
-    block.
-    """
+    """A value that scripts of the page read as JSON, by element identifier; it cannot end the block."""
     text = json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     return Html(f'<script type="application/json" id="{escape(name)}">{text}</script>')
 

@@ -89,7 +89,7 @@ def surface_section(packed: Mapping[str, Any] | None, reason: str) -> Html:
             id="surface-canvas",
             tabindex=0,
             role="img",
-            aria_label="The surface of the run, turning. Arrow keys turn it, plus and minus change the distance.",
+            aria_label="The surface of the run. Arrow keys turn it, plus and minus change the distance.",
         ),
         element(
             "p",

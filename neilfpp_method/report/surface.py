@@ -20,9 +20,7 @@ from neilfpp_method.train.run import Run
 __all__ = ["FACES", "packed_surface"]
 
 FACES = 80_000
-"""Triangles: more are simplified, much fewer are divided, as colours are those of vertices. About 2 MB in the
-page.
-"""
+"""Triangles: more are simplified, far fewer divided, as vertices hold colours. 2 MB in the page."""
 RESOLUTION = 192
 """Cells along an edge of the scene's cube, where the surface is that of a distance field."""
 

@@ -11,6 +11,7 @@ from neilfpp_method.report.files import Changed
 from neilfpp_method.report.markup import Html, cell, element, joined, table
 
 __all__ = [
+    "STAGE_TITLES",
     "effects_section",
     "facts_section",
     "figures_section",
@@ -33,27 +34,26 @@ READING = {
     ),
     "Base colour and light share a factor.": (
         "Twice the light on half the base colour gives the same images, in each channel. Unless the scene "
-        "holds "
-        "something of known colour, that factor is free. So base colour is shown as estimated and, where the "
-        "truth is known, "
-        "with the best factor per channel, and the light with the inverse of it. Neither alone tells enough."
+        "holds something of known colour, that factor is free. So base colour is shown as estimated and, "
+        "where the truth is known, with the best factor per channel, and the light with the inverse of it. "
+        "Neither alone tells enough."
     ),
-    "Roughness and metallic need highlights.": "Where a surface shows none, the priors decide: rough, and no metal.",
+    "Roughness and metallic need highlights.": (
+        "Where a surface shows none, the priors decide: rough, and no metal."
+    ),
     "Light is known where it matters.": (
         "It is estimated above surfaces that the images show. Where the surface is rough, only its broad "
-        "shape "
-        "leaves a trace in the images."
+        "shape leaves a trace in the images."
     ),
     "Figures.": (
-        "They are means over the test views, of the pixels that show the object. PSNR grows by 6 dB when the "
-        "error "
-        "halves. The whole frame counts the background as free of error, as some published tables do, and is "
-        "higher "
-        "by its share. What needs no method is a constant for roughness and metallic, and the mean image for "
-        "base "
-        "colour."
+        "They are means over the test views, of the pixels that show the object. PSNR grows by 6 dB when "
+        "the error halves. The whole frame counts the background as free of error, as some published tables "
+        "do, and is higher by its share. What needs no method is a constant for roughness and metallic, and "
+        "the mean image for base colour."
     ),
-    "Display values clip.": "8-bit captures lose what is brighter than white; light and metallic then come out low.",
+    "Display values clip.": (
+        "8-bit captures lose what is brighter than white; light and metallic then come out low."
+    ),
 }
 
 
@@ -88,7 +88,8 @@ def figures_section(metrics: Mapping[str, float], said: str) -> Html:
         value, frame, baseline = (
             entry.format(metrics[key]) if key in metrics else "–" for key in (name, *beside[name])
         )
-        arrow = {"higher": "↑", "lower": "↓"}[entry.better]
+        arrow = {"higher": "↑", "lower": "↓"}.get(entry.better)
+        beside_value = (" ", element("span", arrow, title=f"{entry.better} is better")) if arrow else ()
         rows.append(
             element(
                 "tr",
@@ -96,8 +97,7 @@ def figures_section(metrics: Mapping[str, float], said: str) -> Html:
                 element(
                     "td",
                     element("b", value),
-                    " ",
-                    element("span", arrow, title=f"{entry.better} is better"),
+                    *beside_value,
                     class_="number",
                 ),
                 element("td", frame, class_="number"),

@@ -1,6 +1,4 @@
-"""Settings that contradict each other, or that nothing can be built from: told in one line, before anything
-is built.
-"""
+"""Settings that contradict each other or cannot be built: refused in one line before the start."""
 
 from __future__ import annotations
 

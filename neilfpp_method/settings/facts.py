@@ -36,9 +36,7 @@ class SceneFacts:
 
 @dataclass(frozen=True)
 class RadianceUnits:
-    """What the losses on radiance are measured in, each in the units that it compares (METHOD §4, last
-    line).
-    """
+    """Units of the losses on radiance, each in those that it compares (METHOD §4, last line)."""
 
     volume: float
     physical: float

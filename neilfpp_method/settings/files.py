@@ -14,7 +14,7 @@ from neilfpp_method.errors import UserError
 
 __all__ = ["read_settings"]
 
-LARGEST = 1 << 20
+MAX_BYTES = 1 << 20
 """Bytes: a thousand times what all settings take."""
 
 
@@ -49,8 +49,7 @@ _Loader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(loader
 
 
 def read_settings(path: Path) -> Mapping[str, Any]:
-    """The settings that a file names: nested, or with dots in their names. A run folder's `config.json` gives
-    its own.
+    """The settings in a file: nested, or with dotted names. A run folder's `config.json` works too.
 
     Raises:
         UserError: there is no such file, or it holds no settings.
@@ -58,7 +57,7 @@ def read_settings(path: Path) -> Mapping[str, Any]:
     if path.suffix not in (".yaml", ".yml", ".json"):
         raise UserError(f"{path}: settings are read from .yaml and .json files", "give it one of these names")
     try:
-        if path.stat().st_size > LARGEST:
+        if path.stat().st_size > MAX_BYTES:
             raise UserError(
                 f"{path}: too large for a file of settings", "name the file of settings with --config"
             )

@@ -1,6 +1,4 @@
-"""Settings to and from plain values (those of JSON and YAML), and changed by them; every value is checked on
-the way in.
-"""
+"""Settings to and from plain values (JSON, YAML), and changes to them; every value is checked."""
 
 from __future__ import annotations
 
@@ -44,8 +42,7 @@ def from_dict(kind: type[Config], values: Mapping[str, Any], where: str = "confi
 def changed(config: Config, values: Mapping[str, Any], where: str = "config") -> Config:
     """The same settings but for these.
 
-    A room (a light, a host, an encoding) whose `kind` changes to one with other settings starts from the
-    defaults of that kind.
+    A part (light, host, encoding) whose `kind` changes starts from the defaults of its new kind.
 
     Args:
         config: a dataclass of settings.

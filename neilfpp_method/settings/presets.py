@@ -1,6 +1,4 @@
-"""The presets: the published settings (`docs/paper.md`), and one for a laptop. Each is written as what it
-changes.
-"""
+"""The presets: the published settings (`docs/paper.md`) and one for a laptop, as differences."""
 
 from __future__ import annotations
 
@@ -37,9 +35,7 @@ PAPER_MLP: Mapping[str, Any] = {
 
 
 def paper_mlp() -> NeilfConfig:
-    """The published MLP setting, for display images: 96k steps, 24 h on a V100. `docs/paper.md` has it line
-    by line.
-    """
+    """The published MLP setting for display images: 96k steps, 24 h on a V100 (`docs/paper.md`)."""
     return changed(NeilfConfig(), PAPER_MLP)
 
 
@@ -74,9 +70,7 @@ PAPER_NGP: Mapping[str, Any] = {
 
 
 def paper_ngp() -> NeilfConfig:
-    """The published hash-grid setting, for display images: 40k steps, 4 h on a V100; it asks for a point
-    cloud.
-    """
+    """The published hash-grid setting for display images: 40k steps, 4 h on a V100; needs a point cloud."""
     return changed(paper_mlp(), PAPER_NGP)
 
 
@@ -136,6 +130,7 @@ FAST: Mapping[str, Any] = {
     "volume.rounds": 2,
     "volume.samples": 32,
     "volume.normal_radius": 0.15,
+    "shading.lobe": "ggx",
     "shading.sampler": "mis",
     "shading.train_samples": 32,
     "shading.eval_samples": 128,
@@ -154,8 +149,7 @@ FAST: Mapping[str, Any] = {
     "loss.lambertian": 0.0,
     "loss.position_gradient": 0.0,
     "loss.normal_gradient": 0.1,
-    # The joint stage is short: geometry goes on at the rate that SDF init ended with, and is not stirred up
-    # again.
+    # The joint stage is short: geometry goes on at the rate that SDF init ended with.
     "optimizer.geometry": 2e-2,
     "optimizer.radiance": 5e-3,
     "optimizer.brdf": 5e-3,

@@ -19,9 +19,7 @@ __all__ = ["NeilfConfig"]
 
 @dataclass(frozen=True)
 class FrequencyConfig:
-    """Positions by sines and cosines, six octaves: the paper's MLP setting. B's hidden units are sines
-    (SIREN) then.
-    """
+    """Positions by sines and cosines, six octaves: the paper's MLP setting; B then has sine units (SIREN)."""
 
     kind: Literal["frequency"] = "frequency"
     """frequency or hash: how G, R and B see positions."""
@@ -29,9 +27,7 @@ class FrequencyConfig:
 
 @dataclass(frozen=True)
 class HashGridConfig:
-    """Positions by multiresolution hash grids, one for each of G, B and, where it has an encoding, R (Müller
-    et al. 2022).
-    """
+    """Positions by multiresolution hash grids: one each for G, B and, where encoded, R (Müller 2022)."""
 
     kind: Literal["hash"] = "hash"
     """frequency or hash: how G, R and B see positions."""
@@ -40,9 +36,7 @@ class HashGridConfig:
     log2_entries: int = 19
     """Table size of one level, as a power of two."""
     sdf_log2_entries: int = 19
-    """The same for G. The surface is all of a scene that is seen, and a table without collisions costs no
-    more to read.
-    """
+    """The same for G. Only the surface of a scene is seen, and a table without collisions costs no more."""
     max_resolution: int = 4096
     """Cells along an edge of the scene's cube at the finest level; at the coarsest there are 16."""
 
@@ -61,9 +55,7 @@ class SdfConfig:
     feature_width: int = 256
     """Length of the feature handed to R."""
     start: Literal["sphere", "silhouettes"] = "sphere"
-    """silhouettes: before SDF init the field is brought to the visual hull of the masks, where the capture
-    has masks.
-    """
+    """silhouettes: before SDF init the field is fitted to the visual hull of the masks, where given."""
 
 
 @dataclass(frozen=True)
@@ -90,13 +82,9 @@ class BrdfConfig:
     """B: position → base colour, roughness, metallic (METHOD §5)."""
 
     initial_base_color: float = 0.5
-    """What the base colour starts as. Light and base colour share a scale that images hardly tell, so it
-    stays near this.
-    """
+    """Initial base colour. Images hardly tell its scale from the light's, so it stays near this."""
     initial_metallic: float = 0.5
-    """What metallic starts as. Most surfaces are no metals, and a light that is found under metals is too
-    weak for others.
-    """
+    """Initial metallic. Most surfaces are no metals; light found under metals is too weak for others."""
     metals: bool = True
     """Whether there may be metal; off, metallic is 0 everywhere."""
     layers: int = 8
@@ -149,9 +137,7 @@ class MapLightConfig:
 
 @dataclass(frozen=True)
 class FreeLightConfig:
-    """L: the paper's field, its own light at every point (METHOD §5): sharp in direction, smooth in
-    position.
-    """
+    """L: the paper's field, its own light at each point (METHOD §5): sharp in direction, smooth in x."""
 
     kind: Literal["free"] = "free"
     """free: its own light at every point (the paper). distant: an environment map. distant_near: a map, and
@@ -181,9 +167,7 @@ class BackgroundConfig:
     else inverted_sphere.
     """
     color: tuple[float, float, float] | None = None
-    """Linear RGB of a constant background, and what an inverted_sphere starts as; none: read from the borders
-    of the images.
-    """
+    """Linear RGB of a constant background and initial inverted_sphere; none: from the image borders."""
     layers: int = 8
     """Hidden layers of the NeRF++ field."""
     width: int = 256
@@ -238,9 +222,7 @@ class VolumeConfig:
     samples: int = 98
     """Samples per ray that are rendered: two thirds where it is stopped, the rest even, ends included."""
     normal_radius: float = 0.0
-    """Surfaces are shaded with the normal of a neighbourhood of this radius, edges kept; 0: with that of the
-    hit alone.
-    """
+    """Surfaces are shaded with the normal of this neighbourhood, edges kept; 0: that of the hit."""
 
 
 # ---------------------------------------------------------------------------------------------------- shading
@@ -263,9 +245,7 @@ class ShadingConfig:
     eval_samples: int = 256
     """Incident directions per point in evaluation."""
     hit_share: float = 0.8
-    """Least concentration of a ray's blending weight that makes its hit a surface point; the others are not
-    shaded.
-    """
+    """Least concentration of a ray's blending weight at a surface point; other hits are not shaded."""
 
 
 @dataclass(frozen=True)
@@ -273,9 +253,7 @@ class InterReflectionConfig:
     """L_ref: what arrives from another surface is what that surface sends (METHOD §2)."""
 
     mode: Literal["off", "soft", "hard"] = "soft"
-    """soft: the paper's loss. hard: a direction that meets the scene brings R from there; only the others ask
-    the light.
-    """
+    """soft: the paper's loss. hard: directions that meet the scene bring R from there; others the light."""
     rays_per_point: float = 1.0
     """Traced directions per surface point and step, in expectation."""
     radiance_gradient: float = 0.0
@@ -302,9 +280,7 @@ class LossConfig:
     eikonal: float = 0.1
     hessian: float = 1e-3
     hessian_growth: float = 1.0
-    """Weight of L_Hess at the end of SDF init over that at its start: early, shapes must be free to fold;
-    late, ripples are noise.
-    """
+    """Weight of L_Hess at the end of SDF init over its start: shapes fold early; late ripples are noise."""
     hessian_joint: float = 1e-4
     surface: float = 1e-3
     surface_joint: float = 1e-4
@@ -363,9 +339,7 @@ class TrainConfig:
     rays: int = 4096
     """Rays per step and process."""
     fresh: float = 1.0
-    """Share of a step's rays that are rendered while the surface stands still; the other points are those of
-    earlier steps.
-    """
+    """Share of a step's rays rendered while the surface stands still; other points are replayed."""
     seed: int = 0
     """Every random number of step k follows from seed and k alone."""
     checkpoint_every: int = 500

@@ -43,9 +43,7 @@ def directional_albedo(
 
 
 def initial_albedo(base_color: float, metallic: float, lobe: Lobe | None) -> float:
-    """Directional albedo of an even grey material of roughness 0.5 along its normal; no `lobe`: a Lambertian
-    surface.
-    """
+    """Directional albedo along the normal of grey material, roughness 0.5; no `lobe`: Lambertian."""
     if lobe is None:
         return base_color
     material = Material(torch.full((1, 3), base_color), torch.full((1, 1), 0.5), torch.full((1, 1), metallic))
@@ -56,9 +54,7 @@ def initial_albedo(base_color: float, metallic: float, lobe: Lobe | None) -> flo
 @lru_cache
 @torch.no_grad()
 def _lobe_integrals(lobe: Lobe, device: torch.device, dtype: torch.dtype) -> Float[Tensor, "1 2 R C"]:
-    """A and B at the middles of equal parts of roughness and of the viewer's cosine; made once for each
-    device and type.
-    """
+    """A and B at middles of parts of roughness and viewer cosine; once per device and type."""
     middle = (torch.arange(SIZE) + 0.5) / SIZE
     roughness, cosine = torch.cartesian_prod(middle, middle)[:, :, None].unbind(1)
     up = torch.tensor([0.0, 0.0, 1.0]).expand(len(cosine), 3)

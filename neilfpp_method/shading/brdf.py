@@ -44,8 +44,7 @@ __all__ = [
 class Lobe:
     """A microfacet lobe: functions of cosines (N, S) and roughness (N, 1), each (N, S).
 
-    A lobe keeps r at or above `roughness_floor`: a smoother surface shades as one of that roughness, and
-    sends no gradient to r.
+    A lobe keeps r ≥ `roughness_floor`: smoother surfaces shade as that one, without gradient to r.
     """
 
     distribution: Callable[[Tensor, Tensor], Tensor]
@@ -59,8 +58,7 @@ class Lobe:
 
 
 def roughness_floor(dtype: torch.dtype) -> float:
-    """The smallest roughness that a lobe can resolve: (32 ε)^¼, which is 0.044 in float32 and 2.9e-4 in
-    float64.
+    """The smallest roughness that a lobe can resolve: (32 ε)^¼, 0.044 in float32 and 2.9e-4 in float64.
 
     D varies on the scale 1 − n·h ~ r⁴/2, and n·h, a number near 1, is rounded to ε/2. At the floor that
     rounding moves D by 3 %; below, D would be noise. The floor also bounds the lobe: in float32 D ≤ 8.4e4 and
@@ -123,8 +121,7 @@ def _ggx_visibility(
     def masking(cosine: Tensor) -> Tensor:
         return (alpha_squared + (1 - alpha_squared) * cosine.square()).sqrt()
 
-    # V grows as 1/(n·wi + n·wo) towards the horizon; the bound acts where both directions lie within 0.03° of
-    # it.
+    # V grows as 1/(n·wi + n·wo) at the horizon; the bound acts where both are within 0.03° of it.
     return 0.5 / (cos_o * masking(cos_i) + cos_i * masking(cos_o)).clamp_min(1e-6)
 
 
@@ -148,7 +145,7 @@ LOBES: Mapping[str, Lobe] = {"spherical_gaussian": SPHERICAL_GAUSSIAN, "ggx": GG
 
 @dataclass(frozen=True)
 class Cosines:
-    """`i` = n·wi, `o` = n·wo, `h` = n·h, `d` = wo·h = wi·h ≥ 0, with the half vector h = (wi + wo)/|wi + wo|."""
+    """`i` = n·wi, `o` = n·wo, `h` = n·h, `d` = wo·h = wi·h ≥ 0; half vector h = (wi + wo)/|wi + wo|."""
 
     i: Float[Tensor, "N S"]
     o: Float[Tensor, "N 1"]
@@ -159,8 +156,8 @@ class Cosines:
 def cosines(n: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"], wi: Float[Tensor, "#N S 3"]) -> Cosines:
     """The cosines that the BRDF is a function of, for unit vectors.
 
-    h is never formed: |wi + wo| = 2 wo·h and (wo·h)² = (1 + wi·wo)/2. For wi = −wo there is no h; the floor on (wo·h)²
-    keeps value and gradient finite there.
+    h is never formed: |wi + wo| = 2 wo·h and (wo·h)² = (1 + wi·wo)/2. For wi = −wo there is no h; the floor
+    on (wo·h)² keeps value and gradient finite there.
     """
     i, o = dot(wi, n), dot(wo.unsqueeze(1), n)
     d = ((1 + dot(wi, wo)) / 2).clamp(1e-8, 1).sqrt()
@@ -180,9 +177,7 @@ class BrdfValue:
 
 @dataclass(frozen=True)
 class SpecularTerms:
-    """f_s = F0 · `facing` + `grazing`: a scalar pair per direction, with the colour of the surface, F0, set
-    aside.
-    """
+    """f_s = F0 · `facing` + `grazing`: a scalar pair per direction, without the surface's colour F0."""
 
     facing: Float[Tensor, "N S"]
     grazing: Float[Tensor, "N S"]

@@ -17,8 +17,7 @@ KNEE = 0.04045
 def linear_to_srgb(color: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """The sRGB curve (IEC 61966-2-1): 12.92 c up to 0.0031308, then 1.055 c^(1/2.4) − 0.055.
 
-    Nothing is clipped: the linear part goes on below 0 and the power above 1, with a finite gradient
-    everywhere.
+    Nothing is clipped: the linear part extends below 0, the power above 1, gradients are finite.
     """
     knee = 0.0031308
     return torch.where(color <= knee, 12.92 * color, 1.055 * color.clamp_min(knee).pow(1 / 2.4) - 0.055)

@@ -10,9 +10,7 @@ __all__ = ["at_least_float32", "dot", "local_frame", "safe_normalize"]
 
 
 def at_least_float32(tensor: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """The tensor in float32 where it is half precision; the 8 bits of a bfloat16 cannot hold a cosine near
-    1.
-    """
+    """Half precision becomes float32: the 8 bits of a bfloat16 cannot hold a cosine near 1."""
     return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
 
 

@@ -43,9 +43,7 @@ GOLDEN_TURN = (3 - math.sqrt(5)) / 2
 """The golden angle as a share of a full turn."""
 
 LOBE_SHARE, LIGHT_SHARE = 0.25, 0.5
-"""Shares of the directions of mis, where there is a light to sample; the cosine has the rest
-(docs/performance.md).
-"""
+"""Shares of mis directions where a light can be sampled; cosine has the rest (docs/performance.md)."""
 
 
 @dataclass(frozen=True)
@@ -63,9 +61,7 @@ class Technique:
 
 @dataclass(frozen=True)
 class _Lattice:
-    """A Fibonacci lattice of [0, 1)²: `u` has one sample in each of S strata, `v` advances by the golden
-    angle.
-    """
+    """A Fibonacci lattice of [0, 1)²: one `u` in each of S strata, `v` advances by the golden angle."""
 
     u: Float[Tensor, "N S"]
     v: Float[Tensor, "N S"]
@@ -121,9 +117,7 @@ def pdf_specular_lobe(
 
 
 def fibonacci(n: Float[Tensor, "N 3"]) -> Technique:
-    """The paper's lattice, with cells of equal solid angle and samples at their midpoints, n·wi = 1 − (k +
-    ½)/S.
-    """
+    """The paper's lattice: equal solid angles, samples at their midpoints, n·wi = 1 − (k + ½)/S."""
     return _hemisphere(n, lambda u: 1 - u, pdf_fibonacci)
 
 
@@ -166,8 +160,7 @@ def specular_lobe(
 def combine(techniques: Sequence[tuple[Technique, int]], stochastic: bool) -> IncidentSamples:
     """So many directions from each technique, joined by the balance heuristic (Veach 1997, §9.2).
 
-    The density is taken at the directions as they were rounded: then a lobe cancels exactly against that of
-    the integrand.
+    The density is that of the rounded directions: a lobe then cancels exactly against the integrand's.
     """
     techniques = [(technique, count) for technique, count in techniques if count]
     wi = torch.cat([technique.draw(count, stochastic) for technique, count in techniques], 1)
@@ -176,9 +169,7 @@ def combine(techniques: Sequence[tuple[Technique, int]], stochastic: bool) -> In
 
 
 def sphere_lattice(count: int, like: Tensor) -> Float[Tensor, "S 3"]:
-    """`count` directions spread evenly over the whole sphere, on the device and of the type of `like`
-    (float32 at least).
-    """
+    """`count` even directions over the whole sphere, of `like`'s device and type (float32 at least)."""
     up = at_least_float32(like).new_tensor([[0.0, 0.0, 1.0]])
     lattice = _lattice(up, count, stochastic=False)
     return _about(up, 1 - 2 * lattice.u, lattice.v)[0]
@@ -196,8 +187,7 @@ def sample_directions(
 ) -> IncidentSamples:
     """`count` incident directions per point, in at least float32, by fibonacci, cosine, lobe or mis.
 
-    mis is cosine and lobe by halves or, where there is a `light` that can be sampled, cosine, lobe and light
-    together.
+    mis: half cosine and half lobe or, with a `light` that can be sampled, cosine, lobe and light.
 
     Raises:
         UserError: there is no such sampler.

@@ -1,3 +1,1 @@
-"""Where the time of a computation goes: code says what it is doing, and a ledger that listens keeps the
-seconds.
-"""
+"""Where time goes: code says what it is doing, and a ledger that listens adds up the seconds."""

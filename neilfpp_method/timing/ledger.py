@@ -169,8 +169,7 @@ def listening(ledger: Ledger) -> Iterator[Ledger]:
 
 
 class doing(ContextDecorator):
-    """Says what kind of work is done within, to the ledger that listens, if one does. Also a decorator of
-    functions.
+    """Tells the listening ledger, if any, what kind of work is done within. Also a decorator.
 
     Args:
         work: the kind.

@@ -267,8 +267,7 @@ def _check(config: NeilfConfig) -> None:
 def _scaled(scale: float, pixels: int, rays: int) -> str:
     return (
         f"images at {scale:.3g} of their size: {pixels / 1e6:.1f} million pixels for {rays / 1e6:.1f} "
-        "million rays; "
-        "--scale 1 takes them whole"
+        "million rays; --scale 1 takes them whole"
     )
 
 
@@ -289,9 +288,7 @@ def _nothing_left_on_failure(out: Path) -> Iterator[None]:
 
 @doing("data", apart=True)
 def _load_pixels(capture: Capture, folder: Path, fabric: Fabric, console: Console) -> PixelDataset:
-    """One process reads the images, and all find them in the folder; what is wrong with them is wrong for
-    all.
-    """
+    """One process reads the images, all find them in the folder; an error in them ends all of them."""
     problem: tuple[str, str] | None = None
     if fabric.is_global_zero:
         try:

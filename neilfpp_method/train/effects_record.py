@@ -1,5 +1,4 @@
-"""The effects of a run, in `RUN/effects.json`: every decision, and the table that follows; read by resumed
-and loaded runs.
+"""The effects of a run, in `RUN/effects.json`: decisions and table; read by resumed and loaded runs.
 
 format      1 asked       the value of --effects decisions   in order: step, effect, on, by, reason, evidence
 (null, or what, value, deviation, threshold, samples) effects     a row per effect as `effects.table.rows` has
@@ -38,8 +37,7 @@ def write_plan(run: Path, plan: Plan) -> None:
 
 
 def read_plan(run: Path, settings: NeilfConfig, before: int | None = None) -> Plan:
-    """The plan of a run as it was after `before` steps; none: as it is. A run without one has its settings as
-    they are.
+    """The plan of a run as it was after `before` steps (none: now). Without one, settings hold as they are.
 
     Raises:
         UserError: the file is damaged or of another version.

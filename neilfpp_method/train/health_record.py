@@ -1,13 +1,11 @@
-"""The findings of a run, in `RUN/health.json`: written with every checkpoint, read by evaluation, report and
-resumed runs.
-"""
+"""The findings of a run, in `RUN/health.json`: written with checkpoints; read by eval and report."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.health.cases import Finding, Verdict, verdict_of
+from neilfpp_method.health.cases import Finding, Health
 from neilfpp_method.health.watch import FILE, FORMAT, Watch
 from neilfpp_method.settings.plain import from_dict
 from neilfpp_method.train.run import read_json, write_json
@@ -44,5 +42,4 @@ def read_findings(run: Path) -> list[Finding] | None:
 
 def in_words(findings: list[Finding]) -> str:
     """A verdict in one line."""
-    verdict: Verdict = verdict_of(findings)
-    return verdict + (": " + "; ".join(finding.what for finding in findings) if findings else "")
+    return str(Health.of(findings))

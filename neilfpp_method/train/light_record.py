@@ -1,6 +1,4 @@
-"""What the kept-back points said of lamps before the environment map: the record of a run, fit by fit, in
-`RUN/light.json`.
-"""
+"""The evidence for lamps before the environment map, fit by fit, in `RUN/light.json`."""
 
 from __future__ import annotations
 

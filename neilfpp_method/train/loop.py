@@ -13,9 +13,11 @@ from lightning_fabric import Fabric
 from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.effects.looks import after_fit, look_at_surface, wants_surface
+from neilfpp_method.effects.first_light import start_with
+from neilfpp_method.effects.looks import after_fit, look_at_light, look_at_surface, wants_surface
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.errors import Diverged, Stopped, UserError
+from neilfpp_method.health.guard import MAX_SKIPPED_IN_A_ROW
 from neilfpp_method.health.watch import Watch
 from neilfpp_method.lighting.solver import LightSolver
 from neilfpp_method.model import NeilfModel
@@ -42,8 +44,6 @@ from neilfpp_method.train.work_record import write_work
 
 __all__ = ["Training", "adam", "make_optimizer", "seed_step", "set_rates", "train"]
 
-# So many steps in a row without a finite gradient are no accident.
-MOST_SKIPPED = 10
 LOG_EVERY = 50
 """Steps between TensorBoard scalars: a thousand points of a curve in the longest training."""
 
@@ -85,8 +85,8 @@ def train(run: Training) -> None:
     step = _restore(run, optimizer)
     total = sum(stage_steps(settings).values())
     optimizer = run.fabric.setup_optimizers(optimizer)
-    if step == 0 and model.stages[stage_at(0, settings).stage].moves_material:
-        _look_at_effects(run, model, 0)
+    if step == 0:
+        _look(run, model, 0)
     while step < total:
         position = stage_at(step, settings)
         step = _train_stage(run, model, optimizer, step, position)
@@ -95,7 +95,7 @@ def train(run: Training) -> None:
                 run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
         if step < total:
             with doing("looks", apart=True):
-                _look_at_effects(run, model, step)
+                _look(run, model, step)
         _save(run, optimizer, step, also=position.stage.value)
         with doing("looks", apart=True):
             model.eval()
@@ -142,9 +142,7 @@ def _train_stage(
 
 
 def _solve_light(run: Training, model: NeilfModel, computed: StepResult, step: int) -> None:
-    """Show the light solver what a step showed; when it is time, it sets the light. The first process does it
-    for all.
-    """
+    """Show a step to the light solver, which sets the light when due. The first process does it for all."""
     fabric, solver = run.fabric, run.light_solver
     if fabric.is_global_zero:
         with doing("light_fits"):
@@ -157,15 +155,46 @@ def _solve_light(run: Training, model: NeilfModel, computed: StepResult, step: i
             found = solver.solve(model.brdf, model.scene)
         note_fit(run.fits, found, model.lamps.lit, step)
         _tell(run, after_fit(run.plan, found, model.lamps.lit, step + 1))
-    if fabric.world_size > 1:
+    _share_light(run, model)
+
+
+def _share_light(run: Training, model: NeilfModel) -> None:
+    """Let all processes have the light of the first."""
+    if run.fabric.world_size > 1:
         for part in (model.light, model.lamps):
-            part.load_state_dict(fabric.broadcast(part.state_dict()))
+            part.load_state_dict(run.fabric.broadcast(part.state_dict()))
+
+
+def _look(run: Training, model: NeilfModel, step: int) -> None:
+    """What is looked at between two stages, where the next one learns a material."""
+    if model.stages[stage_at(step, run.config.train).stage].moves_material:
+        _look_at_effects(run, model, step)
+        _start_light(run, model, step)
+
+
+def _start_light(run: Training, model: NeilfModel, step: int) -> None:
+    """Find the light that training starts with, before a material is learned. The first process does it for
+    all.
+    """
+    if not run.light_solver.seeks_start:
+        return
+    decisions: list[Decision] = []
+    if run.fabric.is_global_zero:
+        seed_step(run.config.train.seed, -4 - step)
+        decisions, found = look_at_light(run.plan, model, run.pixels, step)
+        _tell(run, decisions)
+        if found is not None:
+            run.reporter.say(found.in_words())
+            start_with(model, found)
+            measured = run.light_solver.start(found.observed, found.material, model.scene)
+            note_fit(run.fits, measured, model.lamps.lit, step)
+            _tell(run, after_fit(run.plan, measured, model.lamps.lit, step))
+    _share_light(run, model)
+    _share_decisions(run, model, decisions)
 
 
 def _look_at_effects(run: Training, model: NeilfModel, step: int) -> None:
-    """Let the surface decide what is simulated from here on, where that is open. The first process decides
-    for all.
-    """
+    """Let evidence decide the open effects from here on. The first process decides for all."""
     if not wants_surface(run.plan):
         return
     decisions: list[Decision] = []
@@ -173,6 +202,11 @@ def _look_at_effects(run: Training, model: NeilfModel, step: int) -> None:
         seed_step(run.config.train.seed, -3 - step)
         decisions = look_at_surface(run.plan, model, run.pixels, step)
         _tell(run, decisions)
+    _share_decisions(run, model, decisions)
+
+
+def _share_decisions(run: Training, model: NeilfModel, decisions: Sequence[Decision]) -> None:
+    """Let all processes compute as the first has decided."""
     decisions = run.fabric.broadcast(decisions)
     if not run.fabric.is_global_zero:
         run.plan.decisions += decisions
@@ -237,12 +271,11 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], step: int) ->
         else f"the gradient of {', '.join(fields) or 'another process'}"
     )
     run.reporter.warn(f"step {step} skipped: {where} is not finite ({run.skipped} skipped so far)")
-    if run.skipped_in_a_row >= MOST_SKIPPED:
+    if run.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
         raise Diverged(
-            f"{MOST_SKIPPED} steps in a row were not finite, the last one in {where}",
+            f"{MAX_SKIPPED_IN_A_ROW} steps in a row were not finite, the last one in {where}",
             f"the last good checkpoint is kept in {run.path / 'checkpoints'}; look at the capture's "
-            "brightest pixels "
-            "or lower the learning rates",
+            "brightest pixels or lower the learning rates",
         )
 
 
@@ -304,8 +337,7 @@ def _gradient_norms(model: NeilfModel) -> dict[str, Tensor]:
 def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
     """PSNR of the pixels that the stage compares, dB, in the capture's own response; NaN where there is none.
 
-    The peak is 1, and no error counts for more: a few HDR highlights would otherwise be all that the figure
-    shows.
+    The peak is 1, and errors are capped there: a few HDR highlights would else dominate the figure.
     """
     term, unit = (
         (terms["physical"], units.physical) if "physical" in terms else (terms["volume"], units.volume)

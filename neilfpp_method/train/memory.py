@@ -13,9 +13,7 @@ from neilfpp_method.data.views import View
 __all__ = ["check_training_memory", "training_bytes"]
 
 READING = 48
-"""Bytes to a pixel of the largest file while it is decoded, made linear, averaged and encoded. An
-estimate.
-"""
+"""Bytes per pixel of the largest file while decoded, made linear, averaged and encoded. Estimate."""
 COUNTED = 3 * 8 / 1024
 """Bytes to a pixel of all views: counts of three sets of pixels, by block."""
 LOADED = 0.8e9
@@ -23,8 +21,7 @@ LOADED = 0.8e9
 
 
 def training_bytes(views: Sequence[View]) -> int:
-    """About how many bytes a training takes, at least, beside pages of files, which the system takes back at
-    need.
+    """About the least memory of a training, in bytes, without file pages, which the system reclaims.
 
     What single steps take is left out: it follows from the settings, not from the images.
     """

@@ -21,18 +21,17 @@ from neilfpp_method.structures import RayBatch
 
 __all__ = ["write_preview"]
 
-MOST_PIXELS = 160
+MAX_SIDE = 160
 """Longest side of a panel."""
 
 
 def write_preview(model: NeilfModel, capture: Capture, stage: Stage, path: Path) -> np.ndarray:
     """Render the first test view (or training view) small, write it, and return the picture, (H, W, 3) uint8.
 
-    From left to right: photograph, R, normals; once there is a material also the PBR image, base colour,
-    roughness and metallic.
+    Left to right: photograph, R, normals; with a material also PBR, base colour, roughness, metallic.
     """
     view = (capture.test_views or capture.train_views)[0]
-    view = scaled_view(view, min(1.0, MOST_PIXELS / max(file_size(view))))
+    view = scaled_view(view, min(1.0, MAX_SIDE / max(file_size(view))))
     shape = (view.camera.height, view.camera.width, 3)
     panels = [_photograph(view, capture.hdr)]
     rays = camera_rays(capture.normalisation.camera(view.camera))

@@ -1,6 +1,4 @@
-"""What a person sees while a run trains: a bar per stage, TensorBoard, and a picture at the end of each
-stage.
-"""
+"""What a person sees while a run trains: a bar per stage, TensorBoard, and a picture after each."""
 
 from __future__ import annotations
 

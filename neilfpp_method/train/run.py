@@ -39,6 +39,7 @@ from neilfpp_method.train.effects_record import read_plan
 from neilfpp_method.train.json_files import read_json, write_json
 
 __all__ = [
+    "BESIDE_NERFSTUDIO",
     "PIXELS",
     "CaptureSource",
     "Description",
@@ -51,11 +52,14 @@ __all__ = [
     "load_weights",
     "read_description",
     "read_json",
+    "run_folder",
     "save_checkpoint",
     "write_json",
 ]
 
 FORMAT = 2
+BESIDE_NERFSTUDIO = "neilfpp"
+"""Folder beside nerfstudio's `config.yml` in which the plugin keeps a training as a run."""
 PIXELS = "pixels"
 """Folder of a run in which the pixels of its training views are kept."""
 PACKAGES = (
@@ -136,6 +140,23 @@ class Run:
     def has_material(self) -> bool:
         """Whether a step has moved the material and the light; before that they are what they start as."""
         return has_material(self.step, self.config.train)
+
+
+def run_folder(path: Path) -> Path:
+    """The run folder that a person means: the folder itself, or the one beside nerfstudio's `config.yml`.
+
+    Raises:
+        UserError: there is none beside that file.
+    """
+    if path.suffix != ".yml":
+        return path
+    folder = path.parent / BESIDE_NERFSTUDIO
+    if not (folder / "config.json").is_file():
+        raise UserError(
+            f"{path}: no run folder {BESIDE_NERFSTUDIO}/ beside it",
+            "it is there once `ns-train neilfpp` has saved, on hosts of this package (docs/nerfstudio.md)",
+        )
+    return folder
 
 
 def check_free(path: Path) -> None:
@@ -256,9 +277,7 @@ def _described(kind: type[Part], values: Any, where: str) -> Part:
 def save_checkpoint(
     path: Path, model: nn.Module, light_solver: nn.Module, optimizer: torch.optim.Optimizer, step: int
 ) -> None:
-    """Weights, what the light solver remembers, and the optimiser after `step` steps, in one step: never half
-    a file.
-    """
+    """Weights, solver memory and optimiser after `step` steps, written atomically."""
     parts = {"model": model, "light_solver": light_solver, "optimizer": optimizer}
     contents = {"format": FORMAT, "step": step, **{name: part.state_dict() for name, part in parts.items()}}
     with replacing(path) as temporary, temporary.open("wb") as file:

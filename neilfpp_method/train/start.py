@@ -33,9 +33,7 @@ NEAR_SHARE = 0.5
 NEAR_SURFACE = 0.1
 """How far from the surface these lie, scene units, standard deviation."""
 RATE = 1e-2
-"""Adam's rate for grids and networks of the preset `fast`; it falls to a tenth. Networks with waves take a
-tenth of it.
-"""
+"""Adam's rate for the grids and networks of `fast`, falling to a tenth; sine networks take a tenth."""
 DAMPING = 1e-3
 """Adam's ε. An entry of a fine grid that one point alone asks for has a gradient far below this, and hardly
 moves. With the usual 1e-15 it leaps by the whole rate: normals at the surface were then 12.5° off those of
@@ -92,8 +90,7 @@ def start_geometry(model: NeilfModel, capture: Capture, config: NeilfConfig) -> 
 def fit_distance(
     field: SdfField, target: DistanceCube, radius: float, seed: int, rate: float = RATE
 ) -> float:
-    """Bring a distance field to a sampled distance within the ball of `radius`; returns the mean error at its
-    surface.
+    """Fit a distance field to a sampled distance within `radius`; returns the mean error at its surface.
 
     The L1 error of the distance is minimised at points that are half spread over the ball and half about the
     surface. Features of the field, which R reads, are not asked for and move as they like.

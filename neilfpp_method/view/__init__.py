@@ -1,3 +1,1 @@
-"""The viewer in the browser. Only `browser` knows viser; everything else works, and is tested, without
-one.
-"""
+"""The viewer in the browser. Only `browser` knows viser; the rest works and is tested without it."""

@@ -1,5 +1,4 @@
-"""The page in the browser, by viser: what a person moves becomes wishes, and pictures become the page's
-background.
+"""The page in the browser, by viser: inputs become wishes, and pictures the page's background.
 
 Every browser has a session of its own: camera, layer, light, lamps. Sessions take turns at the model.
 """
@@ -45,9 +44,7 @@ KEYS = {title: name for name, title in LAYERS.items()}
 
 
 class _Local(viser.ViserServer):
-    """Without viser's tunnel: a page in any browser could ask for one, and a capture is nobody else's
-    affair.
-    """
+    """Without viser's tunnel: any page in the browser could request one, and captures are private."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         return None
@@ -283,7 +280,8 @@ class _Session:
         self.map.image = light_picture(radiance, normal)
         material = point.material
         colour = ", ".join(f"{value:.2f}" for value in material.base_color[0].tolist())
-        self.told.content = f"base colour {colour} · roughness {material.roughness.item():.2f} · metallic {material.metallic.item():.2f}"
+        roughness, metallic = material.roughness.item(), material.metallic.item()
+        self.told.content = f"base colour {colour} · roughness {roughness:.2f} · metallic {metallic:.2f}"
         place = point.position.cpu().numpy()
         segment = np.stack((place, place + 0.15 * normal))[None]
         self.client.scene.add_line_segments(

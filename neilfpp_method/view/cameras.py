@@ -13,15 +13,13 @@ from neilfpp_method.data.views import Camera
 
 __all__ = ["Pose", "pinhole", "pose_of"]
 
-MOST_SIDE = 1600
+MAX_SIDE = 1600
 """Pixels: larger windows show a picture of this size enlarged."""
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a camera stands, how it is turned to the scene (w x y z), and its vertical field of view in
-    radians.
-    """
+    """Where a camera stands, its orientation (w x y z), and its vertical field of view in radians."""
 
     position: Float[np.ndarray, " 3"]
     wxyz: Float[np.ndarray, " 4"]
@@ -31,7 +29,7 @@ class Pose:
 
 def pinhole(pose: Pose, width: int, height: int) -> Camera:
     """The camera of a window of width × height pixels."""
-    share = min(1.0, MOST_SIDE / max(width, height, 1))
+    share = min(1.0, MAX_SIDE / max(width, height, 1))
     width, height = max(1, round(width * share)), max(1, round(height * share))
     rotation = Rotation.from_quat(np.roll(pose.wxyz, -1)).as_matrix().T
     w2c = np.eye(4)

@@ -21,7 +21,7 @@ __all__ = ["Request", "view"]
 MAPS = (".exr", ".hdr", ".png", ".jpg", ".jpeg")
 LOOKED_EVERY = 2.0
 """Seconds between two looks for a new checkpoint."""
-OLDEST = 1
+MIN_VERSION = 1
 """Major version of viser that the page is written for."""
 
 
@@ -98,8 +98,8 @@ def check_viser() -> None:
         version = metadata.version("viser")
     except metadata.PackageNotFoundError as error:
         raise UserError("neilfpp view needs viser, which is not installed", remedy) from error
-    if int(version.split(".")[0]) < OLDEST:
-        raise UserError(f"neilfpp view needs viser {OLDEST} or newer, and {version} is installed", remedy)
+    if int(version.split(".")[0]) < MIN_VERSION:
+        raise UserError(f"neilfpp view needs viser {MIN_VERSION} or newer, {version} is installed", remedy)
 
 
 def _load(request: Request) -> Subject:

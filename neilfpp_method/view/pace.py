@@ -13,7 +13,7 @@ CHECKED = 0.05
 """Seconds between two looks at whether the picture is still wanted."""
 UNKNOWN = 20_000.0
 """Rays a second, before any were measured."""
-FEWEST = 256
+MIN_PIXELS = 256
 """Rays that are traced together at least: fewer cost as much."""
 NEW_SHARE = 0.5
 """What the last measurement counts for; the rest is what was known."""
@@ -33,11 +33,11 @@ class Pace:
 
     def at_once(self, layer: str) -> int:
         """Rays for a first picture."""
-        return max(FEWEST, int(AT_ONCE * self.known.get(layer, UNKNOWN)))
+        return max(MIN_PIXELS, int(AT_ONCE * self.known.get(layer, UNKNOWN)))
 
     def together(self, layer: str) -> int:
         """Rays until the next look at whether the picture is still wanted."""
-        return max(FEWEST, int(CHECKED * self.known.get(layer, UNKNOWN)))
+        return max(MIN_PIXELS, int(CHECKED * self.known.get(layer, UNKNOWN)))
 
 
 def sizes(width: int, height: int, at_once: int) -> list[float]:

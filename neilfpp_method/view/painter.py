@@ -1,6 +1,4 @@
-"""A thread that makes the pictures of one browser: the newest wish counts, and what is no longer wanted is
-given up.
-"""
+"""A thread that makes one browser's pictures: the newest wish counts, older ones are given up."""
 
 from __future__ import annotations
 
@@ -17,8 +15,7 @@ Made = TypeVar("Made")
 class Painter(Generic[Asked, Made]):
     """Shows ever finer pictures of the newest wish.
 
-    The first picture of a wish is always finished: while a camera moves there would be nothing to see
-    otherwise.
+    A wish's first picture is always finished: nothing would be seen while a camera moves otherwise.
 
     Args:
         frames: pictures of a wish; None where it can be given up.

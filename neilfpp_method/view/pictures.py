@@ -55,8 +55,7 @@ class Wish:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A picture of a wish, perhaps smaller than the window: sRGB, and depths along the camera's axis, scene
-    units.
+    """A picture of a wish, perhaps smaller than the window: sRGB, and axial depths, scene units.
 
     `share` is its size over that of the window, `samples` how many each pixel has.
     """
@@ -93,9 +92,7 @@ def frames(wish: Wish, pace: Pace) -> Iterator[Frame | None]:
 
 
 def _whole(wish: Wish, camera: Camera, part: Part, pace: Pace, jitter: int) -> Iterator[Tensor | None]:
-    """None after each part but the last, then all pixels; the first sample goes through the middle of a
-    pixel.
-    """
+    """None after each part but the last, then all pixels; the first sample is at each pixel's centre."""
     layer, device = wish.layer, wish.subject.device
     pixels = torch.arange(camera.width * camera.height, device=device)
     inside = (

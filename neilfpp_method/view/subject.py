@@ -59,9 +59,7 @@ class Subject:
 
 @dataclass(frozen=True)
 class Lighting:
-    """The light that is chosen. `own`: the run's own, unchanged. No sky: light that is free at every
-    point.
-    """
+    """The chosen light. `own`: the run's own, unchanged. No sky: light that is free at every point."""
 
     sky: Sky | None
     lamps: Lamplight | None

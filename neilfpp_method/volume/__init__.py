@@ -1,3 +1,1 @@
-"""Volume rendering: where a ray meets the scene, how dense it is there, where to sample it, how to add it
-up.
-"""
+"""Volume rendering: where a ray meets the scene, its density there, where to sample, how to add up."""

@@ -53,9 +53,7 @@ def share_near(
     depth: Float[Tensor, " N"],
     radius: float,
 ) -> Float[Tensor, " N"]:
-    """The weight of intervals that lies within `radius` of a depth; an interval that reaches out of it counts
-    by its part.
-    """
+    """The weight of intervals within `radius` of a depth; partial intervals count in part."""
     start = torch.maximum(distances[:, :-1], depth[:, None] - radius)
     end = torch.minimum(distances[:, 1:], depth[:, None] + radius)
     width = distances.diff(dim=-1).clamp_min(torch.finfo(distances.dtype).tiny)
@@ -65,8 +63,7 @@ def share_near(
 def render_weights(
     density: Float[Tensor, "N M"], distances: Float[Tensor, "N M"], far: Float[Tensor, " N"]
 ) -> Weights:
-    """`depth_weights` of a density that is constant from one sample to the next: τ_i = σ_i δ_i, δ_i = t_{i+1}
-    − t_i.
+    """`depth_weights` of piecewise constant density: τ_i = σ_i δ_i, δ_i = t_{i+1} − t_i.
 
     Args:
         density: σ_i ≥ 0 between sample i and the next, 1 / scene unit.

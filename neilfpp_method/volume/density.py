@@ -20,8 +20,7 @@ BETA_FLOOR = 1e-4
 
 
 def laplace_density(sdf: Float[Tensor, "*shape"], beta: Float[Tensor, "*#shape"]) -> Float[Tensor, "*shape"]:
-    """σ = α Ψ_β(−sdf), α = 1/β, with Ψ_β the CDF of a zero-mean Laplace distribution of scale β (VolSDF eq.
-    2, 3).
+    """σ = α Ψ_β(−sdf), α = 1/β, Ψ_β the CDF of a zero-mean Laplace distribution (VolSDF eq. 2, 3).
 
     Half of 1/β on the surface, 1/β deep inside, 0 far outside. No exponential grows, so value and gradients
     are finite for any distance; small densities outside keep their relative precision.
@@ -34,8 +33,7 @@ def laplace_density(sdf: Float[Tensor, "*shape"], beta: Float[Tensor, "*#shape"]
         Density, 1 / scene unit.
     """
     scaled = sdf / beta
-    # Ψ(−x) = ½ (e^{−max(x, 0)} − expm1(min(x, 0))). The parts share the kink so that the slope at 0 is −½,
-    # not 0 or −1.
+    # Ψ(−x) = ½ (e^{−max(x, 0)} − expm1(min(x, 0))). The parts share the kink: the slope at 0 is −½.
     outside = torch.relu(scaled)
     inside = scaled - outside
     return 0.5 * (torch.exp(-outside) - torch.expm1(inside)) / beta
@@ -44,11 +42,10 @@ def laplace_density(sdf: Float[Tensor, "*shape"], beta: Float[Tensor, "*#shape"]
 def laplace_depth(
     sdf: Float[Tensor, "*shape M"], distances: Float[Tensor, "*shape M"], beta: Float[Tensor, "*#shape"]
 ) -> Float[Tensor, "*shape M-1"]:
-    """Optical depth between neighbouring samples of a ray: the integral of the density, the SDF being linear
-    between them.
+    """Optical depth between neighbouring samples of a ray: the density's integral, the SDF linear there.
 
-    With u = sdf/β the antiderivative of Ψ(−u) is F(u) = min(u, 0) − ½ e^{−|u|}, so an interval of width δ has the depth
-    (δ/β) (F(u₁) − F(u₀)) / (u₁ − u₀). An even cut of a homogeneous medium gives δ σ.
+    With u = sdf/β the antiderivative of Ψ(−u) is F(u) = min(u, 0) − ½ e^{−|u|}, so an interval of width δ has
+    the depth (δ/β) (F(u₁) − F(u₀)) / (u₁ − u₀). An even cut of a homogeneous medium gives δ σ.
 
     The rule of VolSDF, δ times the density of the first sample, takes the last sample before empty space for
     all of it: rays that graze a surface come out too opaque.
@@ -62,14 +59,14 @@ def laplace_depth(
         Depths ≥ 0, in float32 or wider.
 
     Example:
-        >>> laplace_depth(torch.zeros(2), torch.tensor([0.0, 1.0]), torch.tensor(0.1))  # along a surface: 1 / (2 β)
+        >>> along_a_surface = torch.zeros(2)  # its density is 1 / (2 β)
+        >>> laplace_depth(along_a_surface, torch.tensor([0.0, 1.0]), torch.tensor(0.1))
         tensor([5.])
     """
     scaled = sdf.to(torch.promote_types(sdf.dtype, torch.float32)) / beta
     outside = torch.relu(scaled)
     inside = scaled - outside
-    # The two terms of F are subtracted apart: deep inside the first is large, and the second would drown in
-    # it.
+    # The terms of F are subtracted apart: deep inside, the first is large and would absorb the second.
     rise = inside.diff(dim=-1) - 0.5 * torch.exp(inside - outside).diff(dim=-1)
     step = scaled.diff(dim=-1)
     close = step.abs() < CLOSE

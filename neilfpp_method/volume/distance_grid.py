@@ -1,7 +1,6 @@
 """A distance field sampled on a grid, and rays traced through it: visibility at the price of a look-up.
 
-The grid spans the cube [−radius, radius]³ with its vertices on the faces, and is stored z, y, x as
-`grid_sample` reads it.
+The grid spans the cube [−radius, radius]³, vertices on its faces, stored z, y, x (`grid_sample`).
 """
 
 from __future__ import annotations
@@ -24,9 +23,7 @@ CHUNK = 65_536
 STEPS = 40
 """Most steps of a ray; one that has not ended by then passes close to a surface without meeting it."""
 HIT_CELLS = 0.25
-"""A ray meets the surface where the distance is below this share of a cell: about the error of the
-interpolation.
-"""
+"""A ray meets the surface where the distance is below this share of a cell: the interpolation error."""
 
 
 def cell_size(grid: Float[Tensor, "R R R"], radius: float) -> float:
@@ -48,18 +45,14 @@ def sample_grid(
 
 
 def look_up(grid: Float[Tensor, "R R R"], radius: float, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-    """The distance at points, by trilinear interpolation; beyond the cube that of the nearest point of its
-    faces.
-    """
+    """The distance at points, by trilinear interpolation; beyond the cube that of the nearest face point."""
     at = (x / radius).view(1, -1, 1, 1, 3)
     return functional.grid_sample(grid[None, None], at, padding_mode="border", align_corners=True).view(-1)
 
 
 @dataclass(frozen=True)
 class GridHits:
-    """Where rays meet the surface: the distance along the ray, and whether they do before they leave the
-    cube.
-    """
+    """Where rays meet the surface: the distance along the ray, and whether before they leave the cube."""
 
     distance: Float[Tensor, " P"]
     hit: Bool[Tensor, " P"]
@@ -74,8 +67,7 @@ def trace_grid(
 ) -> GridHits:
     """Sphere tracing: each step goes as far as the distance allows, and at least a quarter of a cell.
 
-    On a CPU by compiled loops; elsewhere all rays take all steps together, and the host never waits for the
-    device.
+    On a CPU by compiled loops; elsewhere all rays take all steps together, without synchronisation.
     """
     least = HIT_CELLS * cell_size(grid, radius)
     compiled = ray_tracer(origins.device.type)

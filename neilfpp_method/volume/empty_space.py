@@ -35,15 +35,13 @@ HARDLY_MISSED = 1e-3
 """The same in pictures: a quarter of a level of 8 bits."""
 OPAQUE = 8.0
 """Optical depth behind which nothing is seen."""
-LEAST_LIFE, MOST_LIFE = 20, 100
+MIN_LIFE, MAX_LIFE = 20, 100
 """Steps in which the field moves before the grid may, and must, be sampled anew."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """Which rays have a part that is taken, and from where to where it is; the whole ray where it has
-    none.
-    """
+    """Which rays have a part that is taken, and where it starts and ends; the whole ray without one."""
 
     some: Bool[Tensor, " N"]
     interval: Interval
@@ -86,7 +84,7 @@ class EmptySpace(nn.Module):
         edges, clearance = self._edges(interval), self._clearance(beta, MISSED)
         empty, opaque = self._known(rays, edges, clearance, beta)
         if rays.origins.device.type == "cpu" and not self._holds(sdf, rays, edges, empty, clearance):
-            if self.age is not None and self.age >= LEAST_LIFE:
+            if self.age is not None and self.age >= MIN_LIFE:
                 self.age = None  # the next use samples it
             return interval
         return _span(edges, ~empty & ~opaque, interval).interval
@@ -99,8 +97,7 @@ class EmptySpace(nn.Module):
         interval: Interval,
         beta: Float[Tensor, ""],
     ) -> Span:
-        """Which rays may show anything, and the part of each within which they do, for a field that stands
-        still.
+        """Which rays may show anything, and the part of each within which they do; a fixed field.
 
         The grid must be that of the field as it is: it is sampled by the first who asks, and no promise is
         tested. What is left out has an opacity of at most `HARDLY_MISSED`.
@@ -118,8 +115,7 @@ class EmptySpace(nn.Module):
         interval: Interval,
         beta: Float[Tensor, ""],
     ) -> Bool[Tensor, " N"]:
-        """Which rays may come down on a surface: for rays that leave one, where nearly all of a ray's start
-        is never clear.
+        """Which rays may come down on a surface, for rays that leave one: their start is never clear.
 
         A ray that enters a surface does so where the distance falls. So a ray may meet one if somewhere the
         grid's distance falls along it in a part that is not empty for sure. Between vertices the grid knows a
@@ -133,7 +129,7 @@ class EmptySpace(nn.Module):
         return ((distance.diff(dim=-1) < 0.0) & ~empty[:, 1:]).any(-1)
 
     def _renew(self, sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]) -> None:
-        if self.age is None or self.age >= MOST_LIFE:
+        if self.age is None or self.age >= MAX_LIFE:
             self._sample(sdf)
 
     def _sample(self, sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]) -> None:
@@ -168,15 +164,12 @@ class EmptySpace(nn.Module):
 
     def _doubt(self, edges: Float[Tensor, "N E"]) -> Float[Tensor, "N K"]:
         """How far the field in a part may be from what the grid says in its middle."""
-        # A weighted mean of the vertices of a cell is off by no more than the slope times half of its
-        # diagonal.
+        # A weighted mean of a cell's vertices is off by at most the slope times half of its diagonal.
         reach = 0.5 * math.sqrt(3.0) * cell_size(self.distance, self.radius)
         return self.slope * (0.5 * edges.diff(dim=-1) + reach)
 
     def _clearance(self, beta: Float[Tensor, ""], missed: float) -> Float[Tensor, ""]:
-        """The distance from which on a density of scale β adds up to no more than `missed` along a whole
-        ray.
-        """
+        """The distance from which a density of scale β adds up to at most `missed` along a ray."""
         return beta * math.log(self.radius / missed) - beta * beta.log()  # e^(−G/β) · 2 radius / 2β ≤ missed
 
     def _holds(

@@ -28,17 +28,14 @@ RESOLUTION = 64
 
 @dataclass(frozen=True)
 class FreeSpaceSample:
-    """How deep N points lie within free space, scene units, negative outside, and the gradient of that: a
-    unit vector.
-    """
+    """Depth of N points within free space, scene units, negative outside, and its unit gradient."""
 
     depth: Float[Tensor, " N"]
     gradient: Float[Tensor, "N 3"]
 
 
 def free_radius(distance: Float[Tensor, " V"]) -> Float[Tensor, " V"]:
-    """Radius of the free ball about cameras at a distance from the scene's centre; 0 for those among the
-    objects.
+    """Radius of the free ball about cameras at a distance from the scene's centre; 0 among the objects.
 
     The lesser of `FREE_SHARE` · distance and distance − `OBJECT_RADIUS`, and never negative.
 

@@ -25,13 +25,9 @@ WIDTH = 0.75
 surface of curvature κ by about WIDTH² κ / 2 cells squared.
 """
 BEHIND = 1.25
-"""How far behind its plane a point speaks, in cells: less than to the other side of what is thicker than
-that.
-"""
+"""How far behind its plane a point counts, in cells: less than the thickness of thin objects."""
 KNOWN = 0.15
-"""Least sum of the weights of a vertex whose distance is known: a point at the distance of one and a half
-cells has 0.14.
-"""
+"""Least weight sum of a vertex with a known distance; a point one and a half cells away has 0.14."""
 HALF_DIAGONAL = 0.87
 """In cells: a vertex of the cell that holds a surface is no further from it."""
 AT_ONCE = 8192
@@ -40,9 +36,7 @@ AT_ONCE = 8192
 
 @dataclass(frozen=True)
 class FusedSurface:
-    """Distances at the vertices of the cube, z, y, x; and for means the sum of weights and of weighted values
-    there.
-    """
+    """Distances at the cube's vertices, z, y, x; for means, the sums of weights and weighted values."""
 
     distance: Float[Tensor, "R R R"]
     weight: Float[Tensor, "R R R"]
@@ -105,9 +99,7 @@ def grid_normal(grid: Float[Tensor, "R R R"], radius: float, x: Float[Tensor, "P
 
 
 def _far(near: Tensor, edge: float) -> Float[Tensor, "R R R"]:
-    """A lower bound of the distance from the surface: that from the nearest vertex beside it, less half a
-    cell's diagonal.
-    """
+    """A lower bound of the surface's distance: the nearest vertex beside it, less half a cell diagonal."""
     if not near.any():
         return torch.full(near.shape, near.shape[0] * edge, device=near.device)
     cells = torch.from_numpy(distance_transform_edt((~near).cpu().numpy())).to(near.device, torch.float32)

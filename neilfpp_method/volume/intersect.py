@@ -36,8 +36,7 @@ def sphere_interval(
         radius: scene units.
     """
     closest = -(origins * directions).sum(dim=-1)
-    # From the perpendicular, not from ‖o‖² − m²: the difference of two large squares blurs the edge for far
-    # cameras.
+    # From the perpendicular, not ‖o‖² − m²: the difference of large squares blurs edges of far cameras.
     perpendicular = origins + closest[:, None] * directions
     half = (radius**2 - perpendicular.square().sum(dim=-1)).clamp_min(0.0).sqrt()
     return Interval((closest - half).clamp_min(0.0), (closest + half).clamp_min(0.0))

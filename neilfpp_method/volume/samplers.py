@@ -1,5 +1,4 @@
-"""Where to sample a ray: evenly, by a given distribution, or with a bound on the error of the opacity (VolSDF
-§3).
+"""Where to sample a ray: evenly, by a distribution, or with bounded opacity error (VolSDF §3).
 
 The error-bounded sampler cuts a ray into intervals, bounds how wrong the opacity can be when the density is
 taken as constant on each, and cuts again where that bound comes from. Nothing here is differentiated.
@@ -58,9 +57,7 @@ def strata(like: Float[Tensor, "N _"], count: int, stochastic: bool) -> Float[Te
 def uniform_samples(
     near: Float[Tensor, " N"], far: Float[Tensor, " N"], count: int, stochastic: bool
 ) -> Float[Tensor, "N {count}"]:
-    """`count` distances, ascending: both ends of [near, far], and one in each of equal parts, at random or at
-    its middle.
-    """
+    """`count` ascending distances: both ends of [near, far], and one per equal part, random or central."""
     within = torch.lerp(near[:, None], far[:, None], strata(near[:, None], count - 2, stochastic))
     return torch.cat([near[:, None], within, far[:, None]], dim=-1)
 
@@ -69,11 +66,9 @@ def uniform_samples(
 def inverse_cdf_samples(
     edges: Float[Tensor, "N E"], mass: Float[Tensor, "N E-1"], count: int, stochastic: bool
 ) -> Float[Tensor, "N {count}"]:
-    """Distances distributed as `mass`, evenly within each bin, ascending: one for each of `count` equal
-    shares of it.
+    """Ascending distances distributed as `mass`, even within bins: one for each of `count` equal shares.
 
-    A bin without mass gets no sample. Where no bin has mass the samples are even from the first edge to the
-    last.
+    A bin without mass gets no sample. Without any mass the samples are even from first to last edge.
 
     Args:
         edges: bounds of the bins, ascending; a bin may have no width.
@@ -102,9 +97,7 @@ def inverse_cdf_samples(
 
 @dataclass(frozen=True)
 class Partition(Indexable):
-    """Rays cut into intervals: the E cuts from near to far, the SDF there, and the width and d* of each
-    interval.
-    """
+    """Rays cut into intervals: the E cuts from near to far, the SDF there, and each width and d*."""
 
     distances: Float[Tensor, "N E"]
     sdf: Float[Tensor, "N E"]
@@ -115,10 +108,11 @@ class Partition(Indexable):
 def cut(distances: Float[Tensor, "N E"], sdf: Float[Tensor, "N E"]) -> Partition:
     """Rays cut at `distances`, where the SDF is `sdf`.
 
-    d* is how close the surface can come to an interval (VolSDF Theorem 1 and supplement). The surface does not enter
-    the balls of radius |sdf| about the ends of the interval; d* is the distance from the interval to what is outside
-    both: to the circle where the spheres meet if its foot is in the interval, else the smaller radius. It is 0 where
-    they do not meet, and where the sign changes: a learned distance may promise more room than there is.
+    d* is how close the surface can come to an interval (VolSDF Theorem 1 and supplement). The surface does
+    not enter the balls of radius |sdf| about the ends of the interval; d* is the distance from the interval
+    to what is outside both: to the circle where the spheres meet if its foot is in the interval, else the
+    smaller radius. It is 0 where they do not meet, and where the sign changes: a learned distance may promise
+    more room than there is.
     """
     width = distances.diff(dim=-1)
     start, end = sdf[:, :-1], sdf[:, 1:]
@@ -137,8 +131,7 @@ def optical_depth(partition: Partition, beta: Float[Tensor, "#N 1"]) -> Float[Te
 
 
 def depth_error(partition: Partition, beta: Float[Tensor, "#N 1"]) -> Float[Tensor, "N K"]:
-    """Ê, the bound on the error of R̂, up to the end of each interval: Σ δ² exp(−d*/β) / (4 β²) (VolSDF
-    §3.3).
+    """Ê, the bound on the error of R̂, up to each interval's end: Σ δ² exp(−d*/β) / (4 β²) (VolSDF §3.3).
 
     The slope of the density is at most exp(−d*/β) / (2 β²) on an interval where |∇ sdf| ≤ 1 (Theorem 1).
     """
@@ -188,12 +181,11 @@ def bounded_beta(
 
 @dataclass(frozen=True)
 class ErrorBoundedSamples:
-    """Samples of each ray, what they cost, and how far the opacity they were drawn from can be from the
-    truth.
+    """Samples of each ray, their cost, and how far the opacity they follow can be from the truth.
 
-    `distances` ascend. `error_bound` is that of `log_error_bound` at the true β, at most 1: above `OPACITY_ERROR` the
-    rounds were used up, and the samples follow a wider density. It holds where |∇ sdf| ≤ 1. `sdf_queries` is the number
-    of SDF queries per ray, a mean over the rays.
+    `distances` ascend. `error_bound` is that of `log_error_bound` at the true β, at most 1: above
+    `OPACITY_ERROR` the rounds were used up, and the samples follow a wider density. It holds where
+    |∇ sdf| ≤ 1. `sdf_queries` is the number of SDF queries per ray, a mean over the rays.
     """
 
     distances: Float[Tensor, "N M"]
@@ -212,8 +204,7 @@ def error_bounded_samples(
     config: VolumeConfig,
     stochastic: bool,
 ) -> ErrorBoundedSamples:
-    """Distances where the Laplace density stops a ray, known up to `config.epsilon`, and some between (VolSDF
-    Algorithm 1).
+    """Distances where the Laplace density stops a ray, to `config.epsilon`, and some between (Algorithm 1).
 
     A ray is cut evenly, then up to `config.rounds` times where the bound on the error of its opacity comes
     from (`bound_shares`), until the bound at β is ≤ ε. Each round asks for the SDF at the new cuts only. A
@@ -265,9 +256,7 @@ def error_bounded_samples(
 
 
 def can_leave_early(device: torch.device) -> bool:
-    """Whether the host may ask which rays have converged: on a CPU it knows; elsewhere it would wait for the
-    device.
-    """
+    """Whether the host may ask which rays have converged: a CPU knows; other devices would be waited for."""
     return device.type == "cpu"
 
 
@@ -307,8 +296,7 @@ def query(sdf: SignedDistance, rays: RayBatch, distances: Float[Tensor, "N M"]) 
 def opacity_samples(
     partition: Partition, beta: Float[Tensor, "N 1"], count: int, stochastic: bool
 ) -> Float[Tensor, "N {count}"]:
-    """Both ends of each ray, and between them two thirds of the samples by opacity, and one third alike for
-    every cut.
+    """Both ends of each ray, between them two thirds of samples by opacity and one third over the cuts.
 
     By opacity: the inverse of the partition's Ô, normalised to 1 at far (VolSDF Algorithm 1, last step).
     """

@@ -57,7 +57,7 @@ def test_what_is_no_light_is_refused(tmp_path, pixels, complaint):
 
 def test_the_size_is_refused_before_pixels_are_read(tmp_path, monkeypatch):
     path = write(tmp_path / "sky.exr", np.ones((12, 24, 3)))
-    monkeypatch.setattr(environment_map, "MOST_ROWS", 11)
+    monkeypatch.setattr(environment_map, "MAX_ROWS", 11)
     path.write_bytes(path.read_bytes()[:-40])  # whoever reads the pixels meets the damage
     with pytest.raises(UserError, match="12 rows and 24 columns"):
         check_environment(path)

@@ -215,7 +215,7 @@ def test_pages_that_were_drawn_are_given_back(tmp_path: Path, monkeypatch) -> No
     capture = load_capture(make_capture(tmp_path / "c"))
     pixels, _ = opened(capture, tmp_path / "pixels")
     given_back: list[int] = []
-    monkeypatch.setattr(pixel_store, "MOST_MAPPED", 100 * pixel_store.BYTES_OF_A_DRAW)
+    monkeypatch.setattr(pixel_store, "MAX_MAPPED", 100 * pixel_store.BYTES_OF_A_DRAW)
     monkeypatch.setattr(pixel_store, "_advise", lambda array, what: given_back.append(array.nbytes))
     before = pixels.view(3).color
     for _ in range(4):

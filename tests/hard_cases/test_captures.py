@@ -81,6 +81,14 @@ def path_of_image(value) -> Callable[[dict], None]:
     return lambda scene: files(scene).update({"3": value})
 
 
+def size(value) -> Callable[[dict], None]:
+    return lambda scene: track(scene).update(size=value)
+
+
+def box(transform) -> Callable[[dict], None]:
+    return lambda scene: scene["bbox"].update(transform=np.asarray(transform).tolist())
+
+
 MIRROR = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
 BROKEN_SCENES = {
     "no views": (lambda s: (tracks(s).clear(), files(s).clear()), "no images"),
@@ -102,17 +110,17 @@ BROKEN_SCENES = {
     "extrinsic of text": (extrinsic("eye"), "extrinsic: not 16 or 4×4 finite numbers"),
     "extrinsic with NaN": (extrinsic([float("nan")] * 16), "extrinsic: not 16 or 4×4 finite numbers"),
     "mirror": (extrinsic(MIRROR), "003.exr: the extrinsic is no rotation and translation"),
-    "scaled rotation": (extrinsic(np.diag([2.0, 2.0, 2.0, 1.0]).tolist()), "003.exr: the extrinsic is no rotation"),
-    "projective": (extrinsic([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 0]]), "003.exr: the extrinsic is no"),
+    "scaled rotation": (extrinsic(np.diag([2, 2, 2, 1]).tolist()), "the extrinsic is no rotation"),
+    "projective": (extrinsic([*np.eye(4)[:3].tolist(), [0, 0, 1, 0]]), "the extrinsic is no rotation"),
     "negative focal": (intrinsic(focal=[-25.0, 25.0]), "003.exr: the focal length is not positive"),
     "zero focal": (intrinsic(focal=0), "003.exr: the focal length is not positive"),
     "three focals": (intrinsic(focal=[1, 2, 3]), "focal: not 1 or 2 finite numbers"),
     "infinite principal point": (intrinsic(ppt=[float("inf"), 9]), "ppt: not 2 finite numbers"),
-    "other size": (lambda s: track(s).update(size=[18, 24]), "003.exr: 24×18 pixels where the camera has 18×24"),
-    "size is not whole": (lambda s: track(s).update(size=[24.5, 18]), "size: the image size is not whole"),
-    "negative size": (lambda s: track(s).update(size=[-24, 18]), "003.exr: the image size is not positive"),
-    "empty box": (lambda s: s["bbox"].update(transform=np.zeros((4, 4)).tolist()), "bbox.transform: the box is empty"),
-    "inverted box": (lambda s: s["bbox"].update(transform=(-np.eye(4)).tolist()), "bbox.transform: the box is empty"),
+    "other size": (size([18, 24]), "003.exr: 24×18 pixels where the camera has 18×24"),
+    "size is not whole": (size([24.5, 18]), "size: the image size is not whole"),
+    "negative size": (size([-24, 18]), "003.exr: the image size is not positive"),
+    "empty box": (box(np.zeros((4, 4))), "bbox.transform: the box is empty"),
+    "inverted box": (box(-np.eye(4)), "bbox.transform: the box is empty"),
 }  # fmt: skip
 
 

@@ -240,7 +240,7 @@ def test_light_between_two_planes_is_what_they_emit():
     expected = (1.0 + across[traced.hit][:, :1]).expand(-1, 3)
     torch.testing.assert_close(traced.radiance[traced.hit], expected, atol=1e-5, rtol=0.0)
 
-    # L_ref, in closed form: a light of 1 everywhere differs from the ceiling by |x|, and from the floor by 2 + y.
+    # L_ref in closed form: a light of 1 everywhere differs from the ceiling by |x|, from the floor by 2 + y.
     model = NeilfModel(
         host, mesh_config(loss=dataclasses.replace(mesh_config().loss, unit="activation")), FACTS
     )

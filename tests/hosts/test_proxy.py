@@ -139,6 +139,24 @@ def test_a_checkpoint_traces_as_before():
         assert torch.equal(getattr(proxy.render(rays), field), getattr(other.render(rays), field))
 
 
+def test_a_checkpoint_between_two_refreshes_loses_no_ray():
+    adapted = CallableHost(TableTop())
+
+    def observe(proxy: SurfaceProxy, steps: range) -> None:
+        for step in steps:
+            rays = camera_rays_above(512, seed=step)
+            proxy.observe(rays, adapted.render(rays))
+
+    whole, first, second = (SurfaceProxy(SCENE, 40, 0.8) for _ in range(3))
+    observe(whole, range(8))
+    observe(first, range(3))  # the rays of the third step wait for the refresh after the fourth
+    second.load_state_dict(first.state_dict())
+    observe(second, range(3, 8))
+    rays = camera_rays_above(300, seed=3)
+    for field in ("color", "position", "normal", "opacity"):
+        assert torch.equal(getattr(second.render(rays), field), getattr(whole.render(rays), field))
+
+
 def test_a_host_that_knows_its_radiance_is_asked_for_it():
     proxy = SurfaceProxy(SCENE, CELLS, 0.8, radiance=lambda x, wo: wo.abs())
     adapted, rays = CallableHost(TableTop()), camera_rays_above(512)

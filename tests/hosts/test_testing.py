@@ -89,7 +89,7 @@ BROKEN = [
         r"hits something with rays that lead away",
     ),
     (
-        lambda r, o: {"color": o["color"] * (1.0 + np.random.rand())},
+        lambda r, o: {"color": o["color"] * (1.0 + np.random.default_rng().random())},
         r"renders differently after the same seed",
     ),
     (shift_origins, r"changes its input"),

@@ -25,7 +25,8 @@ def step(x):
     units = softplus_and_slope(x, 100.0)
     features = encode(x, table, spec, True)
     traced = trace_grid(ball, 1.0, 0.1 * x.detach() + start, up).distance
-    return (units.value * units.slope).sum() + softplus(x.detach(), 100.0).sum() + features.features.sum() + traced.sum()
+    parts = units.value * units.slope, softplus(x.detach(), 100.0), features.features, traced
+    return sum(part.sum() for part in parts)
 
 x = torch.rand(6, 3).requires_grad_()
 compiled, plain = torch.compile(step, backend="eager")(x), step(x)

@@ -13,7 +13,8 @@ RESIDENT = """
 import torch
 def resident():
     torch.ones(16_000_000)  # 64 MB, and gone at once
-    return int(next(line for line in open("/proc/self/status") if line.startswith("VmRSS")).split()[1]) // 1024
+    rss = next(line for line in open("/proc/self/status") if line.startswith("VmRSS"))
+    return int(rss.split()[1]) // 1024
 """
 
 

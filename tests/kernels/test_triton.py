@@ -18,10 +18,13 @@ from neilfpp_method.kernels import triton as kernels
 
 fixed = {"width": 2, "with_jacobian": True, "block": kernels.BLOCK}
 for number in ("fp32", "fp64"):
-    pointers = dict.fromkeys(("points", "table", "features", "jacobian", "gradient"), "*" + number) | {"grid": "*i64"}
+    arrays = ("points", "table", "features", "jacobian", "gradient")
+    kind_of = dict.fromkeys(arrays, "*" + number) | {"grid": "*i64"}
     for kernel in (kernels._interpolate, kernels._add_to_table, kernels._pull_to_points):
-        kinds = {p.name: "constexpr" if p.name in fixed else pointers.get(p.name, "i32") for p in kernel.params}
-        code = compile(ASTSource(kernel, kinds, fixed), target=GPUTarget("cuda", 80, 32), options=kernels.FUSED)
+        names = [parameter.name for parameter in kernel.params]
+        kinds = {name: "constexpr" if name in fixed else kind_of.get(name, "i32") for name in names}
+        source, target = ASTSource(kernel, kinds, fixed), GPUTarget("cuda", 80, 32)
+        code = compile(source, target=target, options=kernels.FUSED)
         print(len(code.asm["cubin"]))
 """
 

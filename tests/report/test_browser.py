@@ -41,7 +41,8 @@ def test_clicking_through_the_layers_changes_the_pictures(page: Path):
         click("beside", "error");
         const error = before.src;
         click("view", 1);
-        const strips = [...document.querySelectorAll(".strip[data-view]")].map((s) => getComputedStyle(s).display);
+        const strips = [...document.querySelectorAll(".strip[data-view]")]
+            .map((s) => getComputedStyle(s).display);
         const slider = stage.querySelector("input");
         slider.value = 20;
         slider.dispatchEvent(new Event("input"));

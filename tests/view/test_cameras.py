@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from neilfpp_method.data.views import project
-from neilfpp_method.view.cameras import MOST_SIDE, Pose, pinhole, pose_of
+from neilfpp_method.view.cameras import MAX_SIDE, Pose, pinhole, pose_of
 
 # Looks along world +x, its right hand towards −y: x_cam = −y, y_cam = −z, z_cam = x.
 ALONG_X = np.array([0.5, -0.5, 0.5, -0.5])
@@ -27,8 +27,8 @@ def test_a_pose_comes_back():
 
 
 def test_large_windows_have_smaller_pictures_of_the_same_view():
-    camera = pinhole(Pose(np.zeros(3), ALONG_X, 0.7, 2.0), 4 * MOST_SIDE, 2 * MOST_SIDE)
-    assert (camera.width, camera.height) == (MOST_SIDE, MOST_SIDE // 2)
+    camera = pinhole(Pose(np.zeros(3), ALONG_X, 0.7, 2.0), 4 * MAX_SIDE, 2 * MAX_SIDE)
+    assert (camera.width, camera.height) == (MAX_SIDE, MAX_SIDE // 2)
     assert 2 * math.atan(camera.height / 2 / camera.fy) == pytest.approx(0.7)
 
 

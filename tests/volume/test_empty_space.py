@@ -215,7 +215,7 @@ def test_a_surface_that_has_come_up_is_noticed_at_once():
 
     whole, part = narrowed(moved, rays, 0.01, grid)
     assert torch.equal(part.near, whole.near)  # nobody skips anything
-    for _ in range(empty_space.LEAST_LIFE):
+    for _ in range(empty_space.MIN_LIFE):
         grid.moved()
     narrowed(moved, rays, 0.01, grid)
     whole, part = narrowed(moved, rays, 0.01, grid)
@@ -233,10 +233,10 @@ def test_the_grid_is_sampled_when_it_must():
     narrowed(counted, rays, 0.01, grid)
     assert sum(asked) == empty_space.RESOLUTION**3 + 5
     asked.clear()
-    for _ in range(empty_space.MOST_LIFE):
+    for _ in range(empty_space.MAX_LIFE):
         narrowed(counted, rays, 0.01, grid)
         grid.moved()
-    assert sum(asked) == 5 * empty_space.MOST_LIFE  # one query per ray and use
+    assert sum(asked) == 5 * empty_space.MAX_LIFE  # one query per ray and use
     narrowed(counted, rays, 0.01, grid)
     assert grid.age == 0
 

@@ -172,7 +172,7 @@ def test_the_bound_is_that_of_the_theorem():
 
 
 def opacity_error(sdf, rays, beta, cuts):
-    """max_t |O(t) − Ô(t)| of one ray: O by fine quadrature, Ô with the density constant from each cut to the next."""
+    """max_t |O(t) − Ô(t)| of one ray: O by fine quadrature, Ô with constant density between cuts."""
     origin, direction, near, far = (part[0] for part in rays)
     t = torch.linspace(near.item(), far.item(), 400_001, dtype=F64)
     density = laplace.cdf(-sdf(origin + t[:, None] * direction).numpy(), scale=beta) / beta

@@ -1,13 +1,11 @@
-"""Reader of Blender's transforms_train.json and transforms_test.json, as NeRF's synthetic scenes and
-Stanford-ORB have them.
+"""Reader of Blender's transforms_train.json and transforms_test.json (NeRF synthetic, Stanford-ORB).
 
 camera_angle_x                     radians, for all frames or in each frames[].file_path
 without suffix: .png with alpha, .exr, … frames[].transform_matrix          camera to world, 4×4, OpenGL axes
 <folder>_mask/<name>.png           optional: the masks of the images in <folder>; without them an alpha
 channel is the mask
 
-Views of the test file are held out. Validation views, and those of other scenes (transforms_novel.json), are
-left out.
+Views of the test file are held out. Validation views and transforms_novel.json are left out.
 """
 
 from __future__ import annotations

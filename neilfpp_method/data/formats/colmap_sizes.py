@@ -14,7 +14,8 @@ __all__ = ["check_sizes"]
 
 COUNT, SMALL_COUNT = Struct("<Q"), Struct("<I")
 CAMERA_HEAD, PARAMETER = Struct("<iiQQ"), 8
-FEWEST_PARAMETERS = 2
+MIN_PARAMETERS = 2
+"""Of a camera: a focal length and at least one more."""
 IMAGE_HEAD, POINT_IN_IMAGE = Struct("<I7dI"), 24
 POINT_HEAD, OBSERVATION = Struct("<Q3d3Bd"), 8
 RIG_ID, SENSOR, POSE = 4, 8, 56
@@ -45,7 +46,7 @@ def check_sizes(folder: Path) -> None:
 
 def _camera(data: bytes, offset: int) -> int:
     # The number of parameters depends on the model, which pycolmap checks; a bound for the loop is enough.
-    return offset + CAMERA_HEAD.size + FEWEST_PARAMETERS * PARAMETER
+    return offset + CAMERA_HEAD.size + MIN_PARAMETERS * PARAMETER
 
 
 def _image(data: bytes, offset: int) -> int:

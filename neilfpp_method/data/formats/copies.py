@@ -20,9 +20,10 @@ from neilfpp_method.shading.color import linear_to_srgb, srgb_to_linear
 
 __all__ = ["copy_file", "copy_view", "writing"]
 
-MOST_OF_A_PIXEL = 0.5
-ALL_OF_A_PIXEL = 0.9995
-"""OpenCV interpolates in steps of 1/32: a neighbour that counts at all weighs 1/1024 or more."""
+MASK_THRESHOLD = 0.5
+"""Interpolated mask above which a pixel is on the object."""
+VALID_THRESHOLD = 0.9995
+"""Interpolated validity from which all neighbours are valid: OpenCV weighs them in steps of 1/1024."""
 
 
 @contextmanager
@@ -38,8 +39,7 @@ def writing(out: Path) -> Iterator[None]:
 
 
 def copy_view(view: View, out: Path, hdr: bool, straight: bool) -> View:
-    """Copy a view's files to `out`/images, masks and valid, under the view's name; returns the view that they
-    make.
+    """Copy a view's files to `out`/images, masks and valid, under the view's name; returns the new view.
 
     The files are copied as they are where that says all. An exposure or white balance is divided out, as the
     layouts know none: the image is then written as EXR. With `straight` a lens is undone: the image is
@@ -56,12 +56,13 @@ def copy_view(view: View, out: Path, hdr: bool, straight: bool) -> View:
         image = copy_file(view.image, out / "images" / f"{view.name}{view.image.suffix.lower()}")
     else:
         image = _write_image(view, camera, factor, hdr, out / "images" / view.name)
+    name = f"{view.name}.png"
     return replace(
         view,
         camera=camera,
         image=image,
-        mask=_copy_mask(view.mask, view.camera, camera, out / "masks" / f"{view.name}.png", MOST_OF_A_PIXEL),
-        valid=_copy_mask(view.valid, view.camera, camera, out / "valid" / f"{view.name}.png", ALL_OF_A_PIXEL),
+        mask=_copy_mask(view.mask, view.camera, camera, out / "masks" / name, MASK_THRESHOLD),
+        valid=_copy_mask(view.valid, view.camera, camera, out / "valid" / name, VALID_THRESHOLD),
         exposure=1.0,
         white_balance=(1.0, 1.0, 1.0),
     )

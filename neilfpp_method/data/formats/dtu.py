@@ -4,8 +4,7 @@ cameras_sphere.npz, or cameras.npz      world_mat_<i>: image ← world, 4×4 (th
                                         scale_mat_<i>: world ← unit sphere, a scale and a shift
 image/ or rgb/, mask/                   the i-th file belongs to camera i
 
-In these files a pixel's centre lies at whole numbers; here it lies at +½, so principal points move by half a
-pixel.
+These files put pixel centres at whole numbers, we at +½, so principal points move by half a pixel.
 """
 
 from __future__ import annotations
@@ -28,8 +27,10 @@ LAYOUT = "cameras_sphere.npz or cameras.npz, and image/ or rgb/"
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
 IMAGES = ("image", "rgb", "images")
 MASKS = ("mask", "masks")
-LARGEST_ARCHIVE = 2**26
-SKEW = 0.05
+MAX_BYTES = 2**26
+"""Unpacked size of a camera archive."""
+MAX_SKEW = 0.05
+"""Sideways shift across the height of an image, pixels, that is taken for rounding."""
 
 
 def recognise(root: Path) -> bool:
@@ -67,7 +68,7 @@ def _matrices(archive: Path) -> Mapping[str, np.ndarray]:
     """The arrays of an archive whose unpacked size is bounded; pickled ones are refused."""
     try:
         with zipfile.ZipFile(archive) as packed:
-            if sum(member.file_size for member in packed.infolist()) > LARGEST_ARCHIVE:
+            if sum(member.file_size for member in packed.infolist()) > MAX_BYTES:
                 raise ValueError("it is too large for matrices of cameras")
         with np.load(archive, allow_pickle=False) as stored:
             return {name: stored[name] for name in stored.files}
@@ -105,7 +106,7 @@ def _camera(world_mat: Float64[np.ndarray, "4 4"], width: int, height: int, arch
         raise UserError(f"{where} is not a projection matrix", "export the cameras again")
     translation = np.linalg.solve(upper, projection[:, 3])
     k = upper / upper[2, 2]
-    if abs(k[0, 1]) * height / k[1, 1] > SKEW:
+    if abs(k[0, 1]) * height / k[1, 1] > MAX_SKEW:
         raise UserError(f"{where} has pixels that are not rectangular", "undistort the images to a pinhole")
     w2c = np.eye(4)
     w2c[:3, :3], w2c[:3, 3] = rotation, translation
@@ -127,9 +128,7 @@ def _normalisation(matrices: Mapping[str, np.ndarray], count: int, archive: Path
 
 
 def _files(root: Path, folder: Path) -> tuple[Path, ...]:
-    """The images of a folder, in the order of their names, which must not contradict that of their
-    numbers.
-    """
+    """The images of a folder, in the order of their names, which must agree with that of their numbers."""
     shown = (
         file
         for file in folder.iterdir()

@@ -45,9 +45,7 @@ def lens_from_nerfstudio(model: str, coefficients: Mapping[str, float], where: s
 
 
 def nerfstudio_coefficients(camera: Camera) -> Mapping[str, float] | None:
-    """The coefficients of a camera's lens by name: empty for a pinhole, none for a lens that nerfstudio has
-    not.
-    """
+    """A camera's lens coefficients by name: empty for a pinhole, none for a lens nerfstudio lacks."""
     if camera.lens is None:
         return {}
     names, coefficients = NAMES.get(camera.lens.model), camera.lens.coefficients

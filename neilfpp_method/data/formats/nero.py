@@ -3,8 +3,7 @@
 <i>-camera.pkl      a pickled pair of arrays: world to camera, 3×4, OpenCV axes; and the intrinsics, 3×3,
 pixel centres at +½ <i>.png             the image; 0, 1, …, without gaps
 
-The object lies in the unit sphere. NeRO's real scenes, and others prepared for it, are COLMAP models in
-colmap/sparse/0.
+The object lies in the unit sphere. NeRO's real scenes come as COLMAP models in colmap/sparse/0.
 """
 
 from __future__ import annotations
@@ -23,7 +22,8 @@ __all__ = ["LAYOUT", "read", "recognise"]
 
 LAYOUT = "0-camera.pkl, 0.png and so on"
 SUFFIX = "-camera.pkl"
-SKEW = 1e-3
+MAX_SKEW = 1e-3
+"""Skew over focal length that is taken for rounding."""
 
 
 def recognise(root: Path) -> bool:
@@ -53,7 +53,7 @@ def _view(root: Path, i: int) -> View:
             f"{path}: not a pose of 3×4 and intrinsics of 3×3 finite numbers", "write the camera again"
         )
     pose, k = arrays
-    if abs(k[0, 1]) > SKEW * abs(k[0, 0]) or not np.allclose(k[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
+    if abs(k[0, 1]) > MAX_SKEW * abs(k[0, 0]) or not np.allclose(k[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
         raise UserError(f"{path}: the intrinsics are not those of a pinhole", "undistort the images")
     image = stored_image(root, root / f"{i}.png", str(path))
     header = image_header(image)

@@ -21,8 +21,8 @@ from neilfpp_method.errors import UserError
 
 __all__ = ["read_pickled_arrays"]
 
-LARGEST = 2**16
-"""Bytes: poses and intrinsics are a few hundred."""
+MAX_BYTES = 2**16
+"""Size of a pickle; poses and intrinsics take a few hundred bytes."""
 NUMBERS = ("f4", "f8", "i4", "i8")
 
 
@@ -34,8 +34,8 @@ def read_pickled_arrays(path: Path) -> tuple[Float64[np.ndarray, " *shape"], ...
     """
     try:
         with path.open("rb") as file:
-            data = file.read(LARGEST + 1)
-        if len(data) > LARGEST:
+            data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
             raise ValueError("it is too large for a camera")
         for opcode, argument, _ in pickletools.genops(data):
             if opcode.name.endswith("PUT") and int(argument or 0) > len(data):

@@ -13,8 +13,7 @@ __all__ = ["stored", "stored_image", "view_names"]
 
 
 def stored(root: Path, path: Path) -> Path | None:
-    """The file, or the one of its name with another image suffix: scenes list .png, or no suffix, where files
-    are .exr.
+    """The file, or the one of its name with another image suffix: scenes may list .png where files are .exr.
 
     Raises:
         UserError: the path leads out of `root`, or two files could be meant.

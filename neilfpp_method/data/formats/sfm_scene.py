@@ -1,5 +1,4 @@
-"""Reader of the layout in which the NeILF datasets are published: `inputs/sfm_scene.json` and the files
-around it.
+"""Reader of the layout of the published NeILF datasets: `inputs/sfm_scene.json` and files around it.
 
 camera_track_map.images.<i>.flg                        2: the camera is valid; others are left out
 camera_track_map.images.<i>.size                       width, height
@@ -101,17 +100,13 @@ def _view(root: Path, inputs: Path, index: int, track: Entry, file: Entry) -> Vi
 
 
 def _inputs_folder(root: Path, scene: Path, listed: str) -> Path:
-    """The folder that listed paths start from, told by the first image: the scene file may lie in other
-    places.
-    """
+    """The folder that listed paths start from, found by the first image: the scene file may lie elsewhere."""
     folders = (scene.parent, root / "inputs", root)
     return next((folder for folder in folders if stored(root, folder / listed) is not None), scene.parent)
 
 
 def _refuse_strays(views: tuple[View, ...], listed: set[str], scene: Path) -> None:
-    """Images beside the listed ones that the scene file does not know: somebody believes that they are
-    used.
-    """
+    """Images beside the listed ones that the scene file lacks: a user may believe that they are used."""
     for folder in sorted({view.image.parent for view in views}):
         for file in sorted(folder.iterdir()):
             shown = file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")

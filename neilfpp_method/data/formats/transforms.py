@@ -36,9 +36,7 @@ __all__ = ["FLIP", "LAYOUT", "Frame", "read", "read_frames", "recognise"]
 
 LAYOUT = "transforms.json"
 FLIP = np.array([1.0, -1.0, -1.0, 1.0])
-"""OpenCV's axes (x right, y down, z forward) and OpenGL's (x right, y up, z back): one is the other times
-this.
-"""
+"""From OpenCV's axes (x right, y down, z forward) to OpenGL's (x right, y up, z back), and back."""
 MODELS = ("OPENCV", FISHEYE, "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 
 

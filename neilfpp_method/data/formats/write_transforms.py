@@ -1,6 +1,4 @@
-"""Writer of nerfstudio's transforms.json; `transforms` reads it back, scene box, response and validity
-included.
-"""
+"""Writer of nerfstudio's transforms.json; `transforms` reads it back, with box, response and validity."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The protocol of NeILF++ on its synthetic scenes: apple/ml-neilfpp, `code/evaluation/evaluate.py` and
-`code/utils/general.py`.
+"""The protocol of NeILF++ on its synthetic scenes: apple/ml-neilfpp, `code/evaluation/evaluate.py`.
 
 What is particular about it:
 

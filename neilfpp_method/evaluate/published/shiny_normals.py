@@ -1,5 +1,4 @@
-"""Normals as Ref-NeRF measures them on Shiny Blender: google-research/multinerf, `eval.py` and
-`internal/ref_utils.py`.
+"""Normals as Ref-NeRF measures them on Shiny Blender: google-research/multinerf, `ref_utils.py`.
 
 What is particular about it:
 
@@ -31,17 +30,15 @@ from neilfpp_method.train.run import Run
 __all__ = ["SHINY_NORMALS", "weighted_angle"]
 
 NAME = "shiny-normals"
-LARGEST_COSINE = 1 - 2.0**-23
+MAX_COSINE = 1 - 2.0**-23
 """One less the spacing of float32 at 1."""
 
 
 def weighted_angle(
     estimate: Float[np.ndarray, "H W 3"], truth: Float[np.ndarray, "H W 3"], weight: Float[np.ndarray, "H W"]
 ) -> float:
-    """The weighted mean angle between normals, degrees (`compute_weighted_mae`); NaN where nothing has a
-    weight.
-    """
-    cosine = (_unit(estimate) * _unit(truth)).sum(-1).clip(-LARGEST_COSINE, LARGEST_COSINE)
+    """Weighted mean angle between normals, degrees (`compute_weighted_mae`); NaN without any weight."""
+    cosine = (_unit(estimate) * _unit(truth)).sum(-1).clip(-MAX_COSINE, MAX_COSINE)
     total = weight.sum(dtype=np.float64)
     return float(np.degrees((weight * np.arccos(cosine)).sum() / total)) if total > 0 else float("nan")
 

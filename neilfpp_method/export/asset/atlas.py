@@ -15,7 +15,7 @@ __all__ = ["Unwrapped", "unwrap"]
 
 GAP = 6
 """Texels that are asked for between charts."""
-LEAST_GAP = 2.0
+MIN_GAP = 2.0
 """Texels that must be left between them, so that bilinear look-ups keep to their chart."""
 
 
@@ -54,7 +54,7 @@ def unwrap(surface: Surface, size: int) -> Unwrapped:
     # The resolution is a wish; what came out is scaled to the texture.
     extent = np.array([atlas.width, atlas.height])
     gap = GAP * size / extent.max()
-    if atlas.atlas_count != 1 or gap < LEAST_GAP:
+    if atlas.atlas_count != 1 or gap < MIN_GAP:
         raise UserError(
             f"{atlas.chart_count} charts of {len(faces)} triangles do not fit on a texture of {size}×{size}",
             "raise --texture-size, or lower --faces",

@@ -1,5 +1,4 @@
-"""Textures of an asset: what the run's material is at the surface point of each texel, and which way the fine
-surface faces."""
+"""Textures of an asset: the material at the surface point of each texel, and the fine surface's normal."""
 
 from __future__ import annotations
 
@@ -51,8 +50,7 @@ class Textures:
     deviation: UInt8[np.ndarray, "S S 3"] | None
 
     def metallic_roughness(self) -> UInt8[np.ndarray, "S S 3"]:
-        """As glTF packs it: roughness in green, metallic in blue; red, where others keep occlusion, is
-        white."""
+        """As glTF packs it: roughness in green, metallic in blue; red (occlusion elsewhere) is white."""
         return np.concatenate([np.full_like(self.roughness, 255), self.roughness, self.metallic], axis=-1)
 
 

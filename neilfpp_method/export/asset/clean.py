@@ -52,8 +52,7 @@ def without_crumbs(surface: Surface) -> Surface:
 
 
 def close_holes(surface: Surface) -> Surface:
-    """Borders of up to `HOLE` across get a fan of triangles about their middle, wound as their neighbours
-    are."""
+    """Borders of up to `HOLE` get a fan of triangles about their middle, wound as their neighbours."""
     vertices, fans = [surface.vertices], []
     count = len(surface.vertices)
     for loop in _borders(surface):

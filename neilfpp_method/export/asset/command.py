@@ -1,5 +1,4 @@
-"""`neilfpp export --what asset`: the surface with textures, the light, and scripts that open both in other
-programs."""
+"""`neilfpp export --what asset`: a textured surface, the light, and scripts that open both elsewhere."""
 
 from __future__ import annotations
 
@@ -18,7 +17,7 @@ from neilfpp_method.export.asset.atlas import Unwrapped, unwrap
 from neilfpp_method.export.asset.bake import bake
 from neilfpp_method.export.asset.clean import clean
 from neilfpp_method.export.asset.files import write_asset
-from neilfpp_method.export.asset.simplify import FEWEST, simplified
+from neilfpp_method.export.asset.simplify import MIN_FACES, simplified
 from neilfpp_method.export.asset.surface import fine_surface
 from neilfpp_method.export.asset.usd import has_usd
 from neilfpp_method.export.asset.visible import seen_faces
@@ -28,13 +27,13 @@ from neilfpp_method.train.run import Run
 
 __all__ = ["AssetOptions", "Bar", "Deviations", "check_asset", "export_asset"]
 
-SMALLEST, LARGEST = 64, 8192
+MIN_TEXTURE, MAX_TEXTURE = 64, 8192
 """Texels along an edge of the textures."""
-MOST_FACES = 200_000
+MAX_FACES = 200_000
 """Beyond which xatlas takes minutes."""
-NEAREST = 2.0
+REACH_FACTOR = 2.0
 """The fine surface is looked for within so many times the distance that 99 of 100 of its points keep."""
-LEAST_REACH = 1e-3
+MIN_REACH = 1e-3
 """Scene units."""
 
 Bar = Callable[[str], AbstractContextManager[Callable[[float], None]]]
@@ -64,13 +63,13 @@ def check_asset(run: Run, options: AssetOptions) -> None:
         )
     if run.step <= run.config.train.sdf_steps:
         raise UserError(f"{run.path}: there is no material yet at step {run.step}", "train the next stage")
-    if not SMALLEST <= options.texture_size <= LARGEST:
+    if not MIN_TEXTURE <= options.texture_size <= MAX_TEXTURE:
         raise UserError(
-            f"a texture of {options.texture_size} texels a side", f"ask for {SMALLEST} to {LARGEST}"
+            f"a texture of {options.texture_size} texels a side", f"ask for {MIN_TEXTURE} to {MAX_TEXTURE}"
         )
-    if not FEWEST <= options.faces <= MOST_FACES:
+    if not MIN_FACES <= options.faces <= MAX_FACES:
         raise UserError(
-            f"an asset of {options.faces} triangles", f"ask for {FEWEST} to {MOST_FACES} with --faces"
+            f"an asset of {options.faces} triangles", f"ask for {MIN_FACES} to {MAX_FACES} with --faces"
         )
     if not options.error >= 0:
         raise UserError(f"--error {options.error:g}", "give a length in scene units, from 0 on")
@@ -113,7 +112,7 @@ def export_asset(
     mesh = unwrap(coarse.surface, options.texture_size)
     unsure = None if deviations is None else deviations(run, _points(run, mesh)).double().cpu().numpy()
     with bar("textures") as advance:
-        reach = max(NEAREST * distance.near, LEAST_REACH)
+        reach = max(REACH_FACTOR * distance.near, MIN_REACH)
         textures = bake(run, mesh, fine, reach, options.texture_size, unsure, advance)
     console.print(
         f"textures: {mesh.charts} charts on {100 * textures.covered:.0f} % of {options.texture_size}² texels"

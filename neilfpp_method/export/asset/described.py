@@ -1,5 +1,4 @@
-"""What an asset's scene is made of, as JSON for the scripts that open it: files, cameras and lamps, in the
-capture's world."""
+"""An asset's scene as JSON for the scripts that open it: files, cameras, lamps, in the capture's world."""
 
 from __future__ import annotations
 

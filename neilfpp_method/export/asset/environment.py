@@ -22,8 +22,7 @@ LEFT_EDGE: dict[str, float] = {"blender": -0.25, "unreal": 0.5}
 is a quarter to its left (Cycles, `direction_to_equirectangular`). Unreal: its +X, which is ours, is three
 quarters from the left, and its −Y, our +Y, in the middle (`LookupLongLat` of the texture compressor)."""
 FINER, ENOUGH = 4, 512
-"""Rows are four times as many as ours, but no more than these, unless ours are: what is bilinear between our
-texels stays so."""
+"""Four times our rows, at most this many unless ours are more: bilinear values between texels stay so."""
 
 
 def equirectangular(

@@ -15,8 +15,7 @@ __all__ = ["filling"]
 
 @contextmanager
 def filling(path: Path) -> Iterator[Path]:
-    """A temporary folder beside `path`; when the block ends its files move into `path`, and it vanishes
-    either way.
+    """A temporary folder beside `path`; when the block ends its files move into `path`; always removed.
 
     Moving takes no room, so a full disk shows before anything is there. What else `path` holds stays.
 

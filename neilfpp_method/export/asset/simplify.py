@@ -16,11 +16,9 @@ SAMPLES = 20_000
 """Points of the fine surface whose distance is measured."""
 SHARE = 99.0
 """Per cent of them that are at most at the distance that is reported."""
-MOST_MISSED = 0.02
-"""Share of the points that may have nothing near: next to borders, and where decimation has folded a
-plane.
-"""
-FEWEST = 100
+MAX_MISSED = 0.02
+"""Share of points that may have nothing near: beside borders, and where decimation folds a plane."""
+MIN_FACES = 100
 """Triangles below which nothing is gained."""
 REACH = 0.1
 """Scene units, beyond which nothing is near."""
@@ -28,9 +26,7 @@ REACH = 0.1
 
 @dataclass(frozen=True)
 class Distance:
-    """How far a fine surface is from a coarse one, scene units, where it has one near; and the share where
-    not.
-    """
+    """How far a fine surface is from a coarse one near it, scene units, and the share that has none near."""
 
     near: float
     missed: float
@@ -54,10 +50,10 @@ def simplified(fine: Surface, most_faces: int, error: float) -> Simplified:
     """
     count = min(most_faces, len(fine.faces))
     best = _with_faces(fine, count)
-    while count // 2 >= FEWEST:
+    while count // 2 >= MIN_FACES:
         count //= 2
         fewer = _with_faces(fine, count)
-        if fewer.distance.near > error or fewer.distance.missed > max(MOST_MISSED, best.distance.missed):
+        if fewer.distance.near > error or fewer.distance.missed > max(MAX_MISSED, best.distance.missed):
             break
         best = fewer
     return best

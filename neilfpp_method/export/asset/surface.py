@@ -99,8 +99,7 @@ def meet_along(
     normal: Float[np.ndarray, "N 3"],
     reach: float,
 ) -> Footing:
-    """The nearer of what a point's normal and its opposite meet, within a distance and on a side that faces
-    the same way.
+    """The nearer hit of a point's normal and its opposite, within a distance, on a side facing the same way.
 
     Args:
         surface: where the points come down.

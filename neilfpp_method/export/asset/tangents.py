@@ -1,5 +1,4 @@
-"""Tangents as MikkTSpace makes them (Mikkelsen 2008), the frame of normal maps in glTF, Blender and
-Unreal."""
+"""Tangents as MikkTSpace makes them (Mikkelsen 2008): the frame of normal maps in glTF and Blender."""
 
 from __future__ import annotations
 
@@ -14,8 +13,7 @@ TINY = 1e-20
 
 
 def vertex_tangents(mesh: Unwrapped) -> Float[np.ndarray, "V 4"]:
-    """Unit tangents along u at the vertices, and the sign of the bitangent: bitangent = sign · normal ×
-    tangent, along v.
+    """Unit tangents along u at the vertices, and the sign in bitangent = sign · normal × tangent, along v.
 
     A vertex has the mean over its triangles of the direction of u in its tangent plane, weighted by their
     angles there. Here vertices are parted where normal or texture place differ, as MikkTSpace parts them.

@@ -20,8 +20,7 @@ TEXELS_AT_ONCE = 2**19
 
 @dataclass(frozen=True)
 class Texels:
-    """Texels by number, row by row from the top, the triangle at the middle of each, and the weights of its
-    corners."""
+    """Texels by number, row by row from the top, the triangle at each middle, and its corner weights."""
 
     number: Int[np.ndarray, " T"]
     face: Int[np.ndarray, " T"]

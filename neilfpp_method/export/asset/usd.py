@@ -91,8 +91,7 @@ def _material(stage: Any) -> Any:
 
 
 def _lamp(stage: Any, path: str, lamp: Mapping[str, Any]) -> None:
-    """A bulb is a sphere; a panel a disk, which sends along −Z and whose light falls with the cosine, as ours
-    does."""
+    """A bulb is a sphere; a panel a disk that sends along −Z with the cosine's falloff, as ours does."""
     panel = lamp["axis"] is not None
     light = (UsdLux.DiskLight if panel else UsdLux.SphereLight).Define(stage, path)
     brightest = max(lamp["radiance"])

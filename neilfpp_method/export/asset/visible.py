@@ -14,9 +14,8 @@ from neilfpp_method.export.asset.surface import Surface, first_hits
 
 __all__ = ["seen_faces"]
 
-MOST_RAYS = 2**24
-"""Rays through pixels, of all cameras together: a quarter of a minute with Embree. What they miss is asked on
-its own."""
+MAX_RAYS = 2**24
+"""Rays through pixels of all cameras together: 15 s with Embree. Faces they miss are tested alone."""
 RAYS_AT_ONCE = 2**20
 NEAR = 1e-3
 """Scene units that may lie between a triangle's middle and what a ray towards it meets."""
@@ -36,7 +35,7 @@ def seen_faces(surface: Surface, cameras: Sequence[Camera]) -> Bool[np.ndarray, 
     outward = torch.from_numpy(np.array(mesh.face_normals)).float()
     middle = torch.from_numpy(np.array(mesh.triangles_center)).float()
     seen = torch.zeros(len(surface.faces), dtype=torch.bool)
-    stride = math.ceil(sum(camera.width * camera.height for camera in cameras) / MOST_RAYS)
+    stride = math.ceil(sum(camera.width * camera.height for camera in cameras) / MAX_RAYS)
     for camera in cameras:
         rays = CameraRays([camera])
         for pixel in torch.arange(0, camera.width * camera.height, stride).split(RAYS_AT_ONCE):

@@ -1,5 +1,4 @@
-"""Open this asset in Blender 4 or later: surface, environment, lamps and cameras, in the capture's world (Z
-up).
+"""Open this asset in Blender 4 or later: surface, environment, lamps and cameras, Z up.
 
     blender --python open_in_blender.py
     blender --background --python open_in_blender.py -- --camera 003 --render 003.exr --samples 256
@@ -72,8 +71,7 @@ def add_surface(source):
         bpy.ops.import_scene.gltf(filepath=str(HERE / "asset.glb"))
     for thing in [thing for thing in bpy.data.objects if thing.type == "LIGHT"]:
         bpy.data.objects.remove(thing)
-    # The material was found with a lobe that scatters once; Blender's default adds what it loses, up to half
-    # on rough metal.
+    # The material was found with single scattering; Blender adds what that loses, up to half on rough metal.
     for material in bpy.data.materials:
         for node in material.node_tree.nodes:
             if node.type == "BSDF_PRINCIPLED":

@@ -1,0 +1,87 @@
+"""Steps that are not finite, in a loop of somebody else's."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+from neilfpp_method.errors import Diverged
+from neilfpp_method.health.guard import MAX_SKIPPED_IN_A_ROW, StepGuard
+
+
+def two_fields() -> tuple[nn.Parameter, nn.Parameter, list[torch.optim.Optimizer]]:
+    one, other = nn.Parameter(torch.ones(2)), nn.Parameter(torch.ones(2))
+    optimizers = [
+        torch.optim.Adam([{"params": [one], "name": "brdf"}], lr=0.1),
+        torch.optim.Adam([{"params": [other], "name": "light"}], lr=0.1),
+    ]
+    return one, other, optimizers
+
+
+def step(guard: StepGuard, optimizers, loss: torch.Tensor, number: int = 0) -> None:
+    guard.begin_step({"physical": loss}, number)
+    for optimizer in optimizers:
+        optimizer.zero_grad()
+    loss.backward()
+    for optimizer in optimizers:
+        optimizer.step()
+
+
+def guarded(optimizers) -> tuple[StepGuard, list[str]]:
+    said: list[str] = []
+    guard = StepGuard(said.append)
+    for optimizer in optimizers:
+        guard.watch(optimizer)
+    return guard, said
+
+
+def test_a_gradient_that_is_not_finite_moves_no_field_whichever_steps_first():
+    one, other, optimizers = two_fields()
+    guard, said = guarded(optimizers)
+    # The value is finite; the slope of a square root at 0 is not.
+    step(guard, optimizers, one.sum() + (other - other.detach()).clamp_min(0).sqrt().sum(), 7)
+    assert torch.equal(one, torch.ones(2))
+    assert torch.equal(other, torch.ones(2))
+    assert said == ["step 7 skipped: the gradient of light is not finite (1 skipped so far)"]
+    step(guard, optimizers, one.sum() + other.sum(), 8)
+    assert not torch.equal(one, torch.ones(2))
+    assert not torch.equal(other, torch.ones(2))
+    assert len(said) == guard.skipped == 1
+
+
+def test_a_loss_that_is_not_finite_is_named():
+    one, _, optimizers = two_fields()
+    guard, said = guarded(optimizers)
+    step(guard, optimizers, one.sum() * torch.inf)
+    assert torch.equal(one, torch.ones(2))
+    assert "loss physical" in said[0]
+
+
+def test_a_skipped_step_leaves_no_trace_in_the_moments():
+    one, _, optimizers = two_fields()
+    guard, _ = guarded(optimizers)
+    step(guard, optimizers, one.sum() * torch.nan)
+    step(guard, optimizers, one.sum())
+    clean, _, others = two_fields()
+    step(StepGuard(print), others, clean.sum())
+    assert torch.equal(one, clean)
+
+
+def test_ten_in_a_row_end_the_training_and_nine_do_not():
+    one, _, optimizers = two_fields()
+    guard, _ = guarded(optimizers)
+    for _ in range(MAX_SKIPPED_IN_A_ROW - 1):
+        step(guard, optimizers, one.sum() * torch.nan)
+    step(guard, optimizers, one.sum())
+    for _ in range(MAX_SKIPPED_IN_A_ROW - 1):
+        step(guard, optimizers, one.sum() * torch.nan)
+    with pytest.raises(Diverged, match="loss physical"):
+        step(guard, optimizers, one.sum() * torch.nan)
+
+
+def test_watching_an_optimiser_twice_judges_it_once():
+    one, _, optimizers = two_fields()
+    guard, said = guarded([*optimizers, *optimizers])
+    step(guard, optimizers, one.sum() * torch.nan)
+    assert len(said) == 1

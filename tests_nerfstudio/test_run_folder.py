@@ -1,0 +1,82 @@
+"""What `ns-train neilfpp` keeps beside its `config.yml`, and what this package's own commands make of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from neilfpp_method.cli import main
+from neilfpp_method.health.cases import verdict_of
+from neilfpp_method.plugin.model import NeilfMethod
+from neilfpp_method.train.health_record import read_findings
+from neilfpp_method.train.run import load_checkpoint, load_run, run_folder
+from tests.data.make_capture import make_capture
+from tests.train.small_runs import differences
+from tests_nerfstudio.runs import ns_train, small_settings, trainer_config, weights
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return make_capture(tmp_path_factory.mktemp("capture"), size=(16, 12), test=(0, 1))
+
+
+@pytest.fixture(scope="module")
+def run(data: Path, tmp_path_factory) -> Path:
+    return ns_train(trainer_config(data, tmp_path_factory.mktemp("run"), small_settings()))
+
+
+def test_the_run_folder_holds_the_weights_of_the_checkpoint(run: Path) -> None:
+    loaded = load_run(run_folder(run / "config.yml"))
+    assert loaded.step == 12
+    assert differences(weights(run), dict(loaded.model.state_dict())) == []
+
+
+def test_the_commands_take_the_configuration_for_the_run(run: Path) -> None:
+    config = str(run / "config.yml")
+    assert main(["export", config, "--what", "mesh", "--resolution", "32"]) == 0
+    assert main(["eval", config]) == 0
+    assert (run / "neilfpp" / "export" / "mesh.ply").stat().st_size > 1000
+    assert json.loads((run / "neilfpp" / "metrics.json").read_text())
+
+
+def test_a_configuration_without_a_run_folder_is_refused(tmp_path: Path, capsys) -> None:
+    (tmp_path / "config.yml").write_text("")
+    assert main(["export", str(tmp_path / "config.yml")]) == 2
+    assert "no run folder neilfpp/ beside it" in capsys.readouterr().err
+
+
+def test_a_training_that_was_begun_in_nerfstudio_is_continued_outside(
+    data: Path, run: Path, tmp_path: Path
+) -> None:
+    config = trainer_config(data, tmp_path, small_settings())
+    config.max_num_iterations = 6
+    first = ns_train(config) / "neilfpp"
+    assert load_checkpoint(first / "checkpoints" / "last.pt")["step"] == 6
+    assert main(["train", "--out", str(first), "--resume", "--no-report"]) == 0
+    assert differences(weights(run), load_checkpoint(first / "checkpoints" / "last.pt")["model"]) == []
+
+
+def test_health_is_looked_at(run: Path) -> None:
+    for folder in (run, run / "neilfpp"):
+        findings = read_findings(folder)
+        assert findings is not None
+        assert verdict_of(findings) in ("sound", "doubtful", "failed")
+
+
+def test_a_step_that_is_not_finite_is_left_out(data: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    losses = NeilfMethod.get_loss_dict
+
+    def spoilt(self: NeilfMethod, *arguments: object) -> dict[str, torch.Tensor]:
+        factor = torch.nan if self.training and self.step == 2 else 1.0
+        return {name: factor * loss for name, loss in losses(self, *arguments).items()}
+
+    monkeypatch.setattr(NeilfMethod, "get_loss_dict", spoilt)
+    ended = ns_train(trainer_config(data, tmp_path, small_settings()))
+    said = " ".join(capsys.readouterr().out.split())
+    assert "step 2 skipped: the gradient of" in said
+    assert "(1 skipped so far)" in said
+    kept = weights(ended)
+    assert all(value.isfinite().all() for value in kept.values() if isinstance(value, torch.Tensor))
