@@ -37,7 +37,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class RenderedView:
-    """The maps of one view by their names in `structures.Maps`, each (H, W, C) float32. Colours are linear."""
+    """The maps of one view by their names in `structures.Maps`, (H, W, C) float32. Colours are linear."""
 
     name: str
     maps: Mapping[str, Float[np.ndarray, "H W C"]]
