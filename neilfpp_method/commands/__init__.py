@@ -6,6 +6,7 @@ What a command needs to run is imported when it runs, so that help and a mistype
 from __future__ import annotations
 
 from neilfpp_method.commands import (
+    compare,
     completion,
     demo,
     evaluate,
@@ -14,7 +15,9 @@ from neilfpp_method.commands import (
     prepare,
     relight,
     render,
+    replay,
     report,
+    tradeoff,
     train,
     view,
 )
@@ -26,11 +29,14 @@ COMMANDS = {
     "inspect": inspect.COMMAND,
     "prepare": prepare.COMMAND,
     "train": train.COMMAND,
+    "tradeoff": tradeoff.COMMAND,
     "eval": evaluate.COMMAND,
     "render": render.COMMAND,
     "export": export.COMMAND,
     "relight": relight.COMMAND,
     "report": report.COMMAND,
+    "compare": compare.COMMAND,
+    "replay": replay.COMMAND,
     "view": view.COMMAND,
     "completion": completion.COMMAND,
 }

@@ -19,7 +19,15 @@ class Eval:
 
     run: tyro.conf.Positional[Path]
     """The run's folder."""
-    protocol: Literal["neilfpp", "neilf-synthetic", "shiny-normals"] = "neilfpp"
+    protocol: Literal[
+        "neilfpp",
+        "neilf-synthetic",
+        "tensoir",
+        "stanford-orb",
+        "synthetic4relight",
+        "dtu",
+        "shiny-normals",
+    ] = "neilfpp"
     """How to measure. neilfpp: this project's own figures. The others as the official code of that benchmark
     does, at the size of the files (docs/protocols.md)."""
     checkpoint: Checkpoint = "last"
@@ -53,18 +61,19 @@ def _published(options: Eval) -> None:
     from neilfpp_method.train.run import check_writable, load_run
 
     protocol = PROTOCOLS[options.protocol]
-    scale = 1.0 if options.scale is None and options.width is None else options.scale
-    run = at_size(
-        load_run(options.run, pick_device(options.device), options.checkpoint), scale, options.width
-    )
+    scale, width = options.scale, options.width
+    if scale is None and width is None:
+        scale, width = (1.0, None) if protocol.side is None else (None, protocol.side)
+    run = at_size(load_run(options.run, pick_device(options.device), options.checkpoint), scale, width)
     out = options.out or options.run / "eval" / f"{protocol.name}.json"
     check_writable(out)
     protocol.check(run)
     console = terminal()
-    if size := size_in_words(run):
+    if protocol.side is None and (size := size_in_words(run)):
         console.print(f"{size}; published figures are at the size of the files", soft_wrap=True)
     with computing_fast(), progress_bar("evaluating") as advance:
-        figures = protocol.measure(run, render_test_views(run, advance))
+        figures = protocol.measure(run, render_test_views(run, advance) if protocol.needs_views else ())
+        advance(1.0)
     write_figures(out, protocol, run, figures)
     console.print(
         f"protocol {protocol.name}, as {protocol.source}; left out: {protocol.left_out}", soft_wrap=True

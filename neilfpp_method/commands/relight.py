@@ -29,6 +29,11 @@ class Relight:
     """Stops by which the map is made brighter."""
     lamps: Literal["auto", "keep", "drop"] = "auto"
     """The lamps that the run has found; auto: kept under its own light, left out under another."""
+    lamp_edits: Annotated[
+        tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="lamp", metavar="NUMBER=X,Y,Z|off")
+    ] = ()
+    """Move a lamp that the run has found, or leave it out, and keep the others: 0=1,0.5,2 (the capture's
+    world) or 1=off; numbers as in lamps.json; can be given several times."""
     views: Literal["test", "train", "all", "turntable"] = "test"
     """Views of the capture, or a circle about the scene, which also becomes turntable.mp4."""
     frames: int = 96
@@ -39,6 +44,8 @@ class Relight:
     """Change the material: roughness=0.2, metallic=1 or base_color=0.8,0.1,0.1 (linear); repeatable."""
     box: tuple[float, float, float, float, float, float] | None = None
     """Change it in this box alone: two corners, x y z x y z, in the capture's world frame."""
+    mask: tuple[Path, ...] = ()
+    """Change it where these images are white: painted over a view each, and named as the view."""
     spp: int | None = None
     """Samples of a pixel at most; none: 64, or what --seconds allow."""
     seconds: float | None = None
@@ -85,6 +92,7 @@ COMMAND = Command(
     [
         "neilfpp relight runs/teapot --env studio.exr",
         "neilfpp relight runs/teapot --env forest.hdr --env-layout common --rotate 90 --views turntable",
-        "neilfpp relight runs/teapot --set roughness=0.2 --set metallic=1 --seconds 20",
+        "neilfpp relight runs/teapot --set roughness=0.2 --set metallic=1 --mask 004.png --seconds 20",
+        "neilfpp relight runs/lantern --lamp 0=0.5,-1,1.2 --lamp 1=off",
     ],
 )

@@ -15,7 +15,7 @@ class Entry:
 
     title: str
     pattern: str
-    better: Literal["higher", "lower"]
+    better: Literal["higher", "lower", "neither"]
     meaning: str
 
     def format(self, value: float) -> str:
@@ -31,6 +31,14 @@ def _length(title: str, meaning: str) -> Entry:
     return Entry(title, "%.4f", "lower", meaning)
 
 
+def _millimetres(title: str, meaning: str) -> Entry:
+    return Entry(title, "%.3f mm", "lower", meaning)
+
+
+def _similar(title: str) -> Entry:
+    return Entry(title, "%.4f", "higher", "Likeness of local structure; 1 is the same.")
+
+
 def _log(title: str, meaning: str) -> Entry:
     return Entry(title, "%.3f", "lower", meaning)
 
@@ -42,6 +50,8 @@ def _ratio(title: str) -> Entry:
     return Entry(title, "%.2f", "lower", meaning)
 
 
+EXPOSED = "New views times the factor per channel that brings each closest, as their exposure is unknown."
+
 ENTRIES: Mapping[str, Entry] = {
     "volume_psnr": _decibels(
         "Image, volume rendering", "New views as the outgoing radiance field shows them, tone-mapped."
@@ -51,6 +61,14 @@ ENTRIES: Mapping[str, Entry] = {
     ),
     "volume_psnr_linear": _decibels(
         "Image, volume rendering, linear", "On linear radiance, where highlights weigh most."
+    ),
+    "volume_psnr_exposed": _decibels(
+        "Image, volume rendering, exposed alike",
+        EXPOSED,
+    ),
+    "pbr_psnr_exposed": _decibels(
+        "Image, rendering equation, exposed alike",
+        EXPOSED,
     ),
     "pbr_psnr": _decibels(
         "Image, rendering equation", "New views rendered from material and incident light, tone-mapped."
@@ -94,6 +112,30 @@ ENTRIES: Mapping[str, Entry] = {
     "incident_light_log_mae_occluded_scaled": _log(
         "Light from surfaces, scaled", "As above, with one factor per channel taken out."
     ),
+    "render_psnr": _decibels("Image", "New views, as the protocol shows them."),
+    "render_ssim": _similar("Structure of the image"),
+    "render_psnr_h": _decibels(
+        "Image, linear", "New views, linear, brought to the level of a display, up to 4."
+    ),
+    "render_psnr_l": _decibels("Image, as displayed", "New views as a display shows them."),
+    "albedo_psnr": _decibels("Albedo, scaled", "After the factor per channel that the protocol takes."),
+    "albedo_ssim": _similar("Structure of the albedo, scaled"),
+    "albedo_single_psnr": _decibels("Albedo, one factor", "After one factor for all channels."),
+    "albedo_single_ssim": _similar("Structure of the albedo, one factor"),
+    "roughness_mse": Entry("Roughness", "%.4f", "lower", "Mean squared error over the frame."),
+    "normal_distance": Entry("Normals, 1 − cosine", "%.4f", "lower", "Mean over the eroded mask."),
+    "depth_mse": Entry(
+        "Depth, scaled", "%.4g", "lower", "Mean squared error after one factor for all views."
+    ),
+    "chamfer_mm": _millimetres("Surface", "Mean of the two below."),
+    "chamfer_accuracy_mm": _millimetres("Surface, accuracy", "From the estimate to the truth."),
+    "chamfer_completeness_mm": _millimetres("Surface, completeness", "From the truth to the estimate."),
+    "base_color_gamma": Entry(
+        "Gamma of base colour",
+        "%.3f",
+        "neither",
+        "The power that matches the medians; 1 would change nothing.",
+    ),
     "confidence_base_color_ratio": _ratio("Confidence, base colour"),
     "confidence_roughness_ratio": _ratio("Confidence, roughness"),
     "confidence_metallic_ratio": _ratio("Confidence, metallic"),
@@ -109,4 +151,7 @@ def explain(name: str) -> Entry:
         return replace(
             base, title=f"{base.title}, without a method", meaning="A constant, or the mean image."
         )
+    whole = ENTRIES.get(name.removesuffix("_frame"))
+    if whole is not None:
+        return replace(whole, title=f"{whole.title}, whole frame", meaning="The background counts as right.")
     return Entry(name.replace("_", " ").capitalize(), "%.4g", "higher", "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from neilfpp_method.data.scaling import (
     PIXELS_OF_A_VIEW,
@@ -15,7 +16,7 @@ from neilfpp_method.data.scaling import (
 from neilfpp_method.errors import UserError
 from neilfpp_method.train.run import Run
 
-__all__ = ["at_size", "size_in_words"]
+__all__ = ["at_size", "size_in_words", "what_is_measured"]
 
 
 def at_size(run: Run, scale: float | None = None, width: int | None = None) -> Run:
@@ -51,3 +52,13 @@ def size_in_words(run: Run) -> str | None:
         return None
     files = "×".join(map(str, file_size(view)))
     return f"views of {width}×{height} pixels, files of {files}; --width or --scale for another size"
+
+
+def what_is_measured(run: Run) -> dict[str, Any]:
+    """Which views figures are of, at what size in pixels, and after how many steps: what has to agree for
+    figures of two runs to be compared. The size is that of the widest view.
+    """
+    views = run.capture.test_views
+    widest = max((view.camera for view in views), key=lambda camera: camera.width)
+    names = [view.name for view in views]
+    return {"view_names": names, "width": widest.width, "height": widest.height, "step": run.step}

@@ -25,15 +25,17 @@ from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.relight.cameras import Shot, rays_through, turntable, view_shots
 from neilfpp_method.relight.comparison import compare, find_truth, read_truth
 from neilfpp_method.relight.denoise import check_denoiser, denoised
-from neilfpp_method.relight.edits import Materials, edited, parse_edits, scene_box
+from neilfpp_method.relight.edits import edited, parse_edits, scene_box
 from neilfpp_method.relight.film import Budget, Picture, take_picture
-from neilfpp_method.relight.lamplight import lamps_of_run
+from neilfpp_method.relight.lamp_edits import edited_lamps, parse_lamp_edits
+from neilfpp_method.relight.lamplight import Lamplight, lamps_of_run
 from neilfpp_method.relight.maps import Layout, check_map, map_names, read_map
 from neilfpp_method.relight.movie import write_movie
 from neilfpp_method.relight.path_tracer import Scene
 from neilfpp_method.relight.picture_folder import PictureFolder
 from neilfpp_method.relight.recovered import check_material, surface_of_run
 from neilfpp_method.relight.sky import Sky, sky_of_run
+from neilfpp_method.relight.stencil import painted, read_stencils
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.run import Run, check_writable, load_run, write_json
 
@@ -56,10 +58,12 @@ class Request:
     rotate: float
     exposure: float
     lamps: str
+    lamp_edits: tuple[str, ...]
     views: str
     frames: int
     edits: tuple[str, ...]
     box: tuple[float, ...] | None
+    mask: tuple[Path, ...]
     spp: int | None
     seconds: float | None
     bounces: int
@@ -97,15 +101,18 @@ def relight(
     check_writable(out)
     shots = _shots(request, run)
     lights = _lights(request, run, say)
+    lamps = _lamps(request, run)
+    box = None if request.box is None else scene_box(request.box, run.capture.normalisation)
+    stencils = read_stencils(request.mask, run.capture)
     folders = {name: PictureFolder(out / name, _settings(request, run, name)) for name in lights}
     truths = [find_truth(folder, [shot.view for shot in shots]) for folder in request.truth]
-    materials = _materials(request, run)
     missing = {
         name: [s for s in shots if request.force or not folder.has(s)] for name, folder in folders.items()
     }
     if any(missing.values()):
         surface = surface_of_run(run, request.resolution)
-        lamps = lamps_of_run(run.model.lamps) if _with_lamps(request) else None
+        limits = ([box.holds] if box else []) + ([painted(stencils, surface)] if stencils else [])
+        materials = edited(run.model.materials, parse_edits(request.edits), limits)
         scenes = {name: Scene(surface, materials, run.model.lobe, sky, lamps) for name, sky in lights.items()}
         _render(request, scenes, folders, missing, on_progress)
     for k, folder in enumerate(folders.values()):
@@ -142,10 +149,13 @@ def _check(request: Request) -> None:
         raise UserError("--rotate and --exposure are not finite", "give degrees and stops")
     if request.scale is not None and request.width is not None:
         raise UserError("--scale and --width both say how large", "give one of them")
-    if request.box is not None and not request.edits:
-        raise UserError(
-            "--box without --set limits nothing", "say what changes within it, as --set roughness=0.2"
-        )
+    for option, given in (("--box", request.box is not None), ("--mask", bool(request.mask))):
+        if given and not request.edits:
+            raise UserError(
+                f"{option} without --set limits nothing", "say what changes within it, as --set roughness=0.2"
+            )
+    if request.lamp_edits and request.lamps == "drop":
+        raise UserError("--lamp moves what --lamps drop leaves out", "give one of them")
     if request.truth:
         if request.views == "turntable" or request.scale is not None or request.width is not None:
             raise UserError(
@@ -159,6 +169,7 @@ def _check(request: Request) -> None:
     if request.denoise:
         check_denoiser()
     parse_edits(request.edits)
+    parse_lamp_edits(request.lamp_edits)
     for path in request.env:
         check_map(path)
     map_names(request.env)
@@ -203,24 +214,30 @@ def _settings(request: Request, run: Run, name: str) -> dict[str, Any]:
         "map_sha256": None if path is None else hashlib.sha256(path.read_bytes()).hexdigest(),
         "layout": request.env_layout if path else "ours",
         "lamps": _with_lamps(request),
+        "lamp": list(request.lamp_edits),
         "step": run.step,
         "set": list(request.edits),
         "box": None if request.box is None else list(request.box),
+        "mask": [[path.name, hashlib.sha256(path.read_bytes()).hexdigest()] for path in request.mask],
     }
     kept = ("rotate", "exposure", "spp", "seconds", "bounces", "background", "denoise", "resolution")
     return described | {key: getattr(request, key) for key in kept}
 
 
 def _with_lamps(request: Request) -> bool:
-    return request.lamps == "keep" or (request.lamps == "auto" and not request.env)
+    """Whether lamps shine: those under the run's own light, and those that somebody has asked for."""
+    asked = request.lamps == "keep" or bool(request.lamp_edits)
+    return asked or (request.lamps == "auto" and not request.env)
+
+
+def _lamps(request: Request, run: Run) -> Lamplight | None:
+    if not _with_lamps(request):
+        return None
+    edits = parse_lamp_edits(request.lamp_edits)
+    return edited_lamps(lamps_of_run(run.model.lamps), edits, run.capture.normalisation)
 
 
 # ------------------------------------------------------------------------------------------------------ doing
-
-
-def _materials(request: Request, run: Run) -> Materials:
-    box = None if request.box is None else scene_box(request.box, run.capture.normalisation)
-    return edited(run.model.materials, parse_edits(request.edits), box)
 
 
 def _render(

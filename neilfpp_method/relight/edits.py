@@ -1,4 +1,4 @@
-"""A material that a person changes before it is relit: `roughness=0.2`, in a box or everywhere."""
+"""A material that a person changes before it is relit: `roughness=0.2`, everywhere or within limits."""
 
 from __future__ import annotations
 
@@ -6,16 +6,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from neilfpp_method.data.views import Normalisation
 from neilfpp_method.errors import UserError
 from neilfpp_method.structures import Material
 
-__all__ = ["Box", "Edit", "Materials", "edited", "parse_edits", "scene_box"]
+__all__ = ["Box", "Edit", "Limit", "Materials", "edited", "parse_edits", "scene_box"]
 
 Materials = Callable[[Float[Tensor, "N 3"]], Material]
+Limit = Callable[[Float[Tensor, "N 3"]], Bool[Tensor, "N 1"]]
+"""At which points of the surface an edit counts."""
 
 CHANNELS = {"base_color": 3, "roughness": 1, "metallic": 1}
 
@@ -35,8 +37,8 @@ class Box:
     low: Float[Tensor, " 3"]
     high: Float[Tensor, " 3"]
 
-    def holds(self, x: Float[Tensor, "N 3"]) -> Tensor:
-        """Which points lie in it, (N, 1)."""
+    def holds(self, x: Float[Tensor, "N 3"]) -> Bool[Tensor, "N 1"]:
+        """Which points lie in it."""
         return ((x >= self.low.to(x)) & (x <= self.high.to(x))).all(-1, keepdim=True)
 
 
@@ -64,14 +66,16 @@ def scene_box(corners: Sequence[float], normalisation: Normalisation) -> Box:
     return Box(normalisation.to_scene(low).float(), normalisation.to_scene(high).float())
 
 
-def edited(materials: Materials, edits: Sequence[Edit], box: Box | None = None) -> Materials:
-    """The materials with edits, the last of each parameter counting; within the box where there is one."""
+def edited(materials: Materials, edits: Sequence[Edit], limits: Sequence[Limit] = ()) -> Materials:
+    """The materials with edits, the last of each parameter counting; where every limit holds."""
     if not edits:
         return materials
 
     def changed(x: Float[Tensor, "N 3"]) -> Material:
         material = materials(x)
-        within = torch.ones_like(x[:, :1], dtype=torch.bool) if box is None else box.holds(x)
+        within = torch.ones_like(x[:, :1], dtype=torch.bool)
+        for limit in limits:
+            within &= limit(x)
         values = {field.name: getattr(material, field.name) for field in fields(material)}
         for edit in edits:
             old = values[edit.name]

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from neilfpp_method.errors import UserError
 from neilfpp_method.health.cases import Finding
+from neilfpp_method.report.measured import Measured, numbers, read_measured
 from neilfpp_method.schedule import stage_steps
 from neilfpp_method.settings.plain import to_dict
 from neilfpp_method.settings.presets import PRESETS, fixed_geometry, free_light
 from neilfpp_method.settings.types import MeshConfig, NeilfConfig
 from neilfpp_method.train.health_record import read_findings
+from neilfpp_method.train.quality import Look, read_looks
 from neilfpp_method.train.run import read_description, read_json
 from neilfpp_method.train.work_record import read_work
 
-__all__ = ["Changed", "Files", "changed_settings", "read_files"]
+__all__ = ["Changed", "Files", "changed_settings", "flat_settings", "read_files"]
 
 Read = TypeVar("Read")
 
@@ -40,10 +42,10 @@ class Files:
         config: its settings.
         steps: of the whole training.
         findings: of its health; none: it has no record.
-        metrics, protocol: of `neilfpp eval`; empty where it was not called.
-        measured_before: whether the figures are older than the checkpoint.
+        measured: figures by protocol; empty where `neilfpp eval` was not called.
         timing: seconds of each stage.
         work: seconds of each stage by kind of work.
+        looks: at held-back pixels, on the way.
         effects: a row per effect, as `effects.json` has them.
         machine: versions and hardware.
         notes: what could not be read.
@@ -53,11 +55,10 @@ class Files:
     config: NeilfConfig
     steps: int
     findings: list[Finding] | None
-    metrics: Mapping[str, float]
-    protocol: Mapping[str, str]
-    measured_before: bool
+    measured: Mapping[str, Measured]
     timing: Mapping[str, float]
     work: Mapping[str, Mapping[str, float]]
+    looks: Sequence[Look]
     effects: list[Mapping[str, Any]]
     machine: Mapping[str, Any]
     notes: list[str]
@@ -82,19 +83,18 @@ def read_files(path: Path) -> Files:
     def optional(name: str) -> dict[str, Any]:
         return tried(lambda: read_json(path / name), {}) if (path / name).is_file() else {}
 
-    last, figures = path / "checkpoints" / "last.pt", path / "metrics.json"
-    before = last.is_file() and figures.is_file() and figures.stat().st_mtime < last.stat().st_mtime
+    measured, damaged = read_measured(path)
+    notes += damaged
     rows = optional("effects.json").get("effects")
     return Files(
         path=path,
         config=config,
         steps=sum(stage_steps(config.train).values()),
         findings=tried(lambda: read_findings(path), None),
-        metrics=_numbers(optional("metrics.json")),
-        protocol={name: str(text) for name, text in optional("metrics-protocol.json").items()},
-        measured_before=before,
-        timing=_numbers(optional("timing.json")),
+        measured=measured,
+        timing=numbers(optional("timing.json")),
         work=tried(lambda: read_work(path), {}),
+        looks=tried(lambda: read_looks(path), []),
         effects=[row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else [],
         machine=optional("environment.json"),
         notes=notes,
@@ -112,7 +112,7 @@ def changed_settings(config: NeilfConfig) -> list[Changed] | None:
         return None
     base = fixed_geometry(base) if isinstance(config.host, MeshConfig) else base
     base = free_light(base) if config.light.kind == "free" and base.light.kind != "free" else base
-    own, usual = _flat(to_dict(config)), _flat(to_dict(base))
+    own, usual = flat_settings(to_dict(config)), flat_settings(to_dict(base))
     return [
         Changed(key, str(value), None if key not in usual else str(usual[key]))
         for key, value in own.items()
@@ -120,14 +120,17 @@ def changed_settings(config: NeilfConfig) -> list[Changed] | None:
     ]
 
 
-def _flat(values: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+def flat_settings(values: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+    """Nested settings by their dotted names.
+
+    >>> flat_settings({"train": {"rays": 77}})
+    {'train.rays': 77}
+    """
     found: dict[str, Any] = {}
     for name, value in values.items():
-        found |= _flat(value, f"{where}{name}.") if isinstance(value, Mapping) else {f"{where}{name}": value}
+        found |= (
+            flat_settings(value, f"{where}{name}.")
+            if isinstance(value, Mapping)
+            else {f"{where}{name}": value}
+        )
     return found
-
-
-def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    return {
-        key: float(v) for key, v in values.items() if isinstance(v, int | float) and not isinstance(v, bool)
-    }

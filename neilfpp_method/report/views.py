@@ -6,16 +6,28 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 
 from neilfpp_method.data.scaling import at_scale, file_size
 from neilfpp_method.evaluate.confidence import gather_evidence, with_deviation
-from neilfpp_method.evaluate.panels import albedo_scale, compared_maps, light_sections
+from neilfpp_method.evaluate.panels import ComparedMap, albedo_scale, compared_maps, light_sections
 from neilfpp_method.evaluate.protocols import image_metrics, material_metrics, normal_metrics
-from neilfpp_method.evaluate.views import known_test_views, render_view
+from neilfpp_method.evaluate.views import RenderedView, known_test_views, render_view
 from neilfpp_method.report.encoded import encoded
 from neilfpp_method.train.run import Run
 
-__all__ = ["Cell", "Layer", "LightPicture", "Shown", "show_views", "shown_run"]
+__all__ = [
+    "Cell",
+    "Layer",
+    "LightPicture",
+    "Looked",
+    "Shown",
+    "evenly_spread",
+    "look_at_views",
+    "show_views",
+    "shown_run",
+    "title_of",
+]
 
 TITLES = {"rgb": "Image, rendering equation", "rgb_volume": "Image, volume rendering"}
 CONFIDENCE_STEP = 2
@@ -63,20 +75,49 @@ class Shown:
     figures: dict[str, float]
 
 
+@dataclass(frozen=True)
+class Looked:
+    """The views that are held out as they were rendered, and all that is known of them.
+
+    Attributes:
+        rendered: the views, in order.
+        scale: what fits the base colour to the truth, per channel; none where no truth is known.
+        maps: every map beside its truth, ready to be shown.
+        figures: of these views alone, as the protocol neilfpp measures them.
+        mask_source: what decided which pixels count.
+    """
+
+    rendered: tuple[RenderedView, ...]
+    scale: Float[np.ndarray, " 3"] | None
+    maps: tuple[ComparedMap, ...]
+    figures: dict[str, float]
+    mask_source: str
+
+
+def evenly_spread(names: Sequence[str], count: int) -> tuple[str, ...]:
+    """So many of the names, spread over all of them.
+
+    >>> evenly_spread("abcde", 3)
+    ('a', 'c', 'e')
+    """
+    rows = np.linspace(0, len(names) - 1, min(count, len(names))).round().astype(int)
+    return tuple(names[row] for row in rows)
+
+
 def shown_run(run: Run, views: int, size: int) -> Run:
     """The run with so many views held out, spread over those that are, or over the training views where none
     is; no side of a view is longer than `size` pixels, or than it was in training.
     """
     chosen = run.capture.test_views or run.capture.train_views
-    rows = np.linspace(0, len(chosen) - 1, min(views, len(chosen))).round().astype(int)
+    names = evenly_spread([view.name for view in chosen], views)
     longest = max(max(file_size(view)) for view in run.capture.views)
     trained = max(max(view.camera.width, view.camera.height) for view in run.capture.views)
     capture = at_scale(run.capture, min(size, trained) / longest)
-    return replace(run, capture=replace(capture, test=frozenset(chosen[row].name for row in rows)))
+    return replace(run, capture=replace(capture, test=frozenset(names)))
 
 
-def show_views(run: Run, confidence: bool, on_progress: Callable[[float], None]) -> Shown:
-    """Render the views that are held out, and show all that is known of them.
+def look_at_views(run: Run, confidence: bool, on_progress: Callable[[float], None]) -> Looked:
+    """Render the views that are held out, and set them beside all that is known of them.
 
     Args:
         run: as `shown_run` makes it.
@@ -88,17 +129,32 @@ def show_views(run: Run, confidence: bool, on_progress: Callable[[float], None])
     for i, view in enumerate(held_out):
         index = run.capture.views.index(view)
         rendered.append(render_view(run, index, lambda share, i=i: on_progress((i + share) / len(held_out))))
-    known = known_test_views(run, rendered).views
+    held = known_test_views(run, rendered)
+    known = held.views
     scale = albedo_scale(rendered, known) if run.has_material else None
     pairs = [(r, k) for r, k in zip(rendered, known, strict=True) if k.mask.any()]
     figures = image_metrics(run, pairs) | material_metrics(run, pairs) | normal_metrics(pairs)
     if confidence and run.has_material and run.capture.train_views:
         evidence = gather_evidence(run)
         rendered = [with_deviation(run, evidence, view, CONFIDENCE_STEP) for view in rendered]
-    maps = compared_maps(run, rendered, known, scale)
+    maps = tuple(compared_maps(run, rendered, known, scale))
+    return Looked(tuple(rendered), scale, maps, figures, held.mask_source)
+
+
+def title_of(shown: ComparedMap) -> str:
+    """The title of a map that tells it from every other map of a run."""
+    aligned = f"{shown.title}, scaled" if shown.note.startswith("scaled") else shown.title
+    return TITLES.get(shown.name, aligned)
+
+
+def show_views(run: Run, confidence: bool, on_progress: Callable[[float], None]) -> Shown:
+    """Render the views that are held out, and show all that is known of them; arguments as of
+    `look_at_views`.
+    """
+    looked = look_at_views(run, confidence, on_progress)
     layers = tuple(
         Layer(
-            TITLES.get(m.name, f"{m.title}, scaled" if m.note.startswith("scaled") else m.title),
+            title_of(m),
             m.note.replace("\n", ", "),
             f"{m.largest:g}{m.unit}",
             tuple(
@@ -110,13 +166,13 @@ def show_views(run: Run, confidence: bool, on_progress: Callable[[float], None])
                 for c in m.comparisons
             ),
         )
-        for m in maps
+        for m in looked.maps
     )
-    photographs = tuple(encoded(c.truth) for c in maps[0].comparisons)
-    camera = held_out[0].camera
-    light = _light(light_sections(run, rendered, scale)) if run.has_material else ()
-    names = tuple(view.name for view in held_out)
-    return Shown(names, photographs, camera.width, camera.height, layers, light, figures)
+    photographs = tuple(encoded(c.truth) for c in looked.maps[0].comparisons)
+    camera = run.capture.test_views[0].camera
+    light = _light(light_sections(run, looked.rendered, looked.scale)) if run.has_material else ()
+    names = tuple(view.name for view in looked.rendered)
+    return Shown(names, photographs, camera.width, camera.height, layers, light, looked.figures)
 
 
 def _light(sections: Sequence) -> tuple[LightPicture, ...]:

@@ -14,7 +14,8 @@ from neilfpp_method.report import pictures, tables
 from neilfpp_method.report.encoded import encoded
 from neilfpp_method.report.files import Files, changed_settings, read_files
 from neilfpp_method.report.light import lamps_of, picture_of_map
-from neilfpp_method.report.markup import Html
+from neilfpp_method.report.markup import Html, element, joined
+from neilfpp_method.report.measured import OWN, Measured
 from neilfpp_method.report.page import page
 from neilfpp_method.report.surface import packed_surface
 from neilfpp_method.report.views import Shown, show_views, shown_run
@@ -101,7 +102,6 @@ def _with_model(run: Run, files: Files, options: ReportOptions, on_progress: Cal
             "No view is held out for testing: nothing here says how new views look. Train with --test-every "
             "8 to know."
         )
-    figures, said = _figures(run, files, shown)
     words = (
         in_words(run.config.light, read_fits(run.path, run.step))
         if run.has_material
@@ -112,7 +112,7 @@ def _with_model(run: Run, files: Files, options: ReportOptions, on_progress: Cal
         ("views", "Views", pictures.views_section(shown, bool(run.capture.test_views))),
         ("surface", "Surface", pictures.surface_section(surface, reason)),
         ("light", "Light", pictures.light_section(words, picture_of_map(run), lamps_of(run), shown.light)),
-        ("figures", "Figures", tables.figures_section(figures, said)),
+        ("figures", "Figures", _figures(run, files, shown)),
         *_from_files(files),
         ("reading", "How to read this", tables.reading_section()),
         ("facts", "What made it", tables.facts_section({"Capture": run.capture.summary, **_facts(files)})),
@@ -134,7 +134,7 @@ def _without_model(files: Files) -> str:
 
 def _from_files(files: Files) -> list[tuple[str, str, Html]]:
     return [
-        ("time", "Time", tables.time_section(files.timing, files.work, _previews(files.path))),
+        ("time", "Time", tables.time_section(files.timing, files.work, files.looks, _previews(files.path))),
         ("effects", "Effects", tables.effects_section(files.effects)),
         (
             "settings",
@@ -144,19 +144,37 @@ def _from_files(files: Files) -> list[tuple[str, str, Html]]:
     ]
 
 
-def _figures(run: Run, files: Files, shown: Shown) -> tuple[dict[str, float], str]:
-    """Figures, and how they came about: those of `neilfpp eval`, else those of the views that are shown."""
-    if files.metrics:
-        told = "; ".join(f"{name.replace('_', ' ')}: {text}" for name, text in files.protocol.items())
-        late = " They are older than the checkpoint that is shown here." if files.measured_before else ""
-        return dict(files.metrics), f"Protocol neilfpp, by `neilfpp eval`: {told}.{late}"
+def _figures(run: Run, files: Files, shown: Shown) -> Html:
+    """Figures by protocol, each with how they came about; without any those of the views that are shown."""
+    if files.measured:
+        tables_of = (
+            joined(
+                element("h3", f"Protocol {measured.protocol}"),
+                tables.figures_section(measured.figures, _told(measured)),
+            )
+            for measured in files.measured.values()
+        )
+        return joined(*tables_of)
     if not run.capture.test_views:
-        return {}, "Nothing was measured: no view is held out."
+        return tables.figures_section({}, "Nothing was measured: no view is held out.")
     size = f"{len(shown.names)} views shown here, of {shown.width}×{shown.height} pixels"
-    return (
-        shown.figures,
+    said = (
         f"Of the {size}, not yet the figures of the protocol neilfpp: `neilfpp eval {run.path}` measures "
-        "those.",
+        "those."
+    )
+    return tables.figures_section(shown.figures, said)
+
+
+def _told(measured: Measured) -> str:
+    """How figures came about, in words."""
+    option = "" if measured.protocol == OWN else f" --protocol {measured.protocol}"
+    parts = [measured.extent] if measured.extent else []
+    parts += [f"{name.replace('_', ' ')}: {text}" for name, text in measured.said.items()]
+    late = " They are older than the checkpoint that is shown here." if measured.outdated else ""
+    return (
+        f"By `neilfpp eval{option}`: {'; '.join(parts)}.{late}"
+        if parts
+        else f"By `neilfpp eval{option}`.{late}"
     )
 
 

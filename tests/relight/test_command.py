@@ -4,15 +4,19 @@ given."""
 from __future__ import annotations
 
 import json
+import resource
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from neilfpp_method.cli import COMMANDS, main
 from neilfpp_method.commands.command import Command
-from neilfpp_method.data.images import read_image, write_exr
+from neilfpp_method.data.images import read_image, write_exr, write_png
+from neilfpp_method.relight import command
+from neilfpp_method.relight.lamplight import Lamplight
 from neilfpp_method.settings.presets import PRESETS
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import small_config, solved_light
@@ -159,6 +163,40 @@ def test_an_edit_changes_what_is_seen(given, sky, tmp_path):
     assert beside.min() > 2 * black.max()
 
 
+def test_an_edit_within_a_painted_mask(given, sky, tmp_path):
+    """The left half of a view turns black, the right half stays; what is drawn depends on the view alone."""
+    options = ("--env", sky, "--spp", "8", "--set", "base_color=0", "--set", "metallic=1", "--bounces", 1)
+    assert relit(given, "--env", sky, "--spp", "8", "--bounces", 1, "--out", tmp_path / "plain") == 0
+    white = np.zeros((18, 24, 1), np.uint8)
+    white[:, :12] = 255
+    write_png(tmp_path / "000.png", white)
+    assert relit(given, *options, "--mask", tmp_path / "000.png", "--out", tmp_path / "masked") == 0
+    plain, masked = (read_image(tmp_path / name / "studio" / "000.exr") for name in ("plain", "masked"))
+    inside = plain.alpha == 1
+    assert masked.pixels[:, :11][inside[:, :11]].max() < 0.2 * plain.pixels[:, :11][inside[:, :11]].mean()
+    np.testing.assert_allclose(masked.pixels[:, 13:], plain.pixels[:, 13:], rtol=1e-5)
+
+
+def test_lamps_are_moved_and_left_out(given, sky, tmp_path, monkeypatch):
+    """A lamp behind the ball does not light what the first view sees; moved to the camera it does."""
+    behind = Lamplight(
+        torch.tensor([[-1.5, 0.0, 0.0]]), torch.zeros(1, 3), torch.full((1, 3), 900.0), radius=0.05
+    )
+    monkeypatch.setattr(command, "lamps_of_run", lambda lamps: behind)
+
+    def mean(name: str, *options: object) -> float:
+        assert relit(given, "--env", sky, "--out", tmp_path / name, *options) == 0
+        made = json.loads((tmp_path / name / "studio" / "000.json").read_text())
+        assert made["lamps"] == (name != "without")
+        return float(read_image(tmp_path / name / "studio" / "000.exr").pixels.mean())
+
+    without, kept = mean("without"), mean("kept", "--lamps", "keep")
+    moved, off = mean("moved", "--lamp", "0=2.7,-0.2,1.1"), mean("off", "--lamp", "0=off")
+    assert kept == pytest.approx(without, rel=0.02)
+    assert off == pytest.approx(without, rel=1e-6)
+    assert moved > 1.5 * without
+
+
 def test_figures_against_true_images(given, sky, tmp_path, capfd):
     assert relit(given, "--env", sky, "--out", tmp_path / "one") == 0
     relit_view = read_image(tmp_path / "one" / "studio" / "000.exr")
@@ -214,6 +252,12 @@ def test_a_time_per_view_is_kept(given, sky, tmp_path):
         (["--set", "gloss=1"], ("gloss=1", "roughness")),
         (["--box", "0", "0", "0", "1", "1", "1"], ("--box without --set",)),
         (["--set", "metallic=1", "--box", "0", "0", "0", "1", "1", "0"], ("--box has no inside",)),
+        (["--mask", "000.png"], ("--mask without --set",)),
+        (["--set", "metallic=1", "--mask", "000.png"], ("000.png", "no such image")),
+        (["--set", "metallic=1", "--mask", "nobody.png"], ("no view 'nobody'",)),
+        (["--lamp", "7=off"], ("--lamp 7", "no such lamp")),
+        (["--lamp", "0=up"], ("--lamp 0=up", "x,y,z")),
+        (["--lamp", "0=off", "--lamps", "drop"], ("--lamps drop",)),
         (["--views", "turntable", "--frames", "1"], ("1 frames",)),
         (["--width", "100000"], ("100000×75000",)),
         (["--views", "turntable", "--truth", "x"], ("true images",)),
@@ -240,6 +284,17 @@ def test_a_light_that_is_no_map_needs_one(given, capfd):
 def test_a_folder_that_cannot_be_written(found, sky, tmp_path, capfd):
     (tmp_path / "file").write_text("")
     refused(capfd, found, "--env", sky, "--out", tmp_path / "file" / "relit", words=("cannot be written",))
+
+
+def test_a_full_disk_leaves_no_half_picture(given, sky, tmp_path, capfd):
+    """Files may grow to a size that no picture fits into: one line, and nothing that looks finished."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1500, before[1]))
+    try:
+        refused(capfd, given, "--env", sky, "--out", tmp_path / "out", words=("000.exr", "cannot be written"))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
 
 
 def test_without_a_denoiser_it_says_so(found, sky, capfd, monkeypatch):

@@ -31,7 +31,7 @@ def test_a_box_of_the_world_bounds_an_edit():
     # The world is twice as large as the scene, and its middle at (1, 0, 0).
     box = scene_box((3.0, 2.0, 2.0, 1.0, -2.0, -2.0), Normalisation(2.0, (1.0, 0.0, 0.0)))
     x = torch.tensor([[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0], [0.5, 0.0, 1.1], [1.0, 1.0, -1.0]])
-    changed = edited(grey, parse_edits(["metallic=1"]), box)(x).metallic[:, 0]
+    changed = edited(grey, parse_edits(["metallic=1"]), [box.holds])(x).metallic[:, 0]
     assert changed.numpy() == pytest.approx([1.0, 0.1, 0.1, 1.0])
 
 

@@ -160,6 +160,32 @@ def test_figures_are_of_the_protocol_once_they_are_measured(run: Path):
     assert "older than the checkpoint" in page_of(run).text
 
 
+def test_figures_of_published_protocols_are_shown_with_their_names(run: Path):
+    measured = {"view_names": ["000", "004"], "width": 40, "height": 30, "step": 12}
+    stored = {
+        "protocol": "neilf-synthetic",
+        "source": "apple/ml-neilfpp",
+        "left_out": "nothing",
+        "measured": measured,
+        "figures": {"render_psnr": 23.45, "base_color_gamma": 0.9},
+    }
+    (run / "eval").mkdir()
+    (run / "eval" / "neilf-synthetic.json").write_text(json.dumps(stored))
+    (run / "eval" / "shiny-normals.json").write_text("{")
+    (run / "eval" / "of-a-stranger.json").write_text(json.dumps(stored))
+    text = page_of(run).text
+    for words in (
+        "Protocol neilf-synthetic",
+        "23.45 dB",
+        "source: apple/ml-neilfpp",
+        "2 views of 40×30 pixels",
+    ):
+        assert words in text
+    assert "shiny-normals.json: not readable as JSON" in text
+    assert "stranger" not in text
+    assert "neither is better" not in page_of(run).html
+
+
 def test_a_finding_comes_with_its_cause_and_remedy(run: Path):
     finding = {
         "case": "fog",
@@ -282,4 +308,4 @@ def test_settings_are_compared_with_those_of_the_preset():
 
 def test_figures_are_numbers(run: Path):
     (run / "metrics.json").write_text('{"a": 1, "b": true, "c": "x", "d": [2]}')
-    assert read_files(run).metrics == {"a": 1.0}
+    assert read_files(run).measured["neilfpp"].figures == {"a": 1.0}

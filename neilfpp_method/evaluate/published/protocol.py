@@ -11,6 +11,7 @@ import numpy as np
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
+from neilfpp_method.evaluate.size import what_is_measured
 from neilfpp_method.evaluate.views import RenderedView
 from neilfpp_method.train.run import Run, write_json
 
@@ -31,6 +32,8 @@ class Protocol:
         check: raises a `UserError` where the capture lacks what the protocol needs; called before views are
             rendered.
         measure: figures by name, from the test views in order.
+        needs_views: whether views are rendered for it; if not, `measure` is given none.
+        side: width in pixels at which views are rendered; none: that of their files.
     """
 
     name: str
@@ -38,6 +41,8 @@ class Protocol:
     left_out: str
     check: Callable[[Run], None]
     measure: Callable[[Run, Sequence[RenderedView]], dict[str, float]]
+    needs_views: bool = True
+    side: int | None = None
 
 
 def decibels(squared_error: float) -> float:
@@ -54,8 +59,6 @@ def missing(protocol: str, capture: Capture, view: View, what: str, place: str) 
 
 
 def write_figures(path: Path, protocol: Protocol, run: Run, figures: Mapping[str, float]) -> None:
-    """Write the figures of one protocol, with its name, its source and the size of the views."""
-    view = run.capture.test_views[0].camera
+    """Write the figures of one protocol, with its name, its source, and what was measured."""
     described = {"protocol": protocol.name, "source": protocol.source, "left_out": protocol.left_out}
-    described |= {"views": len(run.capture.test_views), "width": view.width, "height": view.height}
-    write_json(path, {**described, "figures": dict(figures)})
+    write_json(path, {**described, "measured": what_is_measured(run), "figures": dict(figures)})

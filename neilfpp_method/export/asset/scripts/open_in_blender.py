@@ -2,6 +2,7 @@
 
     blender --python open_in_blender.py
     blender --background --python open_in_blender.py -- --camera 003 --render 003.exr --samples 256
+    blender --background --python open_in_blender.py -- --camera 003 --render 003.png --percent 50
     blender --background --python open_in_blender.py -- --save asset.blend
 
 Without Blender's program, `python open_in_blender.py --render 003.exr` does the same with the package bpy.
@@ -25,8 +26,12 @@ def main(arguments):
         prog="open_in_blender.py", description="Open an exported asset in Blender."
     )
     parser.add_argument("--camera", help="name of a view; the first one where none is given")
-    parser.add_argument("--render", type=Path, help="render to this EXR file, linear")
+    parser.add_argument("--render", type=Path, help="render to this file: .exr, linear, or .png")
     parser.add_argument("--samples", type=int, default=128, help="samples per pixel")
+    parser.add_argument("--percent", type=int, default=100, help="size of the picture over that of the view")
+    parser.add_argument(
+        "--source", choices=["glb", "usd"], default="glb", help="where the surface is read from"
+    )
     parser.add_argument("--save", type=Path, help="save as this .blend file")
     options = parser.parse_args(arguments)
     described = json.loads((HERE / "scene.json").read_text())
@@ -39,7 +44,7 @@ def main(arguments):
     scene.render.engine = "CYCLES"
     scene.cycles.samples = options.samples
     scene.view_settings.view_transform = "Standard"
-    add_surface()
+    add_surface(options.source)
     add_environment(scene, described["environment"])
     for number, lamp in enumerate(described["lamps"]):
         add_lamp(scene, f"lamp {number}", lamp)
@@ -47,18 +52,23 @@ def main(arguments):
         add_camera(scene, camera)
     chosen = options.camera or names[0]
     look_through(scene, next(camera for camera in described["cameras"] if camera["name"] == chosen))
+    scene.render.resolution_percentage = options.percent
     if options.save:
         bpy.ops.wm.save_as_mainfile(filepath=str(options.save.resolve()))
     if options.render:
-        scene.render.image_settings.file_format = "OPEN_EXR"
-        scene.render.image_settings.color_depth = "32"
+        png = options.render.suffix.lower() == ".png"
+        scene.render.image_settings.file_format = "PNG" if png else "OPEN_EXR"
+        scene.render.image_settings.color_depth = "8" if png else "32"
         scene.render.filepath = str(options.render.resolve())
         bpy.ops.render.render(write_still=True)
 
 
-def add_surface():
-    """The glTF file without its lights: glTF knows no radius and no panels, `add_lamp` does."""
-    bpy.ops.import_scene.gltf(filepath=str(HERE / "asset.glb"))
+def add_surface(source):
+    """The file without its lights: glTF knows no radius and no panels, `add_lamp` does."""
+    if source == "usd":
+        bpy.ops.wm.usd_import(filepath=str(HERE / "asset.usda"))
+    else:
+        bpy.ops.import_scene.gltf(filepath=str(HERE / "asset.glb"))
     for thing in [thing for thing in bpy.data.objects if thing.type == "LIGHT"]:
         bpy.data.objects.remove(thing)
     # The material was found with single scattering; Blender adds what that loses, up to half on rough metal.
@@ -118,7 +128,6 @@ def look_through(scene, camera):
     """Render what this camera saw: its size, and the shape of its pixels."""
     scene.camera = scene.objects[camera["name"]]
     scene.render.resolution_x, scene.render.resolution_y = camera["width"], camera["height"]
-    scene.render.resolution_percentage = 100
     tall = camera["fx"] / camera["fy"]
     scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = max(1.0, 1.0 / tall), max(1.0, tall)
 

@@ -1,0 +1,156 @@
+"""The asset of a run in Blender, beside our own path tracer: what `neilfpp export --what asset` promises.
+
+    python -m benchmarks.blender RUN --python BPY/bin/python --percent 50 --samples 128
+
+Blender is the package bpy in an environment of its own (`python -m venv BPY`, `BPY/bin/pip install bpy`):
+it asks for its own Python and NumPy. The asset's own script, `open_in_blender.py`, opens it from the GLB
+and from the USD file, and Cycles renders it under the light of the run. Our picture of the same camera is
+path traced on the run's own surface with its own material. PSNR is of what a display shows, within the
+outline of the surface by a pixel.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+import tyro
+from jaxtyping import Bool, Float
+from rich.console import Console
+from scipy.ndimage import binary_erosion
+
+from benchmarks.measure import hardware
+from neilfpp_method.commands.command import progress_bar
+from neilfpp_method.data.images import read_image
+from neilfpp_method.errors import UserError
+from neilfpp_method.evaluate import metrics
+from neilfpp_method.export.asset.command import AssetOptions, check_asset, export_asset
+from neilfpp_method.fields.environment import EnvironmentLight
+from neilfpp_method.relight.cameras import resized
+from neilfpp_method.relight.film import Budget, Picture, take_picture
+from neilfpp_method.relight.lamplight import lamps_of_run
+from neilfpp_method.relight.path_tracer import Scene
+from neilfpp_method.relight.recovered import surface_of_run
+from neilfpp_method.relight.sky import sky_of_run
+from neilfpp_method.shading.color import tone_map
+from neilfpp_method.train.run import Run, load_run
+
+__all__ = ["blender_picture", "shown_psnr"]
+
+BOUNCES = 6
+ASSET = AssetOptions(texture_size=2048, faces=30_000, error=0.001)
+MOST_SECONDS = 3600
+
+
+@dataclass
+class Options:
+    """Compare Cycles' picture of an exported asset with our own of the run."""
+
+    run: tyro.conf.Positional[Path]
+    """A run with a surface and an environment map."""
+    python: Path = Path(sys.executable)
+    """A Python that has bpy."""
+    camera: str | None = None
+    """A view; none: the first of the test views."""
+    percent: int = 100
+    """Size of the pictures over that of the view."""
+    samples: int = 128
+    """Of a pixel, Blender's and ours."""
+    resolution: int = 256
+    """Cells of the surface along an edge of the scene's cube, where the run has no mesh of its own."""
+    out: Path | None = None
+    """Keep the asset and Blender's pictures here; none: nowhere."""
+
+
+def blender_picture(
+    python: Path,
+    asset: Path,
+    camera: str,
+    out: Path,
+    source: Literal["glb", "usd"] = "glb",
+    percent: int = 100,
+    samples: int = 128,
+) -> Float[np.ndarray, "H W 3"]:
+    """Linear radiance as Cycles renders it, by the script beside the asset; behind the surface is the map.
+
+    Raises:
+        UserError: that Python has no bpy, or the script fails.
+    """
+    words = [python, asset / "open_in_blender.py", "--camera", camera, "--render", out, "--source", source]
+    words += ["--percent", percent, "--samples", samples]
+    done = subprocess.run(
+        [str(word) for word in words], capture_output=True, text=True, timeout=MOST_SECONDS, check=False
+    )
+    if done.returncode or not out.is_file():
+        last = (done.stderr.strip() or done.stdout.strip() or "no word").splitlines()[-1]
+        remedy = "name a Python that has bpy with --python (pip install bpy, in an environment of its own)"
+        raise UserError(f"{python}: Blender did not render ({last})", remedy)
+    return read_image(out).pixels
+
+
+def shown_psnr(
+    one: Float[np.ndarray, "H W 3"], other: Float[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]
+) -> float:
+    """Of linear radiance as a display shows it, dB, over a mask."""
+    shown = [tone_map(torch.from_numpy(np.ascontiguousarray(side))).numpy() for side in (one, other)]
+    return metrics.psnr(*shown, mask)
+
+
+def own_picture(run: Run, name: str, options: Options) -> Picture:
+    """The view by our path tracer, under the run's own light and lamps."""
+    if not isinstance(run.model.light, EnvironmentLight):
+        raise UserError(f"{run.path}: the light of this run is no environment map", "take another run")
+    view = next((view for view in run.capture.views if view.name == name), None)
+    if view is None:
+        raise UserError(f"{run.path}: the capture has no view '{name}'", "name one with --camera")
+    surface, sky = surface_of_run(run, options.resolution), sky_of_run(run.model.light)
+    scene = Scene(surface, run.model.materials, run.model.lobe, sky, lamps_of_run(run.model.lamps))
+    camera = resized(run.capture.normalisation.camera(view.camera), options.percent / 100)
+    return take_picture(scene, camera, Budget(options.samples), BOUNCES)
+
+
+def compare(options: Options, folder: Path, console: Console) -> None:
+    """Export, render both ways, and print."""
+    run = load_run(options.run, torch.device("cpu"))
+    check_asset(run, ASSET)
+    name = options.camera or run.capture.test_views[0].name
+    ours = own_picture(run, name, options)
+    radiance = ours.radiance.numpy()
+    within = binary_erosion(ours.alpha[..., 0].numpy() == 1)
+    asset = folder / "asset"
+    export_asset(run, asset, options.resolution, ASSET, console, progress_bar, None)
+    for source in ("glb", "usd"):
+        if not (asset / f"asset.{source}{'a' if source == 'usd' else ''}").is_file():
+            continue
+        out = folder / f"{name}-{source}.exr"
+        theirs = blender_picture(options.python, asset, name, out, source, options.percent, options.samples)
+        share = theirs[within].mean(0) / radiance[within].mean(0)
+        channels = ", ".join(f"{factor:.3f}" for factor in share)
+        console.print(
+            f"{source}, view {name}: PSNR {shown_psnr(theirs, radiance, within):.1f} dB over "
+            f"{within.sum()} pixels, mean radiance {channels} of ours"
+        )
+
+
+def main(options: Options, console: Console) -> None:
+    """Measure, and print."""
+    console.print(hardware())
+    if options.out is not None:
+        compare(options, options.out, console)
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        compare(options, Path(folder), console)
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Options), Console(markup=False, highlight=False))
+    except UserError as error:
+        Console(stderr=True).print(f"error: {error}", markup=False)
+        sys.exit(error.status)

@@ -1,0 +1,117 @@
+"""The protocol of Synthetic4Relight, the dataset of InvRender (zju3dv/InvRender, which has no script that
+measures), as TCZ-Tao/IRGS computes its figures: `eval_material_syn4.py` and `compute_albedo_scale_syn4.py`.
+
+The layout is that of the dataset: beside `<view>_rgba.png` lie `<view>_albedo.png`, and `<view>_rough.png` or
+`<view>_roughness.png`.
+
+What is particular about it:
+
+- The true albedo is in sRGB, multiplied with its alpha, and then made linear. Everything is compared in
+  linear values.
+- Albedo takes a factor per channel: the median, over the pixels of all test views where the truth has any
+  alpha, of truth over estimate; of an even number of values the lower of the middle two. Nothing is clipped.
+- Estimate and truth are multiplied with the alpha of the image, and the errors are of the whole frame.
+- PSNR is taken per channel and averaged over channels and views, so a channel with a small error counts as
+  much as one with a large error.
+- SSIM has windows of 11 pixels, and zeros beyond the border.
+- Roughness is a mean squared error, averaged over views. A truth of one channel counts three times, which
+  changes nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from neilfpp_method.data.capture import Capture
+from neilfpp_method.data.views import View
+from neilfpp_method.errors import UserError
+from neilfpp_method.evaluate.published.protocol import Protocol, decibels, missing
+from neilfpp_method.evaluate.published.similarity import ssim_map
+from neilfpp_method.evaluate.published.tensoir import albedo_factor
+from neilfpp_method.evaluate.published.truth_files import alpha_of, check_full_size, existing, read_beside
+from neilfpp_method.evaluate.views import RenderedView
+from neilfpp_method.shading.color import srgb_to_linear
+from neilfpp_method.train.run import Run
+
+__all__ = ["SYNTHETIC4RELIGHT"]
+
+NAME = "synthetic4relight"
+
+
+@dataclass(frozen=True)
+class _True:
+    """The truth of a view: albedo, linear, and roughness, multiplied with their alphas; two of the alphas."""
+
+    albedo: Float[np.ndarray, "H W 3"]
+    roughness: Float[np.ndarray, "H W 1"]
+    albedo_alpha: Float[np.ndarray, "H W 1"]
+    alpha: Float[np.ndarray, "H W 1"]
+
+
+def _paths(view: View) -> tuple[Path, tuple[Path, Path]]:
+    stem = view.image.stem.removesuffix("_rgba")
+    albedo, rough, roughness = (
+        view.image.with_name(f"{stem}_{name}.png") for name in ("albedo", "rough", "roughness")
+    )
+    return albedo, (rough, roughness)
+
+
+def _true(capture: Capture, view: View) -> _True:
+    place, places = _paths(view)
+    image, albedo = read_beside(view.image, view), read_beside(place, view)
+    rough = read_beside(existing(capture.root, *places) or places[0], view)
+    albedo_alpha = alpha_of(albedo)
+    linear = srgb_to_linear(torch.from_numpy(albedo.pixels * albedo_alpha)).numpy()
+    return _True(linear, rough.pixels[..., :1] * alpha_of(rough), albedo_alpha, alpha_of(image))
+
+
+def _check(run: Run) -> None:
+    if not run.has_material:
+        raise UserError(f"{run.path}: there is no material at step {run.step}", "train the next stage")
+    root = run.capture.root
+    for view in run.capture.test_views:
+        check_full_size(NAME, view)
+        albedo, rough = _paths(view)
+        if existing(root, albedo) is None:
+            raise missing(NAME, run.capture, view, "true albedo", str(albedo.relative_to(root)))
+        if existing(root, *rough) is None:
+            raise missing(NAME, run.capture, view, "true roughness", str(rough[0].relative_to(root)))
+
+
+def _measure(run: Run, rendered: Sequence[RenderedView]) -> dict[str, float]:
+    true = [_true(run.capture, view) for view in run.capture.test_views]
+    covered = [t.albedo_alpha[..., 0] > 0 for t in true]
+    if not any(mask.any() for mask in covered):
+        raise UserError(f"the protocol {NAME}: no pixel of the true albedo has alpha", "render it again")
+    estimate = np.concatenate(
+        [view.maps["base_color"][mask] for view, mask in zip(rendered, covered, strict=True)]
+    )
+    factor = albedo_factor(
+        estimate, np.concatenate([t.albedo[mask] for t, mask in zip(true, covered, strict=True)])
+    )
+    scores: dict[str, list[float]] = {"albedo_psnr": [], "albedo_ssim": [], "roughness_mse": []}
+    for view, t in zip(rendered, true, strict=True):
+        shown, truth = view.maps["base_color"] * factor * t.alpha, t.albedo * t.alpha
+        squared = np.square(shown.astype(np.float64) - truth).mean((0, 1))
+        scores["albedo_psnr"].append(float(np.mean([decibels(error) for error in squared])))
+        scores["albedo_ssim"].append(float(ssim_map(shown, truth).mean()))
+        rough = (view.maps["roughness"] - t.roughness) * t.alpha
+        scores["roughness_mse"].append(float(np.square(rough, dtype=np.float64).mean()))
+    return {name: float(np.mean(values)) for name, values in scores.items()}
+
+
+SYNTHETIC4RELIGHT = Protocol(
+    name=NAME,
+    source="TCZ-Tao/IRGS eval_material_syn4.py",
+    left_out=(
+        "LPIPS, whose weights are downloaded; new views; relit images, which neilfpp relight --truth measures"
+    ),
+    check=_check,
+    measure=_measure,
+)
