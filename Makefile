@@ -5,7 +5,7 @@ VENV := .venv
 RUN := $(VENV)/bin
 INSTALL = $(RUN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
 
-.PHONY: demo demo-short test test-slow lint results clean test-nerfstudio package test-pythons
+.PHONY: demo demo-short test test-slow test-hard lint results clean test-nerfstudio package test-pythons
 
 # What running needs, and nothing for tests; the second adds that.
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -26,10 +26,14 @@ demo-short: $(VENV)/.installed
 # The tensors of the tests are small: a second thread costs more than it brings, many times more on a busy machine.
 # Two processes instead, each with whole modules, so that what a module prepares is prepared once.
 test: $(VENV)/.installed-dev
-	OMP_NUM_THREADS=1 $(RUN)/python -m pytest -m "not slow" -n 2 --dist loadscope
+	OMP_NUM_THREADS=1 $(RUN)/python -m pytest -m "not slow and not hard" -n 2 --dist loadscope
 
 test-slow: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(RUN)/python -m pytest -m slow
+
+# Thousands of damaged files, commands that are killed, planted faults: docs/stability.md. Ends with their counts.
+test-hard: $(VENV)/.installed-dev
+	OMP_NUM_THREADS=1 $(RUN)/python -m pytest tests/hard_cases -m hard -n 2 --dist load
 
 # Nerfstudio pins another OpenCV, so it has an environment of its own.
 NERFSTUDIO := .venv-nerfstudio

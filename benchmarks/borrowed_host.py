@@ -35,7 +35,7 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.train.build import build_model, scene_facts
 from neilfpp_method.train.command import run_training
-from neilfpp_method.train.loop import adam, seed_step, set_rates
+from neilfpp_method.train.optimizer import adam, seed_step, set_rates
 from neilfpp_method.train.run import Run, load_run
 
 TABLE = "borrowed-host"

@@ -32,7 +32,7 @@ from neilfpp_method.kernels.process import computing_fast
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.presets import free_light, preset
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.train.loop import seed_step
+from neilfpp_method.train.optimizer import seed_step
 
 __all__ = ["Growth", "StraightLine", "straight_line"]
 

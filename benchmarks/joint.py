@@ -34,7 +34,7 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import PixelBatch
-from neilfpp_method.train.loop import make_optimizer, seed_step
+from neilfpp_method.train.optimizer import make_optimizer, seed_step
 
 __all__ = ["cheap_paper", "fitted_model", "measurements", "rays_at_the_table", "step_on", "table"]
 

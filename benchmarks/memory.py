@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import resource
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -25,7 +26,8 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from benchmarks.measure import hardware
+from benchmarks.measure import hardware, revision
+from benchmarks.tables import RESULTS, Result, Row, markdown, write_result
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.capture_folder import write_capture
 from neilfpp_method.data.images import read_image, write_exr, write_png
@@ -50,6 +52,8 @@ class Options:
     """The capture whose views are resampled; none: the demo's."""
     steps: int = 20
     """Steps of the training."""
+    save: str | None = None
+    """Keep the figures under this name in benchmarks/results, for the table of docs/performance.md."""
 
 
 def enlarged(source: Path, out: Path, views: int, megapixels: float) -> Path:
@@ -104,32 +108,32 @@ def train_small(data: Path, out: Path, scale: float | None, steps: int) -> None:
 
 
 def main(options: Options) -> None:
-    """Print a row of the table for each size."""
-    print(
-        f"{hardware()}\n\n| views | megapixels | peak | files of pixels | float32 planes "
-        "|\n|---|---|---|---|---|"
-    )
+    """Measure each size; print the table, and keep it where that is asked for."""
+    rows = []
     for size in options.sizes:
         count, megapixels = int(size.split("x")[0]), float(size.split("x")[1])
         with tempfile.TemporaryDirectory() as folder:
             data = enlarged(options.data or demo_scene(), Path(folder) / "capture", count, megapixels)
             run = Path(folder) / "run"
-            arguments = [
-                str(data),
-                str(run),
-                "none" if options.scale is None else str(options.scale),
-                str(options.steps),
-            ]
+            scale = "none" if options.scale is None else str(options.scale)
+            arguments = [str(data), str(run), scale, str(options.steps)]
             command = [sys.executable, "-m", "benchmarks.memory", "--child", *arguments]
             done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
             peak = int(done.stdout.splitlines()[-1])
             files = sum(path.stat().st_size for path in (run / "pixels").iterdir())
         planes = FLOAT_PLANES * count * megapixels * 1e6
-        print(
-            f"| {count} | {megapixels:g} | {peak / 1e9:.2f} GB | {files / 1e9:.2f} GB | {planes / 1e9:.2f} "
-            "GB |",
-            flush=True,
+        figures = {"peak_gb": peak / 1e9, "files_gb": files / 1e9, "planes_gb": planes / 1e9}
+        rows.append(Row(f"{count} views of {megapixels:g} megapixels", figures))
+        result = Result(
+            "memory",
+            revision(),
+            f"python -m benchmarks.memory {shlex.join(sys.argv[1:])}".strip(),
+            hardware(),
+            tuple(rows),
         )
+        if options.save is not None:
+            write_result(RESULTS / f"{options.save}.json", result)
+    Console().print(markdown([result]), markup=False, highlight=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -19,19 +19,28 @@ from jaxtyping import Float
 from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
 
-__all__ = ["Part", "load_mitsuba", "render"]
+__all__ = ["Lamp", "Part", "load_mitsuba", "render"]
 
 BSDF = "neilfpp"
 
 
 @dataclass(frozen=True)
 class Part:
-    """A mesh of one material; flat normals."""
+    """A mesh of one material; flat normals. A surface without a roughness is Lambertian."""
 
     mesh: trimesh.Trimesh
     base_color: tuple[float, float, float]
-    roughness: float
+    roughness: float | None
     metallic: float
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A ball that sends one radiance from all of its surface, and that cameras do not see."""
+
+    position: tuple[float, float, float]
+    radius: float
+    radiance: tuple[float, float, float]
 
 
 def load_mitsuba(variant: str):
@@ -61,8 +70,9 @@ def render(
     samples: int,
     bounces: int,
     seed: int,
+    lamps: Sequence[Lamp] = (),
 ) -> Float[np.ndarray, "h w 3"]:
-    """Linear radiance of a scene under a map in this package's layout, 0 where no surface is.
+    """Linear radiance of a scene under a map in this package's layout, and lamps, 0 where no surface is.
 
     Args:
         mi: of `load_mitsuba`.
@@ -73,6 +83,7 @@ def render(
         samples: of a pixel.
         bounces: surfaces on a path, at most.
         seed: of the samples.
+        lamps: before the map.
     """
     transform = mi.ScalarTransform4f
     pose = np.eye(4)
@@ -105,21 +116,34 @@ def render(
     for k, part in enumerate(parts):
         path = folder / f"part_{k}.ply"
         path.write_bytes(part.mesh.export(file_type="ply", vertex_normal=False))
-        red, green, blue = part.base_color
-        material = {
-            "red": red,
-            "green": green,
-            "blue": blue,
-            "roughness": part.roughness,
-            "metallic": part.metallic,
-        }
         scene[f"part_{k}"] = {
             "type": "ply",
             "filename": str(path),
             "face_normals": True,
-            "bsdf": {"type": BSDF, **material},
+            "bsdf": _material(part),
+        }
+    for k, lamp in enumerate(lamps):
+        scene[f"lamp_{k}"] = {
+            "type": "sphere",
+            "center": list(lamp.position),
+            "radius": lamp.radius,
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": list(lamp.radiance)}},
         }
     return np.array(mi.render(mi.load_dict(scene), seed=seed))[..., :3]
+
+
+def _material(part: Part) -> dict[str, object]:
+    if part.roughness is None:
+        return {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(part.base_color)}}
+    red, green, blue = part.base_color
+    return {
+        "type": BSDF,
+        "red": red,
+        "green": green,
+        "blue": blue,
+        "roughness": part.roughness,
+        "metallic": part.metallic,
+    }
 
 
 def _register(mi) -> None:

@@ -34,7 +34,7 @@ from neilfpp_method.settings.presets import fixed_geometry, free_light, preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model
 from neilfpp_method.train.command import run_training
-from neilfpp_method.train.loop import make_optimizer, seed_step
+from neilfpp_method.train.optimizer import make_optimizer, seed_step
 from neilfpp_method.train.run import (
     create_run,
     load_checkpoint,
@@ -163,7 +163,8 @@ def measure(out: Path, config: NeilfConfig) -> dict[str, dict[str, float]]:
 
 def main(options: Options) -> None:
     """Train, measure, and write the result file."""
-    config = preset(options.preset)
+    # The clouds of captures with known truth are of the true surface, which is to be found.
+    config = changed(preset(options.preset), "loss", point_cloud=0.0)
     config = fixed_geometry(config) if options.host == "mesh" else config
     if options.material_steps is not None:
         config = dataclasses.replace(

@@ -23,7 +23,7 @@ from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.presets import PRESETS, preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts
-from neilfpp_method.train.loop import make_optimizer, seed_step
+from neilfpp_method.train.optimizer import make_optimizer, seed_step
 
 __all__ = ["measurements", "step_of"]
 

@@ -1,4 +1,4 @@
-"""The tables of docs/results.md, docs/performance.md and docs/relighting.md, from benchmarks/results.
+"""The tables of results, performance, hosts and relighting in docs/, from the files in benchmarks/results.
 
     python -m benchmarks.tables            write the tables into the documents
     python -m benchmarks.tables --check    exit status 1 where a document is not what the result files say
@@ -32,7 +32,8 @@ __all__ = ["COLUMNS", "Result", "Row", "filled", "markdown", "read_results", "wr
 
 ROOT = Path(__file__).parent.parent
 RESULTS = Path(__file__).parent / "results"
-DOCUMENTS = tuple(ROOT / "docs" / name for name in ("results.md", "performance.md", "relighting.md"))
+NAMES = ("results.md", "performance.md", "hosts.md", "relighting.md")
+DOCUMENTS = tuple(ROOT / "docs" / name for name in NAMES)
 FORMAT = 1
 MARKED = re.compile(r"(<!-- table: ([\w-]+)((?: \w+)*) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -65,6 +66,9 @@ COLUMNS: Mapping[str, Column] = {
     "confidence_roughness_ratio": Column("roughness"),
     "confidence_metallic_ratio": Column("metallic"),
     "steps_done": Column("steps", 0),
+    "peak_gb": Column("peak, GB"),
+    "files_gb": Column("files of pixels, GB"),
+    "planes_gb": Column("float32 planes, GB"),
     "naive_ms": Column("as one writes it down, ms", 0),
     "reference_ms": Column("reference, ms", 0),
     "compiled_ms": Column("compiled loops, ms", 0),

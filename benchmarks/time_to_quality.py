@@ -30,11 +30,12 @@ from neilfpp_method.evaluate.views import known_test_views, render_test_views
 from neilfpp_method.kernels.process import computing_fast
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import active_losses, stage_at, stage_steps, weigh
+from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts
 from neilfpp_method.train.device import pick_device
-from neilfpp_method.train.loop import make_optimizer, seed_step, set_rates
+from neilfpp_method.train.optimizer import make_optimizer, seed_step, set_rates
 from neilfpp_method.train.run import Run
 
 __all__ = ["Curve", "Mark", "curve", "table"]
@@ -186,7 +187,9 @@ def main(options: Options) -> None:
             curves = {}
             for name in options.presets:
                 cap = float("inf") if name == "fast" else options.cap
-                curves[name] = curve(capture, preset(name), cap, options.first, options.views, device)
+                # The clouds of captures with known truth are of the true surface, which is to be found.
+                config = changed(preset(name), {"loss.point_cloud": 0.0})
+                curves[name] = curve(capture, config, cap, options.first, options.views, device)
                 Console().print(table({name: curves[name]}), markup=False, highlight=False, soft_wrap=True)
             sections.append(f"### {capture.name}\n\n{table(curves)}")
             panels += charts(capture, curves)

@@ -35,12 +35,12 @@ from neilfpp_method.hosts.foreign import ForeignHost, answers_secondary_rays, pr
 from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
-from neilfpp_method.model import Maps, NeilfModel
+from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, stage_at, weigh
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.structures import Material, PixelBatch, RayBatch, Shading, StepResult, SurfaceHits
+from neilfpp_method.structures import Maps, Material, PixelBatch, RayBatch, Shading, StepResult, SurfaceHits
 
 __all__ = ["AttachedNeilf", "CallableHost", "attach_neilf", "missing_capabilities", "pixel_batch"]
 
@@ -139,7 +139,7 @@ class AttachedNeilf(nn.Module):
         return Health.of(self.watch.findings.values())
 
     def maps(self, rays: RayBatch | Camera, hits: Rendered | None = None) -> Maps:
-        """Every map of a view, a row per ray: material, shading, normal, depth (`model.Maps`).
+        """Every map of a view, a row per ray: material, shading, normal, depth (`structures.Maps`).
 
         Args:
             rays: in the scene frame; bound the memory by their number. Or a camera, of a host that draws

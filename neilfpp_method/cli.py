@@ -15,14 +15,18 @@ from rich.console import Console
 
 from neilfpp_method.commands import COMMANDS
 from neilfpp_method.commands.command import Command
+from neilfpp_method.commands.ending import ended_by_signal
 from neilfpp_method.commands.mistakes import closest, mistake
+from neilfpp_method.data.native_signals import sigterm_waits
 from neilfpp_method.errors import EarlyEnd, Stopped, UserError
 
 __all__ = ["main"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command and return the exit status: 0 done, 2 bad input, 130 stopped, 1 anything else."""
+    """Run a command and return the exit status: 0 done, 2 bad input, 130 stopped by Ctrl-C, 143 by SIGTERM, 1
+    anything else.
+    """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview())
@@ -30,17 +34,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Beside the first process of a parallel run the others keep silent, and leave the status to it.
     first = os.environ.get("LOCAL_RANK", "0") == "0"
     errors = Console(stderr=True, quiet=not first)
-    try:
-        _run(arguments[0], arguments[1:])
-    except EarlyEnd as end:
-        text = str(end) if isinstance(end, Stopped) else f"error: {end}"
-        errors.print(text, highlight=False, soft_wrap=True, markup=False)
-        return end.status if first else 0
-    except SystemExit:  # tyro has shown a command's help
-        return 0
-    except KeyboardInterrupt:
-        errors.print("stopped")
-        return Stopped.status
+    with ended_by_signal() as asked:
+        try:
+            _run(arguments[0], arguments[1:])
+        except EarlyEnd as end:
+            text = str(end) if isinstance(end, Stopped) else f"error: {end}"
+            errors.print(text, highlight=False, soft_wrap=True, markup=False)
+            return end.status if first else 0
+        except SystemExit:  # tyro has shown a command's help
+            return 0
+        except BaseException as error:
+            if not asked.number and not isinstance(error, KeyboardInterrupt):
+                raise
+            errors.print("stopped")
+            return asked.status if asked.number else Stopped.status
     return 0
 
 
@@ -56,7 +63,10 @@ def _run(name: str, arguments: Sequence[str]) -> None:
         raise UserError(f"unknown command '{name}'", remedy)
     command = COMMANDS[name]
     try:
-        command.run(_meant(_parse(name, command, arguments)))
+        options = _meant(_parse(name, command, arguments))
+        with sigterm_waits():  # the threads that this library starts do not take it, either
+            import numpy  # noqa: F401
+        command.run(options)
     except OSError as error:  # what nobody nearer to it has explained
         where = f"{error.filename}: " if error.filename else ""
         remedy = "see that it is there, can be read or written, and has room"

@@ -2,7 +2,26 @@
 
 from __future__ import annotations
 
+import unicodedata
+
 __all__ = ["Diverged", "EarlyEnd", "Stopped", "Unsound", "UserError"]
+
+
+LONGEST_HEAD, LONGEST_TAIL = 1200, 300
+"""Characters of a problem that are shown: a path, and what a library says of the file."""
+
+
+def _short(text: str) -> str:
+    whole = len(text) <= LONGEST_HEAD + LONGEST_TAIL
+    return text if whole else f"{text[:LONGEST_HEAD]} … {text[-LONGEST_TAIL:]}"
+
+
+def _printable(text: str) -> str:
+    """One line that does nothing to a terminal, whatever a file says or is called: control characters, and
+    bytes that are no text, are written as escapes.
+    """
+    hidden = {sign for sign in text if unicodedata.category(sign) in ("Cc", "Cf", "Cs", "Zl", "Zp")}
+    return text.translate({ord(sign): sign.encode("unicode_escape").decode() for sign in hidden})
 
 
 class EarlyEnd(Exception):
@@ -11,6 +30,7 @@ class EarlyEnd(Exception):
     status = 1
 
     def __init__(self, problem: str, remedy: str) -> None:
+        problem, remedy = _printable(_short(problem)), _printable(remedy)
         super().__init__(f"{problem}; {remedy}")
         self.problem = problem
         self.remedy = remedy

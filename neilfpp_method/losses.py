@@ -9,11 +9,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from neilfpp_method.shading.color import apply_response, luminance
+from neilfpp_method.shading.color import luminance, residual
 from neilfpp_method.structures import LossTerm, Material
 
 __all__ = [
     "eikonal",
+    "exposure",
     "hessian",
     "inter_reflection",
     "lambertian",
@@ -29,16 +30,18 @@ __all__ = [
 def photometric(
     radiance: Float[Tensor, "N 3"], pixel: Float[Tensor, "N 3"], response: str, unit: float = 1.0
 ) -> LossTerm:
-    """L_vol and L_phys: L1 between a render and the pixel.
+    """L_vol and L_phys: L1 between a render and the pixel; at a clipped one as far as the render is darker.
 
     Args:
         radiance: what the model sees, linear.
         pixel: what the file holds, in the capture's `response`.
-        response: "linear" compares radiance; "srgb" clips the render and encodes it first (METHOD §6).
+        response: "linear" compares radiance; "srgb" encodes the render first, and takes a pixel at the upper
+            end of the range for a lower bound (`shading.color.residual`; METHOD §6 clips the render, which
+            has no gradient where it is too bright).
         unit: what the difference is measured in: with the range of an output activation, the gradient keeps
             its size.
     """
-    return LossTerm((apply_response(radiance, response) - pixel).abs() / unit)
+    return LossTerm(residual(radiance, pixel, response).abs() / unit)
 
 
 def mask(
@@ -54,6 +57,11 @@ def mask(
     surfaces become sharp, which is what a mask that is wrong by a pixel brings about along every silhouette.
     """
     return LossTerm(known * (object_mask * (1 - opacity) + (1 - object_mask) * depth.log1p()))
+
+
+def exposure(drift: Float[Tensor, "V 3"]) -> LossTerm:
+    """The squares of how far the log gains of photographs are from what they started as."""
+    return LossTerm(drift.square())
 
 
 def eikonal(gradient: Float[Tensor, "P 3"]) -> LossTerm:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from neilfpp_method import losses
 from neilfpp_method.fields.brdf import BrdfField
+from neilfpp_method.fields.exposure import PhotographGains, at_mean_exposure
 from neilfpp_method.fields.light import LightModel, make_light
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
@@ -31,12 +32,13 @@ from neilfpp_method.lighting.solver import LightSolver, make_light_solver
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, StagePlan, active_losses
 from neilfpp_method.settings.check import check_config
 from neilfpp_method.settings.facts import SceneFacts, radiance_units
-from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.shading import LOBES, initial_albedo, shade
+from neilfpp_method.settings.types import NeilfConfig, ShadingConfig
+from neilfpp_method.shading import LOBES, Lobe, initial_albedo, shade
 from neilfpp_method.structures import (
     Incident,
     LossTerm,
     LossTerms,
+    Maps,
     Material,
     PixelBatch,
     RayBatch,
@@ -48,49 +50,12 @@ from neilfpp_method.structures import (
 )
 from neilfpp_method.timing.ledger import doing
 
-__all__ = ["Maps", "NeilfModel"]
+__all__ = ["NeilfModel"]
 
 CLEAR_OPACITY = 0.01
 """Opacity below which a ray shows what lies beyond the scene."""
 SURFACE_OPACITY = 0.5
 """Opacity above which a picture shows a surface, also where a pixel mixes two: a picture has no holes."""
-
-
-@dataclass(frozen=True)
-class Maps:
-    """Everything that rays show, one row a ray; colours are linear.
-
-    Where a ray meets no surface, `rgb` is the host's colour and the material is 0.
-    """
-
-    rgb: Float[Tensor, "N 3"]
-    rgb_volume: Float[Tensor, "N 3"]
-    diffuse: Float[Tensor, "N 3"]
-    specular: Float[Tensor, "N 3"]
-    base_color: Float[Tensor, "N 3"]
-    roughness: Float[Tensor, "N 1"]
-    metallic: Float[Tensor, "N 1"]
-    normal: Float[Tensor, "N 3"]
-    depth: Float[Tensor, "N 1"]
-    opacity: Float[Tensor, "N 1"]
-
-    @staticmethod
-    def of_host(rays: RayBatch, hits: SurfaceHits) -> Maps:
-        """What the host alone says: no material anywhere."""
-        color, parameter = torch.zeros_like(hits.color), torch.zeros_like(hits.color[:, :1])
-        depth = ((hits.position - rays.origins) * rays.directions).sum(-1, keepdim=True)
-        return Maps(
-            rgb=hits.color,
-            rgb_volume=hits.color,
-            diffuse=color,
-            specular=color,
-            base_color=color,
-            roughness=parameter,
-            metallic=parameter,
-            normal=hits.normal,
-            depth=depth,
-            opacity=hits.opacity[:, None],
-        )
 
 
 class NeilfModel(nn.Module):
@@ -107,6 +72,7 @@ class NeilfModel(nn.Module):
     Attributes:
         host: geometry and outgoing radiance R.
         brdf: B, the material at every point.
+        gains: how much brighter each photograph is than the others; none where all are taken to be alike.
         light, lamps: L, what arrives where nothing stands in the way, and small lamps close by, perhaps none.
         lobe: distribution of the specular reflection; none for Lambertian surfaces.
         stages: which losses count and what moves in each stage, for this kind of host.
@@ -133,10 +99,14 @@ class NeilfModel(nn.Module):
         self.check_outputs = OutputCheck(host, config.shading.hit_share)
         self.observers: list[Callable[[PixelBatch, SurfaceHits], None]] = []
         self.brdf = BrdfField(config.brdf, config.encoding, config.volume.radius)
-        self.use(config)
-        albedo = initial_albedo(config.brdf.initial_base_color, config.brdf.initial_metallic, self.lobe)
+        albedo = initial_albedo(
+            config.brdf.initial_base_color, config.brdf.initial_metallic, _lobe_of(config.shading)
+        )
+        has_gains = config.optimizer.exposure > 0 and len(facts.log_gains) > 0
+        self.gains = PhotographGains(torch.tensor(facts.log_gains).view(-1, 3)) if has_gains else None
         parts = make_light(config, facts.response, facts.median_radiance / albedo)
         self.light, self.lamps = parts.light, parts.lamps
+        self.use(config)
         # The surface of a borrowed host moves as its own trainer likes.
         stands_still = not borrowed and not self.stages[Stage.MATERIAL_INIT].moves_host
         self.replay = Replay(config.train.fresh if stands_still else 1.0, config.train.rays)
@@ -144,8 +114,10 @@ class NeilfModel(nn.Module):
     def use(self, config: NeilfConfig) -> None:
         """Compute with these settings from now on. Effects change; the sizes of fields stay."""
         self.config = config
-        self.lobe = LOBES[config.shading.lobe] if config.shading.specular else None
-        self.brdf.metals = config.brdf.metals
+        self.lobe = _lobe_of(config.shading)
+        self.brdf.use(config.brdf)
+        if isinstance(self.light, EnvironmentLight):
+            self.light.be_even(config.light.environment_height == 1)
 
     # ----------------------------------------------------------------------------------------------- one step
 
@@ -172,9 +144,16 @@ class NeilfModel(nn.Module):
         # 1. The host renders colour, hit position and normal.
         hits, terms = self._render_host(batch, plan, names, hits)
         if "volume" in names:
-            terms["volume"] = losses.photometric(hits.color, batch.color, self.facts.response, units.volume)
+            color = hits.color
+            if self.gains is not None:
+                color = color * self.gains(batch.view)
+                terms["exposure"] = losses.exposure(self.gains.drift())
+            terms["volume"] = losses.photometric(color, batch.color, self.facts.response, units.volume)
         if not plan.moves_material:
             return StepResult.of(terms, SurfacePixels.none_of(batch), batch[:0])
+        # From here on all photographs are as one of mean exposure. R, which sees all pixels, finds the gains.
+        color = at_mean_exposure(self.gains, batch.color, batch.view, self.facts.response)
+        batch = replace(batch, color=color)
 
         # 2. Rays that meet one surface, on the object, are shaded. The gradient to their hits is scaled.
         rows = torch.nonzero(hits.is_hit(settings.hit_share) & (batch.mask > 0.5))[:, 0]
@@ -373,7 +352,10 @@ class NeilfModel(nn.Module):
         """Parameters by field, the host's among them where it offers them and is not borrowed."""
         offered = isinstance(self.host, HasParameterGroups) and not self.borrowed
         host = self.host.parameter_groups() if offered else {}
-        return {**host, "brdf": list(self.brdf.parameters()), "light": list(self.light.parameters())}
+        own = {"brdf": self.brdf, "light": self.light}
+        if self.gains is not None:
+            own["exposure"] = self.gains
+        return {**host, **{name: list(field.parameters()) for name, field in own.items()}}
 
     def freeze_for(self, stage: Stage) -> None:
         """Let exactly the fields move that the stage moves; the others get no gradient."""
@@ -381,3 +363,7 @@ class NeilfModel(nn.Module):
             for parameter in parameters:
                 parameter.requires_grad_(name in self.stages[stage].moves)
                 parameter.grad = None
+
+
+def _lobe_of(shading: ShadingConfig) -> Lobe | None:
+    return LOBES[shading.lobe] if shading.specular else None

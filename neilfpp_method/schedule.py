@@ -5,7 +5,7 @@
     material init    x     -     -     -      -      -     x      x      x   | B, L
     joint            x     x     x     low    low    -     x      x      x   | G, R, B, L
 
-L_en and L_spec, which the paper does not have, go with L_phys where they are switched on.
+Where photographs have gains of their own, their prior goes with L_vol.
 
 Two more tables are for hosts whose geometry is not ours to train: where it is given, R is a surface light
 field and moves with the material; where the host belongs to another trainer, that one sees to the first
@@ -49,9 +49,14 @@ class Stage(str, Enum):
     JOINT = "joint"
 
 
-LIGHT_FIELD = frozenset({"radiance", "background"})
+LIGHT_FIELD = frozenset({"radiance", "background", "exposure"})
 GEOMETRY = LIGHT_FIELD | {"geometry", "beta"}
 MATERIAL = frozenset({"brdf", "light"})
+
+EXPOSURE_PRIOR = 0.1
+"""Weight of the squares of how far log gains come from their start: the same gain in all pixels of a view is
+otherwise nearly free, as what it sends into each direction is learned as well.
+"""
 
 # Losses of the material stages and the settings that weigh them, relative to L_phys at 1.
 MATERIAL_LOSSES = {name: name for name in ("inter_reflection", "smoothness", "lambertian")}
@@ -197,12 +202,16 @@ def active_losses(
     }
     if plan.moves_material:
         weights["physical"] = 1.0
+    if config.optimizer.exposure > 0 and "volume" in weights:
+        weights["exposure"] = EXPOSURE_PRIOR
     if config.inter_reflection.mode != "soft":
         weights.pop("inter_reflection", None)
     if not config.shading.specular:
         # A Lambertian surface has neither roughness nor metallic, and sends what it gets times its colour.
         for loss in ("smoothness", "lambertian"):
             weights.pop(loss, None)
+    if not (config.brdf.varying_roughness or config.brdf.metals):
+        weights.pop("smoothness", None)  # There is nothing whose slope it could lower.
     return {loss: weight for loss, weight in weights.items() if weight > 0}
 
 

@@ -23,6 +23,7 @@ __all__ = [
     "Indexable",
     "LossTerm",
     "LossTerms",
+    "Maps",
     "Material",
     "Observed",
     "OrientedPoints",
@@ -281,3 +282,40 @@ class StepResult(NamedTuple):
     def surface(self) -> Observed:
         """The surface points that the step rendered, as they are shaded."""
         return Observed(*self.surface_rows.split(3, -1))
+
+
+@dataclass(frozen=True)
+class Maps:
+    """Everything that rays show, one row a ray; colours are linear.
+
+    Where a ray meets no surface, `rgb` is the host's colour and the material is 0.
+    """
+
+    rgb: Float[Tensor, "N 3"]
+    rgb_volume: Float[Tensor, "N 3"]
+    diffuse: Float[Tensor, "N 3"]
+    specular: Float[Tensor, "N 3"]
+    base_color: Float[Tensor, "N 3"]
+    roughness: Float[Tensor, "N 1"]
+    metallic: Float[Tensor, "N 1"]
+    normal: Float[Tensor, "N 3"]
+    depth: Float[Tensor, "N 1"]
+    opacity: Float[Tensor, "N 1"]
+
+    @staticmethod
+    def of_host(rays: RayBatch, hits: SurfaceHits) -> Maps:
+        """What the host alone says: no material anywhere."""
+        color, parameter = torch.zeros_like(hits.color), torch.zeros_like(hits.color[:, :1])
+        depth = ((hits.position - rays.origins) * rays.directions).sum(-1, keepdim=True)
+        return Maps(
+            rgb=hits.color,
+            rgb_volume=hits.color,
+            diffuse=color,
+            specular=color,
+            base_color=color,
+            roughness=parameter,
+            metallic=parameter,
+            normal=hits.normal,
+            depth=depth,
+            opacity=hits.opacity[:, None],
+        )

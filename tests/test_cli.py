@@ -433,10 +433,10 @@ def test_a_folder_of_photographs_has_to_be_prepared(tmp_path, capfd, folder):
     refused(capfd, ["train", "--data", photos], *words, leaves=tmp_path)
 
 
-def test_a_point_cloud_that_the_settings_need(tmp_path, capfd, capture):
-    root = tmp_path / "without"
+def test_a_point_cloud_that_cannot_be_read(tmp_path, capfd, capture):
+    root = tmp_path / "broken"
     shutil.copytree(capture, root)
-    (root / "inputs" / "model" / "oriented_pcd.ply").unlink()
+    (root / "inputs" / "model" / "oriented_pcd.ply").write_bytes(b"ply")
     command = ["train", "--data", root, "--out", tmp_path / "run", "--preset", "tiny", "--device", "cpu"]
     refused(capfd, [*command, "--config.loss.point-cloud", "0.1"], root, "oriented_pcd.ply", leaves=tmp_path)
 

@@ -18,7 +18,7 @@ from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import MapLightConfig
 from neilfpp_method.structures import Material, RayBatch, SurfaceHits
-from neilfpp_method.train.loop import make_optimizer
+from neilfpp_method.train.optimizer import make_optimizer
 from tests.scenes import sphere_batch, sphere_model, tiny_config
 
 

@@ -27,7 +27,7 @@ from neilfpp_method.data.views import camera_rays, project
 from neilfpp_method.errors import UserError
 from neilfpp_method.plugin.datamanager import CaptureDataManagerConfig, CaptureDataset, pixel_batch
 from neilfpp_method.plugin.dataparser import CaptureParserConfig, capture_of
-from neilfpp_method.train.loop import seed_step
+from neilfpp_method.train.optimizer import seed_step
 from tests.data.formats.scenes import POINTS, material
 from tests.data.formats.test_colmap import colmap_camera, reconstruction
 from tests.data.formats.test_colmap import write as write_model

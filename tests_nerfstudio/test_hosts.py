@@ -19,7 +19,7 @@ from neilfpp_method.hosts.nerfstudio import NerfstudioHost
 from neilfpp_method.plugin.foreign import build_foreign
 from neilfpp_method.schedule import Stage
 from neilfpp_method.structures import RayBatch
-from neilfpp_method.train.loop import seed_step
+from neilfpp_method.train.optimizer import seed_step
 from neilfpp_method.train.run import run_folder
 from tests.data.make_capture import make_capture
 from tests.scenes import sphere_batch

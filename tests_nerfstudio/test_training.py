@@ -19,11 +19,10 @@ from nerfstudio.utils.eval_utils import eval_setup
 from neilfpp_method.data.images import write_exr
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.protocols import evaluate
-from neilfpp_method.model import Maps
 from neilfpp_method.schedule import STAGES, Stage, stage_steps
 from neilfpp_method.settings.presets import fixed_geometry, free_light
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.structures import RayBatch
+from neilfpp_method.structures import Maps, RayBatch
 from neilfpp_method.train.loop import train
 from neilfpp_method.train.run import Run
 from tests.data.make_capture import make_capture

@@ -58,6 +58,10 @@ class Train:
     """Image size over that of the files; 1: full size; none: as large as the training's rays can use."""
     effects: str | None = None
     """auto, all, none, as-set, or as auto,-lamps."""
+    budget: str | None = None
+    """How long all of it may take, as 90s, 10m or 1h: steps are planned for that (docs/budget.md). None: as
+    many steps as the settings say.
+    """
     strict: bool = False
     """End with exit status 1 where the result is of no use (docs/health.md)."""
     device: Device = "auto"
@@ -77,10 +81,12 @@ class TrainWithSettings(Train):
 
 
 def run(options: TrainWithSettings) -> None:
+    from neilfpp_method.budget.durations import read_duration
     from neilfpp_method.effects.asked import read_asked
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.command import run_training
 
+    budget = None if options.budget is None else read_duration(options.budget)
     config = _with_files(options)
     named = options.preset is not None or options.config_file is not None
     as_before = options.resume and not named and config == preset(DEFAULT_PRESET)
@@ -104,6 +110,7 @@ def run(options: TrainWithSettings) -> None:
             devices=options.devices,
             strict=options.strict,
             effects=asked,
+            budget=budget,
             console=terminal(),
             at_end=(lambda path: after_training(path, options.device)) if options.report else None,
         )
@@ -190,6 +197,7 @@ COMMAND = Command(
         "neilfpp train --data captures/teapot --preset paper-ngp --out runs/teapot",
         "neilfpp train --data captures/teapot --config settings.yaml",
         "neilfpp train --data captures/teapot --host mesh --mesh scans/teapot.ply",
+        "neilfpp train --data captures/teapot --budget 10m   (steps are planned for the time)",
         "neilfpp train --out runs/teapot --resume",
         "neilfpp train --data captures/teapot --effects auto,-lamps   (evidence decides, but no lamps)",
     ],

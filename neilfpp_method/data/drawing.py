@@ -77,6 +77,7 @@ class PixelDraws:
 
     def __init__(self, bits: UInt8[np.ndarray, " P"], total: int) -> None:
         self.valid = PixelSet(bits, VALID, VALID)
+        self._left_out = torch.zeros(0, dtype=torch.long)
         near = PixelSet(bits, VALID | NEAR, VALID | NEAR)
         self._all = self.valid.count == total
         # Nearly everything may be near the object already, and none of it the rest.
@@ -84,15 +85,30 @@ class PixelDraws:
         if 0 < near.count < NEAR_SHARE * self.valid.count:
             self._parts = (near, PixelSet(bits, VALID | NEAR, VALID))
 
+    def leave_out(self, numbers: Int[Tensor, " N"]) -> None:
+        """Draw these pixels no more; they must be few among those near the object and among the rest."""
+        self._left_out = numbers
+
     def draw(self, count: int) -> Int[Tensor, " count"]:
         """`count` indices of valid pixels, with repetition, from torch's global CPU generator; unordered."""
         if self._parts is None:
-            return torch.randint(self.valid.count, (count,)) if self._all else self.valid.draw(count)
+            return self._of(self.valid, count)
         near, rest = self._parts
         first = round(NEAR_SHARE * count)
-        drawn = torch.cat([near.draw(first), rest.draw(count - first)])
+        drawn = torch.cat([self._of(near, first), self._of(rest, count - first)])
         # A step may use the first pixels alone.
         return drawn[torch.randperm(count)]
+
+    def _of(self, pixels: PixelSet, count: int) -> Int[Tensor, " count"]:
+        """Numbers from one set. Those that are left out are drawn again: all others stay equally likely."""
+        drawn = self._any_of(pixels, count)
+        while len(again := torch.nonzero(torch.isin(drawn, self._left_out))[:, 0]):
+            drawn[again] = self._any_of(pixels, len(again))
+        return drawn
+
+    def _any_of(self, pixels: PixelSet, count: int) -> Int[Tensor, " count"]:
+        everything = self._all and pixels is self.valid  # needs no look-up
+        return torch.randint(pixels.count, (count,)) if everything else pixels.draw(count)
 
 
 def near_object(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:

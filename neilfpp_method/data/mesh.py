@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,13 +38,43 @@ def read_mesh(path: Path, normalisation: Normalisation) -> Mesh:
             f"{path}: there is no such mesh", "give the path of a triangle mesh, such as a PLY file"
         )
     try:
+        if path.suffix.lower() == ".glb":
+            _check_counts(path)
         mesh = trimesh.load_mesh(path, process=False)
         vertices = torch.as_tensor(np.array(mesh.vertices), dtype=torch.float32)
         faces = torch.as_tensor(np.array(mesh.faces), dtype=torch.int64)
     except Exception as error:  # whatever trimesh meets in a damaged file
         raise UserError(f"{path}: not a mesh that can be read ({error})", "export it again as PLY") from error
-    if not len(faces) or not vertices.isfinite().all() or faces.min() < 0 or faces.max() >= len(vertices):
+    flat = vertices.shape != (len(vertices), 3) or faces.shape != (len(faces), 3)
+    if (
+        flat
+        or not len(faces)
+        or not vertices.isfinite().all()
+        or faces.min() < 0
+        or faces.max() >= len(vertices)
+    ):
         raise UserError(
             f"{path}: no triangles, or triangles of vertices that are not there", "export it again"
         )
     return Mesh(normalisation.to_scene(vertices), faces)
+
+
+def _check_counts(path: Path) -> None:
+    """That a binary glTF is as long as it says: trimesh makes room for what is announced before it looks.
+
+    Raises:
+        ValueError: it is not.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        place = 12
+        while place + 8 <= size:
+            file.seek(place)
+            length, kind = struct.unpack("<I4s", file.read(8))
+            place += 8 + length
+            if place > size:
+                raise ValueError("it is shorter than it says")
+            if kind == b"JSON":
+                accessors = json.loads(file.read(length)).get("accessors", [])
+                if any(accessor["count"] > size for accessor in accessors):
+                    raise ValueError("it announces more numbers than it has bytes")

@@ -98,6 +98,16 @@ class PixelDataset:
         """The numbers of the pixels that `sample` would return, from 0 to P − 1."""
         return self._draws.draw(count)
 
+    def leave_out(self, numbers: Int[Tensor, " N"]) -> None:
+        """Draw these pixels no more; see `data.held_back`."""
+        self._draws.leave_out(numbers)
+
+    def numbered(self, numbers: Int[Tensor, " N"]) -> PixelBatch:
+        """Pixels by their numbers, in that order; without image gradients."""
+        chosen = numbers.cpu().numpy()
+        views = self._views_of(chosen)
+        return self._batch(chosen, views, self.store.colors(chosen, views), None)
+
     def view(self, i: int, gradients: bool = True) -> PixelBatch:
         """All pixels of `views[i]`, row by row, invalid ones included. Image gradients as in `sample`."""
         rows, camera = self.store.rows(i), self.views[i].camera

@@ -77,6 +77,11 @@ def check_asked(asked: Asked, config: NeilfConfig) -> None:
                 f"--effects {'+' if on else '-'}{name}: {obstacle}",
                 f"leave {name} out, or change the settings",
             )
+        needs = EFFECTS[name].needs
+        if on and needs and not asked.named.get(needs, asked.base != "none"):
+            raise UserError(
+                f"--effects +{name}: there is none without {needs}", f"add +{needs}, or leave {name} out"
+            )
 
 
 def _unknown(word: str, what: str) -> UserError:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from neilfpp_method.settings.plain import changed
-from neilfpp_method.settings.types import FreeLightConfig, MapLightConfig, NeilfConfig
+from neilfpp_method.settings.presets import EXPOSURE_RATE
+from neilfpp_method.settings.types import FreeLightConfig, MapLightConfig, MeshConfig, NeilfConfig
 
 __all__ = ["EFFECTS", "Effect", "switched"]
 
@@ -26,6 +27,8 @@ class Effect:
         cost: what it takes while a material is learned.
         risk: what goes wrong where it is left out of a scene that has it.
         unjudged: why no evidence decides with these settings; empty: evidence does.
+        advised: evidence is shown and changes nothing: it cannot tell that the effect is not needed.
+        needs: an effect without which there is none of this; empty: nothing.
         solved: the light solver decides it again at each fit, so evidence changes no setting.
     """
 
@@ -39,6 +42,8 @@ class Effect:
     risk: str
     unjudged: Callable[[NeilfConfig], str] = lambda config: ""
     solved: bool = False
+    advised: bool = False
+    needs: str = ""
 
 
 def switched(config: NeilfConfig, effect: Effect, on: bool) -> NeilfConfig:
@@ -67,6 +72,31 @@ def _free_light(what: str) -> Callable[[NeilfConfig], str]:
     return lambda config: what if isinstance(config.light, FreeLightConfig) else ""
 
 
+def _is_map(config: NeilfConfig) -> bool:
+    return isinstance(config.light, MapLightConfig)
+
+
+def _without_reflection(what: str) -> Callable[[NeilfConfig], str]:
+    return lambda config: "" if config.shading.specular else what
+
+
+def _map_on(config: NeilfConfig) -> Mapping[str, Any]:
+    height = config.light.environment_height
+    return {"light.environment_height": height if height > 1 else MapLightConfig().environment_height}
+
+
+def _given_map(config: NeilfConfig) -> str:
+    return "the map is given" if config.known_map is not None else ""
+
+
+def _joint_obstacle(config: NeilfConfig) -> str:
+    if isinstance(config.host, MeshConfig):
+        return "the surface is given, and the material moves with R from the start"
+    return "" if config.train.joint_steps else "no steps are set for it (train.joint_steps)"
+
+
+UNKNOWN_IN_FREE_LIGHT = "not judged: a light that is free at every point explains any material"
+
 EFFECTS: Mapping[str, Effect] = {
     effect.name: effect
     for effect in (
@@ -94,19 +124,87 @@ EFFECTS: Mapping[str, Effect] = {
             solved=True,
         ),
         Effect(
+            name="environment-map",
+            title="an environment map, not one colour from everywhere",
+            is_on=lambda config: _is_map(config) and config.light.environment_height > 1,
+            on=_map_on,
+            off={"light.environment_height": 1},
+            obstacle=lambda config: (
+                _free_light("a light that is free at every point is no map")(config) or _given_map(config)
+            ),
+            cost=lambda config: (
+                f"{config.shading.train_samples * config.train.rays} look-ups a step, half of the directions "
+                f"drawn by the light, and fits of {2 * config.light.environment_height**2} texels"
+                if _is_map(config)
+                else ""
+            ),
+            risk="shading and reflections of the light become base colour",
+            advised=True,
+        ),
+        Effect(
+            name="coloured-light",
+            title="colours in the map, not white light",
+            is_on=lambda config: not config.light.monochrome,
+            on=lambda config: {"light.monochrome": False},
+            off={"light.monochrome": True},
+            obstacle=_given_map,
+            cost=lambda config: "three unknowns a texel, not one",
+            risk="colours of the light become base colour",
+            advised=True,
+            unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
+        ),
+        Effect(
+            name="reflection",
+            title="specular reflection",
+            is_on=lambda config: config.shading.specular,
+            on=lambda config: {"shading.specular": True},
+            off={"shading.specular": False},
+            obstacle=_none,
+            cost=lambda config: (
+                f"a lobe in {config.shading.train_samples * config.train.rays} directions a step, and three "
+                "matrices in fits of the light, not one"
+            ),
+            risk="gloss becomes base colour",
+            advised=True,
+            unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
+        ),
+        Effect(
             name="metals",
             title="metals",
             is_on=lambda config: config.brdf.metals,
             on=lambda config: {"brdf.metals": True},
             off={"brdf.metals": False},
-            obstacle=lambda config: (
-                "" if config.shading.specular else "a surface without reflection shows no metal"
-            ),
+            obstacle=_without_reflection("a surface without reflection shows no metal"),
             cost=lambda config: "one more unknown at every point",
             risk="metal becomes dark gloss",
-            unjudged=_free_light(
-                "not judged: a light that is free at every point explains paint and metal alike"
+            unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
+            needs="reflection",
+        ),
+        Effect(
+            name="varying-roughness",
+            title="roughness that varies from place to place",
+            is_on=lambda config: config.brdf.varying_roughness,
+            on=lambda config: {"brdf.varying_roughness": True},
+            off={"brdf.varying_roughness": False},
+            obstacle=_without_reflection("a surface without reflection has no roughness"),
+            cost=lambda config: "one more unknown at every point",
+            risk="all gloss is as sharp as that in the middle",
+            unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
+            needs="reflection",
+        ),
+        Effect(
+            name="lobe-sampling",
+            title="directions drawn by the specular lobe",
+            is_on=lambda config: config.shading.sampler in ("mis", "lobe"),
+            on=lambda config: {"shading.sampler": "mis"},
+            off={"shading.sampler": "no_lobe"},
+            obstacle=_without_reflection("a surface without reflection has no lobe"),
+            cost=lambda config: (
+                f"the lobe's density in {config.shading.train_samples * config.train.rays} directions a step"
             ),
+            risk="sharp reflections are noise",
+            unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
+            needs="reflection",
         ),
         Effect(
             name="long-tails",
@@ -114,12 +212,11 @@ EFFECTS: Mapping[str, Effect] = {
             is_on=lambda config: config.shading.lobe == "ggx",
             on=lambda config: {"shading.lobe": "ggx"},
             off={"shading.lobe": "spherical_gaussian"},
-            obstacle=lambda config: (
-                "" if config.shading.specular else "a surface without reflection has no highlights"
-            ),
+            obstacle=_without_reflection("a surface without reflection has no highlights"),
             cost=lambda config: "none",
             risk="the glow about highlights becomes roughness",
-            unjudged=_free_light("not judged: a light that is free at every point explains both lobes alike"),
+            unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
+            needs="reflection",
         ),
         Effect(
             name="background",
@@ -130,6 +227,36 @@ EFFECTS: Mapping[str, Effect] = {
             obstacle=lambda config: "R paints the scene sphere" if config.background.kind == "none" else "",
             cost=lambda config: f"{config.background.samples} network queries per ray",
             risk="what lies behind the scene becomes surfaces in it",
+        ),
+        Effect(
+            name="exposure",
+            title="exposure and white balance of each photograph",
+            is_on=lambda config: config.optimizer.exposure > 0,
+            on=lambda config: {"optimizer.exposure": config.optimizer.exposure or EXPOSURE_RATE},
+            off={"optimizer.exposure": 0.0},
+            obstacle=_none,
+            cost=lambda config: "three unknowns for each photograph",
+            risk="photographs of one place that differ become gloss, fog, and light that is uneven",
+        ),
+        Effect(
+            name="response",
+            title="pixels are display values, not radiance",
+            is_on=lambda config: False,
+            on=lambda config: {},
+            off={},
+            obstacle=lambda config: "told from the files, or by --response",
+            cost=lambda config: "a curve over the pixels",
+            risk="dark pixels count too much, and all light is wrong",
+        ),
+        Effect(
+            name="joint-stage",
+            title="surface and material trained together",
+            is_on=lambda config: config.train.joint_steps > 0,
+            on=lambda config: {},
+            off={"train.joint_steps": 0},
+            obstacle=_joint_obstacle,
+            cost=lambda config: f"{config.train.joint_steps} steps that move everything",
+            risk="the surface keeps the errors that shading shows",
         ),
     )
 }

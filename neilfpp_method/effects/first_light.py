@@ -115,7 +115,8 @@ def start_with(model: NeilfModel, found: FirstLight) -> None:
     """Give a model whose material is untrained the light that was found, and the mean material."""
     light = model.light.log_radiance
     directions = map_directions(*light.shape[1:]).to(light)
-    light.copy_(interpolate(found.log_radiance, directions).permute(2, 0, 1))
+    shown = interpolate(found.log_radiance, directions).permute(2, 0, 1)
+    light.copy_(shown.mean(0, keepdim=True) if model.config.light.monochrome else shown)
     model.brdf.start_at(found.mean)
 
 

@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.effects.disagreement import ShownSurface, shading_disagreement
+from neilfpp_method.effects.exposure import Exposures
 from neilfpp_method.effects.first_light import FirstLight, find_first_light
 from neilfpp_method.effects.lobes import lobe_evidence
+from neilfpp_method.effects.material import JUDGED, material_evidence
 from neilfpp_method.effects.measurement import Measurement
-from neilfpp_method.effects.metals import metal_evidence
 from neilfpp_method.effects.places import gather_places
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.visibility import self_visibility
 from neilfpp_method.lighting.fit import MIN_GAIN, Evidence
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.schedule import has_material
 from neilfpp_method.settings.facts import SceneFacts
-from neilfpp_method.structures import PixelBatch
+from neilfpp_method.structures import Observed, PixelBatch
 
-__all__ = ["LOOKED_AT", "after_fit", "look_at_light", "look_at_surface", "note_facts", "wants_surface"]
+__all__ = [
+    "LOOKED_AT",
+    "after_fit",
+    "look_at_light",
+    "look_at_surface",
+    "note_exposures",
+    "note_facts",
+    "wants_surface",
+]
 
 LOOKED_AT = 1024
 """Training pixels whose surface points are measured: the standard error of a 1 % share is 0.3 %."""
@@ -35,14 +42,6 @@ AT_ONCE = 512
 """Rays that are rendered together; bounds the memory."""
 
 
-@dataclass(frozen=True)
-class SurfacePoints:
-    """Where pixels of the object meet one surface, scene frame."""
-
-    position: Float[Tensor, "P 3"]
-    normal: Float[Tensor, "P 3"]
-
-
 def note_facts(plan: Plan, facts: SceneFacts) -> None:
     """What the files of the capture decide before training."""
     if plan.newest("background") is None:
@@ -53,11 +52,30 @@ def note_facts(plan: Plan, facts: SceneFacts) -> None:
             else "one colour is all that the borders show"
         )
         plan.decisions.append(Decision(0, "background", on, "files", seen))
+    response = plan.newest("response")
+    if response is None or response.by != "files":
+        on = facts.response == "srgb"
+        kind = "display values" if on else "linear radiance"
+        plan.decisions.append(Decision(0, "response", on, "files", f"the files hold {kind}"))
+
+
+def note_exposures(plan: Plan, found: Exposures | None) -> None:
+    """What the photographs say of their exposures before training; none where nothing shows them the same
+    places.
+    """
+    if plan.newest("exposure") is not None:
+        return
+    if found is None:
+        unknown = "without a point cloud nothing tells the same place in two photographs"
+        plan.decisions.append(Decision(0, "exposure", False, "files", unknown))
+        return
+    on, reason = found.measured.favours(chosen=False) is True, found.measured.in_words()
+    plan.decisions.append(Decision(0, "exposure", on, "files", reason, found.measured))
 
 
 def wants_surface(plan: Plan) -> bool:
     """Whether a look at the surface could decide anything."""
-    return plan.is_open("inter-reflection") or plan.is_open("metals")
+    return any(plan.is_open(name) for name in ("inter-reflection", *JUDGED, "joint-stage"))
 
 
 @torch.no_grad()
@@ -70,7 +88,7 @@ def look_at_light(
     """
     mode = model.training
     model.eval()
-    surface = _surface_points(model, pixels.sample(LIGHT_PIXELS, gradients=False))
+    surface = _shown_surface(model, pixels.sample(LIGHT_PIXELS, gradients=False)).observed
     position, normal = surface.position[:PLACES], surface.normal[:PLACES]
     places = gather_places(model, pixels, position, normal, VIEWS).in_views(MIN_VIEWS)
     typical, decisions = model.facts.median_radiance, []
@@ -97,15 +115,17 @@ def look_at_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: i
     """
     mode = model.training
     model.eval()
-    surface = _surface_points(model, pixels.sample(LOOKED_AT, gradients=False))
+    seen = _shown_surface(model, pixels.sample(LOOKED_AT, gradients=False))
+    surface = seen.observed
     decisions = []
     if plan.is_open("inter-reflection"):
         measured = self_visibility(model, plan.settings.inter_reflection, surface.position, surface.normal)
         decisions.append(plan.decide("inter-reflection", measured, step))
-    if plan.is_open("metals") and plan.newest("metals") is None:
-        decisions.append(
-            plan.decide("metals", metal_evidence(model, pixels, surface.position, surface.normal), step)
-        )
+    names = frozenset(name for name in JUDGED if plan.is_open(name))
+    found = material_evidence(model, pixels, surface.position, surface.normal, names) if names else {}
+    decisions += [plan.decide(name, measured, step) for name, measured in found.items()]
+    if plan.is_open("joint-stage") and has_material(step, plan.settings.train):
+        decisions.append(plan.decide("joint-stage", shading_disagreement(model, seen), step))
     model.train(mode)
     return decisions
 
@@ -128,12 +148,15 @@ def after_fit(plan: Plan, found: Evidence | None, lit: int, step: int) -> list[D
     return plan.decisions[-1:]
 
 
-def _surface_points(model: NeilfModel, pixels: PixelBatch) -> SurfacePoints:
+def _shown_surface(model: NeilfModel, pixels: PixelBatch) -> ShownSurface:
     pixels = pixels[torch.nonzero(pixels.mask > 0.5)[:, 0]]
-    places, normals = [pixels.origins[:0]], [pixels.origins[:0]]
+    parts = []
     for start in range(0, len(pixels), AT_ONCE):
-        hits = model.host.render(pixels[start : start + AT_ONCE].rays)
-        hits = hits[torch.nonzero(hits.is_hit(model.config.shading.hit_share))[:, 0]]
-        places.append(hits.position)
-        normals.append(model.shading_normals(hits.position, hits.normal))
-    return SurfacePoints(torch.cat(places), torch.cat(normals))
+        part = pixels[start : start + AT_ONCE]
+        hits = model.host.render(part.rays)
+        rows = torch.nonzero(hits.is_hit(model.config.shading.hit_share))[:, 0]
+        hits, part = hits[rows], part[rows]
+        normal = model.shading_normals(hits.position, hits.normal)
+        parts.append((hits.position, normal, -part.directions, part.color, hits.color))
+    joined = [torch.cat(column) for column in zip(*parts, strict=True)] or [pixels.color[:0]] * 5
+    return ShownSurface(Observed(*joined[:4]), joined[4])

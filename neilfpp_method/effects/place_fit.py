@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -24,7 +25,7 @@ from neilfpp_method.lighting.transport import Transport, from_texels_at
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import Material, SceneTracer
 
-__all__ = ["PlaceFit", "fit_places", "place_errors", "place_transport"]
+__all__ = ["PlaceFit", "any_map", "fit_places", "place_errors", "place_transport"]
 
 ROUGHNESSES = (0.08, 0.14, 0.2, 0.28, 0.36, 0.45, 0.55, 0.66, 0.8, 1.0)
 """Of the grid; the lobe's width changes by about a half from one to the next."""
@@ -93,6 +94,11 @@ def place_transport(places: Places, lobe: Lobe, scene: SceneTracer | None) -> Tr
     return Transport(sources, scene_light)
 
 
+def any_map(log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+    """A map whose texels and channels have nothing to do with each other."""
+    return log_radiance
+
+
 def fit_places(
     places: Places,
     transport: Transport,
@@ -101,6 +107,7 @@ def fit_places(
     mean_base_color: float | None = None,
     start: PlaceFit | None = None,
     rounds: int = ROUNDS,
+    form: Callable[[Float[Tensor, "3 H W"]], Float[Tensor, "3 H W"]] = any_map,
 ) -> PlaceFit:
     """Light and materials of places.
 
@@ -112,13 +119,14 @@ def fit_places(
         mean_base_color: where the geometric mean over places and channels is held; none: it is free.
         start: what the search starts from; none: grey paint under an even light.
         rounds: turns of light and material.
+        form: makes the map of log radiance from as many unknowns.
     """
     held = START_BASE_COLOR if mean_base_color is None else mean_base_color
     fit = _even_start(places, typical, held) if start is None else start
     near = _neighbours(places)
     for turn in range(rounds):
         steps = FIRST_STEPS if start is None and turn == 0 else STEPS
-        fit = _better_light(fit, places, transport, typical, steps, mean_base_color)
+        fit = _better_light(fit, places, transport, typical, steps, mean_base_color, form)
         fit = _best_material(fit, places, transport, typical, METALLICS if metals else METALLICS[:1], near)
     return fit
 
@@ -177,6 +185,7 @@ def _better_light(
     typical: float,
     steps: int,
     mean_base_color: float | None,
+    form: Callable[[Tensor], Tensor],
 ) -> PlaceFit:
     """The light by descent, and the base colours with it, at the roughness and metallic that places have."""
     shown = _at_roughness(transport, fit.roughness[places.place])
@@ -189,7 +198,7 @@ def _better_light(
     with torch.enable_grad():
         for _ in range(steps):
             base_color = fit.base_color * gain.exp()
-            sent = (flat @ log_radiance.exp().flatten(1).t()).view_as(shown.scene) + shown.scene
+            sent = (flat @ form(log_radiance).exp().flatten(1).t()).view_as(shown.scene) + shown.scene
             error = _relative_error(
                 _outgoing(sent, base_color.clamp(0, 1)[places.place], metallic), places, typical
             )
@@ -203,7 +212,7 @@ def _better_light(
             loss.backward()
             optimizer.step()
     base_color = (fit.base_color * gain.detach().exp()).clamp(MIN_BASE_COLOR, 1)
-    return PlaceFit(log_radiance.detach(), base_color, fit.roughness, fit.metallic)
+    return PlaceFit(form(log_radiance).detach(), base_color, fit.roughness, fit.metallic)
 
 
 def _log_mean(base_color: Float[Tensor, "P 3"]) -> Float[Tensor, ""]:

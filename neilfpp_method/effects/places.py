@@ -12,8 +12,9 @@ from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.views import project
+from neilfpp_method.fields.exposure import at_mean_exposure
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.shading.color import srgb_to_linear
+from neilfpp_method.shading.color import CLIPPED, srgb_to_linear
 from neilfpp_method.structures import Observed
 
 __all__ = ["Places", "gather_places"]
@@ -24,8 +25,6 @@ MAX_OFFSET = 2.5
 """Distance, in pixels, at which a pixel still shows the same place."""
 SAME_NORMAL = 0.9
 """Cosine between the normal at a place and at what a pixel shows of it."""
-CLIPPED = 0.99
-"""Display values from here on may be cut off: they say only that the place is bright."""
 
 
 @dataclass(frozen=True)
@@ -101,10 +100,10 @@ def gather_places(
             & ((shaded * normal[place]).sum(-1) > SAME_NORMAL)
             & ((shaded * -batch.directions).sum(-1) > MIN_COSINE)
         )
-        linear = batch.color
+        linear = at_mean_exposure(model.gains, batch.color, batch.view, model.facts.response)
         if model.facts.response == "srgb":
             same = same & (batch.color.amax(-1) < CLIPPED)
-            linear = srgb_to_linear(batch.color)
+            linear = srgb_to_linear(linear)
         kept = torch.nonzero(same)[:, 0]
         observed = Observed(hits.position[kept], shaded[kept], -batch.directions[kept], linear[kept])
         found.append(Places(len(position), place[kept], torch.full_like(kept, number), observed))

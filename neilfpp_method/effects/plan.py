@@ -95,6 +95,7 @@ class Plan:
                 plan.decisions.append(Decision(0, name, False, "settings", "off in the settings"))
             elif effect.unjudged(settings):
                 plan.decisions.append(Decision(0, name, True, "settings", effect.unjudged(settings)))
+        plan._leave_out_what_needs_others()
         return plan
 
     @property
@@ -123,15 +124,26 @@ class Plan:
         newest = self.newest(name)
         return newest is None or newest.by == "evidence"
 
+    def _leave_out_what_needs_others(self) -> None:
+        """Decide against what there is none of without an effect that is off."""
+        for name, effect in EFFECTS.items():
+            cause = self.newest(effect.needs) if effect.needs else None
+            if cause is None or cause.on or not self.is_on(name) or effect.obstacle(self.settings):
+                continue
+            why = f"there is none without {effect.needs}"
+            self.decisions.append(Decision(0, name, False, cause.by, why))
+
     def decide(self, name: str, measured: Measurement, step: int, must_be_earned: bool = False) -> Decision:
         """Decide an open effect by evidence, from now on; without enough samples it stays as it is.
 
-        `must_be_earned`: it counts as off so far, whatever the settings say.
+        Where evidence only advises (`Effect.advised`), it is noted, and the effect stays as it is.
+        `must_be_earned`: the effect counts as off so far, whatever the settings say.
         """
         before = self.is_on(name)
         favoured = measured.favours(before and not must_be_earned)
-        on = before if favoured is None else favoured
-        reason = measured.in_words()
+        advised = EFFECTS[name].advised
+        on = before if favoured is None or advised else favoured
+        reason = f"{measured.in_words()}; advice, it stays as it is" if advised else measured.in_words()
         if favoured is None:
             reason = f"{measured.samples} samples are too few to say anything of {measured.what}"
         elif self.newest(name) is not None and on != before:

@@ -50,6 +50,8 @@ def _ratio(title: str) -> Entry:
     return Entry(title, "%.2f", "lower", meaning)
 
 
+EXPOSED = "New views times the factor per channel that brings each closest, as their exposure is unknown."
+
 ENTRIES: Mapping[str, Entry] = {
     "volume_psnr": _decibels(
         "Image, volume rendering", "New views as the outgoing radiance field shows them, tone-mapped."
@@ -59,6 +61,14 @@ ENTRIES: Mapping[str, Entry] = {
     ),
     "volume_psnr_linear": _decibels(
         "Image, volume rendering, linear", "On linear radiance, where highlights weigh most."
+    ),
+    "volume_psnr_exposed": _decibels(
+        "Image, volume rendering, exposed alike",
+        EXPOSED,
+    ),
+    "pbr_psnr_exposed": _decibels(
+        "Image, rendering equation, exposed alike",
+        EXPOSED,
     ),
     "pbr_psnr": _decibels(
         "Image, rendering equation", "New views rendered from material and incident light, tone-mapped."

@@ -59,8 +59,9 @@ class Comparison:
 
 @dataclass(frozen=True)
 class ComparedMap:
-    """One map over all shown views, by its name in `model.Maps`. `largest` is the error at the bright end of
-    its scale, `unit` that of the error.
+    """One map over all shown views, by its name in `structures.Maps`.
+
+    `largest` is the error at the bright end of its scale, `unit` that of the error.
     """
 
     name: str

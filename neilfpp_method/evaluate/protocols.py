@@ -6,6 +6,8 @@ figure without it.
 
     volume_psnr, pbr_psnr, *_ssim     R and the rendering equation against the image, clipped, sRGB-encoded
     *_psnr_linear                     the same on linear radiance, peak 1, HDR captures
+    *_psnr_exposed                    with the least-squares gain of each new view and channel, where
+                                      photographs have gains
     base_color_psnr, _gamma, _scaled  as estimated; with one gamma; with a least-squares factor per channel
     roughness_psnr, metallic_psnr     as estimated
     *_frame                           the same over the whole frame, the background counted as free of error
@@ -48,7 +50,7 @@ from neilfpp_method.export.mesh import extract_mesh
 from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.hosts.base import HasSdf
 from neilfpp_method.hosts.volsdf import HIT_RADIUS
-from neilfpp_method.shading.color import tone_map
+from neilfpp_method.shading.color import CLIPPED, srgb_to_linear, tone_map
 from neilfpp_method.train.health_record import read_findings
 from neilfpp_method.train.run import Run, write_json
 
@@ -149,9 +151,30 @@ def image_metrics(run: Run, pairs: Pairs) -> dict[str, float]:
             scores[f"{name}_psnr"].append(metrics.psnr(estimate, image, known.mask))
             if min(known.mask.shape) >= metrics.SSIM_WINDOW:
                 scores[f"{name}_ssim"].append(metrics.ssim(estimate, image, known.mask))
+            if run.model.gains is not None:
+                exposed = exposed_alike(view.maps[key], known.image, known.mask, run.facts.response)
+                scores[f"{name}_psnr_exposed"].append(metrics.psnr(_tone_mapped(exposed), image, known.mask))
             if run.capture.hdr:
                 scores[f"{name}_psnr_linear"].append(metrics.psnr(view.maps[key], known.image, known.mask))
     return scores.means()
+
+
+def exposed_alike(
+    estimate: Float[np.ndarray, "H W 3"],
+    image: Float[np.ndarray, "H W 3"],
+    mask: Bool[np.ndarray, "H W"],
+    response: str,
+) -> Float[np.ndarray, "H W 3"]:
+    """Radiance as the camera of a view saw it: times one factor per channel, the best in least squares of
+    linear values over the masked pixels that are not clipped. A new view has a gain that no training knows.
+    """
+    pixels = image[mask].astype(np.float64)
+    counts = np.ones(len(pixels), dtype=bool)
+    if response == "srgb":
+        counts = pixels.max(-1) < CLIPPED
+        pixels = srgb_to_linear(torch.from_numpy(pixels)).numpy()
+    gain = metrics.align_scale(estimate[mask][counts], pixels[counts])
+    return (estimate * gain).astype(np.float32)
 
 
 def material_metrics(run: Run, pairs: Pairs) -> dict[str, float]:

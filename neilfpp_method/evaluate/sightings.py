@@ -12,6 +12,7 @@ from torch import Tensor
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.views import Camera, project
+from neilfpp_method.fields.exposure import at_mean_exposure
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.structures import Indexable, PixelBatch, RayBatch
 
@@ -86,11 +87,10 @@ class TrainingViews:
             kept = (index >= 0) & usable[index] & ((direction * normal[rows]).sum(-1) > MIN_COSINE)
             rows, direction, distance, index = rows[kept], direction[kept], distance[kept], index[kept]
             free = _nothing_between(model, self.centres[i], position[rows], direction, distance)
-            rows, slot = rows[free], seen[rows[free]].sum(1)
-            seen[rows, slot], wo[rows, slot], pixel[rows, slot] = (
-                True,
-                direction[free],
-                view.color[index[free]],
+            rows, slot, index = rows[free], seen[rows[free]].sum(1), index[free]
+            seen[rows, slot], wo[rows, slot] = True, direction[free]
+            pixel[rows, slot] = at_mean_exposure(
+                model.gains, view.color[index], view.view[index], model.facts.response
             )
         return Sightings(seen, wo, pixel)
 

@@ -15,8 +15,8 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import View, camera_rays, project
 from neilfpp_method.errors import UserError
-from neilfpp_method.model import Maps
 from neilfpp_method.shading.color import srgb_to_linear
+from neilfpp_method.structures import Maps
 from neilfpp_method.train.run import Run
 
 __all__ = [
@@ -37,7 +37,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class RenderedView:
-    """The maps of one view by their names in `model.Maps`, each (H, W, C) float32. Colours are linear."""
+    """The maps of one view by their names in `structures.Maps`, (H, W, C) float32. Colours are linear."""
 
     name: str
     maps: Mapping[str, Float[np.ndarray, "H W C"]]

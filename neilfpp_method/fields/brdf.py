@@ -32,12 +32,13 @@ class BrdfSample:
 class BrdfField(nn.Module):
     """Every parameter is ½ + ½ tanh of a network output; roughness starts near ½, the others as set.
 
-    `metals` off: metallic is 0 everywhere, with no gradient.
+    `metals` off: metallic is 0 everywhere, with no gradient. `varying_roughness` off: roughness is the same
+    everywhere, and is learned as the bias of its output; switched on again, it goes on from there.
     """
 
     def __init__(self, config: BrdfConfig, encoding: FrequencyConfig | HashGridConfig, radius: float) -> None:
         super().__init__()
-        self.metals = config.metals
+        self.use(config)
         self.encoding = position_encoding(encoding, radius)
         # Sines reach the detail that six octaves do not; a grid has it already (NeILF++ §5).
         activation = "sine" if isinstance(encoding, FrequencyConfig) else "relu"
@@ -50,6 +51,10 @@ class BrdfField(nn.Module):
             self.mlp.layers[-1].bias[:3] = math.atanh(2 * config.initial_base_color - 1)
             self.mlp.layers[-1].bias[4] = math.atanh(2 * config.initial_metallic - 1)
 
+    def use(self, config: BrdfConfig) -> None:
+        """Whether there are metals, and whether roughness varies, from now on."""
+        self.metals, self.varying_roughness = config.metals, config.varying_roughness
+
     def forward(self, x: Float[Tensor, "N 3"]) -> Material:
         return self._material(torch.tanh(self.mlp(self.encoding(x))))
 
@@ -61,7 +66,9 @@ class BrdfField(nn.Module):
         slope = 0.5 * (1 - saturation[:, 3:].square())
         roughness, metallic = (slope[..., None] * pull_back(sample.gradient, encoded)).unbind(1)
         return BrdfSample(
-            self._material(saturation), roughness, metallic if self.metals else torch.zeros_like(metallic)
+            self._material(saturation),
+            roughness if self.varying_roughness else torch.zeros_like(roughness),
+            metallic if self.metals else torch.zeros_like(metallic),
         )
 
     @torch.no_grad()
@@ -72,4 +79,6 @@ class BrdfField(nn.Module):
 
     def _material(self, saturation: Float[Tensor, "N 5"]) -> Material:
         base_color, roughness, metallic = (0.5 + 0.5 * saturation).split((3, 1, 1), -1)
+        if not self.varying_roughness:
+            roughness = (0.5 + 0.5 * torch.tanh(self.mlp.layers[-1].bias[3:4])).expand_as(roughness)
         return Material(base_color, roughness, metallic if self.metals else torch.zeros_like(metallic))

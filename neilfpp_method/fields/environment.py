@@ -19,12 +19,14 @@ from neilfpp_method.shading.color import luminance
 from neilfpp_method.shading.sampling import Technique
 from neilfpp_method.structures import IncidentSamples
 
-__all__ = ["EnvironmentLight", "TexelDirections"]
+__all__ = ["EVEN_ROWS", "EnvironmentLight", "TexelDirections"]
 
 UNIFORM_SHARE = 0.1
 """Share of the samples spread evenly over the sphere, so that every direction has a density."""
 MEAN_OF_CELL = (1 / 8, 3 / 4)
 """Mean over a cell of what is linear between cell middles: shares of each neighbour, and of the cell."""
+EVEN_ROWS = 16
+"""Rows of an even light: of its texels only the directions count, in which a fit looks for it."""
 MIN_RADIANCE = 1e-6
 """Of the mean of a map that is shown: what is darker counts as this, as radiance is kept as its logarithm."""
 
@@ -42,6 +44,9 @@ class EnvironmentLight(nn.Module):
 
     The map is no parameter: what surfaces send is linear in it, so `lighting` solves for it.
 
+    `even` on, the light is one colour from everywhere: all texels are alike, none is looked up, and there is
+    nothing to sample.
+
     Args:
         height: rows of the map; it has twice as many columns.
         initial_radiance: what every texel starts at.
@@ -51,8 +56,17 @@ class EnvironmentLight(nn.Module):
         super().__init__()
         self.register_buffer("log_radiance", torch.full((3, height, 2 * height), math.log(initial_radiance)))
         self.register_buffer("cos_edges", _cos_edges(height), persistent=False)
+        self.even = False
         # A map that was shown has a size that no setting knows.
         self.register_load_state_dict_pre_hook(_take_size)
+
+    @torch.no_grad()
+    def be_even(self, even: bool) -> None:
+        """From now on be one colour, the mean of the texels by their solid angles, or a map again."""
+        self.even = even
+        if even and (self.log_radiance != self.log_radiance[:, :1, :1]).any():
+            share = self._texel_solid_angles() / (4 * math.pi)
+            self.log_radiance.copy_((self.log_radiance.exp().flatten(1) @ share).log()[:, None, None])
 
     @torch.no_grad()
     def show(self, radiance: Float[Tensor, "3 H W"]) -> None:
@@ -82,10 +96,17 @@ class EnvironmentLight(nn.Module):
 
     def radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "#N S 3"]) -> Float[Tensor, "#N S 3"]:
         """Radiance > 0 from wi, whatever x; what stands between is not this model's."""
+        if self.even:
+            return self.log_radiance[:, 0, 0].exp().expand(*wi.shape[:-1], 3)
         return interpolate(self.log_radiance.exp(), wi)
 
-    def technique(self, normal: Float[Tensor, "N 3"]) -> Technique:
-        """Directions in proportion to the radiance, for points of these normals; some below horizons."""
+    def technique(self, normal: Float[Tensor, "N 3"]) -> Technique | None:
+        """Directions in proportion to the radiance, for points of these normals; some below horizons.
+
+        None for an even light, of which all directions bring the same.
+        """
+        if self.even:
+            return None
         return Technique(lambda count, stochastic: self.sample(normal, count, stochastic).wi, self.pdf)
 
     @torch.no_grad()

@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from neilfpp_method.fields.environment import EnvironmentLight
+from neilfpp_method.fields.environment import EVEN_ROWS, EnvironmentLight
 from neilfpp_method.fields.incident_light import IncidentLightField
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.settings.types import FreeLightConfig, NeilfConfig
@@ -53,4 +53,7 @@ def make_light(config: NeilfConfig, response: str, initial_radiance: float) -> L
         field = IncidentLightField(settings, config.encoding, FREE_BASE[response], initial_radiance)
         return LightModel(field, Lamps(0, LAMP_RADIUS))
     lamps = Lamps(0 if settings.kind == "distant" else MAX_LAMPS, LAMP_RADIUS)
-    return LightModel(EnvironmentLight(settings.environment_height, initial_radiance), lamps)
+    height = settings.environment_height
+    environment = EnvironmentLight(EVEN_ROWS if height == 1 else height, initial_radiance)
+    environment.be_even(height == 1)
+    return LightModel(environment, lamps)

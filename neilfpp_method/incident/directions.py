@@ -15,8 +15,8 @@ __all__ = ["directions_for_viewers", "draw_directions"]
 BY_COSINE, BY_LIGHT, BY_LOBE = 24, 24, 3
 """Incident directions of `directions_for_viewers`: by cosine, by the light, and by each viewer's lobe."""
 
-WITHOUT_LOBE = {"mis": "cosine", "lobe": "cosine"}
-"""A Lambertian surface has no lobe to sample: the cosine then leaves no variance but that of the light."""
+WITHOUT_LOBE = {"mis": "no_lobe", "lobe": "cosine"}
+"""A Lambertian surface has no lobe to sample."""
 
 
 def draw_directions(

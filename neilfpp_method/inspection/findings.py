@@ -14,7 +14,15 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.inspection.measure import ViewFigures, measure
 from neilfpp_method.inspection.relations import Stand, duplicates, exposure_factors, stand
 
-__all__ = ["Finding", "Inspection", "Verdict", "inspect_capture", "problems", "to_leave_out"]
+__all__ = [
+    "Finding",
+    "Inspection",
+    "Verdict",
+    "inspect_capture",
+    "problems",
+    "problems_of_poses",
+    "to_leave_out",
+]
 
 Severity = Literal["problem", "warning"]
 Quality = Literal["good", "limited", "poor"]
@@ -117,6 +125,12 @@ def problems(inspection: Inspection) -> tuple[str, ...]:
     return tuple(
         f"problem: {finding.line()}" for finding in inspection.findings if finding.severity == "problem"
     )
+
+
+def problems_of_poses(capture: Capture) -> tuple[str, ...]:
+    """As `problems`, of what cameras and points tell without a look at any pixel, so at once."""
+    found = (*_of_cameras(capture, stand(capture)), *_of_scene(capture))
+    return tuple(f"problem: {finding.line()}" for finding in found if finding.severity == "problem")
 
 
 def to_leave_out(inspection: Inspection) -> Mapping[str, str]:

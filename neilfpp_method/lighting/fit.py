@@ -100,7 +100,9 @@ def fit_light(start: Light, carried: Transport, target: Target, objective: Objec
         return start
     config, unit = objective.config, objective.unit
     texels = start.log_radiance[0].numel()
-    log_radiance = start.log_radiance.clone().requires_grad_()
+    channels = start.log_radiance.clone()
+    log_radiance = channels.mean(0, keepdim=True) if objective.monochrome else channels
+    log_radiance.requires_grad_()
     # In units of a lamp's mean contribution to a white surface, so that its unknowns have one size.
     brought = carried.sources[0, :, texels:].mean(0)[:, None] / unit
     reaches = brought > MIN_REACH * brought.mean()
@@ -114,13 +116,14 @@ def fit_light(start: Light, carried: Transport, target: Target, objective: Objec
     set_by_images = ((visible_share > MIN_VISIBLE_SHARE) | (reaching_any >= texels))[:, None]
 
     def light() -> Light:
-        return Light(log_radiance, torch.where(reaches, root.square() / brought.clamp_min(1e-20), 0.0))
+        colored = log_radiance.expand_as(start.log_radiance)
+        return Light(colored, torch.where(reaches, root.square() / brought.clamp_min(1e-20), 0.0))
 
     def loss_of(gain: Float[Tensor, "#N 3"]) -> Float[Tensor, ""]:
         strength = light().strength()[reaching_any]
         strength = torch.where(set_by_images, strength, strength.detach())
         loss = objective.misfit(strength, carried, target, gain)
-        loss = loss + objective.unlikely(log_radiance)
+        loss = loss + objective.unlikely(log_radiance.expand_as(start.log_radiance))
         return loss + objective.price(unit * root.square().mean(-1), mean_transport @ strength)
 
     unknowns = (Unknown(log_radiance, RATE), Unknown(root, ROOT_RATE * RATE))

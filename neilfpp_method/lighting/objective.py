@@ -17,7 +17,7 @@ from torch.nn import functional
 from neilfpp_method.lighting.sky import KnownSky
 from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.settings.types import LightFitConfig
-from neilfpp_method.shading.color import apply_response, response_slope
+from neilfpp_method.shading.color import residual, response_slope
 from neilfpp_method.structures import Indexable, Material
 
 __all__ = [
@@ -74,12 +74,14 @@ class Objective:
             this.
         config: the weights.
         sky: what cameras saw of the light itself; none where they saw nothing of it.
+        monochrome: the map has one channel for all three colours.
     """
 
     response: str
     unit: float
     config: LightFitConfig
     sky: KnownSky | None = None
+    monochrome: bool = False
 
     def relative_error(
         self,
@@ -89,12 +91,12 @@ class Objective:
         gain: Float[Tensor, "#N 3"] | float,
     ) -> Float[Tensor, "N 3"]:
         """How far radiance is off, of itself: what the camera stores of the points, their base colour times
-        `gain`, against their pixels.
+        `gain`, against their pixels; a clipped one is a lower bound.
         """
         material = target.material
         tinted = Material((material.base_color * gain).clamp(0, 1), material.roughness, material.metallic)
-        shown = apply_response(carried.outgoing(tinted, strength), self.response)
-        return (shown - target.pixel) / error_unit(target.pixel, self.response, self.unit)
+        off = residual(carried.outgoing(tinted, strength), target.pixel, self.response)
+        return off / error_unit(target.pixel, self.response, self.unit)
 
     def misfit(
         self, strength: Float[Tensor, "T 3"], carried: Transport, target: Target, gain: Float[Tensor, "#N 3"]

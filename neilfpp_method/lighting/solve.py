@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from neilfpp_method.fields.environment import EVEN_ROWS
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.candidates import merge, propose
 from neilfpp_method.lighting.fit import Evidence, Light, compare, evidence, fit_light
@@ -64,8 +65,12 @@ def solve_light(
     target = Target(observed.position, material, observed.pixel)
     dark = environment.log_radiance.new_zeros(0, 3)
     if config.map is None:
-        sought = environment.log_radiance
-        texels = from_texels(environment, observed, material.roughness, lobe, scene)
+        # An even light is one source, and one texel that stands for all.
+        even = environment.even
+        sought = environment.log_radiance[:, :1, :1] if even else environment.log_radiance
+        seen = environment.at_most(EVEN_ROWS) if even else environment
+        texels = from_texels(seen, observed, material.roughness, lobe, scene)
+        texels = texels.together() if even else texels
     else:
         sought = environment.log_radiance.new_zeros(3, 0, 0)
         known = environment.at_most(KNOWN_ROWS)

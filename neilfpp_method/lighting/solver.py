@@ -126,7 +126,8 @@ class MapSolver(nn.Module):
         self.memory = SurfaceMemory(config.fit.points, config.fit.every)
         # Only a background that is no backdrop shows the light, and only an unknown map must match it.
         sightings = config.map is None and facts.background == "inverted_sphere"
-        self.sky = SkySightings(config.environment_height, facts.response) if sightings else None
+        rows = light.light.log_radiance.shape[1]
+        self.sky = SkySightings(rows, facts.response) if sightings else None
 
     @property
     def due(self) -> bool:
@@ -149,7 +150,8 @@ class MapSolver(nn.Module):
     @property
     def seeks_start(self) -> bool:
         """As of `LightSolver`."""
-        return self.config.map is None and self.memory.age is None and self.points == 0
+        sought = self.config.map is None and not self.light.light.even
+        return sought and self.memory.age is None and self.points == 0
 
     @torch.no_grad()
     def start(self, observed: Observed, material: Material, scene: SceneTracer | None) -> Evidence | None:
@@ -184,8 +186,15 @@ class MapSolver(nn.Module):
         benefit_of_doubt: bool = False,
     ) -> Evidence | None:
         sky = None if self.sky is None else self.sky.known()
-        objective = Objective(self.response, self.unit, self.config.fit, sky)
-        return solve_light(
+        environment = self.light.light
+        objective = Objective(
+            self.response,
+            self.unit,
+            self.config.fit,
+            None if environment.even else sky,
+            self.config.monochrome,
+        )
+        found = solve_light(
             self.light,
             observed,
             material,
@@ -196,6 +205,9 @@ class MapSolver(nn.Module):
             first,
             benefit_of_doubt,
         )
+        if environment.even:
+            environment.log_radiance.copy_(environment.log_radiance[:, :1, :1].clone())
+        return found
 
 
 def make_light_solver(

@@ -50,6 +50,10 @@ class Transport:
         """From some of the sources."""
         return Transport(self.sources[..., sources], self.scene)
 
+    def together(self) -> Transport:
+        """One source: all of them, where they are equally strong."""
+        return Transport(self.sources.sum(-1, keepdim=True), self.scene)
+
     def beside(self, other: Transport) -> Transport:
         """Both sets of sources."""
         return Transport(torch.cat((self.sources, other.sources), -1), self.scene + other.scene)

@@ -28,7 +28,7 @@ from neilfpp_method.hosts.foreign import ForeignHost, proxy_for
 from neilfpp_method.hosts.nerfstudio import OWN_LOSSES, NerfstudioHost
 from neilfpp_method.hosts.proxy import SurfaceProxy
 from neilfpp_method.lighting.fit import Evidence
-from neilfpp_method.model import Maps, NeilfModel
+from neilfpp_method.model import NeilfModel
 from neilfpp_method.plugin.datamanager import PIXELS, VALID, pixel_batch
 from neilfpp_method.plugin.foreign import build_foreign
 from neilfpp_method.plugin.record import RunRecord, no_record
@@ -37,10 +37,10 @@ from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.color import apply_response, tone_map
 from neilfpp_method.shading.sampling import sample_directions
-from neilfpp_method.structures import RayBatch, StepResult
+from neilfpp_method.structures import Maps, RayBatch, StepResult
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.health_record import write_findings
-from neilfpp_method.train.loop import adam, seed_step, set_rates
+from neilfpp_method.train.optimizer import adam, seed_step, set_rates
 
 __all__ = ["FieldAdamConfig", "NeilfMethod", "NeilfMethodConfig"]
 
@@ -53,7 +53,7 @@ class FieldAdamConfig(OptimizerConfig):
     """The field."""
 
     def setup(self, params: list[nn.Parameter]) -> torch.optim.Optimizer:
-        """Adam, as in `train.loop.make_optimizer`."""
+        """Adam, as in `train.optimizer.make_optimizer`."""
         return adam([{"params": params, "name": self.name, "lr": self.lr}])
 
 

@@ -17,7 +17,7 @@ from neilfpp_method.plugin.dataparser import CaptureParserConfig
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.health_record import write_findings
-from neilfpp_method.train.loop import make_optimizer
+from neilfpp_method.train.optimizer import make_optimizer
 from neilfpp_method.train.run import BESIDE_NERFSTUDIO, CaptureSource, create_run, save_checkpoint
 
 __all__ = ["RunRecord", "no_record"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,6 +15,7 @@ from neilfpp_method.settings.plain import to_dict
 from neilfpp_method.settings.presets import PRESETS, fixed_geometry, free_light
 from neilfpp_method.settings.types import MeshConfig, NeilfConfig
 from neilfpp_method.train.health_record import read_findings
+from neilfpp_method.train.quality import Look, read_looks
 from neilfpp_method.train.run import read_description, read_json
 from neilfpp_method.train.work_record import read_work
 
@@ -44,6 +45,7 @@ class Files:
         measured: figures by protocol; empty where `neilfpp eval` was not called.
         timing: seconds of each stage.
         work: seconds of each stage by kind of work.
+        looks: at held-back pixels, on the way.
         effects: a row per effect, as `effects.json` has them.
         machine: versions and hardware.
         notes: what could not be read.
@@ -56,6 +58,7 @@ class Files:
     measured: Mapping[str, Measured]
     timing: Mapping[str, float]
     work: Mapping[str, Mapping[str, float]]
+    looks: Sequence[Look]
     effects: list[Mapping[str, Any]]
     machine: Mapping[str, Any]
     notes: list[str]
@@ -91,6 +94,7 @@ def read_files(path: Path) -> Files:
         measured=measured,
         timing=numbers(optional("timing.json")),
         work=tried(lambda: read_work(path), {}),
+        looks=tried(lambda: read_looks(path), []),
         effects=[row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else [],
         machine=optional("environment.json"),
         notes=notes,

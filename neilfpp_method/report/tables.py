@@ -7,8 +7,10 @@ from typing import Any
 
 from neilfpp_method.evaluate.glossary import explain
 from neilfpp_method.health.cases import Finding, verdict_of
+from neilfpp_method.report.curves import quality_curve, work_bars
 from neilfpp_method.report.files import Changed
 from neilfpp_method.report.markup import Html, cell, element, joined, table
+from neilfpp_method.train.quality import Look
 
 __all__ = [
     "STAGE_TITLES",
@@ -110,9 +112,12 @@ def figures_section(metrics: Mapping[str, float], said: str) -> Html:
 
 
 def time_section(
-    timing: Mapping[str, float], work: Mapping[str, Mapping[str, float]], previews: Sequence[tuple[str, str]]
+    timing: Mapping[str, float],
+    work: Mapping[str, Mapping[str, float]],
+    looks: Sequence[Look],
+    previews: Sequence[tuple[str, str]],
 ) -> Html:
-    """Seconds of each stage, what they went to, and a picture at the end of each."""
+    """Seconds of each stage, what they went to, what they bought, and a picture at the end of each."""
     stages = {stage: sum(parts.values()) for stage, parts in work.items()} or dict(timing)
     if not stages:
         return element("p", "No stage has been timed.")
@@ -149,7 +154,14 @@ def time_section(
         )
         for stage, address in previews
     )
-    return joined(table(("stage", "time", "", "most of it"), *rows), *pictures)
+    times = table(("stage", "time", "", "most of it"), *rows)
+    curve = quality_curve(looks)
+    said = (
+        "Quality on the way, at small patches of training views that no step learns from:" if curve else None
+    )
+    return joined(
+        times, work_bars(work, STAGE_TITLES), said and element("p", said, class_="pale"), curve, *pictures
+    )
 
 
 def _most(parts: Mapping[str, float]) -> str:

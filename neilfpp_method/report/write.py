@@ -134,7 +134,7 @@ def _without_model(files: Files) -> str:
 
 def _from_files(files: Files) -> list[tuple[str, str, Html]]:
     return [
-        ("time", "Time", tables.time_section(files.timing, files.work, _previews(files.path))),
+        ("time", "Time", tables.time_section(files.timing, files.work, files.looks, _previews(files.path))),
         ("effects", "Effects", tables.effects_section(files.effects)),
         (
             "settings",

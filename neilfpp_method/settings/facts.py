@@ -24,6 +24,8 @@ class SceneFacts:
         background_color: linear RGB of a constant background, and what an inverted sphere starts as.
         far_points: points of the scene reach far beyond its box, to walls and trees: what lies behind has a
             shape.
+        log_gains: natural logarithms of how much brighter the training views are than their mean, red, green
+            and blue of view after view; none: all are exposed alike.
     """
 
     response: str
@@ -32,6 +34,7 @@ class SceneFacts:
     background: str
     background_color: tuple[float, float, float] = (0.0, 0.0, 0.0)
     far_points: bool = False
+    log_gains: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

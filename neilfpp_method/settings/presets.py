@@ -9,8 +9,10 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.types import FrequencyConfig, MeshConfig, NeilfConfig
 
-__all__ = ["PRESETS", "fixed_geometry", "free_light", "preset"]
+__all__ = ["EXPOSURE_RATE", "PRESETS", "fixed_geometry", "free_light", "preset"]
 
+EXPOSURE_RATE = 1e-3
+"""Learning rate of log gains of photographs where they are switched on: a percent takes ten steps."""
 SINE_FREQUENCY = 30.0
 """ω of the sine layers sin(ω (W x + b)) of B and L. In the published code ω is part of W and b, so that a
 step of Adam there is one of 1/ω here.
@@ -70,7 +72,7 @@ PAPER_NGP: Mapping[str, Any] = {
 
 
 def paper_ngp() -> NeilfConfig:
-    """The published hash-grid setting for display images: 40k steps, 4 h on a V100; needs a point cloud."""
+    """The published hash-grid setting for display images: 40k steps, 4 h on a V100; made for point clouds."""
     return changed(paper_mlp(), PAPER_NGP)
 
 
@@ -144,6 +146,7 @@ FAST: Mapping[str, Any] = {
     "loss.hessian_joint": 1.6e-3,
     "loss.surface": 1e-2,
     "loss.surface_joint": 1e-3,
+    "loss.point_cloud": 0.1,
     "loss.mask": 0.1,
     "loss.smoothness": 0.0,
     "loss.lambertian": 0.0,
@@ -156,6 +159,7 @@ FAST: Mapping[str, Any] = {
     "optimizer.light": 3e-2,
     "optimizer.background": 1e-3,
     "optimizer.beta": 1e-3,
+    "optimizer.exposure": EXPOSURE_RATE,
     "optimizer.joint": 0.1,
     "optimizer.background_from": 0.5,
     "train.sdf_steps": 2_000,

@@ -87,6 +87,8 @@ class BrdfConfig:
     """Initial metallic. Most surfaces are no metals; light found under metals is too weak for others."""
     metals: bool = True
     """Whether there may be metal; off, metallic is 0 everywhere."""
+    varying_roughness: bool = True
+    """Whether roughness is a field; off, the whole scene has one, which is learned."""
     layers: int = 8
     """Hidden layers."""
     width: int = 512
@@ -126,7 +128,9 @@ class MapLightConfig:
     them.
     """
     environment_height: int = 32
-    """Rows of the environment map; it has twice as many columns."""
+    """Rows of the environment map; it has twice as many columns. 1: one colour from everywhere."""
+    monochrome: bool = False
+    """One channel for all three colours; lamps keep theirs."""
     map: str | None = None
     """An environment map that is known, a linear EXR in the layout of docs/light.md; none: the map is
     recovered. Lamps before it are sought where `kind` says so.
@@ -151,7 +155,7 @@ class FreeLightConfig:
     width: int = 128
     """Units of a hidden layer."""
     monochrome: bool = False
-    """One channel for all three colours, for LDR input."""
+    """One channel for all three colours; lamps keep theirs."""
 
 
 IncidentLightConfig = Annotated[FreeLightConfig | MapLightConfig, tyro.conf.AvoidSubcommands]
@@ -236,9 +240,9 @@ class ShadingConfig:
     """Distribution and masking of the specular lobe."""
     specular: bool = True
     """Off: a Lambertian surface; roughness and metallic are not asked for."""
-    sampler: Literal["fibonacci", "cosine", "lobe", "mis"] = "fibonacci"
-    """Who draws the incident directions: the paper's lattice, a cosine, the specular lobe, or cosine, lobe
-    and (where it can be sampled) light together by the balance heuristic.
+    sampler: Literal["fibonacci", "cosine", "lobe", "mis", "no_lobe"] = "fibonacci"
+    """Who draws the incident directions: the paper's lattice, a cosine, the specular lobe; mis: cosine, lobe
+    and (where it can be sampled) light by the balance heuristic; no_lobe: cosine and light.
     """
     train_samples: int = 128
     """Incident directions per point in training."""
@@ -311,6 +315,8 @@ class OptimizerConfig:
     light: float = 1e-3
     background: float = 1e-3
     beta: float = 1e-3
+    exposure: float = 0.0
+    """Of log gains of photographs, where evidence calls for them; 0: all are taken to be exposed alike."""
     joint: float = 1.0
     """Factor on all rates in the joint stage."""
     final: tuple[float, float, float] = (0.1, 0.1, 0.1)
@@ -321,8 +327,7 @@ class OptimizerConfig:
     """Steps at the start of each stage in which the rate rises from a tenth."""
     background_from: float = 0.0
     """Share of SDF init that is over when the field beyond the scene starts to move. Until then it is the
-    colour that it starts as, so that what lies within the scene is made of surfaces: a field that is seen
-    from everywhere can paint it as well.
+    colour that it starts as: a field that is seen from everywhere can paint the scene as well.
     """
 
 

@@ -8,10 +8,24 @@ from torch import Tensor
 
 from neilfpp_method.errors import UserError
 
-__all__ = ["apply_response", "linear_to_srgb", "luminance", "response_slope", "srgb_to_linear", "tone_map"]
+__all__ = [
+    "CLIPPED",
+    "apply_response",
+    "at_common_exposure",
+    "linear_to_srgb",
+    "luminance",
+    "residual",
+    "response_slope",
+    "srgb_to_linear",
+    "tone_map",
+]
 
 KNEE = 0.04045
 """The pixel at which the sRGB curve goes over from a line to a power."""
+CLIPPED = 0.99
+"""Display values from here on may be cut off: they say only that radiance is at least so much. The encoders
+of cameras leave clipped areas two or three of 255 levels below white.
+"""
 
 
 def linear_to_srgb(color: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
@@ -44,6 +58,43 @@ def apply_response(color: Float[Tensor, "*shape"], response: str) -> Float[Tenso
     if response == "srgb":
         return tone_map(color)
     raise UserError(f"unknown response '{response}'", "choose linear or srgb")
+
+
+def residual(
+    radiance: Float[Tensor, "*shape"], pixel: Float[Tensor, "*shape"], response: str
+) -> Float[Tensor, "*shape"]:
+    """What the camera would store of a radiance, were its range endless, less what it stored.
+
+    A display value that may be clipped is a lower bound: there the residual of a brighter radiance is 0, and
+    so is its gradient. Elsewhere radiance beyond the camera's range is off by how far it lies beyond, and has
+    a gradient that leads back.
+
+    Example:
+        >>> residual(torch.tensor([4.0, 1.0]), torch.tensor([1.0, 0.5]), "srgb")
+        tensor([0.0000, 0.5000])
+    """
+    if response == "linear":
+        return radiance - pixel
+    off = linear_to_srgb(radiance.clamp_min(0)) - pixel
+    return torch.where(pixel >= CLIPPED, off.clamp_max(0), off)
+
+
+def at_common_exposure(
+    pixel: Float[Tensor, "*shape"], gain: Float[Tensor, "#*shape"], response: str
+) -> Float[Tensor, "*shape"]:
+    """What a camera of gain 1 would have stored, were its range endless, in place of one of another gain.
+
+    A display value that may be clipped stays one, whatever the gain: it remains a lower bound.
+
+    Args:
+        pixel: in the capture's response.
+        gain: what the camera multiplied radiance by.
+        response: "linear" or "srgb".
+    """
+    if response == "linear":
+        return pixel / gain
+    common = linear_to_srgb(srgb_to_linear(pixel) / gain)
+    return torch.where(pixel >= CLIPPED, common.clamp_min(1), common)
 
 
 def response_slope(pixel: Float[Tensor, "*shape"], response: str) -> Float[Tensor, "*shape"]:

@@ -185,9 +185,10 @@ def sample_directions(
     stochastic: bool,
     light: Technique | None = None,
 ) -> IncidentSamples:
-    """`count` incident directions per point, in at least float32, by fibonacci, cosine, lobe or mis.
+    """`count` incident directions per point, in at least float32, by fibonacci, cosine, lobe, mis or no_lobe.
 
     mis: half cosine and half lobe or, with a `light` that can be sampled, cosine, lobe and light.
+    no_lobe: half cosine and half light, or the cosine alone.
 
     Raises:
         UserError: there is no such sampler.
@@ -206,6 +207,10 @@ def sample_directions(
             (specular_lobe(n, wo, roughness, lobe), to_lobe),
         ]
         techniques += [(light, to_light)] if light is not None else []
+    elif kind == "no_lobe":
+        to_light = 0 if light is None else int(LIGHT_SHARE * count)
+        techniques = [(cosine(n), count - to_light)]
+        techniques += [(light, to_light)] if light is not None else []
     else:
-        raise UserError(f"unknown sampler '{kind}'", "choose fibonacci, cosine, lobe or mis")
+        raise UserError(f"unknown sampler '{kind}'", "choose fibonacci, cosine, lobe, mis or no_lobe")
     return combine(techniques, stochastic)

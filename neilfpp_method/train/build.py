@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.environment_map import read_environment
@@ -15,6 +16,7 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.point_cloud import load_point_cloud
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import camera_rays
+from neilfpp_method.effects.exposure import Exposures, measure_exposures
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.base import Host
 from neilfpp_method.hosts.mesh import MeshHost
@@ -24,12 +26,14 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import OrientedPoints
 
-__all__ = ["build_model", "scene_facts", "show_known_light"]
+__all__ = ["build_model", "cloud_in_words", "exposures_of", "scene_facts", "show_known_light"]
 
-# The sigmoid of R reaches 1 for LDR input. Radiance has no unit: the paper's 3 for HDR is twenty times the
-# median of a well exposed image. Where more is bright R needs more room; the few brightest pixels (a lamp in
-# view) do not decide for all.
+# The sigmoid of R reaches 1 for LDR input, as published. Where errors have a unit of their own it reaches
+# twice that: clipped pixels are lower bounds, and dark photographs show more than others before they clip.
+# Radiance has no unit: the paper's 3 for HDR is twenty times the median of a well exposed image. Where more
+# is bright R needs more room; the few brightest pixels (a lamp in view) do not decide for all.
 LDR_SCALE = 1.0
+LDR_ROOM = 2.0
 HDR_MEDIANS = 20.0
 BRIGHT_QUANTILE = 0.999
 
@@ -37,27 +41,49 @@ BRIGHT_QUANTILE = 0.999
 SEEN_EVERY = 67
 
 
-def scene_facts(capture: Capture, pixels: PixelDataset, config: NeilfConfig) -> SceneFacts:
-    """What the training images decide before training; see `SceneFacts`."""
+def scene_facts(
+    capture: Capture, pixels: PixelDataset, config: NeilfConfig, log_gains: Tensor | None = None
+) -> SceneFacts:
+    """What the training images decide before training; see `SceneFacts`.
+
+    `log_gains` are those of the training views, (V, 3); none: all are exposed alike.
+    """
     response = "linear" if capture.hdr else "srgb"
     median = pixels.median_radiance()
     hdr = max(HDR_MEDIANS * median, pixels.radiance_quantile(BRIGHT_QUANTILE))
-    scale = LDR_SCALE if response == "srgb" else hdr
+    ldr = LDR_SCALE if config.loss.unit == "activation" else LDR_ROOM
+    scale = ldr if response == "srgb" else hdr
     kind, color = config.background.kind, config.background.color
     if kind == "auto":
         kind = "inverted_sphere" if color is None and pixels.border_color() is None else "constant"
     if color is None and kind != "none":
         color = tuple(pixels.border_median().tolist())
     return SceneFacts(
-        response, median, scale, kind, color or (0.0, 0.0, 0.0), far_points=capture.scene_from == "focus"
+        response,
+        median,
+        scale,
+        kind,
+        color or (0.0, 0.0, 0.0),
+        far_points=capture.scene_from == "focus",
+        log_gains=() if log_gains is None else tuple(log_gains.flatten().tolist()),
     )
+
+
+def exposures_of(capture: Capture, pixels: PixelDataset) -> Exposures | None:
+    """What the training photographs say of their exposures; none where no cloud shows them the same
+    places.
+    """
+    if capture.point_cloud is None:
+        return None
+    return measure_exposures(pixels, load_point_cloud(capture.point_cloud, capture.normalisation))
 
 
 def build_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> NeilfModel:
     """An untrained model for a capture.
 
     Raises:
-        UserError: the settings ask for a point cloud or a mesh that the capture does not have.
+        UserError: the settings ask for a mesh that the capture does not have, or its point cloud is of no
+            use.
     """
     return NeilfModel(HOSTS[config.host.kind](capture, facts, config), config, facts)
 
@@ -97,6 +123,18 @@ def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
 HOSTS: Mapping[str, Callable[[Capture, SceneFacts, NeilfConfig], Host]] = {"volsdf": _volsdf, "mesh": _mesh}
 
 
+def cloud_in_words(capture: Capture, config: NeilfConfig) -> str | None:
+    """What a point cloud that geometry could learn from comes to, for people; none where there is nothing to
+    say.
+    """
+    if config.host.kind != "volsdf" or config.loss.point_cloud == 0.0:
+        return None
+    if capture.point_cloud is None:
+        return "point cloud: the capture has none with normals, so geometry is found from the images alone"
+    used = f"point cloud: geometry keeps to {capture.point_cloud.name}"
+    return f"{used}; --config.loss.point-cloud 0 leaves it out"
+
+
 def _check_seen(host: MeshHost, capture: Capture, path: str) -> None:
     """That the cameras see the outside of the mesh."""
     cameras = [capture.normalisation.camera(view.camera) for view in capture.train_views]
@@ -111,13 +149,8 @@ def _check_seen(host: MeshHost, capture: Capture, path: str) -> None:
 
 
 def _points(capture: Capture, config: NeilfConfig) -> OrientedPoints | None:
-    if config.loss.point_cloud == 0.0:
+    if config.loss.point_cloud == 0.0 or capture.point_cloud is None:
         return None
-    if capture.point_cloud is None:
-        raise UserError(
-            f"{capture.root}: the point-cloud loss is on, and the capture has no oriented point cloud",
-            "add inputs/model/oriented_pcd.ply or set --config.loss.point-cloud 0",
-        )
     points = load_point_cloud(capture.point_cloud, capture.normalisation)
     # What lies beyond the scene sphere is no business of G.
     within = points[points.position.norm(dim=-1) < config.volume.radius]

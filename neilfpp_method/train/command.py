@@ -14,33 +14,55 @@ import torch
 from lightning_fabric import Fabric
 from lightning_fabric.strategies import DDPStrategy
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from torch import Tensor
 
+from neilfpp_method.budget.durations import in_words as time_in_words
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.environment_map import check_environment
+from neilfpp_method.data.held_back import hold_back
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import at_scale, scale_for_rays
 from neilfpp_method.effects.asked import Asked, check_asked
-from neilfpp_method.effects.looks import note_facts
+from neilfpp_method.effects.looks import note_exposures, note_facts
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.table import table
-from neilfpp_method.errors import Unsound, UserError
+from neilfpp_method.errors import Stopped, Unsound, UserError
 from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.health.watch import LOOKED_AT, Watch
+from neilfpp_method.inspection.findings import problems_of_poses
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, stage_steps
 from neilfpp_method.settings.check import check_config
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.timing.ledger import Ledger, doing, listening
-from neilfpp_method.train.build import build_model, scene_facts, show_known_light
+from neilfpp_method.timing.ledger import Ledger, listening
+from neilfpp_method.train.budget_record import read_budget, write_budget
+from neilfpp_method.train.budgeted import (
+    close_budget,
+    outcome,
+    plan_budget,
+    planned_effects,
+    planned_settings,
+)
+from neilfpp_method.train.build import (
+    build_model,
+    cloud_in_words,
+    exposures_of,
+    scene_facts,
+    show_known_light,
+)
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.health_record import in_words as health_in_words
 from neilfpp_method.train.light_record import in_words
-from neilfpp_method.train.loop import Training, seed_step, train
+from neilfpp_method.train.lock import alone_in
+from neilfpp_method.train.loop import Training, train
 from neilfpp_method.train.memory import check_training_memory
+from neilfpp_method.train.optimizer import seed_step
+from neilfpp_method.train.pace import Pace
 from neilfpp_method.train.preview import write_preview
 from neilfpp_method.train.progress import Reporter, reporting
+from neilfpp_method.train.quality import Quality
+from neilfpp_method.train.reading import load_pixels
 from neilfpp_method.train.run import (
     PIXELS,
     CaptureSource,
@@ -71,6 +93,7 @@ def run_training(
     scale: float | None = None,
     strict: bool = False,
     effects: Asked | None = None,
+    budget: float | None = None,
     command: str = "neilfpp train",
     at_end: Callable[[Path], None] | None = None,
 ) -> Path:
@@ -84,6 +107,8 @@ def run_training(
         strict: end with an error where the result is of no use.
         effects: which effects are simulated (`effects.asked`); none: those of the settings, or with `resume`
             of the run.
+        budget: seconds that all of it may take, from here to the end of `at_end`; none: as many steps as the
+            settings say, or with `resume` what the run was given.
         command: what a person types to get here, for the line that says how a stopped run continues.
         at_end: called with the folder of a run that came to its end, sound or not, by the first process.
 
@@ -106,32 +131,50 @@ def run_training(
             raise UserError(
                 f"{out}: its effects are '{plan.asked}'", "leave --effects out, or start a new run"
             )
-        config = plan.config_of_model
-        if _is_finished(out, config):
+        config, planned = plan.config_of_model, read_budget(out)
+        if budget not in (None, planned and planned.budget):
+            was = "no budget" if planned is None else f"a budget of {time_in_words(planned.budget)}"
+            raise UserError(f"{out}: the run has {was}", "leave --budget out, or start a new run")
+        ledger.add(read_work(out))
+        if _is_finished(out, plan.config):
+            if planned is not None and planned.took is None:  # it was ended while its report was made
+                close_budget(out, planned, ledger.total)
             console.print(f"run folder {out}: finished already, nothing to continue", soft_wrap=True)
             return out
-        ledger.add(read_work(out))
     else:
         if data is None or config is None:
             raise UserError("no capture given", "name its folder with --data DIR")
         asked = effects or Asked("as-set")
         check_asked(asked, config)
-        plan = Plan.begin(asked, config)
-        settings, config = config, plan.config
-        _check(config)
+        _check(Plan.begin(asked, config).config)
         source = CaptureSource(str(data.resolve()), test_every, response, format)
         out = out or Path("runs") / f"{data.resolve().name}-{config.preset}"
         check_free(out)
     capture = source.load_again(out) if resume else source.load()
     if not resume:
+        planned = None
+        if budget is not None:
+            with_page = at_end is not None
+            planned = plan_budget(
+                budget, capture, config, asked, place, devices, ledger, with_page, console.print
+            )
+            config = planned_settings(planned, config)
+        settings, plan = config, Plan.begin(asked, config)
+        if planned is not None:
+            planned_effects(planned, plan)
+        config = plan.config
         rays = config.train.rays * devices * sum(stage_steps(config.train).values())
         source = replace(source, scale=scale_for_rays(capture.train_views, rays) if scale is None else scale)
         capture = at_scale(capture, source.scale)
     check_training_memory(capture)
     fabric = _launch(place, devices)
-    with listening(ledger), _nothing_left_on_failure(out):
-        pixels = _load_pixels(capture, out / PIXELS, fabric, console)
-        facts = described.facts if resume else scene_facts(capture, pixels, config)
+    with listening(ledger), _nothing_left_on_failure(out), alone_in(out):
+        pixels = load_pixels(capture, out / PIXELS, fabric, console)
+        if resume:
+            facts = described.facts
+        else:
+            gains = _log_gains(plan, capture, pixels)
+            facts = scene_facts(capture, pixels, config, gains)
         note_facts(plan, facts)
         config = plan.config_of_model
         seed_step(config.train.seed, step=-1)
@@ -143,9 +186,17 @@ def run_training(
             if not resume:
                 create_run(out, settings, source, facts)
                 write_plan(out, plan)
+                if planned is not None:
+                    write_budget(out, planned)
             console.print(capture.summary, soft_wrap=True)
-            if source.scale < 1 and not resume:
-                console.print(_scaled(source.scale, len(pixels), rays), soft_wrap=True)
+            if not resume:
+                for line in problems_of_poses(capture):
+                    console.print(line, style="yellow", soft_wrap=True, markup=False)
+                if source.scale < 1:
+                    console.print(_scaled(source.scale, len(pixels), rays), soft_wrap=True)
+                for line in (cloud_in_words(capture, config), _exposures_in_words(plan)):
+                    if line is not None:
+                        console.print(line, soft_wrap=True)
             console.print(f"run folder {out}", soft_wrap=True)
         # Every process fits the same geometry for itself.
         started = start_geometry(model, capture, config) if begins else None
@@ -154,10 +205,12 @@ def run_training(
     fabric.barrier()
     continue_with = _continue_with(command, out, device, devices)
     with (
+        alone_in(out),
         listening(ledger),
         reporting(out, console, fabric.is_global_zero) as reporter,
-        _stop_request() as stopped,
+        _stop_request(continue_with) as stopped,
     ):
+        held_back = hold_back(pixels, config.train.seed)
         preview = _preview(out, capture, fabric, reporter)
         solver, watch = model.light_solver(), _watch(pixels, config, reporter)
         training = Training(
@@ -173,7 +226,9 @@ def run_training(
             solver,
             watch,
             plan,
+            Quality(held_back, capture.hdr),
             ledger,
+            None if planned is None else Pace(planned, ledger),
         )
         train(training)
     if fabric.is_global_zero:
@@ -187,9 +242,31 @@ def run_training(
         console.print(f"health: {health_in_words(findings)}", soft_wrap=True, markup=False)
         if at_end is not None:
             at_end(out)
+    if fabric.is_global_zero and planned is not None:
+        close_budget(out, planned, ledger.total)
+        console.print(outcome(planned, training.quality.looks), soft_wrap=True)
     if strict and verdict_of(findings) == "failed":
         raise Unsound(f"{out}: {findings[0].what}", findings[0].remedy)
     return out
+
+
+def _log_gains(plan: Plan, capture: Capture, pixels: PixelDataset) -> Tensor | None:
+    """The gains that photographs start with, where the plan has them on after it has heard the photographs;
+    zeros where a person asks for them and nothing shows what they are.
+    """
+    if not plan.is_on("exposure"):
+        return None
+    found = exposures_of(capture, pixels)
+    note_exposures(plan, found)
+    if not plan.is_on("exposure"):
+        return None
+    return torch.zeros(len(pixels.views), 3) if found is None else found.log_gain
+
+
+def _exposures_in_words(plan: Plan) -> str | None:
+    """That photographs have gains, and why; none where they have none."""
+    decision = plan.newest("exposure")
+    return f"effects: exposure on, {decision.reason}" if decision is not None and decision.on else None
 
 
 def _watch(pixels: PixelDataset, config: NeilfConfig, reporter: Reporter) -> Watch:
@@ -286,30 +363,6 @@ def _nothing_left_on_failure(out: Path) -> Iterator[None]:
         raise
 
 
-@doing("data", apart=True)
-def _load_pixels(capture: Capture, folder: Path, fabric: Fabric, console: Console) -> PixelDataset:
-    """One process reads the images, all find them in the folder; an error in them ends all of them."""
-    problem: tuple[str, str] | None = None
-    if fabric.is_global_zero:
-        try:
-            pixels = _read_pixels(capture, folder, fabric, console)
-        except UserError as error:
-            problem = (error.problem, error.remedy)
-    problem = fabric.broadcast(problem)
-    if problem is not None:
-        raise UserError(*problem)
-    return pixels if fabric.is_global_zero else _read_pixels(capture, folder, fabric, console)
-
-
-def _read_pixels(capture: Capture, folder: Path, fabric: Fabric, console: Console) -> PixelDataset:
-    columns = (TextColumn("reading images"), BarColumn(), MofNCompleteColumn())
-    hidden = not (fabric.is_global_zero and console.is_terminal)
-    with Progress(*columns, console=console, transient=True, disable=hidden) as progress:
-        task = progress.add_task("", total=len(capture.train_views))
-        views = capture.train_views
-        return PixelDataset(capture, views, fabric.device, lambda _: progress.advance(task), folder)
-
-
 def _preview(
     out: Path, capture: Capture, fabric: Fabric, reporter: Reporter
 ) -> Callable[[NeilfModel, Stage], None]:
@@ -322,8 +375,10 @@ def _preview(
 
 
 @contextmanager
-def _stop_request() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C and SIGTERM ask for a stop after the step in progress; a second Ctrl-C does not wait."""
+def _stop_request(continue_with: str) -> Iterator[Callable[[], bool]]:
+    """Ctrl-C and SIGTERM ask for a stop after the step in progress; a second one does not wait, and loses the
+    steps since the last checkpoint.
+    """
     asked = []
 
     def ask(number: int, _frame: object) -> None:
@@ -337,6 +392,8 @@ def _stop_request() -> Iterator[Callable[[], bool]]:
         before = {}
     try:
         yield lambda: bool(asked)
+    except KeyboardInterrupt:
+        raise Stopped("stopped at once", f"continue from its last checkpoint with: {continue_with}") from None
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

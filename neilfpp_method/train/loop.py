@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -26,23 +28,26 @@ from neilfpp_method.schedule import (
     StagePosition,
     Total,
     active_losses,
-    rate_factor,
     stage_at,
     stage_steps,
     weigh,
 )
 from neilfpp_method.settings.facts import RadianceUnits
-from neilfpp_method.settings.types import NeilfConfig, OptimizerConfig
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import LossTerms, StepResult
 from neilfpp_method.timing.ledger import Ledger, doing
 from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.health_record import read_findings, write_findings
 from neilfpp_method.train.light_record import LightFit, note_fit, read_fits, write_fits
+from neilfpp_method.train.optimizer import gradient_norms, make_optimizer, seed_step, set_rates
+from neilfpp_method.train.pace import Pace
 from neilfpp_method.train.progress import Reporter
+from neilfpp_method.train.quality import Quality, read_looks, write_looks
 from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, save_checkpoint, write_json
+from neilfpp_method.train.skipped import Moment, keep_step
 from neilfpp_method.train.work_record import write_work
 
-__all__ = ["Training", "adam", "make_optimizer", "seed_step", "set_rates", "train"]
+__all__ = ["Training", "train"]
 
 LOG_EVERY = 50
 """Steps between TensorBoard scalars: a thousand points of a curve in the longest training."""
@@ -50,7 +55,9 @@ LOG_EVERY = 50
 
 @dataclass
 class Training:
-    """A run in progress; `continue_with` is the command that goes on with it after a stop."""
+    """A run in progress. `continue_with` is the command that goes on with it after a stop, `pace` keeps it
+    to a budget; none: it has none.
+    """
 
     path: Path
     config: NeilfConfig
@@ -64,7 +71,9 @@ class Training:
     light_solver: LightSolver
     watch: Watch
     plan: Plan
+    quality: Quality
     ledger: Ledger = field(default_factory=Ledger)
+    pace: Pace | None = None
     fits: list[LightFit] = field(default_factory=list)
     skipped: int = 0
     skipped_in_a_row: int = 0
@@ -78,22 +87,20 @@ def train(run: Training) -> None:
         Stopped: `run.should_stop` said so; the state is saved, and training continues from it bit for bit.
         Diverged: ten steps in a row were not finite; the last good checkpoint is kept.
     """
-    settings = run.config.train
     model = run.model.to(run.fabric.device).train()
     run.light_solver.to(run.fabric.device)
     optimizer = make_optimizer(model, run.config.optimizer)
     step = _restore(run, optimizer)
-    total = sum(stage_steps(settings).values())
     optimizer = run.fabric.setup_optimizers(optimizer)
     if step == 0:
         _look(run, model, 0)
-    while step < total:
-        position = stage_at(step, settings)
+    while step < _all_steps(run):
+        position = stage_at(step, run.config.train)
         step = _train_stage(run, model, optimizer, step, position)
         if run.fabric.is_global_zero:
             with doing("looks", apart=True):
                 run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
-        if step < total:
+        if step < _all_steps(run):
             with doing("looks", apart=True):
                 _look(run, model, step)
         _save(run, optimizer, step, also=position.stage.value)
@@ -101,6 +108,11 @@ def train(run: Training) -> None:
             model.eval()
             run.preview(model, position.stage)
             model.train()
+
+
+def _all_steps(run: Training) -> int:
+    """Of the whole training, as planned so far."""
+    return sum(stage_steps(run.config.train).values())
 
 
 def _train_stage(
@@ -117,28 +129,42 @@ def _train_stage(
     started = time.perf_counter()
     before = run.seconds.get(stage.value, 0.0)
     gradients = "smoothness" in active_losses(stage, model.config, model.stages)  # nothing else asks for them
-    for number in range(position.step, position.length):
+    number, length = position.step, position.length
+    while number < length:
         with run.ledger.step(number):
             seed_step(settings.seed, step, run.fabric.global_rank)
-            share = number / position.length
-            at = StagePosition(stage, number, position.length)
+            at = StagePosition(stage, number, length)
             set_rates(optimizer, run.config.optimizer, at, background_waits=not run.model.facts.far_points)
             with doing("data"):
                 batch = run.pixels.sample(settings.rays, gradients)
+            moment = Moment.before_step(model, batch, at)
             computed = wrapped(batch, stage)
-            total = weigh(computed.terms, active_losses(stage, model.config, model.stages, share))
-            stop = _update(run, model, optimizer, computed.terms, total, step)
+            total = weigh(computed.terms, active_losses(stage, model.config, model.stages, at.share))
+            stop = _update(run, model, optimizer, computed.terms, total, moment, step)
             _solve_light(run, model, computed, step)
         run.watch.after_step(model.stages[stage], computed, step)
-        step += 1
+        number, step = number + 1, step + 1
+        length = _keep_pace(run, StagePosition(stage, number, length), step)
+        _look_at_quality(run, model, StagePosition(stage, number, length), step)
         run.seconds[stage.value] = before + time.perf_counter() - started
-        if number + 1 == position.length:
+        if number == length:
             break  # The end of a stage is saved under its name, and a stop waits for that.
         if stop or step % settings.checkpoint_every == 0:
             _save(run, optimizer, step)
         if stop:
             raise Stopped(f"stopped after step {step}", f"continue with: {run.continue_with}")
     return step
+
+
+def _keep_pace(run: Training, position: StagePosition, step: int) -> int:
+    """Keep to the budget, where there is one. Returns how many steps the stage has."""
+    if run.pace is None:
+        return position.length
+    kept = run.pace.keep(run.config.train, position, step)
+    if kept is not run.config.train:
+        run.config = dataclasses.replace(run.config, train=kept)
+        run.reporter.lengthen(stage_steps(kept)[position.stage])
+    return stage_steps(kept)[position.stage]
 
 
 def _solve_light(run: Training, model: NeilfModel, computed: StepResult, step: int) -> None:
@@ -193,6 +219,12 @@ def _start_light(run: Training, model: NeilfModel, step: int) -> None:
     _share_decisions(run, model, decisions)
 
 
+@doing("looks", apart=True)
+def _look_at_quality(run: Training, model: NeilfModel, position: StagePosition, step: int) -> None:
+    if run.fabric.is_global_zero:
+        run.quality.look_when_due(model, position, step, run.ledger.total)
+
+
 def _look_at_effects(run: Training, model: NeilfModel, step: int) -> None:
     """Let evidence decide the open effects from here on. The first process decides for all."""
     if not wants_surface(run.plan):
@@ -214,8 +246,12 @@ def _share_decisions(run: Training, model: NeilfModel, decisions: Sequence[Decis
 
 
 def _use(run: Training, model: NeilfModel) -> None:
-    """Compute as the plan says."""
+    """Compute as the plan says; evidence may take the joint stage away."""
     config = run.plan.config
+    if not config.train.joint_steps:
+        run.config = dataclasses.replace(
+            run.config, train=dataclasses.replace(run.config.train, joint_steps=0)
+        )
     model.use(config)
     run.light_solver.use(config.light, model.lobe)
 
@@ -232,6 +268,7 @@ def _update(
     optimizer: torch.optim.Optimizer,
     terms: LossTerms,
     total: Total,
+    moment: Moment,
     step: int,
 ) -> bool:
     """One step down the gradient; a step whose loss or gradient is not finite is left out, counted and named.
@@ -242,7 +279,7 @@ def _update(
     if total.loss.requires_grad:
         with doing("gradients"):
             run.fabric.backward(total.loss)
-    norms = _gradient_norms(model)
+    norms = gradient_norms(model)
     psnr = _psnr(terms, run.model.units)
     stop = torch.full_like(psnr, run.should_stop())
     # The one transfer of the step: everything that the loop and the person must know. Every process takes the
@@ -253,14 +290,14 @@ def _update(
         optimizer.step()
         run.skipped_in_a_row = 0
     else:
-        _skip(run, total, found, step)
+        _skip(run, total, found, _kept(run, model, moment, step), step)
     run.reporter.step(loss, decibels)
     if step % LOG_EVERY == 0:
         _log(run, model, total, decibels, loss, step)
     return asked > 0.0
 
 
-def _skip(run: Training, total: Total, norms: Mapping[str, float], step: int) -> None:
+def _skip(run: Training, total: Total, norms: Mapping[str, float], kept: str, step: int) -> None:
     run.skipped += 1
     run.skipped_in_a_row += 1
     culprits = [name for name, value in total.terms.items() if not math.isfinite(value.item())]
@@ -270,7 +307,7 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], step: int) ->
         if culprits
         else f"the gradient of {', '.join(fields) or 'another process'}"
     )
-    run.reporter.warn(f"step {step} skipped: {where} is not finite ({run.skipped} skipped so far)")
+    run.reporter.warn(f"step {step} skipped: {where} is not finite ({run.skipped} skipped so far){kept}")
     if run.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
         raise Diverged(
             f"{MAX_SKIPPED_IN_A_ROW} steps in a row were not finite, the last one in {where}",
@@ -279,59 +316,15 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], step: int) ->
         )
 
 
-# -------------------------------------------------------------------------------------------------- optimiser
-
-
-def make_optimizer(model: NeilfModel, config: OptimizerConfig) -> torch.optim.Optimizer:
-    """Adam with a named group for each field; frozen parameters get no gradient and do not move."""
-    groups = [
-        {"params": parameters, "name": name, "lr": getattr(config, name)}
-        for name, parameters in model.parameter_groups().items()
-        if parameters
-    ]
-    return adam(groups)
-
-
-def adam(groups: Sequence[Mapping[str, object]]) -> torch.optim.Adam:
-    """Adam as every loop here uses it.
-
-    Fused: one pass over the tables of hash grids, which are most of all parameters, in place of a dozen.
-    """
-    return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
-
-
-def set_rates(
-    optimizer: torch.optim.Optimizer,
-    config: OptimizerConfig,
-    position: StagePosition,
-    background_waits: bool = True,
-) -> None:
-    """The rate of each field at a step of a stage.
-
-    `background_waits` off: what lies beyond the scene moves from the start, whatever `config.background_from`
-    says. Where structure from motion has found points there, one colour is no stand-in for it: training would
-    fill the scene with clouds.
-    """
-    factor = rate_factor(config, position)
-    waits = background_waits and position.stage is Stage.SDF_INIT and position.share < config.background_from
-    for group in optimizer.param_groups:
-        name = group["name"]
-        group["lr"] = 0.0 if waits and name == "background" else getattr(config, name) * factor
-
-
-def seed_step(seed: int, step: int, rank: int = 0) -> None:
-    """Seed every random number of a step: what a step draws depends on these three numbers alone."""
-    torch.manual_seed((seed * 1_000_003 + step) * 4_099 + rank)
-
-
-def _gradient_norms(model: NeilfModel) -> dict[str, Tensor]:
-    """Length of the gradient of each field that has one."""
-    norms = {}
-    for name, parameters in model.parameter_groups().items():
-        gradients = [p.grad for p in parameters if p.grad is not None]
-        if gradients:
-            norms[name] = torch.stack([g.norm() for g in gradients]).norm()
-    return norms
+def _kept(run: Training, model: NeilfModel, moment: Moment, step: int) -> str:
+    """Write down what is skipped, and say how it is looked into; a full disk is no reason to stop for it."""
+    if not run.fabric.is_global_zero:
+        return ""
+    try:
+        kept = keep_step(run.path, model, moment, step)
+    except UserError as error:
+        return f"; its rays are not kept: {error.problem}"
+    return f"; see neilfpp replay {shlex.quote(str(run.path))} {step}" if kept else ""
 
 
 def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
@@ -357,6 +350,9 @@ def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str 
             write_fits(run.path, run.fits)
             write_findings(run.path, run.watch)
             write_plan(run.path, run.plan)
+            write_looks(run.path, run.quality)
+            if run.pace is not None:
+                run.pace.save(run.path, run.config.train)
             for name in filter(None, (also, "last")):
                 save_checkpoint(
                     run.path / "checkpoints" / f"{name}.pt", run.model, run.light_solver, optimizer, step
@@ -380,6 +376,7 @@ def _restore(run: Training, optimizer: torch.optim.Optimizer) -> int:
         run.seconds.update(read_json(run.path / "timing.json"))
     run.fits += read_fits(run.path, saved["step"])
     run.plan = read_plan(run.path, run.plan.settings, saved["step"])
+    run.quality.looks += read_looks(run.path, saved["step"])
     _use(run, run.model)
     run.watch.findings |= {finding.case: finding for finding in read_findings(run.path) or ()}
     return saved["step"]

@@ -42,6 +42,11 @@ class Reporter:
                 TITLES[stage], total=length, completed=done, loss="–", psnr="–"
             )
 
+    def lengthen(self, length: int) -> None:
+        """The stage has another number of steps than it began with."""
+        if self.progress is not None and self.task is not None:
+            self.progress.update(self.task, total=length)
+
     def step(self, loss: float, psnr: float) -> None:
         """One step further; `psnr` is NaN where the step compared no pixel."""
         if self.progress is not None and self.task is not None:

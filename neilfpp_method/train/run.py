@@ -6,8 +6,11 @@ scene.json        what the images decided     checkpoints/      last.pt, and one
 previews/         a picture per stage         tensorboard/      scalars and pictures
 pixels/           of the training views; can be deleted, and is made again when training goes on
 work.json         seconds of each stage by kind of work (docs/budget.md)
+quality.json      how good the run was on the way, at pixels that no step learned from
+plan.json         what was planned for a budget, and how the clock changed it; not there without --budget
 effects.json      which effects are simulated, and why
 light.json        what spoke for lamps, fit by fit; not there where the settings had decided
+skipped/          steps that were not finite, for `neilfpp replay`; not there where none was
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import platform
+import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -33,10 +37,11 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import has_material
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.plain import from_dict, to_dict
-from neilfpp_method.settings.types import NeilfConfig
+from neilfpp_method.settings.types import NeilfConfig, TrainConfig
 from neilfpp_method.train.build import build_model
 from neilfpp_method.train.effects_record import read_plan
 from neilfpp_method.train.json_files import read_json, write_json
+from neilfpp_method.train.lock import LOCK
 
 __all__ = [
     "BESIDE_NERFSTUDIO",
@@ -52,6 +57,7 @@ __all__ = [
     "load_weights",
     "read_description",
     "read_json",
+    "rewrite_training",
     "run_folder",
     "save_checkpoint",
     "write_json",
@@ -62,6 +68,10 @@ BESIDE_NERFSTUDIO = "neilfpp"
 """Folder beside nerfstudio's `config.yml` in which the plugin keeps a training as a run."""
 PIXELS = "pixels"
 """Folder of a run in which the pixels of its training views are kept."""
+DESCRIBING = ("capture.json", "scene.json", "environment.json")
+"""What is written before `config.json`, which makes a folder a run."""
+HALF_WRITTEN = re.compile(r"\.(capture|scene|environment|config)\.[0-9]+\.json")
+"""What `replacing` calls them while they are written."""
 PACKAGES = (
     "neilfpp-method",
     "torch",
@@ -163,12 +173,17 @@ def check_free(path: Path) -> None:
     """That a new run may take this folder.
 
     Raises:
-        UserError: the folder is there already and holds more than the pixels of a training that never began,
-            or cannot be made.
+        UserError: the folder is there already and holds more than a training that never began left there, or
+            cannot be made.
     """
-    if path.exists() and (not path.is_dir() or any(inner.name != PIXELS for inner in path.iterdir())):
+    if path.exists() and (not path.is_dir() or any(not _of_no_run(inner.name) for inner in path.iterdir())):
         raise UserError(f"{path}: exists already", "choose another --out, or continue it with --resume")
     check_writable(path)
+
+
+def _of_no_run(name: str) -> bool:
+    """Whether a file is left over from a training that was killed before it was a run."""
+    return name in (PIXELS, LOCK, *DESCRIBING) or bool(HALF_WRITTEN.fullmatch(name))
 
 
 def check_writable(path: Path) -> None:
@@ -202,6 +217,13 @@ def create_run(path: Path, config: NeilfConfig, source: CaptureSource, facts: Sc
         for name in description:
             (path / name).unlink(missing_ok=True)
         raise
+
+
+def rewrite_training(path: Path, config: TrainConfig) -> None:
+    """The settings of the loop of a run that is there already, where its steps are planned anew."""
+    stored = read_json(path / "config.json")
+    stored["config"]["train"] = to_dict(config)
+    write_json(path / "config.json", stored)
 
 
 def load_run(path: Path | str, device: torch.device | str = "cpu", checkpoint: str = "last") -> Run:

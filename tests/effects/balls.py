@@ -27,21 +27,31 @@ def sky() -> EnvironmentLight:
     return environment
 
 
-def ball(base_color: Tensor, roughness: Tensor, metallic: Tensor, lobe: Lobe, views: int = 9) -> Places:
-    """P places of the given materials, each seen in so many views."""
+def ball(
+    base_color: Tensor,
+    roughness: Tensor,
+    metallic: Tensor,
+    lobe: Lobe | None,
+    views: int = 9,
+    environment: EnvironmentLight | None = None,
+) -> Places:
+    """P places of the given materials, each in so many views; under `sky` where no light is given."""
     torch.manual_seed(0)
     count = len(base_color)
     normal = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1).repeat_interleave(views, 0)
     aside = torch.nn.functional.normalize(torch.randn(len(normal), 3), dim=-1)
     wo = torch.nn.functional.normalize(normal + 0.9 * aside, dim=-1)
     material = Material(*(v.repeat_interleave(views, 0) for v in (base_color, roughness, metallic)))
-    pixel = _rendered(Observed(normal, normal, wo, torch.zeros_like(normal)), material, lobe)
+    pixel = _rendered(
+        Observed(normal, normal, wo, torch.zeros_like(normal)), material, lobe, environment or sky()
+    )
     place = torch.arange(count).repeat_interleave(views)
     return Places(count, place, torch.arange(views).repeat(count), Observed(normal, normal, wo, pixel))
 
 
-def _rendered(dark: Observed, material: Material, lobe: Lobe) -> Float[Tensor, "N 3"]:
-    environment = sky()
+def _rendered(
+    dark: Observed, material: Material, lobe: Lobe | None, environment: EnvironmentLight
+) -> Float[Tensor, "N 3"]:
     radiance = environment.log_radiance.exp().flatten(1).t()
     drawn = [from_texels(environment, dark, material.roughness, lobe, None) for _ in range(DIRECTIONS)]
     return torch.stack([carried.outgoing(material, radiance) for carried in drawn]).mean(0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 
 import pytest
 import torch
@@ -10,14 +11,21 @@ import torch
 from neilfpp_method.cli import main
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.asked import check_asked, read_asked
-from neilfpp_method.effects.looks import after_fit, look_at_surface
+from neilfpp_method.effects.disagreement import ShownSurface, shading_disagreement
+from neilfpp_method.effects.looks import _shown_surface, after_fit, look_at_surface
+from neilfpp_method.effects.material import JUDGED
 from neilfpp_method.effects.measurement import Measurement, mean_of
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.visibility import self_visibility
 from neilfpp_method.errors import UserError
-from neilfpp_method.lighting.fit import Evidence
-from neilfpp_method.schedule import Stage
+from neilfpp_method.fields import environment
+from neilfpp_method.fields.direction_map import interpolate
+from neilfpp_method.lighting import solve
+from neilfpp_method.lighting.fit import Evidence, fit_light
+from neilfpp_method.schedule import Stage, active_losses
+from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.presets import preset
+from neilfpp_method.shading import LOBES, Lobe
 from neilfpp_method.structures import SceneLight
 from tests.scenes import sphere_batch, sphere_model, tiny_config
 from tests.test_model import count_queries
@@ -60,7 +68,8 @@ def test_self_visibility_is_the_share_by_the_cosine(share):
 def test_a_ball_sees_nothing_of_itself_so_nothing_is_traced():
     config = solved_light(tiny_config())
     config = dataclasses.replace(config, shading=dataclasses.replace(config.shading, hit_share=0.2))
-    model, plan = sphere_model(config), Plan.begin(read_asked("auto,+metals"), config)
+    named = "auto," + ",".join(f"+{name}" for name in (*JUDGED, "joint-stage"))
+    model, plan = sphere_model(config), Plan.begin(read_asked(named), config)
     torch.manual_seed(0)
     (decision,) = look_at_surface(plan, model, OnePicture(), step=4)
     assert not decision.on
@@ -79,6 +88,117 @@ def test_a_ball_sees_nothing_of_itself_so_nothing_is_traced():
     counts = traced()
     assert not calls
     assert counts["rays"] == len(sphere_batch())
+
+
+def counted(lobe: Lobe, calls: Counter) -> Lobe:
+    """The same lobe, which counts what is asked of it."""
+
+    def count(name):
+        def call(*arguments):
+            calls[name] += 1
+            return getattr(lobe, name)(*arguments)
+
+        return call
+
+    return Lobe(*(count(field.name) for field in dataclasses.fields(lobe)))
+
+
+def asked_of_the_lobe(effects: str, monkeypatch) -> Counter:
+    config = Plan.begin(read_asked(effects), solved_light(tiny_config())).config
+    calls = Counter()
+    monkeypatch.setitem(LOBES, config.shading.lobe, counted(LOBES[config.shading.lobe], calls))
+    model = sphere_model(
+        dataclasses.replace(config, shading=dataclasses.replace(config.shading, hit_share=0.2))
+    )
+    calls.clear()
+    model.losses(sphere_batch(), Stage.MATERIAL_INIT)
+    return calls
+
+
+def test_a_lobe_that_is_off_is_not_asked(monkeypatch):
+    assert asked_of_the_lobe("all", monkeypatch)["sample_cos_h"] > 0
+    without_sampling = asked_of_the_lobe("all,-lobe-sampling", monkeypatch)
+    assert without_sampling["distribution"] > 0
+    assert without_sampling["sample_cos_h"] == without_sampling["pdf_h"] == 0
+    assert not asked_of_the_lobe("all,-reflection", monkeypatch)
+
+
+def test_an_even_light_is_not_looked_up_and_is_one_source(monkeypatch):
+    config = Plan.begin(read_asked("all,-environment-map"), solved_light(tiny_config())).config
+    model = sphere_model(
+        dataclasses.replace(config, shading=dataclasses.replace(config.shading, hit_share=0.2))
+    )
+    looked_up, sources = [], []
+    monkeypatch.setattr(environment, "interpolate", lambda *a: looked_up.append(a) or interpolate(*a))
+    monkeypatch.setattr(solve, "fit_light", lambda *a: sources.append(a[1].sources.shape[2]) or fit_light(*a))
+    solver = model.light_solver()
+    while not solver.due:
+        solver.observe(model.step(sphere_batch(), Stage.MATERIAL_INIT))
+    before = model.light.log_radiance.clone()
+    solver.solve(model.brdf, model.scene)
+    assert not looked_up
+    assert min(sources) == 1
+    assert model.light.log_radiance.flatten(1).std(1).max() < 1e-6
+    assert (model.light.log_radiance != before).all()
+
+
+def test_white_light_has_one_channel():
+    config = Plan.begin(read_asked("all,-coloured-light"), solved_light(tiny_config())).config
+    model = sphere_model(
+        dataclasses.replace(config, shading=dataclasses.replace(config.shading, hit_share=0.2))
+    )
+    solver = model.light_solver()
+    while not solver.due:
+        solver.observe(model.step(sphere_batch(), Stage.MATERIAL_INIT))
+    solver.solve(model.brdf, model.scene)
+    channels = model.light.log_radiance
+    assert channels.flatten(1).std(1).max() > 0.01
+    torch.testing.assert_close(channels, channels[:1].expand_as(channels))
+
+
+def test_without_reflection_there_is_nothing_that_needs_it():
+    plan = Plan.begin(read_asked("auto,-reflection"), preset("fast"))
+    config = plan.config
+    assert not config.shading.specular
+    assert not config.brdf.metals
+    assert not config.brdf.varying_roughness
+    assert config.shading.sampler == "no_lobe"
+    assert not plan.is_open("metals")
+
+
+def test_advice_changes_nothing_and_is_said():
+    plan = Plan.begin(read_asked("auto"), preset("fast"))
+    worthless = Measurement("error", 0.0, 0.001, 0.01, 100)
+    assert worthless.favours(True) is False
+    for name in ("reflection", "environment-map", "coloured-light"):
+        decision = plan.decide(name, worthless, 4)
+        assert decision.on
+        assert "advice" in decision.reason
+    assert plan.config == plan.settings
+    assert not plan.decide("varying-roughness", worthless, 4).on
+    assert not plan.config.brdf.varying_roughness
+
+
+def test_nothing_varies_so_no_slope_is_asked():
+    config = Plan.begin(read_asked("as-set,-metals,-varying-roughness"), tiny_config()).config
+    config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, smoothness=1.0))
+    assert "smoothness" not in active_losses(Stage.MATERIAL_INIT, config)
+    assert "smoothness" in active_losses(Stage.MATERIAL_INIT, changed(config, {"brdf.metals": True}))
+
+
+def test_shading_that_is_as_good_as_r_leaves_nothing_to_the_joint_stage():
+    model = sphere_model(tiny_config()).eval()
+    seen = _shown_surface(model, sphere_batch(400))
+    observed, radiance = seen.observed, seen.radiance
+    assert len(radiance) > 50
+    material = model.materials(observed.position)
+    samples = model.config.shading.eval_samples
+    shaded = model.shade(observed.position, observed.normal, observed.wo, material, samples).color.detach()
+    same = ShownSurface(dataclasses.replace(observed, pixel=shaded), shaded)
+    assert shading_disagreement(model, same).value == 0
+    worse = shading_disagreement(model, ShownSurface(dataclasses.replace(observed, pixel=radiance), radiance))
+    off = (shaded - radiance).abs() / (radiance + 0.1 * model.units.physical)
+    assert worse.value == pytest.approx(off.clamp_max(1).mean().item(), rel=1e-4)
 
 
 def test_evidence_is_revised_and_said():
@@ -116,6 +236,8 @@ def test_the_standard_error_is_that_of_the_mean():
 def test_names_switch_settings():
     config = preset("fast")
     none = Plan.begin(read_asked("none"), config).config
+    assert (none.shading.specular, none.light.environment_height, none.light.monochrome) == (False, 1, True)
+    assert (none.brdf.metals, none.brdf.varying_roughness, none.train.joint_steps) == (False, False, 0)
     assert (none.inter_reflection.mode, none.light.kind, none.background.kind) == (
         "off",
         "distant",
@@ -140,11 +262,12 @@ def test_names_switch_settings():
         ("", "nothing is given"),
         ("+lamps,-lamps", "lamps is named twice"),
         ("-response", "--response"),
+        ("none,+metals", r"there is none without reflection; add \+reflection"),
     ],
 )
 def test_bad_names_get_one_line(text, complaint):
     with pytest.raises(UserError, match=complaint):
-        read_asked(text)
+        check_asked(read_asked(text), preset("fast"))
 
 
 def test_a_free_light_has_no_lamps_to_switch():

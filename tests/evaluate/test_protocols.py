@@ -30,10 +30,10 @@ from neilfpp_method.evaluate.views import (
     render_view,
     surface_points,
 )
-from neilfpp_method.model import Maps, NeilfModel
+from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
-from neilfpp_method.structures import Material, RayBatch
+from neilfpp_method.structures import Maps, Material, RayBatch
 from neilfpp_method.train.run import Run
 from tests.data import make_capture as scene
 

@@ -1,9 +1,14 @@
-"""What trainings of hard cases share."""
+"""What trainings of hard cases share, and the counts that `make test-hard` ends with."""
 
 from __future__ import annotations
 
+from collections import Counter
+
 import jaxtyping
 import pytest
+
+COUNTED = ("inputs", "kills", "files", "mutants")
+"""What tests count with `record_property`."""
 
 
 @pytest.fixture(scope="module")
@@ -12,3 +17,16 @@ def without_shape_checks():
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """One line with the counts, where hard cases were run."""
+    counts: Counter[str] = Counter()
+    for reports in terminalreporter.stats.values():
+        for report in reports:
+            if getattr(report, "when", None) == "call" and "hard" in report.keywords:
+                counts["cases"] += 1
+                counts.update({name: n for name, n in report.user_properties if name in COUNTED})
+    if counts["cases"]:
+        told = ", ".join(f"{counts[name]:,} {name}" for name in ("cases", *COUNTED))
+        terminalreporter.write_line(f"hard: {told}")

@@ -21,7 +21,7 @@ import neilfpp_method
 from neilfpp_method.cli import main
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.images import write_exr, write_png
-from neilfpp_method.inspection.findings import Inspection, inspect_capture
+from neilfpp_method.inspection.findings import Inspection, inspect_capture, problems_of_poses
 from tests.data.make_capture import make_capture, srgb, write_ply
 
 SCENE = Path(neilfpp_method.__file__).parent / "demo" / "scene"
@@ -97,6 +97,10 @@ def test_a_camera_that_looks_away(capture: Capture) -> None:
     turned = replace(view, camera=replace(view.camera, w2c=w2c))
     views = (*capture.views[:VICTIM], turned, *capture.views[VICTIM + 1 :])
     assert found(replace(capture, views=views)) == {"looking_away": (view.name,)}
+    (line,) = problems_of_poses(replace(capture, views=views))  # what `neilfpp train` prints, without a pixel
+    assert line.startswith("problem: the cameras look away")
+    assert view.name in line
+    assert problems_of_poses(capture) == ()
 
 
 def test_clipped_highlights_in_linear_files(capture: Capture) -> None:

@@ -22,7 +22,7 @@ def test_a_step_of_every_stage(name):
     config = preset(name)
     # An untrained surface is fog; here whatever a ray meets is shaded.
     config = dataclasses.replace(config, shading=dataclasses.replace(config.shading, hit_share=1e-3))
-    facts = SceneFacts("linear", 0.2, 3.0, "constant")
+    facts = SceneFacts("linear", 0.2, 3.0, "constant", log_gains=(0.1, 0.0, 0.0, -0.1, 0.0, 0.0))
     direction = torch.nn.functional.normalize(torch.randn(50, 3), dim=-1)
     host = VolSdfHost(
         config, facts.radiance_scale, facts.background, points=OrientedPoints(0.6 * direction, direction)

@@ -8,8 +8,10 @@ import torch
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.color import (
     apply_response,
+    at_common_exposure,
     linear_to_srgb,
     luminance,
+    residual,
     response_slope,
     srgb_to_linear,
     tone_map,
@@ -60,3 +62,39 @@ def test_the_slope_of_a_response_is_its_derivative_by_log_radiance(response):
     (slope,) = torch.autograd.grad(pixel.sum(), logarithm)
     # The standard rounds the constants of its curve: at the knee the slopes of its two parts are 1.6 % apart.
     torch.testing.assert_close(response_slope(pixel.detach(), response), slope, rtol=1e-6, atol=0.0)
+
+
+def test_a_clipped_pixel_is_a_lower_bound():
+    radiance = torch.tensor([4.0, 0.2, 4.0, 0.5], requires_grad=True)
+    pixel = torch.tensor([1.0, 1.0, 0.5, apply_response(torch.tensor(0.3), "srgb")])
+    off = residual(radiance, pixel, "srgb")
+    off.abs().sum().backward()
+    off = off.detach()
+    # Brighter than white is free, darker costs. Too bright where the camera saw less costs, and leads back.
+    assert off[0] == 0
+    assert radiance.grad[0] == 0
+    assert off[1] < -0.4
+    assert radiance.grad[1] < 0
+    assert off[2] == pytest.approx(1.055 * 4.0 ** (1 / 2.4) - 0.055 - 0.5)
+    assert radiance.grad[2] > 0
+    assert off[3] == pytest.approx(0.735357 - pixel[3].item(), abs=1e-5)
+
+
+def test_radiance_has_no_upper_end():
+    radiance, pixel = torch.tensor([4.0, 0.2]), torch.tensor([1.0, 1.0])
+    assert torch.equal(residual(radiance, pixel, "linear"), radiance - pixel)
+
+
+@pytest.mark.parametrize("response", ["linear", "srgb"])
+def test_common_exposure_is_the_inverse_of_a_gain(response):
+    radiance, gain = torch.tensor([0.01, 0.1, 0.4]), torch.tensor([0.5, 2.0, 1.5])
+    taken = apply_response(radiance * gain, response)
+    found = at_common_exposure(taken, gain, response)
+    torch.testing.assert_close(found, apply_response(radiance, response))
+
+
+def test_what_is_clipped_stays_a_lower_bound_at_any_exposure():
+    found = at_common_exposure(torch.tensor([1.0, 1.0]), torch.tensor([2.0, 0.5]), "srgb")
+    assert found[0] == 1.0  # its bound is 0.5; as a bound of 1 it is still none from above
+    assert found[1] == pytest.approx(1.055 * 2.0 ** (1 / 2.4) - 0.055)
+    assert residual(torch.tensor(9.0), found[0], "srgb") == 0

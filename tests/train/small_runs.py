@@ -10,6 +10,7 @@ from lightning_fabric import Fabric
 from rich.console import Console
 
 from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.held_back import hold_back
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.asked import Asked
 from neilfpp_method.effects.plan import Plan
@@ -17,8 +18,10 @@ from neilfpp_method.health.watch import Watch
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts
-from neilfpp_method.train.loop import Training, seed_step
+from neilfpp_method.train.loop import Training
+from neilfpp_method.train.optimizer import seed_step
 from neilfpp_method.train.progress import Reporter
+from neilfpp_method.train.quality import Quality
 from tests.scenes import tiny_config
 
 
@@ -72,7 +75,8 @@ def small_training(root: Path, out: Path, config: NeilfConfig) -> Training:
     solver, watch = model.light_solver(), Watch(pixels.sample(64), listener.warn)
     plan = Plan.begin(Asked("as-set"), config)
     quiet = (lambda: False, lambda model, stage: None, "")
-    return Training(out, config, model, pixels, fabric, listener, *quiet, solver, watch, plan)
+    quality = Quality(hold_back(pixels, config.train.seed), capture.hdr)
+    return Training(out, config, model, pixels, fabric, listener, *quiet, solver, watch, plan, quality)
 
 
 def differences(one: object, other: object, where: str = "") -> list[str]:

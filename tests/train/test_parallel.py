@@ -16,7 +16,7 @@ import torch
 
 from neilfpp_method.cli import main
 from neilfpp_method.schedule import Stage, active_losses, weigh
-from neilfpp_method.train.loop import seed_step
+from neilfpp_method.train.optimizer import seed_step
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import differences, small_config, small_training
 

@@ -165,6 +165,35 @@ def test_a_stop_in_the_last_step_has_nothing_left_to_stop(tmp_path, capture, who
     assert differences(state(tmp_path / "run"), state(whole)) == []
 
 
+def test_seed_step_and_process_each_have_random_numbers_of_their_own():
+    def drawn(*place: int) -> float:
+        loop.seed_step(*place)
+        return torch.rand(()).item()
+
+    places = list(itertools.product((0, 1), (0, 1, 2, 1000), (0, 1)))
+    assert len({drawn(*place) for place in places}) == len(places)
+    assert drawn(1, 2, 0) == drawn(1, 2, 0)
+
+
+def test_a_second_ctrl_c_does_not_wait(tmp_path, capture, whole, monkeypatch):
+    """Steps since the last checkpoint are lost, and computed again."""
+
+    def seed_step(seed: int, step: int, rank: int = 0) -> None:
+        if step == 5:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+        original(seed, step, rank)
+
+    original, out = loop.seed_step, tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "seed_step", seed_step)
+        with pytest.raises(Stopped, match="stopped at once; continue from its last checkpoint with: neilfpp"):
+            run(capture, out, small_config())
+    assert state(out)["step"] == 4
+    run(None, out, resume=True)
+    assert differences(state(out), state(whole)) == []
+
+
 def test_time_adds_up_over_stops(tmp_path, capture, monkeypatch):
     """On a clock that ticks when it is read, a stage takes one second a step, stopped or not."""
     out = tmp_path / "run"

@@ -17,7 +17,8 @@ from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import OptimizerConfig
 from neilfpp_method.train.build import scene_facts
-from neilfpp_method.train.loop import make_optimizer, set_rates, train
+from neilfpp_method.train.loop import train
+from neilfpp_method.train.optimizer import make_optimizer, set_rates
 from tests.data.make_capture import make_capture
 from tests.data.skies import GROUND, SKY, make_sky_capture
 from tests.scenes import sphere_model, tiny_config

@@ -20,7 +20,7 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.types import NeilfConfig, VolSdfConfig
 from neilfpp_method.train import command, start
 from neilfpp_method.train.build import build_model, scene_facts
-from neilfpp_method.train.loop import make_optimizer, seed_step
+from neilfpp_method.train.optimizer import make_optimizer, seed_step
 from neilfpp_method.train.run import save_checkpoint
 from neilfpp_method.train.start import GeometryStart, start_geometry
 from tests.data.make_capture import RADIUS, SCALE, make_capture

@@ -106,3 +106,13 @@ def test_gradients():
         return composite(found.weights, values), found.transmittance, found.opacity
 
     assert torch.autograd.gradcheck(rendered, (density, distances, far, values))
+
+
+def test_samples_that_rounding_has_swapped_emit_nothing():
+    """One unit in the last place behind its neighbour, in a medium in which that is a depth of −0.6."""
+    distances = torch.tensor([[0.5, 1.0, 1.0, 1.5]])
+    distances[0, 2] = torch.nextafter(distances[0, 1], torch.tensor(0.0))
+    found = render_weights(torch.tensor([[0.0, 1e7, 0.0, 0.1]]), distances, torch.tensor([2.0]))
+    assert (found.weights >= 0).all()
+    assert found.weights[0, 1] == 0
+    torch.testing.assert_close(found.opacity, -torch.expm1(torch.tensor([-0.05])))

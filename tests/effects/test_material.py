@@ -1,28 +1,43 @@
-"""Places that many views show: whether paint or metal explains them, where the truth is made up."""
+"""Places that many views show: what explains them, where the truth is made up."""
 
 from __future__ import annotations
 
+import dataclasses
+
+import pytest
 import torch
 
-from neilfpp_method.effects.metals import WORTH
-from neilfpp_method.effects.place_fit import METALLICS, fit_places, place_errors, place_transport
+from neilfpp_method.effects.material import WORTH, judge_material
+from neilfpp_method.effects.noise import lobe_noise
+from neilfpp_method.effects.place_fit import (
+    METALLICS,
+    ROWS,
+    PlaceFit,
+    fit_places,
+    place_errors,
+    place_transport,
+)
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.transport import from_texels, from_texels_at
 from neilfpp_method.settings.presets import preset
-from neilfpp_method.shading import LOBES
+from neilfpp_method.shading import LOBES, Lobe
 from neilfpp_method.structures import Observed
-from tests.effects.balls import ball
+from tests.effects.balls import ball as patches
+from tests.effects.balls import sky
+from tests.scenes import sphere_model, tiny_config
+from tests.train.small_runs import solved_light
 
 LOBE = LOBES["spherical_gaussian"]
 PLACES, VIEWS = 40, 9
 
 
-def ball_of(metallic: float) -> Places:
+def ball(metallic: float, lobe: Lobe | None = LOBE, environment: EnvironmentLight | None = None) -> Places:
     """A ball of one material."""
     one = torch.ones(PLACES, 1)
-    return ball(torch.tensor([[0.6, 0.5, 0.4]]).expand(PLACES, 3), 0.28 * one, metallic * one, LOBE, VIEWS)
+    color = torch.tensor([[0.6, 0.5, 0.4]]).expand(PLACES, 3)
+    return patches(color, 0.28 * one, metallic * one, lobe, VIEWS, environment)
 
 
 def gain_of_metals(places: Places) -> tuple[float, float]:
@@ -45,16 +60,65 @@ def gain_of_metals(places: Places) -> tuple[float, float]:
 
 
 def test_metal_explains_views_kept_back_of_a_metal_ball_and_not_of_a_painted_one():
-    of_metal, share = gain_of_metals(ball_of(1.0))
-    of_paint, share_of_paint = gain_of_metals(ball_of(0.0))
+    of_metal, share = gain_of_metals(ball(1.0))
+    of_paint, share_of_paint = gain_of_metals(ball(0.0))
     assert of_metal > 2 * WORTH
     assert share > 0.2  # the dark side of the sky tells little
     assert of_paint < 0.2 * WORTH
     assert share_of_paint == 0
 
 
+def judged(places: Places, *names: str) -> dict:
+    typical = places.observed.pixel.median().item()
+    found = judge_material(places, place_transport(places, LOBE, None), typical, frozenset(names))
+    return found.measured
+
+
+def test_a_shiny_ball_reflects_and_a_dull_one_does_not():
+    shiny = judged(ball(0.0), "reflection", "environment-map", "coloured-light")
+    assert shiny["reflection"].favours(False)
+    assert shiny["environment-map"].favours(False)
+    assert not shiny["coloured-light"].favours(False)
+    assert not judged(ball(0.0, None), "reflection")["reflection"].favours(False)
+
+
+def test_colours_of_the_light_are_told_from_those_of_paint():
+    """A red window and a blue sky: no paint of one colour looks so from all sides."""
+    window = sky()
+    window.log_radiance[1:, 4:6, 10:14] -= 2.0
+    window.log_radiance[0, : ROWS // 2] -= 1.0
+    assert judged(ball(0.0, LOBE, window), "coloured-light")["coloured-light"].favours(False)
+
+
+@pytest.mark.parametrize(("roughness", "worth_it"), [(1, True), (9, False)])
+def test_the_lobe_is_sampled_where_surfaces_are_smooth(roughness, worth_it):
+    torch.manual_seed(0)
+    places = ball(1.0)
+    fit = PlaceFit(
+        sky().log_radiance,
+        torch.full((PLACES, 3), 0.5),
+        torch.full((PLACES,), roughness),
+        torch.full((PLACES,), len(METALLICS) - 1),
+    )
+    found = lobe_noise(sphere_model(solved_light(tiny_config())), places, fit)
+    assert found.samples == PLACES
+    assert found.favours(False) is worth_it
+
+
+def test_one_roughness_is_the_same_everywhere_and_learns():
+    config = preset("fast")
+    field = BrdfField(dataclasses.replace(config.brdf, varying_roughness=False), config.encoding, 1.0)
+    x = torch.rand(5, 3)
+    material = field(x)
+    assert material.roughness.unique().numel() == 1
+    assert field.with_gradients(x).roughness_gradient.abs().max() == 0
+    material.roughness.sum().backward()
+    assert field.mlp.layers[-1].bias.grad[3] > 0
+    assert field.mlp.layers[-1].weight.grad is None
+
+
 def test_several_roughnesses_are_traced_once_and_are_what_each_is_alone():
-    observed = ball_of(0.0).observed[:20]
+    observed = ball(0.0).observed[:20]
     environment = EnvironmentLight(8, 1.0)
     torch.manual_seed(3)
     both = from_texels_at(environment, observed, (0.3, 0.7), LOBE, None)

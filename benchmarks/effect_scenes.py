@@ -1,0 +1,241 @@
+"""Three small captures of which it is known what light does in them, rendered by Mitsuba 3.
+
+    python -m benchmarks.effect_scenes build/effect-scenes --variant llvm_ad_rgb
+
+    lambertian   a ball of eight paints without any gloss under a coloured sky with a sun: convex, nothing
+                 else there
+    lamp         a shiny ball and a dull box on a floor under an even white sky, and a white lamp beside them
+    bowl         a bowl with four coloured walls, all equally glossy, under a grey sky with a bright window
+
+Each is a folder in the layout of the published captures, with its mesh, depth, normals, and materials of the
+test views. A surface without gloss has the roughness 1 in them.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+import tyro
+from jaxtyping import Float
+from rich.console import Console
+
+from benchmarks.mitsuba_scene import Lamp, Part, load_mitsuba, render
+from neilfpp_method.data.images import write_exr, write_png
+from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.views import Camera
+from neilfpp_method.errors import UserError
+
+__all__ = ["SCENES", "KnownScene", "write_capture"]
+
+DISTANCE = 3.4
+"""Of the cameras from the middle, world units; the scene box is the unit ball."""
+BOUNCES = 6
+TEST_EVERY = 6
+
+
+@dataclass(frozen=True)
+class KnownScene:
+    """What is there, the map over it, and how high the cameras stand, by turns, in degrees."""
+
+    parts: list[Part]
+    radiance: Float[np.ndarray, "H W 3"]
+    lamps: tuple[Lamp, ...]
+    elevations: tuple[float, float]
+
+
+def lambertian() -> KnownScene:
+    """A ball whose octants are of eight paints."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.8)
+    octant = (ball.triangles_center > 0) @ np.array([1, 2, 4])
+    paints = [(0.2 + 0.5 * (k & 1), 0.2 + 0.25 * (k & 2), 0.2 + 0.12 * (k & 4)) for k in range(8)]
+    parts = [
+        Part(ball.submesh([np.nonzero(octant == k)[0]], append=True), paint, None, 0.0)
+        for k, paint in enumerate(paints)
+    ]
+    return KnownScene(parts, sky((0.5, 0.8, 1.3), (1.0, 0.9, 0.8), (90.0, 60.0, 30.0)), (), (40.0, -15.0))
+
+
+def lamp() -> KnownScene:
+    """Two things on a floor and a lamp between them and the cameras."""
+    floor = trimesh.creation.box((1.3, 1.3, 0.04))
+    floor.apply_translation((0, 0, -0.32))
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.28)
+    ball.apply_translation((-0.25, 0.05, -0.02))
+    box = trimesh.creation.box((0.3, 0.3, 0.4))
+    box.apply_translation((0.3, 0.15, -0.1))
+    parts = [
+        Part(floor, (0.5, 0.5, 0.5), 0.7, 0.0),
+        Part(ball, (0.7, 0.15, 0.1), 0.25, 0.0),
+        Part(box, (0.15, 0.3, 0.6), 0.6, 0.0),
+    ]
+    bulb = Lamp((0.05, -0.35, 0.35), 0.06, (30.0, 30.0, 30.0))
+    return KnownScene(parts, np.full((16, 32, 3), 0.25), (bulb,), (35.0, 60.0))
+
+
+def bowl() -> KnownScene:
+    """A shell of half a ball, open above; each quarter has a colour."""
+    turn = np.linspace(0, math.pi / 2, 24)
+    inner = np.stack([0.72 * np.sin(turn), -0.72 * np.cos(turn)], 1)
+    outer = np.stack([0.8 * np.sin(turn), -0.8 * np.cos(turn)], 1)
+    profile = np.concatenate([outer, inner[::-1]])
+    profile[[0, -1], 0] = 0
+    shell = trimesh.creation.revolve(profile, sections=64)
+    shell.apply_translation((0, 0, 0.35))
+    centre = shell.triangles_center
+    quarter = (centre[:, 0] > 0) + 2 * (centre[:, 1] > 0)
+    colors = [(0.75, 0.15, 0.1), (0.15, 0.65, 0.2), (0.15, 0.25, 0.75), (0.7, 0.7, 0.65)]
+    parts = [
+        Part(shell.submesh([np.nonzero(quarter == k)[0]], append=True), color, 0.3, 0.0)
+        for k, color in enumerate(colors)
+    ]
+    return KnownScene(parts, sky((0.7,) * 3, (0.15,) * 3, (25.0,) * 3), (), (65.0, 40.0))
+
+
+SCENES: Mapping[str, Callable[[], KnownScene]] = {"lambertian": lambertian, "lamp": lamp, "bowl": bowl}
+
+
+def sky(
+    above: tuple[float, ...], below: tuple[float, ...], sun: tuple[float, ...], height: int = 32
+) -> Float[np.ndarray, "H W 3"]:
+    """A map that changes evenly from above to below, with a window of 17° beside the zenith."""
+    share = np.linspace(0, 1, height)[:, None, None]
+    radiance = (1 - share) * np.array(above) + share * np.array(below) + np.zeros((height, 2 * height, 3))
+    radiance[height // 4 - 1 : height // 4 + 2, height // 2 : height // 2 + 5] = sun
+    return radiance
+
+
+def camera_at(azimuth: float, elevation: float, width: int, height: int) -> Camera:
+    """A camera that looks at the middle; angles in radians."""
+    outward = np.array(
+        [
+            math.cos(azimuth) * math.cos(elevation),
+            math.sin(azimuth) * math.cos(elevation),
+            math.sin(elevation),
+        ]
+    )
+    right = np.cross(-outward, (0, 0, 1))
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(-outward, right), -outward])
+    pose[:3, 3] = -pose[:3, :3] @ (DISTANCE * outward)
+    focal = 1.6 * height
+    return Camera(focal, focal, width / 2, height / 2, width, height, pose)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the pixels of a view show, row by row: z-depth, 0 beside the scene, normal, number of the part."""
+
+    depth: Float[np.ndarray, "h w"]
+    normal: Float[np.ndarray, "h w 3"]
+    part: Float[np.ndarray, "h w"]
+
+
+def look(mesh: trimesh.Trimesh, part_of_face: np.ndarray, camera: Camera) -> Seen:
+    """By rays through the middles of the pixels."""
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    local = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+    directions = local.reshape(-1, 3) @ camera.w2c[:3, :3]
+    origins = np.broadcast_to(-camera.w2c[:3, :3].T @ camera.w2c[:3, 3], directions.shape)
+    places, rays, faces = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
+    depth, normal, part = np.zeros(u.size), np.zeros((u.size, 3)), np.full(u.size, -1)
+    depth[rays] = places @ camera.w2c[2, :3] + camera.w2c[2, 3]
+    normal[rays], part[rays] = mesh.face_normals[faces], part_of_face[faces]
+    return Seen(depth.reshape(u.shape), normal.reshape(*u.shape, 3), part.reshape(u.shape))
+
+
+def write_capture(mi, scene: KnownScene, root: Path, views: int, size: tuple[int, int], samples: int) -> Path:
+    """Render a scene into a folder; one view in `TEST_EVERY` is kept for tests. `mi` is of `load_mitsuba`."""
+    inputs, (width, height) = root / "inputs", size
+    mesh = trimesh.util.concatenate([part.mesh for part in scene.parts])
+    part_of_face = np.repeat(range(len(scene.parts)), [len(part.mesh.faces) for part in scene.parts])
+    for folder in (inputs / "model", inputs / "images", inputs / "masks"):
+        folder.mkdir(parents=True, exist_ok=True)
+    mesh.export(inputs / "model" / "mesh.ply")
+    rows = np.array(
+        [[*p.base_color, 1.0 if p.roughness is None else p.roughness, p.metallic] for p in scene.parts]
+    )
+    tracks, files, test = {}, {}, []
+    for i in range(views):
+        elevation = math.radians(scene.elevations[i % 2])
+        camera, name = camera_at(2 * math.pi * i / views, elevation, width, height), f"{i:03d}"
+        with tempfile.TemporaryDirectory() as folder:
+            picture = render(
+                mi, scene.parts, scene.radiance, camera, Path(folder), samples, BOUNCES, i, scene.lamps
+            )
+        seen = look(mesh, part_of_face, camera)
+        write_exr(inputs / "images" / f"{name}.exr", {"RGB": picture.astype(np.float32)})
+        write_exr(inputs / "depth_maps" / f"{name}.exr", {"Y": seen.depth.astype(np.float32)})
+        write_exr(inputs / "normal_maps" / f"{name}.exr", {"RGB": seen.normal.astype(np.float32)})
+        write_png(inputs / "masks" / f"{name}.png", np.where(seen.part >= 0, 255, 0).astype(np.uint8))
+        if i % TEST_EVERY == 0:
+            test.append(name)
+            shown = np.where(seen.part[..., None] >= 0, rows[seen.part], 0)
+            for kind, part in (("kd", slice(3)), ("roughness", 3), ("metallic", 4)):
+                path = root / "ground_truths" / "materials" / kind / f"{name}.png"
+                write_png(path, np.rint(255 * shown[..., part]).astype(np.uint8))
+        intrinsic = {"focal": [camera.fx, camera.fy], "ppt": [camera.cx, camera.cy]}
+        extrinsic = camera.w2c.reshape(-1).tolist()
+        tracks[str(i)] = {
+            "flg": 2,
+            "size": [width, height],
+            "camera": {"intrinsic": intrinsic, "extrinsic": extrinsic},
+        }
+        files[str(i)] = f"images/{name}.exr"
+    box = np.diag([2.0, 2.0, 2.0, 1.0]).reshape(-1).tolist()
+    write_json(root / "split.json", {"test": test})
+    write_json(
+        inputs / "sfm_scene.json",
+        {
+            "camera_track_map": {"images": tracks},
+            "image_path": {"file_paths": files},
+            "bbox": {"transform": box},
+        },
+    )
+    write_exr(root / "light" / "envmap.exr", {"RGB": scene.radiance.astype(np.float32)})
+    return root
+
+
+@dataclass
+class Options:
+    """Render the captures."""
+
+    out: tyro.conf.Positional[Path]
+    """Folder; a scene becomes a folder in it."""
+    variant: str = "scalar_rgb"
+    """Of Mitsuba; llvm_ad_rgb is a hundred times faster, and needs LLVM (DRJIT_LIBLLVM_PATH)."""
+    views: int = 24
+    """Of each scene; one in six is kept for tests."""
+    width: int = 96
+    """Pixels; the height is three quarters of it."""
+    samples: int = 256
+    """Of a pixel."""
+
+
+def main(options: Options, console: Console) -> None:
+    """Write those that are not there yet."""
+    mi = load_mitsuba(options.variant)
+    for name, scene in SCENES.items():
+        root = options.out / name
+        if (root / "split.json").exists():
+            console.print(f"{root} is there", soft_wrap=True)
+            continue
+        size = (options.width, round(0.75 * options.width))
+        console.print(
+            f"{write_capture(mi, scene(), root, options.views, size, options.samples)}", soft_wrap=True
+        )
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Options), Console())
+    except UserError as error:
+        Console(stderr=True).print(f"error: {error}", markup=False)
+        sys.exit(error.status)

@@ -1,0 +1,105 @@
+"""What evidence decided of the effects of some captures, beside what is true of them.
+
+    python -m benchmarks.effect_scenes build/effect-scenes
+    neilfpp train --data build/effect-scenes/bowl --host mesh --out runs/bowl
+    python -m benchmarks.effect_table runs/bowl
+
+Prints a table in Markdown: a row for each effect, a column for each run, which is known by the name of its
+capture's folder. "on" or "off" is the last decision; "wrong" stands beside one that is not the truth. Then
+comes what each wrong decision rests on.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+
+from neilfpp_method.errors import UserError
+from neilfpp_method.train.run import read_json
+
+__all__ = ["TRUE_EFFECTS", "markdown"]
+
+JUDGED = (
+    "inter-reflection",
+    "lamps",
+    "environment-map",
+    "coloured-light",
+    "reflection",
+    "metals",
+    "varying-roughness",
+    "lobe-sampling",
+)
+GLOSSY = {"reflection", "varying-roughness", "lobe-sampling"}
+SKY = {"environment-map", "coloured-light"}
+TRUE_EFFECTS: Mapping[str, set[str]] = {
+    "lambertian": SKY,
+    "lamp": {"inter-reflection", "lamps", *GLOSSY},
+    "bowl": {"inter-reflection", "environment-map", "reflection", "lobe-sampling"},
+    "tabletop_env": {"inter-reflection", "metals", *SKY, *GLOSSY},
+    "tabletop_mix": {"inter-reflection", "lamps", "metals", *SKY, *GLOSSY},
+    "spot_city": {"inter-reflection", "metals", *SKY, *GLOSSY},
+    "spot_paint": {"inter-reflection", *SKY, *GLOSSY},
+}
+"""What is in each capture, by the name of its folder: those of `effect_scenes`, and four others."""
+
+
+@dataclass(frozen=True)
+class Decided:
+    """The effects of a run, by name, as its `effects.json` has them, and the name of its capture."""
+
+    capture: str
+    effects: Mapping[str, Mapping[str, Any]]
+
+    def is_wrong(self, name: str) -> bool:
+        """Whether the last decision is not the truth."""
+        return (self.effects[name]["decision"] == "on") != (name in TRUE_EFFECTS[self.capture])
+
+
+def read_run(path: Path) -> Decided:
+    """The decisions of a run.
+
+    Raises:
+        UserError: the run has none, or nothing is known of its capture.
+    """
+    if not (path / "effects.json").is_file():
+        raise UserError(f"{path}: no effects.json", "give the folder of a run")
+    capture = Path(read_json(path / "capture.json")["root"]).name
+    if capture not in TRUE_EFFECTS:
+        raise UserError(f"{path}: nothing is known of {capture}", f"choose among {', '.join(TRUE_EFFECTS)}")
+    return Decided(capture, {row["effect"]: row for row in read_json(path / "effects.json")["effects"]})
+
+
+def markdown(runs: Sequence[Decided]) -> list[str]:
+    """The table, and a line for each wrong decision."""
+    lines = ["| effect | " + " | ".join(run.capture for run in runs) + " |", "|---" * (len(runs) + 1) + "|"]
+    for name in JUDGED:
+        cells = [run.effects[name]["decision"] + (" (wrong)" if run.is_wrong(name) else "") for run in runs]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    lines.append("")
+    for run in runs:
+        wrong = [name for name in JUDGED if run.is_wrong(name)]
+        lines += [f"- {run.capture}, {name}: {run.effects[name]['reason']}" for name in wrong]
+    return lines
+
+
+@dataclass
+class Options:
+    """Tabulate the decisions of runs."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders of runs."""
+
+
+if __name__ == "__main__":
+    try:
+        for line in markdown([read_run(path) for path in tyro.cli(Options).runs]):
+            Console().print(line, markup=False, soft_wrap=True, highlight=False)
+    except UserError as error:
+        Console(stderr=True).print(f"error: {error}", markup=False)
+        sys.exit(error.status)

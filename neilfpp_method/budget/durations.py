@@ -1,0 +1,45 @@
+"""Times as people write them."""
+
+from __future__ import annotations
+
+import re
+
+from neilfpp_method.errors import UserError
+
+__all__ = ["in_words", "read_duration"]
+
+UNITS = {"h": 3600.0, "m": 60.0, "s": 1.0}
+MAX_HOURS = 24 * 30
+
+
+def read_duration(text: str) -> float:
+    """Seconds.
+
+    Raises:
+        UserError: it is no time, or none that a training can take.
+
+    >>> read_duration("90s"), read_duration("10m"), read_duration("1h30m")
+    (90.0, 600.0, 5400.0)
+    """
+    parts = re.fullmatch(r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s)?", text.strip())
+    if parts is None or not any(parts.groups()):
+        raise UserError(f"'{text}' is no time", "write it as 90s, 10m, 1h or 1h30m")
+    seconds = sum(float(n or 0) * unit for n, unit in zip(parts.groups(), UNITS.values(), strict=True))
+    if not 0 < seconds <= MAX_HOURS * 3600:
+        raise UserError(f"'{text}' is no time for a training", f"give more than 0 and at most {MAX_HOURS}h")
+    return seconds
+
+
+def in_words(seconds: float) -> str:
+    """A time that `read_duration` reads, to the second; without seconds from an hour on.
+
+    >>> in_words(59.6), in_words(600), in_words(754), in_words(5400)
+    ('1m', '10m', '12m34s', '1h30m')
+    """
+    whole = round(seconds)
+    if whole >= 3600:
+        minutes = round(seconds / 60)
+        return f"{minutes // 60}h" + (f"{minutes % 60}m" if minutes % 60 else "")
+    if whole >= 60:
+        return f"{whole // 60}m" + (f"{whole % 60}s" if whole % 60 else "")
+    return f"{whole}s"

@@ -1,0 +1,34 @@
+"""`neilfpp replay`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from neilfpp_method.commands.command import Command, terminal
+
+__all__ = ["COMMAND"]
+
+
+@dataclass
+class Replay:
+    """Run a step that training skipped again, and name its first operation that is not finite."""
+
+    run: tyro.conf.Positional[Path]
+    """The run's folder."""
+    step: tyro.conf.Positional[int]
+    """The step that was skipped, as the warning named it; a run keeps the first four."""
+
+
+def run(options: Replay) -> None:
+    from neilfpp_method.kernels.process import computing_fast
+    from neilfpp_method.train.rerun import in_words, rerun_step
+
+    with computing_fast():
+        found = rerun_step(options.run, options.step)
+    terminal().print(in_words(found), soft_wrap=True)
+
+
+COMMAND = Command(Replay, run, ["neilfpp replay runs/teapot 1207"])

@@ -1,0 +1,61 @@
+"""`neilfpp tradeoff`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from neilfpp_method.commands.command import Command, Device, terminal
+from neilfpp_method.commands.report import after_training
+
+__all__ = ["COMMAND"]
+
+
+@dataclass
+class Tradeoff:
+    """Show what accuracy costs in time: train for several budgets, measure, write the frontier."""
+
+    data: Path
+    """The capture's folder."""
+    budgets: str = "1m,3m,10m"
+    """How long the runs may take, as 90s, 10m or 1h, with commas between them."""
+    out: Path | None = None
+    """The folder of the runs and of tradeoff.csv, .json and .svg; none: runs/CAPTURE-PRESET-tradeoff. What is
+    done there is not done again, and a run that was stopped goes on.
+    """
+    seeds: int = 1
+    """Runs of each budget, which differ in their random numbers; from two on the figure has error bars."""
+    preset: Literal["fast", "paper-mlp", "paper-ngp", "paper-ngp-hdr"] = "fast"
+    """The settings of all runs."""
+    host: Literal["volsdf", "mesh"] = "volsdf"
+    """Where geometry comes from, as of neilfpp train; mesh: the capture's inputs/model/mesh.ply."""
+    report: bool = False
+    """Write the page of each run, within its budget."""
+    device: Device = "auto"
+    """Where to compute."""
+
+
+def run(options: Tradeoff) -> None:
+    from neilfpp_method.budget.durations import read_duration
+    from neilfpp_method.kernels.process import computing_fast
+    from neilfpp_method.settings.presets import fixed_geometry, preset
+    from neilfpp_method.tradeoff.command import run_tradeoff
+
+    config = preset(options.preset)
+    config = fixed_geometry(config) if options.host == "mesh" else config
+    budgets = [read_duration(word) for word in options.budgets.split(",") if word.strip()]
+    out = options.out or Path("runs") / f"{options.data.resolve().name}-{config.preset}-tradeoff"
+    at_end = (lambda path: after_training(path, options.device)) if options.report else None
+    with computing_fast():
+        run_tradeoff(options.data, out, config, budgets, options.seeds, options.device, terminal(), at_end)
+
+
+COMMAND = Command(
+    Tradeoff,
+    run,
+    [
+        "neilfpp tradeoff --data captures/teapot --budgets 1m,3m,10m",
+        "neilfpp tradeoff --data captures/teapot --host mesh --budgets 1m,3m --seeds 3 --out runs/frontier",
+    ],
+)

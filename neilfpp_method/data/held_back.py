@@ -1,0 +1,73 @@
+"""Pixels of training views that no step learns from, by which a training is judged while it runs.
+
+They are small patches on the object, spread over the views. The test views of a capture stay untouched.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from jaxtyping import Int
+
+from neilfpp_method.data.drawing import MASK, VALID, PixelSet
+from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.structures import PixelBatch
+
+__all__ = ["PATCHES", "SIDE", "hold_back"]
+
+PATCHES, SIDE = 16, 4
+"""How many patches, and the pixels along the side of one."""
+MAX_SHARE = 1 / 32
+"""Of the pixels of the object that are held back at most: small captures have fewer patches, or none."""
+TRIES = 64
+"""Places that are tried for a patch: others may leave no room, or lie on a border."""
+
+
+def hold_back(pixels: PixelDataset, seed: int) -> PixelBatch:
+    """Take patches of pixels out of all later draws of `pixels`, and return those of their pixels that are
+    valid and on the object.
+
+    Which ones follows from the seed and the capture alone; torch's generators are left as they are. A draw of
+    other pixels still reads the colours beside them for its image gradient.
+
+    Args:
+        pixels: of the training views; it draws the patches no more.
+        seed: of the training.
+    """
+    bits = pixels.store.bits
+    of_object = PixelSet(bits, VALID | MASK, VALID | MASK)
+    count = min(PATCHES, int(MAX_SHARE * of_object.count) // SIDE**2)
+    chosen: list[Int[np.ndarray, " N"]] = []
+    taken: set[int] = set()
+    in_view: Counter[int] = Counter()
+    for view, patch in _places(pixels, of_object, seed, TRIES * count):
+        if len(chosen) == count:
+            break
+        if in_view[view] < -(-count // len(pixels.views)) and taken.isdisjoint(patch.tolist()):
+            chosen.append(patch)
+            taken.update(patch.tolist())
+            in_view[view] += 1
+    numbers = np.array(sorted(taken), dtype=np.int64)
+    pixels.leave_out(torch.from_numpy(numbers))
+    return pixels.numbered(torch.from_numpy(numbers[(bits[numbers] & (VALID | MASK)) == (VALID | MASK)]))
+
+
+def _places(
+    pixels: PixelDataset, of_object: PixelSet, seed: int, tries: int
+) -> Iterator[tuple[int, Int[np.ndarray, " N"]]]:
+    """Views and the numbers of the pixels of patches about pixels of the object, whole within the image."""
+    if not of_object.count:
+        return
+    kth = np.random.default_rng(seed).integers(of_object.count, size=tries)
+    for number in of_object.find(torch.from_numpy(kth)).tolist():
+        view = int(np.searchsorted(pixels.store.starts, number, side="right")) - 1
+        start, camera = int(pixels.store.starts[view]), pixels.views[view].camera
+        row, column = divmod(number - start, camera.width)
+        top, left = row - SIDE // 2, column - SIDE // 2
+        if top < 0 or left < 0 or top + SIDE > camera.height or left + SIDE > camera.width:
+            continue
+        rows, columns = np.arange(top, top + SIDE), np.arange(left, left + SIDE)
+        yield view, (start + rows[:, None] * camera.width + columns).reshape(-1)

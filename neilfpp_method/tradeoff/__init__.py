@@ -1,0 +1,1 @@
+"""What accuracy costs in time: one run for each budget, measured, put beside each other."""

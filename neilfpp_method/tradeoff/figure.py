@@ -1,0 +1,82 @@
+"""The frontier as a picture: a panel for each figure, accuracy over minutes, every point labelled; SVG."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from neilfpp_method.budget.durations import in_words
+from neilfpp_method.report.markup import Html, element
+from neilfpp_method.tradeoff.frontier import FIGURES, Point
+
+__all__ = ["draw_frontier"]
+
+COLUMNS = 3
+WIDTH, HEIGHT, HEAD = 330.0, 230.0, 44.0
+LEFT, RIGHT, TOP, BOTTOM = 48.0, 40.0, 34.0, 38.0
+INK, PALE, LINE, GRAY = "#1c1e22", "#5c626b", "#4477aa", "#aaaaaa"
+
+
+def draw_frontier(title: str, points: Sequence[Point]) -> str:
+    """The picture as text. Time is logarithmic; a bar through a point is a standard deviation over seeds to
+    either side; dominated points are hollow.
+    """
+    names = [name for name in FIGURES if points and name in points[0].figures]
+    rows = max(1, math.ceil(len(names) / COLUMNS))
+    panels = [
+        element(
+            "g",
+            *_panel(name, points),
+            transform=f"translate({number % COLUMNS * WIDTH} {HEAD + number // COLUMNS * HEIGHT})",
+        )
+        for number, name in enumerate(names)
+    ]
+    size = {"width": COLUMNS * WIDTH, "height": HEAD + rows * HEIGHT}
+    paper = element("rect", **size, fill="#ffffff")
+    heading = element("text", title, x=LEFT, y=28, font_size=18, fill=INK)
+    frame = {"xmlns": "http://www.w3.org/2000/svg", "font_family": "sans-serif"}
+    return element("svg", paper, heading, *panels, **frame, **size) + "\n"
+
+
+def _panel(name: str, points: Sequence[Point]) -> list[Html]:
+    figure = FIGURES[name]
+    ends = [
+        point.figures[name] + sign * point.deviations.get(name, 0.0) for point in points for sign in (-1, 1)
+    ]
+    margin = 0.1 * max(max(ends) - min(ends), 0.1)
+    low, high = min(ends) - margin, max(ends) + margin
+    times = [math.log(point.seconds) for point in points]
+    first, span = min(times), max(max(times) - min(times), 1e-6)
+
+    def place(seconds: float, value: float) -> tuple[float, float]:
+        across = (math.log(seconds) - first) / span if len(points) > 1 else 0.5
+        up = (value - low) / (high - low)
+        return LEFT + across * (WIDTH - LEFT - RIGHT), TOP + (1 - up) * (HEIGHT - TOP - BOTTOM)
+
+    better = "higher" if figure.higher_is_better else "lower"
+    drawn = [_text(LEFT, 18.0, f"{figure.title}, {figure.unit} ({better} is better)", INK, "start")]
+    for value in (min(ends), max(ends)):
+        drawn.append(_text(LEFT - 6, place(points[0].seconds, value)[1] + 4, f"{value:.1f}", PALE, "end"))
+    drawn.append(
+        _text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 8, "time that runs took, logarithmic", PALE, "middle")
+    )
+    line = [place(point.seconds, point.figures[name]) for point in points]
+    path = " ".join(f"{x:.1f},{y:.1f}" for x, y in line)
+    drawn.append(element("polyline", points=path, fill="none", stroke=LINE, stroke_width=2))
+    for point, (x, y) in zip(points, line, strict=True):
+        off = point.deviations.get(name)
+        if off is not None:
+            ends_of_bar = (place(point.seconds, point.figures[name] + sign * off)[1] for sign in (-1, 1))
+            bottom, top = (f"{end:.1f}" for end in ends_of_bar)
+            bar = {"x1": f"{x:.1f}", "x2": f"{x:.1f}", "y1": bottom, "y2": top}
+            drawn.append(element("line", **bar, stroke=LINE))
+        fill = "#ffffff" if point.dominated else LINE
+        drawn.append(element("circle", cx=f"{x:.1f}", cy=f"{y:.1f}", r=4, fill=fill, stroke=LINE))
+        label = f"{in_words(point.budget)}: {point.figures[name]:.2f}"
+        drawn.append(_text(x, y - 9, label, GRAY if point.dominated else INK, "middle"))
+    return drawn
+
+
+def _text(x: float, y: float, text: str, color: str, anchor: str) -> Html:
+    place = {"x": f"{x:.1f}", "y": f"{y:.1f}", "text_anchor": anchor}
+    return element("text", text, **place, fill=color, font_size=12)

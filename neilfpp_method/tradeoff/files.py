@@ -1,0 +1,47 @@
+"""A frontier on disk: `tradeoff.csv` with a line for each run, `tradeoff.json` with runs and points, and
+`tradeoff.svg`.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from neilfpp_method.budget.durations import in_words
+from neilfpp_method.data.images import replacing
+from neilfpp_method.tradeoff.figure import draw_frontier
+from neilfpp_method.tradeoff.frontier import FIGURES, Measured, frontier
+from neilfpp_method.train.json_files import write_json
+from neilfpp_method.train.run import environment
+
+__all__ = ["write_tradeoff"]
+
+FORMAT = 1
+
+
+def write_tradeoff(out: Path, title: str, runs: Sequence[Measured]) -> None:
+    """Write the three files; each whole or not at all."""
+    points = frontier(runs)
+    names = [name for name in FIGURES if any(name in run.figures for run in runs)]
+    dominated = {point.budget: point.dominated for point in points}
+    text = io.StringIO()
+    lines = csv.writer(text, lineterminator="\n")
+    lines.writerow(["budget", "seed", "budget_seconds", "seconds", *names, "dominated"])
+    for run in runs:
+        figures = [f"{run.figures[name]:.4f}" if name in run.figures else "" for name in names]
+        known = [in_words(run.budget), run.seed, f"{run.budget:.0f}", f"{run.seconds:.2f}"]
+        lines.writerow([*known, *figures, "yes" if dominated[run.budget] else "no"])
+    stored = {
+        "format": FORMAT,
+        "title": title,
+        "machine": {name: value for name, value in environment().items() if name != "command"},
+        "runs": [dataclasses.asdict(run) for run in runs],
+        "points": [dataclasses.asdict(point) for point in points],
+    }
+    for name, content in (("tradeoff.csv", text.getvalue()), ("tradeoff.svg", draw_frontier(title, points))):
+        with replacing(out / name) as temporary:
+            temporary.write_text(content, encoding="utf-8")
+    write_json(out / "tradeoff.json", stored)

@@ -1,0 +1,103 @@
+"""The frontier of accuracy over time, from the figures of runs: means over seeds, what each minute brought,
+and which budgets are dominated. Numbers in, numbers out.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+__all__ = ["FIGURES", "Measured", "Point", "frontier"]
+
+
+@dataclass(frozen=True)
+class _Figure:
+    title: str
+    unit: str
+    higher_is_better: bool
+
+
+FIGURES: Mapping[str, _Figure] = {
+    "base_color_psnr_scaled": _Figure("base colour, scaled", "dB", True),
+    "roughness_psnr": _Figure("roughness", "dB", True),
+    "metallic_psnr": _Figure("metallic", "dB", True),
+    "normal_mae_deg": _Figure("normals", "degrees", False),
+    "pbr_psnr": _Figure("novel view", "dB", True),
+    "held_back_psnr": _Figure("pixels held back", "dB", True),
+}
+"""Those of `neilfpp eval` where the capture's truth allows them; the last is of training views
+(`train.quality`) and always there.
+"""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A run that came to its end.
+
+    Attributes:
+        budget: seconds that it was given.
+        seed: of its random numbers.
+        seconds: that it took.
+        figures: by name, as in `FIGURES`.
+    """
+
+    budget: float
+    seed: int
+    seconds: float
+    figures: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Point:
+    """What a budget came to.
+
+    Attributes:
+        budget: seconds.
+        seconds: that its runs took, mean.
+        runs: how many.
+        figures: means over its runs, of figures that all runs have.
+        deviations: standard deviations over its runs; empty where there is one.
+        per_minute: what each figure changed by from the budget before, per minute of time that runs took;
+            empty for the first.
+        dominated: a budget whose runs took no longer is as good in every figure, and better in one.
+    """
+
+    budget: float
+    seconds: float
+    runs: int
+    figures: Mapping[str, float]
+    deviations: Mapping[str, float]
+    per_minute: Mapping[str, float]
+    dominated: bool
+
+
+def frontier(runs: Sequence[Measured]) -> list[Point]:
+    """The points of a frontier, by budget."""
+    known = set(FIGURES).intersection(*(run.figures for run in runs)) if runs else set()
+    names = [name for name in FIGURES if name in known]
+    by_budget: dict[float, list[Measured]] = {}
+    for run in sorted(runs, key=lambda run: run.budget):
+        by_budget.setdefault(run.budget, []).append(run)
+    means = {
+        budget: {name: statistics.fmean(run.figures[name] for run in group) for name in names}
+        for budget, group in by_budget.items()
+    }
+    took = {budget: statistics.fmean(run.seconds for run in group) for budget, group in by_budget.items()}
+    points, before = [], None
+    for budget, group in by_budget.items():
+        minutes = 0.0 if before is None else (took[budget] - took[before]) / 60.0
+        gained = {} if minutes <= 0 else {n: (means[budget][n] - means[before][n]) / minutes for n in names}
+        spread = {
+            name: statistics.stdev(run.figures[name] for run in group) for name in names if len(group) > 1
+        }
+        others = [other for other in by_budget if other != budget and took[other] <= took[budget]]
+        dominated = any(_dominates(means[other], means[budget], names) for other in others)
+        points.append(Point(budget, took[budget], len(group), means[budget], spread, gained, dominated))
+        before = budget
+    return points
+
+
+def _dominates(one: Mapping[str, float], other: Mapping[str, float], names: Sequence[str]) -> bool:
+    better = [(one[n] - other[n]) * (1 if FIGURES[n].higher_is_better else -1) for n in names]
+    return bool(better) and min(better) >= 0 < max(better)

@@ -1,0 +1,121 @@
+"""The runs of a tradeoff: each a run folder that `neilfpp train --resume` continues as any other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rich.console import Console
+
+from neilfpp_method.budget.durations import in_words
+from neilfpp_method.effects.asked import read_asked
+from neilfpp_method.errors import UserError
+from neilfpp_method.evaluate.protocols import evaluate, write_metrics
+from neilfpp_method.evaluate.size import at_size
+from neilfpp_method.settings.types import NeilfConfig
+from neilfpp_method.tradeoff.frontier import FIGURES, Measured
+from neilfpp_method.train.budget_record import read_budget
+from neilfpp_method.train.command import run_training
+from neilfpp_method.train.device import pick_device
+from neilfpp_method.train.json_files import read_json
+from neilfpp_method.train.quality import read_looks
+from neilfpp_method.train.run import load_run
+
+__all__ = ["Row", "measured", "rows_of", "run_row"]
+
+METRICS = "metrics.json"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A run to make: everything that a process elsewhere needs to know.
+
+    Attributes:
+        data: the capture.
+        out: the run's folder.
+        config: the settings, their seed included.
+        effects: as `--effects`.
+        budget: seconds.
+        device: where to compute.
+    """
+
+    data: Path
+    out: Path
+    config: NeilfConfig
+    effects: str
+    budget: float
+    device: str
+
+    @property
+    def name(self) -> str:
+        """As the figure has it."""
+        return self.out.name
+
+
+def rows_of(
+    data: Path, out: Path, config: NeilfConfig, budgets: Sequence[float], seeds: int, device: str
+) -> list[Row]:
+    """A row for each budget and seed, `OUT/10m-seed0` and so on, by budget.
+
+    Raises:
+        UserError: no budget, one that is given twice, or no seed.
+    """
+    if not budgets or len(set(budgets)) != len(budgets):
+        raise UserError("the budgets are none, or one is given twice", "name each once, as 1m,3m,10m")
+    if seeds < 1:
+        raise UserError(f"--seeds is {seeds}", "set it to 1 or more")
+    effects = "as-set" if config.preset.startswith("paper-") else "auto"
+    rows = []
+    for budget in sorted(budgets):
+        for seed in range(config.train.seed, config.train.seed + seeds):
+            seeded = replace(config, train=replace(config.train, seed=seed))
+            rows.append(Row(data, out / f"{in_words(budget)}-seed{seed}", seeded, effects, budget, device))
+    return rows
+
+
+def run_row(row: Row, console: Console, at_end: Callable[[Path], None] | None = None) -> None:
+    """Train a row, or the rest of it, and measure it; what is there already is left as it is.
+
+    Raises:
+        UserError: among others, the budget is too small for this machine.
+    """
+    there = (row.out / "config.json").is_file()
+    plan = read_budget(row.out) if there else None
+    if plan is None or plan.took is None:
+        run_training(
+            data=None if there else row.data,
+            out=row.out,
+            config=None if there else row.config,
+            resume=there,
+            test_every=None,
+            response="auto",
+            device=row.device,
+            devices=1,
+            console=console,
+            effects=None if there else read_asked(row.effects),
+            budget=row.budget,
+            at_end=at_end,
+        )
+    if not (row.out / METRICS).is_file():
+        run = at_size(load_run(row.out, pick_device(row.device)), None, None)
+        if run.capture.test_views:
+            write_metrics(row.out / METRICS, run, evaluate(run))
+
+
+def measured(row: Row) -> Measured | None:
+    """What a row came to; none: it has not come to its end.
+
+    Raises:
+        UserError: a file of the run is damaged.
+    """
+    plan = read_budget(row.out)
+    if plan is None or plan.took is None:
+        return None
+    known = read_json(row.out / METRICS) if (row.out / METRICS).is_file() else {}
+    figures = {name: float(known[name]) for name in FIGURES if isinstance(known.get(name), int | float)}
+    looks = read_looks(row.out)
+    if looks:
+        last = looks[-1]
+        figures["held_back_psnr"] = last.radiance if last.physical is None else last.physical
+    return Measured(row.budget, row.config.train.seed, plan.took, figures)

@@ -1,0 +1,119 @@
+"""A skipped step, run again from its own rays and weights, to see what in it is not finite."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import torch
+from torch.autograd import anomaly_mode
+
+from neilfpp_method.model import NeilfModel
+from neilfpp_method.schedule import active_losses, weigh
+from neilfpp_method.structures import PixelBatch
+from neilfpp_method.train.build import build_model
+from neilfpp_method.train.effects_record import read_plan
+from neilfpp_method.train.first_not_finite import Origin, OriginsOfNotFinite, is_finite
+from neilfpp_method.train.run import load_weights, read_description
+from neilfpp_method.train.skipped import SkippedStep, load_step
+
+__all__ = ["Rerun", "in_words", "rerun_step"]
+
+ROWS_SHOWN = 8
+
+
+@dataclass(frozen=True)
+class Rerun:
+    """What a step showed when it was run again.
+
+    Attributes:
+        skipped: the step.
+        inputs: names of weights and parts of the batch that are not finite before anything is computed.
+        losses: names of the losses that are not finite.
+        gradients: names of the fields whose gradient is not finite.
+        origin: the first operation that is not finite and comes to bear on one of these; none: all is finite,
+            or it was not an operation of torch.
+    """
+
+    skipped: SkippedStep
+    inputs: tuple[str, ...]
+    losses: tuple[str, ...]
+    gradients: tuple[str, ...]
+    origin: Origin | None
+
+    @property
+    def finite(self) -> bool:
+        """Whether nothing was wrong this time."""
+        return not (self.inputs or self.losses or self.gradients)
+
+
+def rerun_step(run: Path, step: int) -> Rerun:
+    """Run a skipped step again, on the CPU, with the random numbers that it had there.
+
+    Raises:
+        UserError: no run there, or no such step is kept in it.
+    """
+    described, skipped = read_description(run), load_step(run, step)
+    plan = read_plan(run, described.config, step)
+    capture = described.source.load_again(run)
+    model = build_model(capture, described.facts, plan.config_of_model)
+    model.use(plan.config)
+    load_weights(model, skipped.model, run)
+    model.train().freeze_for(skipped.stage)
+    torch.set_rng_state(skipped.random)
+    return _computed(model, skipped)
+
+
+def _computed(model: NeilfModel, skipped: SkippedStep) -> Rerun:
+    inputs = tuple(_broken_inputs(model, skipped.batch))
+    weights = active_losses(skipped.stage, model.config, model.stages, skipped.share)
+    # Anomaly mode notes, for each derivative, which line its operation was on.
+    with anomaly_mode.set_detect_anomaly(True, check_nan=False), OriginsOfNotFinite() as origins:
+        terms = model.step(skipped.batch, skipped.stage).terms
+        total = weigh(terms, weights)
+        if total.loss.requires_grad:
+            total.loss.backward()
+    losses = tuple(name for name, value in total.terms.items() if not math.isfinite(value.item()))
+    broken = {
+        name: [p.grad for p in parameters if p.grad is not None and not is_finite(p.grad)]
+        for name, parameters in model.parameter_groups().items()
+    }
+    gradients = tuple(name for name, found in broken.items() if found)
+    ends = [terms[name].values for name in losses] + [grad for found in broken.values() for grad in found]
+    known = [origin for end in ends if (origin := origins.origin_of(end)) is not None]
+    first = min(known, key=lambda origin: origin.order, default=None)
+    return Rerun(skipped, inputs, losses, gradients, first)
+
+
+def _broken_inputs(model: NeilfModel, batch: PixelBatch) -> Iterator[str]:
+    yield from (name for name, p in model.named_parameters() if not is_finite(p))
+    yield from (f.name for f in fields(batch) if not is_finite(getattr(batch, f.name)))
+
+
+def in_words(rerun: Rerun) -> str:
+    """What was found, a few lines."""
+    skipped, origin = rerun.skipped, rerun.origin
+    lines = [f"step {skipped.step}, stage {skipped.stage.value}, {len(skipped.batch)} rays"]
+    if rerun.finite:
+        lines.append("every loss and gradient is finite now: another process or device computed what was not")
+        return "\n".join(lines)
+    parts = {"not finite from the start": rerun.inputs, "losses": rerun.losses, "gradients": rerun.gradients}
+    lines += [f"{what}: {', '.join(names)}" for what, names in parts.items() if names]
+    if origin is None:
+        lines.append(
+            "first operation: none of torch's; the value came into the step as it is, or from a compiled loop"
+        )
+        return "\n".join(lines)
+    derivative = f", in the derivative of {origin.derivative_of}" if origin.derivative_of else ""
+    lines.append(f"first operation: {origin.operation}{derivative}")
+    lines.append(f"values: {origin.broken} of {origin.values} are not finite")
+    if origin.place:
+        lines.append(f"at {origin.place}: {origin.code}")
+    if origin.length == len(skipped.batch):
+        views = skipped.batch.view[list(origin.rows[:ROWS_SHOWN])].tolist()
+        more = " …" if len(origin.rows) > ROWS_SHOWN else ""
+        told = ", ".join(f"{row} (training view {v})" for row, v in zip(origin.rows, views, strict=False))
+        lines.append(f"rays: {told}{more}")
+    return "\n".join(lines)

@@ -1,0 +1,45 @@
+"""The drawings of time and quality: every number stands where it belongs."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from neilfpp_method.report.curves import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, quality_curve, work_bars
+from neilfpp_method.train.quality import Look
+
+
+def points(svg: str) -> list[list[tuple[float, float]]]:
+    lines = re.findall(r'<polyline points="([^"]*)"', svg)
+    return [[tuple(map(float, point.split(","))) for point in line.split()] for line in lines]
+
+
+def test_looks_lie_on_the_axes_that_are_drawn():
+    looks = [
+        Look(10, "sdf_init", 0.0, 20.0, None, 0.1),
+        Look(20, "joint", 50.0, 25.0, 22.0, 0.1),
+        Look(30, "joint", 100.0, 30.0, 24.0, 0.1),
+    ]
+    svg = quality_curve(looks)
+    radiance, physical = points(svg)
+    bottom, right = HEIGHT - BOTTOM, WIDTH - RIGHT
+    middle = (LEFT + right) / 2, (TOP + bottom) / 2
+    assert radiance == [(LEFT, bottom), middle, (right, TOP)]  # 20 to 30 dB are the ends of the axis
+    assert physical[0] == pytest.approx((middle[0], bottom - 0.2 * (bottom - TOP)))
+    assert "R 30.0 dB" in svg
+    assert "PBR 24.0 dB" in svg
+    assert quality_curve([]) is None
+    assert len(points(quality_curve(looks[:1]))) == 1  # no material yet
+
+
+def test_bars_are_as_long_as_the_work_took():
+    svg = work_bars(
+        {"preparation": {"data": 1.0}, "joint": {"shading": 3.0, "gradients": 1.0}}, {"joint": "Joint"}
+    )
+    widths = [float(width) for width in re.findall(r'<rect [^>]*width="([^"]*)"', svg)]
+    assert widths == pytest.approx([117.5, 352.5, 117.5])  # of the 470 that 4 s are long
+    assert "shading: 3.0 s" in svg
+    assert "Joint" in svg
+    assert "rendering" not in svg
+    assert work_bars({}, {}) is None

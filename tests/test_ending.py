@@ -1,0 +1,86 @@
+"""Commands that are asked to end: one line, the status that shells expect, and no half-written file."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+from neilfpp_method.cli import main
+from neilfpp_method.commands import COMMANDS
+from neilfpp_method.data.images import replacing
+from neilfpp_method.data.native_signals import sigterm_waits
+
+
+@dataclass
+class Nothing:
+    """No options."""
+
+
+def command(monkeypatch: pytest.MonkeyPatch, run: Callable[[object], None]) -> list[str]:
+    """The words of a command that does this."""
+    monkeypatch.setitem(COMMANDS, "inspect", replace(COMMANDS["inspect"], options=Nothing, run=run))
+    return ["inspect"]
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_command_ends_in_one_line(monkeypatch, capfd, tmp_path, number, status):
+    def work(_: object) -> None:
+        with replacing(tmp_path / "result.txt") as temporary:
+            temporary.write_text("half of")
+            signal.raise_signal(number)
+
+    before = signal.getsignal(number)
+    assert main(command(monkeypatch, work)) == status
+    assert capfd.readouterr().err == "stopped\n"
+    assert not list(tmp_path.iterdir())
+    assert signal.getsignal(number) is before
+
+
+def test_what_a_library_makes_of_ctrl_c_is_not_shown(monkeypatch, capfd):
+    def load(_: object) -> None:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise ImportError("initialization failed") from None
+
+    assert main(command(monkeypatch, load)) == 130
+    assert capfd.readouterr().err == "stopped\n"
+
+
+def test_other_errors_are_shown(monkeypatch):
+    def fail(_: object) -> None:
+        raise ImportError("a fault of ours")
+
+    with pytest.raises(ImportError, match="a fault of ours"):
+        main(command(monkeypatch, fail))
+
+
+def test_sigterm_waits_for_a_library_that_puts_its_own_handler_in_place():
+    told: list[str] = []
+    before = signal.signal(signal.SIGTERM, lambda *_: told.append("ours"))
+    try:
+        with sigterm_waits():
+            signal.signal(signal.SIGTERM, lambda *_: told.append("the library's"))
+            signal.raise_signal(signal.SIGTERM)
+            assert told == []
+        assert told == ["ours"]
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def test_a_stopped_write_keeps_what_was_there(monkeypatch, tmp_path: Path):
+    path = tmp_path / "result.txt"
+    path.write_text("whole")
+
+    def work(_: object) -> None:
+        with replacing(path) as temporary:
+            temporary.write_text("half of")
+            signal.raise_signal(signal.SIGTERM)
+
+    assert main(command(monkeypatch, work)) == 143
+    assert [file.name for file in tmp_path.iterdir()] == ["result.txt"]
+    assert path.read_text() == "whole"

@@ -1,0 +1,82 @@
+"""Rows are runs: those that are done stay, those that were stopped go on, those too small are left out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from neilfpp_method.cli import main
+from neilfpp_method.errors import UserError
+from neilfpp_method.settings import presets
+from neilfpp_method.tradeoff import rows
+from neilfpp_method.tradeoff.rows import rows_of
+from neilfpp_method.train.budget_record import read_budget
+from tests.data.make_capture import make_capture
+from tests.train.small_runs import small_config
+from tests.train.test_budget import STEPS, clock
+from tests.train.test_resume import files, interrupt_at
+
+__all__ = ["clock"]  # a fixture
+
+
+@pytest.fixture
+def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    config = small_config(**STEPS)
+    monkeypatch.setitem(presets.PRESETS, "fast", lambda: config)
+    capture = make_capture(tmp_path / "sphere", size=(48, 36), masks=True)
+    return ["tradeoff", "--data", str(capture), "--out", str(tmp_path / "out"), "--device", "cpu"]
+
+
+def test_a_second_call_goes_on_and_does_nothing_twice(tmp_path, words, clock, monkeypatch, capsys):
+    out = tmp_path / "out"
+    words += ["--budgets", "2m,1s,3m"]
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 12)
+        assert main(words) == 130  # in the row of 2m, as that of 1s is too small
+    assert "left out: a budget of 1s is too small" in capsys.readouterr().out
+    assert read_budget(out / "2m-seed0").took is None
+    assert main(words) == 0
+    assert "stopped" not in capsys.readouterr().err
+    points = json.loads((out / "tradeoff.json").read_text())["points"]
+    assert [point["budget"] for point in points] == [120.0, 180.0]
+    assert points[0]["seconds"] == pytest.approx(120.0, rel=0.1)
+    assert {"base_color_psnr_scaled", "pbr_psnr", "held_back_psnr"} <= set(points[0]["figures"])
+    assert not (out / "1s-seed0").exists()
+
+    before = files(out / "2m-seed0") | files(out / "3m-seed0")
+    assert main(words) == 0
+    assert files(out / "2m-seed0") | files(out / "3m-seed0") == before
+
+    assert main([*words, "--host", "mesh"]) == 2
+    assert "another capture or with other settings" in capsys.readouterr().err
+
+
+def test_nothing_can_be_run(tmp_path, words, clock, capsys):
+    assert main([*words, "--budgets", "1s"]) == 2
+    assert "no row could be run" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (["--budgets", "soon"], "no time"),
+        (["--budgets", "1m,60s"], "given twice"),
+        (["--budgets", ","], "the budgets are none"),
+        (["--seeds", "0"], "--seeds is 0"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, words, options, complaint, capsys):
+    assert main([*words, *options]) == 2
+    assert complaint in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_seeds_count_on(tmp_path):
+    found = rows_of(tmp_path, tmp_path, small_config(seed=3), [180.0, 60.0], 2, "cpu")
+    assert [row.name for row in found] == ["1m-seed3", "1m-seed4", "3m-seed3", "3m-seed4"]
+    assert [row.config.train.seed for row in found] == [3, 4, 3, 4]
+    with pytest.raises(UserError, match="given twice"):
+        rows.rows_of(tmp_path, tmp_path, small_config(), [60.0, 60.0], 1, "cpu")

@@ -1,0 +1,199 @@
+"""A run for a time: tried out, planned, kept to by its own clock, continued, refused where it cannot be."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+
+from neilfpp_method.budget.plan import Costs, StageCost
+from neilfpp_method.cli import main
+from neilfpp_method.data.capture import load_capture
+from neilfpp_method.effects.asked import Asked, read_asked
+from neilfpp_method.errors import Stopped, UserError
+from neilfpp_method.settings.presets import PRESETS
+from neilfpp_method.timing.ledger import Ledger
+from neilfpp_method.train import budgeted, command
+from neilfpp_method.train.budget_record import read_budget
+from neilfpp_method.train.command import run_training
+from neilfpp_method.train.run import load_checkpoint, load_run
+from neilfpp_method.train.trial import Trial, try_out
+from tests.data.make_capture import make_capture
+from tests.train.small_runs import small_config, solved_light
+from tests.train.test_resume import interrupt_at
+
+STEPS = {"sdf_steps": 40, "material_steps": 40, "joint_steps": 20}
+TICK = 0.1
+"""Seconds that pass at every look at the clock: some two seconds a step."""
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_capture(tmp_path_factory.mktemp("capture") / "sphere")
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A ledger whose time passes by being looked at, and a trial that takes steps for twice as cheap."""
+
+    def ticking(synchronise: object = None) -> Ledger:
+        ticks = itertools.count()
+        return Ledger(now=lambda: TICK * next(ticks))
+
+    cost = {"step": 1.0, "start": 0.5, "end": 1.0}
+    stages = {name.replace("steps", "init").replace("joint_init", "joint"): n for name, n in STEPS.items()}
+    costs = Costs({stage: StageCost(steps=n, **cost) for stage, n in stages.items()}, reserve=0.0)
+    monkeypatch.setattr(command, "Ledger", ticking)
+    monkeypatch.setattr(budgeted, "try_out", lambda *_: Trial(costs, places=0.0))
+
+
+def run(data: Path | None, out: Path, resume: bool = False, **options) -> str:
+    console = Console()
+    config = None if resume else small_config(**STEPS)
+    options = {"test_every": None, "response": "auto", "device": "cpu", "devices": 1, **options}
+    with console.capture() as said:
+        run_training(data=data, out=out, config=config, resume=resume, console=console, **options)
+    return said.get()
+
+
+def trained_steps(out: Path) -> int:
+    return load_checkpoint(out / "checkpoints" / "last.pt")["step"]
+
+
+def test_a_run_keeps_to_its_budget_though_steps_take_longer_than_the_trial_said(tmp_path, capture, clock):
+    said = run(capture, tmp_path / "run", budget=120.0, effects=read_asked("auto"))
+    plan = read_budget(tmp_path / "run")
+    assert plan.took == pytest.approx(120.0, rel=0.1)
+    first, last = plan.revisions[0], plan.revisions[-1]
+    assert len(plan.revisions) > 3
+    assert sum(last.steps.values()) < 0.8 * sum(first.steps.values())  # as many as the trial promised
+    assert trained_steps(tmp_path / "run") == sum(last.steps.values())
+
+    # Whoever loads the run finds the steps that were taken, and the material that is there.
+    loaded = load_run(tmp_path / "run")
+    assert loaded.config.train.sdf_steps == last.steps["sdf_init"]
+    assert loaded.config.train.joint_steps == last.steps["joint"]
+    assert loaded.has_material
+    assert "budget 2m: steps planned: sdf init" in said
+    assert f"budget: {plan.took:.1f} s of 120 s" in said
+
+    # The trial found no time for evidence for metals, so there may be metals.
+    decisions = json.loads((tmp_path / "run" / "effects.json").read_text())["decisions"]
+    metals = [decision for decision in decisions if decision["effect"] == "metals"]
+    assert [(decision["on"], decision["by"]) for decision in metals] == [(True, "settings")]
+
+
+def test_a_run_that_was_stopped_goes_on_within_its_budget(tmp_path, capture, clock):
+    out = tmp_path / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        interrupt_at(patch, 12)
+        with pytest.raises(Stopped):
+            run(capture, out, budget=120.0)
+    before = read_budget(out)
+    assert before.took is None
+    with pytest.raises(UserError, match="the run has a budget of 2m"):
+        run(None, out, resume=True, budget=60.0)
+    run(None, out, resume=True)
+    after = read_budget(out)
+    assert after.revisions[: len(before.revisions)] == before.revisions
+    assert after.took == pytest.approx(120.0, rel=0.1)
+    assert trained_steps(out) == sum(after.steps.values())
+
+
+def test_a_budget_too_small_is_refused_with_one_that_is_not(tmp_path, capture, clock, monkeypatch, capsys):
+    monkeypatch.setitem(PRESETS, "tiny", lambda: small_config(**STEPS))
+    words = ["train", "--data", str(capture), "--preset", "tiny", "--device", "cpu", "--no-report"]
+    assert main([*words, "--out", str(tmp_path / "run"), "--budget", "10s"]) == 2
+    complaint = capsys.readouterr().err
+    assert "a budget of 10s is too small" in complaint
+    assert not (tmp_path / "run").exists()
+    smallest = complaint.split("--budget ")[1].strip()
+    assert main([*words, "--out", str(tmp_path / "run"), "--budget", smallest]) == 0
+    assert main([*words, "--out", str(tmp_path / "other"), "--budget", "ten"]) == 2
+    assert not (tmp_path / "other").exists()
+
+
+def test_several_processes_have_no_budget(tmp_path, capture, clock):
+    with pytest.raises(UserError, match="--budget plans for one process"):
+        run(capture, tmp_path / "run", budget=120.0, devices=2)
+
+
+def test_a_run_without_a_budget_has_none(tmp_path, capture, clock):
+    with pytest.MonkeyPatch.context() as patch:
+        interrupt_at(patch, 2)
+        with pytest.raises(Stopped):
+            run(capture, tmp_path / "run")
+    assert read_budget(tmp_path / "run") is None
+    with pytest.raises(UserError, match="the run has no budget"):
+        run(None, tmp_path / "run", resume=True, budget=60.0)
+
+
+def test_a_trial_measures_every_stage_that_has_steps(capture):
+    config = solved_light(small_config(sdf_steps=100, material_steps=0, joint_steps=50))
+    state = load_capture(capture)
+    trial = try_out(
+        state, config, Asked("auto"), torch.device("cpu"), limit=0.2, most_for_places=1e9, report=True
+    )
+    costs = trial.costs
+    assert {stage: cost.steps for stage, cost in costs.stages.items()} == {"sdf_init": 100, "joint": 50}
+    assert all(cost.step > 0 and cost.end > 0 for cost in costs.stages.values())
+    assert costs.stages["sdf_init"].fit == costs.stages["sdf_init"].start == 0.0
+    assert costs.stages["joint"].fit > 0
+    assert costs.stages["joint"].first_fit > 0
+    assert costs.stages["joint"].start > trial.places > 0  # that of the surface, and that of places
+    assert costs.reserve > 0
+
+
+def test_evidence_that_takes_too_long_is_not_looked_for(capture):
+    config = solved_light(small_config(sdf_steps=0))
+    trial = try_out(
+        load_capture(capture), config, Asked("auto"), torch.device("cpu"), 0.05, 1e-9, report=False
+    )
+    assert trial.places == 0.0
+    assert list(trial.costs.stages) == ["material_init", "joint"]
+    assert trial.costs.stages["joint"].first_fit == 0.0  # it was in the stage before
+
+
+def test_what_settings_decide_is_not_tried(capture):
+    config = small_config(joint_steps=0)
+    trial = try_out(
+        load_capture(capture), config, Asked("as-set"), torch.device("cpu"), 0.05, 1.0, report=False
+    )
+    assert list(trial.costs.stages) == ["sdf_init", "material_init"]
+    assert trial.costs.stages["material_init"].fit == 0.0  # a light that is free is not solved for
+    assert trial.costs.reserve == trial.places == 0.0
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"format": 9},
+        {"revisions": []},
+        {"budget": None},
+        {"size": "huge"},
+        {"costs": {"stages": {"joint": {"steps": 1}}, "reserve": 0}},
+        {"revisions": [{"seconds": 1, "step": 0, "steps": {"tea": 3}}]},
+        {"revisions": [{"seconds": 1, "step": 0, "steps": {"joint": -3}}]},
+        {"costs": 7},
+    ],
+)
+def test_a_damaged_plan_is_named(tmp_path, damage):
+    cost = {"steps": 10, "step": 0.1, "fit": 0.0, "start": 0.0, "end": 0.0}
+    good = {
+        "format": 1,
+        "budget": 60.0,
+        "size": "usual",
+        "costs": {"stages": {"joint": cost}, "reserve": 1.0},
+        "places_looked_at": True,
+        "revisions": [{"seconds": 1.0, "step": 0, "steps": {"joint": 10}}],
+        "took": None,
+    }
+    (tmp_path / "plan.json").write_text(json.dumps(good))
+    assert read_budget(tmp_path).steps == {"joint": 10}
+    (tmp_path / "plan.json").write_text(json.dumps(good | damage))
+    with pytest.raises(UserError, match=r"plan\.json"):
+        read_budget(tmp_path)

@@ -1,0 +1,49 @@
+"""Geometry keeps to the capture's point cloud, where there is one."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.schedule import Stage
+from neilfpp_method.settings.plain import changed
+from neilfpp_method.settings.presets import fixed_geometry, preset
+from neilfpp_method.train.build import build_model, cloud_in_words, scene_facts
+from tests.data.make_capture import make_capture
+from tests.scenes import tiny_config
+
+
+@pytest.fixture
+def capture(tmp_path):
+    return load_capture(make_capture(tmp_path / "sphere"))
+
+
+def built(capture, config):
+    pixels = PixelDataset(capture, capture.train_views)
+    return build_model(capture, scene_facts(capture, pixels, config), config), pixels
+
+
+def test_the_cloud_is_in_the_loss_of_fast(capture):
+    config = preset("fast")
+    assert config.loss.point_cloud > 0
+    model, pixels = built(capture, changed(tiny_config(), {"loss.point_cloud": config.loss.point_cloud}))
+    terms = model.losses(pixels.sample(8), Stage.SDF_INIT)
+    # The sphere of the start is no sphere of 0.8: points lie off it.
+    assert terms["point_cloud"].values.max() > 0.05
+    assert "geometry keeps to oriented_pcd.ply" in cloud_in_words(capture, config)
+
+
+def test_a_capture_without_a_cloud_goes_without_it(capture):
+    without = dataclasses.replace(capture, point_cloud=None)
+    config = changed(tiny_config(), {"loss.point_cloud": 0.1})
+    model, pixels = built(without, config)
+    assert "point_cloud" not in model.losses(pixels.sample(8), Stage.SDF_INIT)
+    assert "from the images alone" in cloud_in_words(without, config)
+
+
+def test_nothing_is_said_where_no_cloud_is_asked_for(capture):
+    assert cloud_in_words(capture, changed(preset("fast"), {"loss.point_cloud": 0.0})) is None
+    assert cloud_in_words(capture, fixed_geometry(preset("fast"))) is None

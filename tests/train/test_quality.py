@@ -1,0 +1,123 @@
+"""Held-back pixels are looked at while a run trains, and the training is the same without."""
+
+from __future__ import annotations
+
+import json
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+from rich.console import Console
+
+from neilfpp_method.errors import Stopped, UserError
+from neilfpp_method.schedule import Stage, StagePosition
+from neilfpp_method.train import quality
+from neilfpp_method.train.command import run_training
+from neilfpp_method.train.loop import train
+from neilfpp_method.train.quality import FILE, MAX_SHARE, Look, Quality, read_looks
+from tests.data.make_capture import make_capture
+from tests.scenes import sphere_batch, sphere_model
+from tests.train.small_runs import differences, small_config, small_training, solved_light
+from tests.train.test_resume import interrupt_at, state
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return make_capture(tmp_path_factory.mktemp("capture") / "sphere", size=(48, 36), masks=True)
+
+
+def train_here(data, out, resume=False, **settings):
+    options = {"test_every": None, "response": "auto", "device": "cpu", "devices": 1}
+    config = None if resume else solved_light(small_config(**settings))
+    run_training(data=data, out=out, config=config, resume=resume, console=Console(quiet=True), **options)
+
+
+def test_looks_change_nothing_and_a_resumed_run_goes_on_with_them(tmp_path, capture, monkeypatch):
+    """A look after every step, against none but at the ends of stages; and against a run that was stopped."""
+    train_here(capture, tmp_path / "seldom")
+    monkeypatch.setattr(quality, "MIN_STEPS", 1)
+    monkeypatch.setattr(quality, "MAX_SHARE", 1.0)
+    train_here(capture, tmp_path / "often")
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 6)
+        with pytest.raises(Stopped):
+            train_here(capture, tmp_path / "stopped")
+    train_here(None, tmp_path / "stopped", resume=True)
+
+    assert [look.step for look in read_looks(tmp_path / "seldom")] == [4, 8, 12]
+    looks = read_looks(tmp_path / "often")
+    assert [look.step for look in looks] == list(range(1, 13))
+    assert [look.physical is None for look in looks] == [True] * 4 + [False] * 8
+    assert all(later.seconds > look.seconds for look, later in pairwise(looks))
+    for name in ("seldom", "stopped"):
+        assert differences(state(tmp_path / name), state(tmp_path / "often")) == []
+    again = read_looks(tmp_path / "stopped")
+    assert [look.step for look in again] == list(range(1, 13))
+    assert [look.radiance for look in again] == [look.radiance for look in looks]
+    assert [look.step for look in read_looks(tmp_path / "often", before=7)] == list(range(1, 8))
+
+
+def test_the_psnr_is_that_of_clipped_srgb_values():
+    """R and PBR of a model against pixels that lie a known distance off, in display values."""
+    model = sphere_model()
+    model.eval()
+    batch = sphere_batch(32)
+    maps = model.maps(batch.rays)
+    for off in (0.1, 0.01):
+        # A photograph that is R brighter by `off` in display values, where that does not clip.
+        shown = quality.tone_map(maps.rgb_volume)
+        batch.color.copy_(shown + torch.where(shown > 0.5, -off, off))
+        watch = Quality(batch, hdr=False)
+        watch.look_when_due(model.train(), StagePosition(Stage.JOINT, 4, 4), 12, 1.0)
+        assert watch.looks[0].radiance == pytest.approx(-20 * math.log10(off), abs=1e-3)
+        assert watch.looks[0].physical is not None
+        assert model.training
+
+
+def test_looks_are_seldom_and_cheap(monkeypatch):
+    monkeypatch.setattr(quality, "_decibels", lambda *_: (20.0, None))
+    watch = Quality(sphere_batch(4), hdr=True)
+    model = sphere_model()
+    for number in range(1, 3001):
+        watch.look_when_due(model, StagePosition(Stage.SDF_INIT, number, 3000), number, 1e9)
+    assert [look.step for look in watch.looks] == list(range(300, 3001, 300))
+    for number in range(1, 501):
+        watch.look_when_due(model, StagePosition(Stage.JOINT, number, 500), 3000 + number, 1e9)
+    assert [look.step for look in watch.looks[10:]] == [3200, 3400, 3500]
+    # Looks that have cost too much wait, but for the one at the end of a stage.
+    watch = Quality(sphere_batch(4), True, [Look(10, "sdf_init", 10.0, 1.0, None, took=1.0)])
+    for seconds, looks in ((0.9 / MAX_SHARE, 1), (1.1 / MAX_SHARE, 2)):
+        watch.look_when_due(model, StagePosition(Stage.JOINT, 400, 900), 1000, seconds)
+        assert len(watch.looks) == looks
+    watch.look_when_due(model, StagePosition(Stage.JOINT, 900, 900), 1500, 1.0)
+    assert watch.looks[-1].step == 1500
+
+
+def test_a_capture_too_small_is_not_looked_at(tmp_path):
+    training = small_training(make_capture(tmp_path / "sphere", size=(8, 6)), tmp_path, small_config())
+    assert not len(training.quality.pixels)
+    train(training)
+    assert read_looks(tmp_path) == []
+    assert json.loads((tmp_path / FILE).read_text())["pixels"] == 0
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"format": 9},
+        {"format": 1},
+        {"format": 1, "looks": [1]},
+        {"format": 1, "looks": [{"step": 1}]},
+        {
+            "format": 1,
+            "looks": [
+                {"step": 1, "stage": "joint", "seconds": 1e999, "radiance": 1, "physical": None, "took": 0}
+            ],
+        },
+    ],
+)
+def test_a_damaged_record_is_named(tmp_path, damage):
+    (tmp_path / FILE).write_text(json.dumps(damage))
+    with pytest.raises(UserError, match=r"quality\.json"):
+        read_looks(tmp_path)

@@ -1,0 +1,158 @@
+"""A skipped step is kept, and running it again names the operation that is not finite."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from neilfpp_method import losses
+from neilfpp_method.cli import main
+from neilfpp_method.errors import UserError
+from neilfpp_method.settings.presets import PRESETS
+from neilfpp_method.structures import LossTerm
+from neilfpp_method.train.first_not_finite import OriginsOfNotFinite
+from neilfpp_method.train.loop import Training, train
+from neilfpp_method.train.rerun import in_words, rerun_step
+from neilfpp_method.train.run import CaptureSource, create_run
+from neilfpp_method.train.skipped import FOLDER, MAX_KEPT, load_step
+from tests.data.make_capture import make_capture
+from tests.train.small_runs import small_config, small_training
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_capture(tmp_path_factory.mktemp("capture") / "sphere")
+
+
+@pytest.fixture
+def training(tmp_path: Path, capture: Path, monkeypatch: pytest.MonkeyPatch) -> Training:
+    """A run on disk, four steps a stage, whose material stage shades points of earlier steps again."""
+    monkeypatch.setattr("neilfpp_method.lighting.replay.KEPT_STEPS", 1)
+    config = small_config(fresh=0.5)
+    made = small_training(capture, tmp_path / "run", config)
+    create_run(made.path, config, CaptureSource(str(capture)), made.model.facts)
+    return made
+
+
+def spoil(monkeypatch: pytest.MonkeyPatch, training: Training, number: int, spoiled) -> None:
+    """Let `losses.photometric` return `spoiled(errors)` in this step, and whenever that step is run again."""
+    honest, step = losses.photometric, training.model.step
+    calls, now = iter(range(1000)), [number]
+
+    def counted(*arguments):
+        now[0] = next(calls)
+        return step(*arguments)
+
+    def photometric(*arguments):
+        term = honest(*arguments)
+        return LossTerm(spoiled(term.values)) if now[0] == number else term
+
+    training.model.step = counted
+    monkeypatch.setattr(losses, "photometric", photometric)
+    monkeypatch.setattr(
+        "neilfpp_method.train.rerun.load_step", lambda *a: (now.__setitem__(0, number), load_step(*a))[1]
+    )
+
+
+@pytest.mark.parametrize("step", [2, 7, 9])
+def test_a_loss_that_is_not_finite(training, monkeypatch, step):
+    def divided(errors: torch.Tensor) -> torch.Tensor:
+        spread = torch.ones_like(errors)
+        spread[3] = 0.0
+        return errors / spread / spread
+
+    spoil(monkeypatch, training, step, divided)
+    train(training)
+    assert training.skipped == 1
+    assert f"neilfpp replay {training.path} {step}" in "\n".join(training.reporter.said)
+    assert [file.stem for file in (training.path / FOLDER).iterdir()] == [str(step)]
+    found = rerun_step(training.path, step)
+    assert not found.finite
+    assert "aten.div.Tensor" in found.origin.operation
+    assert found.origin.derivative_of is None
+    assert found.origin.rows == (3,)
+    assert "first operation: aten.div.Tensor" in in_words(found)
+
+
+def test_a_gradient_that_is_not_finite_names_the_line_of_its_operation(training, monkeypatch):
+    """√0 has the value 0 and no slope."""
+
+    def rooted(errors: torch.Tensor) -> torch.Tensor:
+        return errors + (errors[:1] * 0.0).sqrt()
+
+    spoil(monkeypatch, training, 2, rooted)
+    train(training)
+    found = rerun_step(training.path, 2)
+    assert found.losses == ()
+    assert found.gradients
+    assert found.origin.derivative_of == "SqrtBackward0"
+
+
+def test_a_rerun_repeats_the_step_bit_for_bit(training, monkeypatch):
+    """Its losses are those of the skipped step, in a stage that shades remembered points again as well."""
+    values, honest = [], training.model.step
+
+    def remembering(*arguments):
+        computed = honest(*arguments)
+        values.append({name: term.values.detach().clone() for name, term in computed.terms.items()})
+        if len(values) == 7:
+            return computed._replace(
+                terms={name: LossTerm(t.values * math.nan) for name, t in computed.terms.items()}
+            )
+        return computed
+
+    training.model.step = remembering
+    train(training)
+    again: list[dict] = []
+    weigh = "neilfpp_method.train.rerun.weigh"
+    from neilfpp_method.train import rerun
+
+    original = rerun.weigh
+    monkeypatch.setattr(
+        weigh,
+        lambda terms, weights: (
+            again.append({n: t.values.detach() for n, t in terms.items()}),
+            original(terms, weights),
+        )[1],
+    )
+    found = rerun_step(training.path, 6)
+    assert found.finite
+    assert "finite now" in in_words(found)
+    assert training.model.replay.ring.full  # points of earlier steps were shaded
+    assert values[6].keys() == again[0].keys()
+    for name, value in values[6].items():
+        assert torch.equal(value, again[0][name]), name
+
+
+def test_the_first_ones_are_kept(training):
+    honest = training.model.step
+    training.model.step = lambda *a: (r := honest(*a))._replace(
+        terms={name: LossTerm(t.values * math.nan) for name, t in r.terms.items()}
+    )
+    with pytest.raises(Exception, match="10 steps in a row"):
+        train(training)
+    assert sorted(int(file.stem) for file in (training.path / FOLDER).iterdir()) == list(range(MAX_KEPT))
+
+
+def test_an_infinity_that_a_mask_takes_out_is_not_told():
+    with OriginsOfNotFinite() as origins:
+        x = torch.tensor([0.0, 1.0])
+        harmless = torch.where(x > 0, 1.0 / x, 0.0)
+        wrong = harmless.log() * 0.0 + 1.0
+    assert origins.origin_of(harmless) is None
+    assert "log" in origins.origin_of(wrong).operation
+    assert origins.origin_of(wrong).rows == (0,)
+
+
+def test_a_step_that_was_not_kept(training, monkeypatch, capfd):
+    monkeypatch.setitem(PRESETS, "tiny", small_config)
+    with pytest.raises(UserError, match="no skipped step 3 is kept; it has none"):
+        load_step(training.path, 3)
+    assert main(["replay", str(training.path), "3"]) == 2
+    (training.path / FOLDER).mkdir()
+    (training.path / FOLDER / "3.pt").write_bytes(b"not a step")
+    assert main(["replay", str(training.path), "3"]) == 2
+    assert capfd.readouterr().err.count("\n") == 2
