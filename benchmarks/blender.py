@@ -45,7 +45,7 @@ __all__ = ["blender_picture", "shown_psnr"]
 
 BOUNCES = 6
 ASSET = AssetOptions(texture_size=2048, faces=30_000, error=0.001)
-MOST_SECONDS = 3600
+MAX_SECONDS = 3600
 
 
 @dataclass
@@ -85,7 +85,7 @@ def blender_picture(
     words = [python, asset / "open_in_blender.py", "--camera", camera, "--render", out, "--source", source]
     words += ["--percent", percent, "--samples", samples]
     done = subprocess.run(
-        [str(word) for word in words], capture_output=True, text=True, timeout=MOST_SECONDS, check=False
+        [str(word) for word in words], capture_output=True, text=True, timeout=MAX_SECONDS, check=False
     )
     if done.returncode or not out.is_file():
         last = (done.stderr.strip() or done.stdout.strip() or "no word").splitlines()[-1]
