@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from neilfpp_method import losses
 from neilfpp_method.fields.brdf import BrdfField
+from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.exposure import PhotographGains, at_mean_exposure
 from neilfpp_method.fields.light import LightModel, make_light
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised, SmoothsNormals
