@@ -23,7 +23,7 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import PIXELS_OF_A_VIEW, at_scale, scale_for_pixels
 from neilfpp_method.effects.asked import Asked
 from neilfpp_method.effects.looks import look_at_surface, note_facts
-from neilfpp_method.effects.material import seconds_of_evidence
+from neilfpp_method.effects.material import JUDGED, seconds_of_evidence
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.health.look import look
 from neilfpp_method.health.watch import LOOKED_AT
