@@ -188,6 +188,7 @@ EFFECTS: Mapping[str, Effect] = {
             obstacle=_without_reflection("a surface without reflection has no roughness"),
             cost=lambda config: "one more unknown at every point",
             risk="all gloss is as sharp as that in the middle",
+            advised=True,
             unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
             needs="reflection",
         ),
@@ -203,6 +204,20 @@ EFFECTS: Mapping[str, Effect] = {
             ),
             risk="sharp reflections are noise",
             unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
+            needs="reflection",
+        ),
+        Effect(
+            name="long-tails",
+            title="the long tails of highlights (GGX)",
+            is_on=lambda config: config.shading.lobe == "ggx",
+            on=lambda config: {"shading.lobe": "ggx"},
+            off={"shading.lobe": "spherical_gaussian"},
+            obstacle=lambda config: (
+                "" if config.shading.specular else "a surface without reflection has no highlights"
+            ),
+            cost=lambda config: "none",
+            risk="the glow about highlights becomes roughness",
+            unjudged=_free_light("not judged: a light that is free at every point explains both lobes alike"),
             needs="reflection",
         ),
         Effect(

@@ -6,8 +6,11 @@ import torch
 
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.disagreement import ShownSurface, shading_disagreement
+from neilfpp_method.effects.first_light import FirstLight, find_first_light
+from neilfpp_method.effects.lobes import lobe_evidence
 from neilfpp_method.effects.material import JUDGED, material_evidence
 from neilfpp_method.effects.measurement import Measurement
+from neilfpp_method.effects.places import gather_places
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.visibility import self_visibility
 from neilfpp_method.lighting.fit import MIN_GAIN, Evidence
@@ -16,10 +19,16 @@ from neilfpp_method.schedule import has_material
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.structures import Observed, PixelBatch
 
-__all__ = ["LOOKED_AT", "after_fit", "look_at_surface", "note_facts", "wants_surface"]
+__all__ = ["LOOKED_AT", "after_fit", "look_at_light", "look_at_surface", "note_facts", "wants_surface"]
 
 LOOKED_AT = 1024
 """Training pixels whose surface points are measured: the standard error of a 1 % share is 0.3 %."""
+LIGHT_PIXELS = 4096
+"""Training pixels among which places are looked for that many views show."""
+PLACES, VIEWS, MIN_VIEWS = 1200, 20, 4
+"""How many places the light starts from at most, and how many views of each; fewer views than these do not
+tell materials apart. 10,000 pixels take 200 MB.
+"""
 AT_ONCE = 512
 """Rays that are rendered together; bounds the memory."""
 
@@ -44,6 +53,31 @@ def note_facts(plan: Plan, facts: SceneFacts) -> None:
 def wants_surface(plan: Plan) -> bool:
     """Whether a look at the surface could decide anything."""
     return any(plan.is_open(name) for name in ("inter-reflection", *JUDGED, "joint-stage"))
+
+
+@torch.no_grad()
+def look_at_light(
+    plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int
+) -> tuple[list[Decision], FirstLight | None]:
+    """Decide on the lobe of highlights where that is open, and find the light that training starts with.
+
+    Arguments as of `look_at_surface`; the model computes as the plan says afterwards.
+    """
+    mode = model.training
+    model.eval()
+    surface = _shown_surface(model, pixels.sample(LIGHT_PIXELS, gradients=False)).observed
+    position, normal = surface.position[:PLACES], surface.normal[:PLACES]
+    places = gather_places(model, pixels, position, normal, VIEWS).in_views(MIN_VIEWS)
+    typical, decisions = model.facts.median_radiance, []
+    if plan.is_open("long-tails") and plan.newest("long-tails") is None:
+        measured = lobe_evidence(places, model.scene, typical, model.brdf.metals)
+        decisions.append(plan.decide("long-tails", measured, step, must_be_earned=True))
+        model.use(plan.config)
+    found = None
+    if model.lobe is not None:
+        found = find_first_light(places, model.lobe, model.scene, typical, model.brdf.metals)
+    model.train(mode)
+    return decisions, found
 
 
 @torch.no_grad()

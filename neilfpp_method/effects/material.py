@@ -91,9 +91,7 @@ def material_evidence(
     Returns:
         A measurement for each name, of no samples where views show too little.
     """
-    places = gather_places(model, pixels, position[:PLACES], normal[:PLACES], VIEWS)
-    views = torch.bincount(places.place, minlength=places.count)
-    places = places.where(torch.nonzero(views[places.place] >= MIN_VIEWS)[:, 0])
+    places = gather_places(model, pixels, position[:PLACES], normal[:PLACES], VIEWS).in_views(MIN_VIEWS)
     if not len(places.place):
         return {name: Measurement("views of the same place", 0.0, 0.0, WORTH, 0) for name in names}
     transport = place_transport(places, LOBES[model.config.shading.lobe], model.scene)
@@ -163,7 +161,7 @@ class Trial:
     def of(self, model: Model) -> Explained:
         """The places as a model explains them."""
         carried, typical = model.sees(self.carried), self.typical
-        fit = fit_places(self.known, carried, typical, model.metals, model.form)
+        fit = fit_places(self.known, carried, typical, model.metals, form=model.form)
         if model.roughness is not None:
             fit = replace(fit, roughness=torch.full_like(fit.roughness, model.roughness))
         fitted = place_errors(fit, self.known, carried, typical).mean().item()

@@ -8,6 +8,7 @@ two take turns.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.objective import FLOOR, OUTLIER, total_variation
 from neilfpp_method.lighting.transport import Transport, from_texels_at
 from neilfpp_method.shading.brdf import Lobe
-from neilfpp_method.structures import SceneTracer
+from neilfpp_method.structures import Material, SceneTracer
 
 __all__ = ["PlaceFit", "any_map", "fit_places", "place_errors", "place_transport"]
 
@@ -30,8 +31,10 @@ ROUGHNESSES = (0.08, 0.14, 0.2, 0.28, 0.36, 0.45, 0.55, 0.66, 0.8, 1.0)
 """Of the grid; the lobe's width changes by about a half from one to the next."""
 METALLICS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 """Of the grid."""
-ROWS = 32
-"""Of the map: texels of 6°, in which lobes of roughness 0.3 fit."""
+ROWS = 16
+"""Of the map: texels of 12°. What is finer is left to training, which sees more pixels."""
+DIRECTIONS = 4
+"""Directions in each texel for each pixel: lobes of roughness 0.2 are narrower than a texel."""
 ROUNDS = 6
 """Turns of material and light."""
 FIRST_STEPS, STEPS = 100, 40
@@ -40,14 +43,20 @@ RATE, GAIN_RATE = 0.1, 0.03
 """Of log radiance, and of the logarithms of base colours."""
 SMOOTHNESS = 0.02
 """Weight of the map's total variation, as preset `fast` has it."""
-BOUND, BOUND_WEIGHT = 0.9, 10.0
+BOUND, BOUND_WEIGHT = 0.95, 1.0
 """Base colours above this pay for it, so that light rather than a bound takes up the scale."""
+SCALE_WEIGHT = 10.0
+"""Of the squared distance of the mean log base colour from where it is held."""
+NEIGHBOURS_SHARE = 1 / 200
+"""Share of the places that decide together on roughness and metallic, as neighbours often are of one
+material, and the views of one place hardly tell them.
+"""
 REWEIGHTED = 4
 """Solves for the base colour, in each of which pixels count by the inverse of their last error."""
 START_BASE_COLOR, START_ROUGHNESS = 0.3, 4
 """What places start as; roughness by its number."""
 MIN_BASE_COLOR = 0.01
-"""Of base colours."""
+"""Darker places count as this dark."""
 
 
 @dataclass(frozen=True)
@@ -64,12 +73,25 @@ class PlaceFit:
         """Of the texels, row by row."""
         return self.log_radiance.exp().flatten(1).t()
 
+    def material(self, place: Int[Tensor, " N"]) -> Material:
+        """Of places by number."""
+        roughness = torch.tensor(ROUGHNESSES, device=place.device)[self.roughness[place]]
+        metallic = torch.tensor(METALLICS, device=place.device)[self.metallic[place]]
+        return Material(self.base_color[place], roughness[:, None], metallic[:, None])
+
 
 @torch.no_grad()
 def place_transport(places: Places, lobe: Lobe, scene: SceneTracer | None) -> Transport:
-    """To N pixels from the texels of a map, in the layers of `from_texels_at`: 84 kB a pixel."""
+    """To N pixels from the texels of a map, in the layers of `from_texels_at`: 21 kB a pixel."""
     environment = EnvironmentLight(ROWS, 1.0).to(places.place.device)
-    return from_texels_at(environment, places.observed, ROUGHNESSES, lobe, scene)
+    drawn = [
+        from_texels_at(environment, places.observed, ROUGHNESSES, lobe, scene) for _ in range(DIRECTIONS)
+    ]
+    sources, scene_light = (
+        functools.reduce(torch.add, (getattr(part, name) / DIRECTIONS for part in drawn))
+        for name in ("sources", "scene")
+    )
+    return Transport(sources, scene_light)
 
 
 def any_map(log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
@@ -82,29 +104,49 @@ def fit_places(
     transport: Transport,
     typical: float,
     metals: bool,
+    mean_base_color: float | None = None,
+    start: PlaceFit | None = None,
+    rounds: int = ROUNDS,
     form: Callable[[Float[Tensor, "3 H W"]], Float[Tensor, "3 H W"]] = any_map,
 ) -> PlaceFit:
-    """Light and materials from a start of grey paint under an even light.
+    """Light and materials of places.
 
     Args:
         places: with linear radiance.
         transport: of the same pixels.
         typical: radiance of a typical pixel.
         metals: whether metallic may be more than 0.
+        mean_base_color: where the geometric mean over places and channels is held; none: it is free.
+        start: what the search starts from; none: grey paint under an even light.
+        rounds: turns of light and material.
         form: makes the map of log radiance from as many unknowns.
     """
-    device = places.place.device
-    count = places.count
-    fit = PlaceFit(
-        log_radiance=torch.full((3, ROWS, 2 * ROWS), math.log(typical / START_BASE_COLOR), device=device),
-        base_color=torch.full((count, 3), START_BASE_COLOR, device=device),
+    held = START_BASE_COLOR if mean_base_color is None else mean_base_color
+    fit = _even_start(places, typical, held) if start is None else start
+    near = _neighbours(places)
+    for turn in range(rounds):
+        steps = FIRST_STEPS if start is None and turn == 0 else STEPS
+        fit = _better_light(fit, places, transport, typical, steps, mean_base_color, form)
+        fit = _best_material(fit, places, transport, typical, METALLICS if metals else METALLICS[:1], near)
+    return fit
+
+
+def _even_start(places: Places, typical: float, base_color: float) -> PlaceFit:
+    """Grey paint under an even light."""
+    device, count = places.place.device, places.count
+    return PlaceFit(
+        log_radiance=torch.full((3, ROWS, 2 * ROWS), math.log(typical / base_color), device=device),
+        base_color=torch.full((count, 3), base_color, device=device),
         roughness=torch.full((count,), START_ROUGHNESS, device=device),
         metallic=torch.zeros(count, dtype=torch.long, device=device),
     )
-    for turn in range(ROUNDS):
-        fit = _better_light(fit, places, transport, typical, STEPS if turn else FIRST_STEPS, form)
-        fit = _best_material(fit, places, transport, typical, METALLICS if metals else METALLICS[:1])
-    return fit
+
+
+def _neighbours(places: Places) -> Int[Tensor, "P K"]:
+    """Of each place itself and those next to it."""
+    middle = places.mean(places.observed.position)
+    count = max(1, min(places.count, round(NEIGHBOURS_SHARE * places.count)))
+    return torch.cdist(middle, middle).topk(count, largest=False).indices
 
 
 @torch.no_grad()
@@ -112,7 +154,8 @@ def place_errors(fit: PlaceFit, places: Places, transport: Transport, typical: f
     """Relative error of each pixel, at most 1, mean of its channels."""
     shown = _at_roughness(transport, fit.roughness[places.place])
     sent = torch.einsum("knt,tc->knc", shown.sources, fit.radiance) + shown.scene
-    outgoing = _outgoing(sent, fit.base_color[places.place], _metallic(fit)[places.place])
+    material = fit.material(places.place)
+    outgoing = _outgoing(sent, material.base_color, material.metallic)
     return _relative_error(outgoing, places, typical).abs().clamp_max(1).mean(-1)
 
 
@@ -121,10 +164,6 @@ def _at_roughness(transport: Transport, number: Int[Tensor, " N"]) -> Transport:
     rows = torch.arange(len(number), device=number.device)
     layers = torch.stack((torch.zeros_like(number), 1 + 2 * number, 2 + 2 * number))
     return Transport(transport.sources[layers, rows].float(), transport.scene[layers, rows])
-
-
-def _metallic(fit: PlaceFit) -> Float[Tensor, "P 1"]:
-    return torch.tensor(METALLICS, device=fit.metallic.device)[fit.metallic][:, None]
 
 
 def _outgoing(sent: Tensor, base_color: Tensor, metallic: Tensor) -> Tensor:
@@ -145,10 +184,12 @@ def _better_light(
     transport: Transport,
     typical: float,
     steps: int,
+    mean_base_color: float | None,
     form: Callable[[Tensor], Tensor],
 ) -> PlaceFit:
     """The light by descent, and the base colours with it, at the roughness and metallic that places have."""
-    shown, metallic = _at_roughness(transport, fit.roughness[places.place]), _metallic(fit)[places.place]
+    shown = _at_roughness(transport, fit.roughness[places.place])
+    metallic = fit.material(places.place).metallic
     flat = shown.sources.flatten(0, 1)
     log_radiance = fit.log_radiance.clone().requires_grad_()
     gain = torch.zeros_like(fit.base_color, requires_grad=True)
@@ -164,6 +205,9 @@ def _better_light(
             loss = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER)
             loss = loss + SMOOTHNESS * total_variation(log_radiance)
             loss = loss + BOUND_WEIGHT * (base_color - BOUND).clamp_min(0).square().mean()
+            if mean_base_color is not None:
+                off = _log_mean(base_color) - math.log(mean_base_color)
+                loss = loss + SCALE_WEIGHT * off.square()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -171,16 +215,27 @@ def _better_light(
     return PlaceFit(form(log_radiance).detach(), base_color, fit.roughness, fit.metallic)
 
 
+def _log_mean(base_color: Float[Tensor, "P 3"]) -> Float[Tensor, ""]:
+    return base_color.clamp_min(MIN_BASE_COLOR).log().mean()
+
+
 @torch.no_grad()
 def _best_material(
-    fit: PlaceFit, places: Places, transport: Transport, typical: float, metallics: tuple[float, ...]
+    fit: PlaceFit,
+    places: Places,
+    transport: Transport,
+    typical: float,
+    metallics: tuple[float, ...],
+    near: Int[Tensor, "P K"],
 ) -> PlaceFit:
-    """Of all pairs of roughness and metallic at a place, the one with the least error (best base colour).
+    """Of all pairs of roughness and metallic at a place the one whose best base colours leave the smallest
+    error there and at the places near it.
 
     Radiance is linear in the base colour, b · slope + rest, so the best is a weighted mean.
     """
     layers = torch.stack([part.float() @ fit.radiance for part in transport.sources]) + transport.scene
     diffuse, unit = layers[0], places.observed.pixel + FLOOR * typical
+    pixels = torch.bincount(places.place, minlength=places.count).to(unit.dtype)
     best = torch.full((places.count,), torch.inf, device=unit.device)
     base_color, roughness, metallic = fit.base_color.clone(), fit.roughness.clone(), fit.metallic.clone()
     for k in range(len(ROUGHNESSES)):
@@ -199,7 +254,7 @@ def _best_material(
             size = functional.smooth_l1_loss(
                 error, torch.zeros_like(error), beta=OUTLIER, reduction="none"
             ).mean(-1)
-            left = places.mean(size)
+            left = (pixels * places.mean(size))[near].sum(1) / pixels[near].sum(1).clamp_min(1)
             better = left < best
             best = torch.where(better, left, best)
             base_color = torch.where(better[:, None], tried, base_color)

@@ -48,6 +48,11 @@ class Places:
         """Some of the pixels; the places keep their numbers."""
         return Places(self.count, self.place[rows], self.view[rows], self.observed[rows])
 
+    def in_views(self, least: int) -> Places:
+        """Places that so many views show, or more."""
+        views = torch.bincount(self.place, minlength=self.count)
+        return self.where(torch.nonzero(views[self.place] >= least)[:, 0])
+
     def mean(self, values: Float[Tensor, "N ..."]) -> Float[Tensor, "P ..."]:
         """Of each place; 0 for a place without a pixel."""
         sums = values.new_zeros(self.count, *values.shape[1:]).index_add(0, self.place, values)

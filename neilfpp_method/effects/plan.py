@@ -133,13 +133,14 @@ class Plan:
             why = f"there is none without {effect.needs}"
             self.decisions.append(Decision(0, name, False, cause.by, why))
 
-    def decide(self, name: str, measured: Measurement, step: int) -> Decision:
+    def decide(self, name: str, measured: Measurement, step: int, must_be_earned: bool = False) -> Decision:
         """Decide an open effect by evidence, from now on; without enough samples it stays as it is.
 
         Where evidence only advises (`Effect.advised`), it is noted, and the effect stays as it is.
+        `must_be_earned`: it counts as off so far, whatever the settings say.
         """
         before = self.is_on(name)
-        favoured = measured.favours(before)
+        favoured = measured.favours(before and not must_be_earned)
         advised = EFFECTS[name].advised
         on = before if favoured is None or advised else favoured
         reason = f"{measured.in_words()}; advice, it stays as it is" if advised else measured.in_words()

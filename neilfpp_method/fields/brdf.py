@@ -16,6 +16,9 @@ from neilfpp_method.structures import Material
 
 __all__ = ["BrdfField", "BrdfSample"]
 
+START_RANGE = (0.05, 0.95)
+"""Where every parameter starts: at 0 and at 1 it would have no slope."""
+
 
 @dataclass(frozen=True)
 class BrdfSample:
@@ -67,6 +70,12 @@ class BrdfField(nn.Module):
             roughness if self.varying_roughness else torch.zeros_like(roughness),
             metallic if self.metals else torch.zeros_like(metallic),
         )
+
+    @torch.no_grad()
+    def start_at(self, material: Material) -> None:
+        """Be of one material everywhere, up to what the untrained network adds; N is 1."""
+        values = torch.cat((material.base_color, material.roughness, material.metallic), -1)[0]
+        self.mlp.layers[-1].bias.copy_(torch.atanh(2 * values.clamp(*START_RANGE) - 1))
 
     def _material(self, saturation: Float[Tensor, "N 5"]) -> Material:
         base_color, roughness, metallic = (0.5 + 0.5 * saturation).split((3, 1, 1), -1)

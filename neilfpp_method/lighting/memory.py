@@ -49,6 +49,10 @@ class SurfaceMemory(nn.Module):
         if self.age is not None:
             self.age += 1
 
+    def wait(self) -> None:
+        """Let the first fit be due after `every` steps, as the light that there is needs none before."""
+        self.age = 0
+
     def recall(self) -> Observed:
         """Everything that is remembered, for a fit that is done now."""
         self.age = 0

@@ -42,6 +42,7 @@ def solve_light(
     objective: Objective,
     config: MapLightConfig,
     first: bool,
+    benefit_of_doubt: bool = False,
 ) -> Evidence | None:
     """Set the map, and lamps where allowed, to what explains the points. A known map stays.
 
@@ -53,6 +54,9 @@ def solve_light(
         config: with "auto" the lamps must earn their place: the fit is done with and without, and they stay
             where they lower the error at points kept back from both (`Evidence.favours`).
         first: nothing has been decided yet.
+        benefit_of_doubt: lamps stay out only where it is sure that they are not worth it. Surfaces learn the
+            light that they are under: a lamp too many goes out at a later fit, as surfaces then show; a lamp
+            that is missing has left its glow on them, and no later fit asks for it.
 
     Returns:
         What was measured for and against lamps; none where the settings had decided.
@@ -96,7 +100,7 @@ def solve_light(
             carried = (texels[kept_back], both[kept_back])
             gains.append(compare((plain, found), carried, target[kept_back], objective))
         measured = evidence(torch.cat(gains))
-        if not measured.favours(chosen=lamps.lit > 0):
+        if not measured.favours(chosen=benefit_of_doubt or lamps.lit > 0):
             sought.copy_(plain.log_radiance)
             lamps.place(dark, dark)
             return measured

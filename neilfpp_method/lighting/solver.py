@@ -25,7 +25,7 @@ from neilfpp_method.lighting.solve import solve_light
 from neilfpp_method.settings.facts import RadianceUnits, SceneFacts
 from neilfpp_method.settings.types import FreeLightConfig, MapLightConfig
 from neilfpp_method.shading.brdf import Lobe
-from neilfpp_method.structures import SceneTracer, StepResult
+from neilfpp_method.structures import Material, Observed, SceneTracer, StepResult
 
 __all__ = ["LightSolver", "MapSolver", "NothingToSolve", "make_light_solver"]
 
@@ -52,6 +52,24 @@ class LightSolver(Protocol):
         """Solve with these settings, and for surfaces of this lobe, from now on; what is remembered stays."""
         ...
 
+    @property
+    def seeks_start(self) -> bool:
+        """Whether a map is sought, and nothing is known of it yet."""
+        ...
+
+    def start(self, observed: Observed, material: Material, scene: SceneTracer | None) -> Evidence | None:
+        """Seek lamps before the map that has been set; without any it stays as it is. Surfaces learn under it
+        for a while before the first `solve`.
+
+        Args:
+            observed, material: surface points, and what they are made of.
+            scene: as of `solve`.
+
+        Returns:
+            As of `solve`.
+        """
+        ...
+
     def solve(self, brdf: BrdfField, scene: SceneTracer | None) -> Evidence | None:
         """Set the light to what explains the remembered points, when it is time.
 
@@ -69,7 +87,10 @@ class LightSolver(Protocol):
 class NothingToSolve(nn.Module):
     """The solver of a light that is learned by gradients, or known."""
 
-    due, points = False, 0
+    due, points, seeks_start = False, 0, False
+
+    def start(self, observed: Observed, material: Material, scene: SceneTracer | None) -> None:
+        """Nothing is solved for."""
 
     def observe(self, step: StepResult) -> None:
         """Nothing is remembered."""
@@ -126,6 +147,23 @@ class MapSolver(nn.Module):
         if self.sky is not None:
             self.sky.remember(*step.beyond_rows.split(3, -1))
 
+    @property
+    def seeks_start(self) -> bool:
+        """As of `LightSolver`."""
+        return self.config.map is None and self.memory.age is None and self.points == 0
+
+    @torch.no_grad()
+    def start(self, observed: Observed, material: Material, scene: SceneTracer | None) -> Evidence | None:
+        """As of `LightSolver`."""
+        self.memory.wait()
+        if self.config.kind == "distant":
+            return None
+        before = self.light.light.log_radiance.clone()
+        measured = self._solve(observed, material, scene, first=True, benefit_of_doubt=True)
+        if not self.light.lamps.lit:
+            self.light.light.log_radiance.copy_(before)
+        return measured
+
     def use(self, config: MapLightConfig, lobe: Lobe | None) -> None:
         """As of `LightSolver`."""
         self.config, self.lobe = config, lobe
@@ -136,6 +174,16 @@ class MapSolver(nn.Module):
         if not self.due:
             return None
         first, observed = self.memory.age is None, self.memory.recall()
+        return self._solve(observed, brdf(observed.position), scene, first)
+
+    def _solve(
+        self,
+        observed: Observed,
+        material: Material,
+        scene: SceneTracer | None,
+        first: bool,
+        benefit_of_doubt: bool = False,
+    ) -> Evidence | None:
         sky = None if self.sky is None else self.sky.known()
         environment = self.light.light
         objective = Objective(
@@ -146,7 +194,15 @@ class MapSolver(nn.Module):
             self.config.monochrome,
         )
         found = solve_light(
-            self.light, observed, brdf(observed.position), self.lobe, scene, objective, self.config, first
+            self.light,
+            observed,
+            material,
+            self.lobe,
+            scene,
+            objective,
+            self.config,
+            first,
+            benefit_of_doubt,
         )
         if environment.even:
             environment.log_radiance.copy_(environment.log_radiance[:, :1, :1].clone())

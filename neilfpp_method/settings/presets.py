@@ -130,6 +130,7 @@ FAST: Mapping[str, Any] = {
     "volume.rounds": 2,
     "volume.samples": 32,
     "volume.normal_radius": 0.15,
+    "shading.lobe": "ggx",
     "shading.sampler": "mis",
     "shading.train_samples": 32,
     "shading.eval_samples": 128,

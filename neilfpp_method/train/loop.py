@@ -13,7 +13,8 @@ from lightning_fabric import Fabric
 from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.effects.looks import after_fit, look_at_surface, wants_surface
+from neilfpp_method.effects.first_light import start_with
+from neilfpp_method.effects.looks import after_fit, look_at_light, look_at_surface, wants_surface
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.errors import Diverged, Stopped, UserError
 from neilfpp_method.health.watch import Watch
@@ -26,7 +27,7 @@ from neilfpp_method.schedule import (
     active_losses,
     rate_factor,
     stage_at,
-    stage_steps,
+    total_steps,
     weigh,
 )
 from neilfpp_method.settings.facts import RadianceUnits
@@ -84,27 +85,22 @@ def train(run: Training) -> None:
     optimizer = make_optimizer(model, run.config.optimizer)
     step = _restore(run, optimizer)
     optimizer = run.fabric.setup_optimizers(optimizer)
-    if step == 0 and model.stages[stage_at(0, settings).stage].moves_material:
-        _look_at_effects(run, model, 0)
-    while step < _length(run):
+    if step == 0:
+        _look(run, model, 0)
+    while step < total_steps(run.plan.config.train):
         position = stage_at(step, settings)
         step = _train_stage(run, model, optimizer, step, position)
         if run.fabric.is_global_zero:
             with doing("looks", apart=True):
                 run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
-        if step < _length(run):
+        if step < total_steps(run.plan.config.train):
             with doing("looks", apart=True):
-                _look_at_effects(run, model, step)
+                _look(run, model, step)
         _save(run, optimizer, step, also=position.stage.value)
         with doing("looks", apart=True):
             model.eval()
             run.preview(model, position.stage)
             model.train()
-
-
-def _length(run: Training) -> int:
-    """Steps of the training; evidence may take the joint stage away."""
-    return sum(stage_steps(run.plan.config.train).values())
 
 
 def _train_stage(
@@ -159,9 +155,42 @@ def _solve_light(run: Training, model: NeilfModel, computed: StepResult, step: i
             found = solver.solve(model.brdf, model.scene)
         note_fit(run.fits, found, model.lamps.lit, step)
         _tell(run, after_fit(run.plan, found, model.lamps.lit, step + 1))
-    if fabric.world_size > 1:
+    _share_light(run, model)
+
+
+def _share_light(run: Training, model: NeilfModel) -> None:
+    """Let all processes have the light of the first."""
+    if run.fabric.world_size > 1:
         for part in (model.light, model.lamps):
-            part.load_state_dict(fabric.broadcast(part.state_dict()))
+            part.load_state_dict(run.fabric.broadcast(part.state_dict()))
+
+
+def _look(run: Training, model: NeilfModel, step: int) -> None:
+    """What is looked at between two stages, where the next one learns a material."""
+    if model.stages[stage_at(step, run.config.train).stage].moves_material:
+        _look_at_effects(run, model, step)
+        _start_light(run, model, step)
+
+
+def _start_light(run: Training, model: NeilfModel, step: int) -> None:
+    """Find the light that training starts with, before a material is learned. The first process does it for
+    all.
+    """
+    if not run.light_solver.seeks_start:
+        return
+    decisions: list[Decision] = []
+    if run.fabric.is_global_zero:
+        seed_step(run.config.train.seed, -4 - step)
+        decisions, found = look_at_light(run.plan, model, run.pixels, step)
+        _tell(run, decisions)
+        if found is not None:
+            run.reporter.say(found.in_words())
+            start_with(model, found)
+            measured = run.light_solver.start(found.observed, found.material, model.scene)
+            note_fit(run.fits, measured, model.lamps.lit, step)
+            _tell(run, after_fit(run.plan, measured, model.lamps.lit, step))
+    _share_light(run, model)
+    _share_decisions(run, model, decisions)
 
 
 def _look_at_effects(run: Training, model: NeilfModel, step: int) -> None:
@@ -173,6 +202,11 @@ def _look_at_effects(run: Training, model: NeilfModel, step: int) -> None:
         seed_step(run.config.train.seed, -3 - step)
         decisions = look_at_surface(run.plan, model, run.pixels, step)
         _tell(run, decisions)
+    _share_decisions(run, model, decisions)
+
+
+def _share_decisions(run: Training, model: NeilfModel, decisions: Sequence[Decision]) -> None:
+    """Let all processes compute as the first has decided."""
     decisions = run.fabric.broadcast(decisions)
     if not run.fabric.is_global_zero:
         run.plan.decisions += decisions

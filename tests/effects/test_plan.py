@@ -170,13 +170,13 @@ def test_advice_changes_nothing_and_is_said():
     plan = Plan.begin(read_asked("auto"), preset("fast"))
     worthless = Measurement("error", 0.0, 0.001, 0.01, 100)
     assert worthless.favours(True) is False
-    for name in ("reflection", "environment-map", "coloured-light"):
+    for name in ("reflection", "environment-map", "coloured-light", "varying-roughness"):
         decision = plan.decide(name, worthless, 4)
         assert decision.on
         assert "advice" in decision.reason
     assert plan.config == plan.settings
-    assert not plan.decide("varying-roughness", worthless, 4).on
-    assert not plan.config.brdf.varying_roughness
+    assert not plan.decide("lobe-sampling", worthless, 4).on
+    assert plan.config.shading.sampler == "no_lobe"
 
 
 def test_nothing_varies_so_no_slope_is_asked():

@@ -1,0 +1,57 @@
+"""A convex ball under a made-up sky, photographed from all around: known places, material and light."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from neilfpp_method.effects.place_fit import ROWS
+from neilfpp_method.effects.places import Places
+from neilfpp_method.fields.environment import EnvironmentLight
+from neilfpp_method.lighting.transport import from_texels
+from neilfpp_method.shading.brdf import Lobe
+from neilfpp_method.structures import Material, Observed
+
+DIRECTIONS = 8
+"""Directions in each texel that a pixel of the ball is made of."""
+
+
+def sky() -> EnvironmentLight:
+    """A bright window and a dark ground."""
+    environment = EnvironmentLight(ROWS, 1.0)
+    radiance = torch.full((3, ROWS, 2 * ROWS), 0.3)
+    radiance[:, : ROWS // 2] = 1.0
+    radiance[:, ROWS // 4 : 3 * ROWS // 8, 10:14] = 20.0
+    environment.show(radiance)
+    return environment
+
+
+def ball(
+    base_color: Tensor,
+    roughness: Tensor,
+    metallic: Tensor,
+    lobe: Lobe | None,
+    views: int = 9,
+    environment: EnvironmentLight | None = None,
+) -> Places:
+    """P places of the given materials, each seen in so many views, under `sky` or another map."""
+    torch.manual_seed(0)
+    count = len(base_color)
+    normal = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1).repeat_interleave(views, 0)
+    aside = torch.nn.functional.normalize(torch.randn(len(normal), 3), dim=-1)
+    wo = torch.nn.functional.normalize(normal + 0.9 * aside, dim=-1)
+    material = Material(*(v.repeat_interleave(views, 0) for v in (base_color, roughness, metallic)))
+    pixel = _rendered(
+        Observed(normal, normal, wo, torch.zeros_like(normal)), material, lobe, environment or sky()
+    )
+    place = torch.arange(count).repeat_interleave(views)
+    return Places(count, place, torch.arange(views).repeat(count), Observed(normal, normal, wo, pixel))
+
+
+def _rendered(
+    dark: Observed, material: Material, lobe: Lobe | None, environment: EnvironmentLight
+) -> Float[Tensor, "N 3"]:
+    radiance = environment.log_radiance.exp().flatten(1).t()
+    drawn = [from_texels(environment, dark, material.roughness, lobe, None) for _ in range(DIRECTIONS)]
+    return torch.stack([carried.outgoing(material, radiance) for carried in drawn]).mean(0)

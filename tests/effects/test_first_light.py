@@ -1,0 +1,103 @@
+"""The light that training starts with, and the lobe, at places whose light and material are made up."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from neilfpp_method.effects.first_light import MIN_PLACES, FirstLight, _lowest, find_first_light, start_with
+from neilfpp_method.effects.lobes import lobe_evidence
+from neilfpp_method.effects.measurement import Measurement
+from neilfpp_method.effects.place_fit import ROWS
+from neilfpp_method.effects.places import Places
+from neilfpp_method.fields.brdf import BrdfField
+from neilfpp_method.settings.presets import preset
+from neilfpp_method.shading import LOBES
+from neilfpp_method.structures import Material, Observed
+from tests.effects.balls import ball, sky
+from tests.scenes import sphere_model
+
+COUNT, VIEWS = 110, 7
+
+
+def patched(lobe: str) -> Places:
+    """Half paint, half metal, in colours and roughnesses of their own."""
+    torch.manual_seed(1)
+    base_color = 0.2 + 0.6 * torch.rand(COUNT, 3)
+    roughness = torch.tensor([0.2, 0.36, 0.66]).repeat(COUNT)[:COUNT, None]
+    metallic = (torch.arange(COUNT) % 2)[:, None].float()
+    return ball(base_color, roughness, metallic, LOBES[lobe], VIEWS)
+
+
+def log_distance(log_radiance: torch.Tensor) -> float:
+    """Mean error of the logarithm of the map, by solid angle."""
+    off = (log_radiance - sky().log_radiance).abs().mean(0).flatten()
+    weight = sky().texel_directions(torch.zeros(1, 3)).solid_angle
+    return ((off * weight).sum() / weight.sum()).item()
+
+
+def test_scale_and_map_are_found_together():
+    places, lobe = patched("ggx"), LOBES["ggx"]
+    typical = places.observed.pixel.median().item()
+    found = find_first_light(places, lobe, None, typical, metals=True)
+    torch.manual_seed(1)
+    truth = (0.2 + 0.6 * torch.rand(COUNT, 3)).log().mean().exp().item()
+    assert abs(math.log(found.scale / truth)) < math.log(1.35)
+    start = torch.full((3, ROWS, 2 * ROWS), math.log(typical / truth))
+    assert log_distance(found.log_radiance) < 0.6 * log_distance(start)
+    assert found.places == COUNT
+    assert f"{COUNT} places" in found.in_words()
+    assert len(found.observed) == len(found.material.roughness) <= len(places.place)
+    assert (found.material.base_color == found.mean.base_color).all()
+
+
+def test_views_kept_back_tell_the_lobe_that_the_images_were_made_with():
+    torch.manual_seed(1)
+    color, ones = 0.2 + 0.6 * torch.rand(60, 3), torch.ones(60, 1)
+
+    def gain(lobe: str) -> Measurement:
+        places = ball(color, 0.36 * ones, ones, LOBES[lobe], views=16)
+        return lobe_evidence(places, None, places.observed.pixel.median().item(), metals=True)
+
+    of_ggx, of_gaussian = gain("ggx"), gain("spherical_gaussian")
+    assert of_ggx.value > 2 * of_ggx.deviation
+    assert of_gaussian.value < 0
+
+
+def test_a_handful_of_places_is_no_ground_for_a_light():
+    places = patched("ggx")
+    few = places.where(torch.nonzero(places.place < MIN_PLACES - 1)[:, 0])
+    assert find_first_light(few, LOBES["ggx"], None, 1.0, metals=True) is None
+
+
+def test_lowest_is_the_foot_of_the_parabola_over_the_logarithm():
+    def errors(foot: float) -> dict[float, float]:
+        return {s: math.log(s / foot) ** 2 for s in (0.1, 0.15, 0.22, 0.33, 0.5, 0.7)}
+
+    assert _lowest(errors(0.27)) == pytest.approx(0.27)
+    assert _lowest(errors(0.05)) == 0.1  # at an end: no further
+    assert _lowest(errors(0.9)) == 0.7
+
+
+def test_an_untrained_field_starts_at_the_material_that_was_found():
+    config = preset("fast")
+    field = BrdfField(config.brdf, config.encoding, 1.0)
+    color = torch.tensor([[0.6, 0.3, 0.1]])
+    field.start_at(Material(color, torch.tensor([[0.4]]), torch.tensor([[0.0]])))
+    started = field(torch.zeros(1, 3))
+    torch.testing.assert_close(started.base_color, color, atol=0.02, rtol=0)
+    torch.testing.assert_close(started.roughness, torch.tensor([[0.4]]), atol=0.02, rtol=0)
+    torch.testing.assert_close(started.metallic, torch.tensor([[0.05]]), atol=0.02, rtol=0)
+
+
+def test_a_model_takes_the_map_that_was_found():
+    model = sphere_model(preset("fast"))
+    none = torch.zeros(0, 3)
+    grey = Material(torch.full((1, 3), 0.5), torch.full((1, 1), 0.5), torch.zeros(1, 1))
+    unseen = Observed(none, none, none, none), Material(none, none[:, :1], none[:, :1])
+    found = FirstLight(sky().log_radiance, grey, {0.33: 0.1}, 0.33, COUNT, *unseen)
+    start_with(model, found)
+    coarse = model.light.at_most(ROWS).log_radiance
+    assert (coarse - sky().log_radiance).abs().median() < 0.1
