@@ -386,7 +386,7 @@ MUTANTS: Sequence[Mutant] = (
     ),
     Mutant(
         "steps share their random numbers",
-        "train/loop.py",
+        "train/optimizer.py",
         "(seed * 1_000_003 + step) * 4_099 + rank",
         "seed * 4_099 + rank",
         "train/test_resume.py",

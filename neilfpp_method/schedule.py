@@ -37,6 +37,7 @@ __all__ = [
     "rate_factor",
     "stage_at",
     "stage_steps",
+    "total_steps",
     "weigh",
 ]
 
@@ -134,6 +135,11 @@ def stage_steps(config: TrainConfig) -> Mapping[Stage, int]:
         Stage.MATERIAL_INIT: config.material_steps,
         Stage.JOINT: config.joint_steps,
     }
+
+
+def total_steps(config: TrainConfig) -> int:
+    """Of all stages together."""
+    return sum(stage_steps(config).values())
 
 
 def has_material(steps: int, config: TrainConfig) -> bool:

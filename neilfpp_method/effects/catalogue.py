@@ -189,6 +189,7 @@ EFFECTS: Mapping[str, Effect] = {
             obstacle=_without_reflection("a surface without reflection has no roughness"),
             cost=lambda config: "one more unknown at every point",
             risk="all gloss is as sharp as that in the middle",
+            advised=True,
             unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
             needs="reflection",
         ),

@@ -7,7 +7,7 @@ import torch
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.disagreement import ShownSurface, shading_disagreement
 from neilfpp_method.effects.exposure import Exposures
-from neilfpp_method.effects.first_light import FirstLight, find_first_light
+from neilfpp_method.effects.first_light import MIN_PLACES, FirstLight, find_first_light
 from neilfpp_method.effects.lobes import lobe_evidence
 from neilfpp_method.effects.material import JUDGED, material_evidence
 from neilfpp_method.effects.measurement import Measurement
@@ -92,6 +92,9 @@ def look_at_light(
     position, normal = surface.position[:PLACES], surface.normal[:PLACES]
     places = gather_places(model, pixels, position, normal, VIEWS).in_views(MIN_VIEWS)
     typical, decisions = model.facts.median_radiance, []
+    if len(places.place.unique()) < MIN_PLACES:
+        model.train(mode)
+        return [], None
     if plan.is_open("long-tails") and plan.newest("long-tails") is None:
         measured = lobe_evidence(places, model.scene, typical, model.brdf.metals)
         decisions.append(plan.decide("long-tails", measured, step, must_be_earned=True))

@@ -30,6 +30,7 @@ from neilfpp_method.schedule import (
     active_losses,
     stage_at,
     stage_steps,
+    total_steps,
     weigh,
 )
 from neilfpp_method.settings.facts import RadianceUnits
@@ -94,13 +95,13 @@ def train(run: Training) -> None:
     optimizer = run.fabric.setup_optimizers(optimizer)
     if step == 0:
         _look(run, model, 0)
-    while step < _all_steps(run):
+    while step < total_steps(run.config.train):
         position = stage_at(step, run.config.train)
         step = _train_stage(run, model, optimizer, step, position)
         if run.fabric.is_global_zero:
             with doing("looks", apart=True):
                 run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
-        if step < _all_steps(run):
+        if step < total_steps(run.config.train):
             with doing("looks", apart=True):
                 _look(run, model, step)
         _save(run, optimizer, step, also=position.stage.value)
@@ -108,11 +109,6 @@ def train(run: Training) -> None:
             model.eval()
             run.preview(model, position.stage)
             model.train()
-
-
-def _all_steps(run: Training) -> int:
-    """Of the whole training, as planned so far."""
-    return sum(stage_steps(run.config.train).values())
 
 
 def _train_stage(

@@ -35,7 +35,7 @@ def ball(
     views: int = 9,
     environment: EnvironmentLight | None = None,
 ) -> Places:
-    """P places of the given materials, each in so many views; under `sky` where no light is given."""
+    """P places of the given materials, each seen in so many views, under `sky` or another map."""
     torch.manual_seed(0)
     count = len(base_color)
     normal = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1).repeat_interleave(views, 0)

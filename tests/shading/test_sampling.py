@@ -105,7 +105,7 @@ def test_samples_carry_no_gradient():
 
 
 def test_an_unknown_sampler_is_refused():
-    with pytest.raises(UserError, match="choose fibonacci, cosine, lobe or mis"):
+    with pytest.raises(UserError, match="choose fibonacci, cosine, lobe, mis or no_lobe"):
         sample_directions("uniform", *points((0, 0, 1.0), (0, 0, 1.0), 1), 4, GGX, False)
 
 
