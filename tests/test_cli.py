@@ -238,7 +238,7 @@ def test_help_and_mistyped_options_do_not_wait_for_torch(arguments):
 @pytest.mark.parametrize(
     ("words", "completed"),
     [
-        ("tr", "train"),
+        ("trai", "train"),
         ("train --da", "--data"),
         ("eval --check", "--checkpoint"),
         ("train --config.train.ra", "--config.train.rays"),
