@@ -17,9 +17,7 @@ from neilfpp_method.settings.types import LightFitConfig
 
 
 class Surfels(nn.Module):
-    """Stands for your splats: soft discs on a ball, blended in front to back. `render_image` is all that it
-    takes.
-    """
+    """Stands for your splats: soft discs on a ball. `render_image` is all that it takes."""
 
     def __init__(self, count: int = 300) -> None:
         super().__init__()

@@ -22,7 +22,7 @@ from tests.train.small_runs import small_config
 def record(folder: Path) -> None:
     """Have the training loop write down what it computes."""
     rank = os.environ.get("LOCAL_RANK", "0")
-    norms, train = loop._gradient_norms, command.train
+    norms, train = loop.gradient_norms, command.train
 
     def gradient_norms(model):
         path = folder / f"gradients_{rank}.pt"
@@ -34,7 +34,7 @@ def record(folder: Path) -> None:
         train(run)
         torch.save(dict(run.model.named_parameters()), folder / f"parameters_{rank}.pt")
 
-    loop._gradient_norms, command.train = gradient_norms, train_and_save
+    loop.gradient_norms, command.train = gradient_norms, train_and_save
 
 
 if __name__ == "__main__":

@@ -258,6 +258,7 @@ EFFECTS: Mapping[str, Effect] = {
             obstacle=_joint_obstacle,
             cost=lambda config: f"{config.train.joint_steps} steps that move everything",
             risk="the surface keeps the errors that shading shows",
+            advised=True,
         ),
     )
 }

@@ -58,8 +58,8 @@ def gain_of_metals(places: Places) -> tuple[float, float]:
 
 
 def test_metal_explains_views_kept_back_of_a_metal_ball_and_not_of_a_painted_one():
-    of_metal, share = gain_of_metals(ball(1.0))
-    of_paint, share_of_paint = gain_of_metals(ball(0.0))
+    of_metal, share = gain_of_metals(ball_of(1.0))
+    of_paint, share_of_paint = gain_of_metals(ball_of(0.0))
     assert of_metal > 2 * WORTH
     assert share > 0.2  # the dark side of the sky tells little
     assert of_paint < 0.2 * WORTH
@@ -117,7 +117,7 @@ def test_one_roughness_is_the_same_everywhere_and_learns():
 
 
 def test_several_roughnesses_are_traced_once_and_are_what_each_is_alone():
-    observed = ball(0.0).observed[:20]
+    observed = ball_of(0.0).observed[:20]
     environment = EnvironmentLight(8, 1.0)
     torch.manual_seed(3)
     both = from_texels_at(environment, observed, (0.3, 0.7), LOBE, None)

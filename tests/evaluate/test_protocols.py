@@ -45,6 +45,7 @@ class KnownSphere(NeilfModel):
 
     def __init__(self, base_color_factor: float = 1.0, light_factor: float = 1.0) -> None:
         nn.Module.__init__(self)
+        self.gains = None
         self.somewhere = nn.Parameter(torch.zeros(1))
         self.base_color_factor = base_color_factor
         self.light_factor = light_factor

@@ -6,6 +6,7 @@ Factors are powers of two, which no rounding touches, so two trainings can be co
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 import torch
 
 from neilfpp_method.data.images import read_image, write_exr
+from neilfpp_method.data.point_cloud import read_oriented_ply, write_oriented_ply
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.loop import Training, train
 from tests.data.make_capture import make_capture
@@ -44,6 +46,10 @@ def trained(folder: Path, light: str, radiance: float = 1.0, length: float = 1.0
     box[:3] *= length
     scene["bbox"]["transform"] = box.tolist()
     path.write_text(json.dumps(scene))
+    cloud = root / "inputs" / "model" / "oriented_pcd.ply"
+    if cloud.exists():
+        points = read_oriented_ply(cloud)
+        write_oriented_ply(cloud, dataclasses.replace(points, position=points.position * length))
     run = small_training(root, folder / "run", settings(light))
     train(run)
     assert run.skipped == 0

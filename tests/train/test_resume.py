@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import BinaryIO
 
 import pytest
@@ -198,7 +199,7 @@ def test_time_adds_up_over_stops(tmp_path, capture, monkeypatch):
     """On a clock that ticks when it is read, a stage takes one second a step, stopped or not."""
     out = tmp_path / "run"
     with monkeypatch.context() as patch:
-        patch.setattr(loop.time, "perf_counter", ticking())
+        patch.setattr(loop, "time", SimpleNamespace(perf_counter=ticking()))  # of the loop alone
         interrupt_at(patch, 1, 5)
         with pytest.raises(Stopped):
             run(capture, out, small_config())

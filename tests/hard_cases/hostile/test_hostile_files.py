@@ -86,7 +86,7 @@ def read(folder, path):
     if len(calls) == 5: bytearray(4 << 30)
     if len(calls) == 7: ctypes.string_at(0)
 
-outcome = worker.attack(Reader(make, read), Path(sys.argv[1]) / "x", 10, 9)
+outcome = worker.attack(Reader(make, read), Path(sys.argv[1]) / "x", 10, 6)
 print(json.dumps([[fault[0], fault[2]] for fault in outcome.faults]))
 """
     done = subprocess.run(

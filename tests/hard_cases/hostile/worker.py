@@ -88,7 +88,7 @@ def attack(reader: Reader, folder: Path, first: int, count: int) -> Outcome:
 def _read_all(
     reader: Reader, capture: Path, whole: dict[Path, bytes], numbers: range, told: Path, at: Path
 ) -> None:
-    """In a copy of the process, which this ends. What is found is written down every hundred inputs."""
+    """In a copy of the process, which this ends. Faults are written down at once, counts every hundred inputs."""
     held, paths, outcome = _address_space(), list(whole), Outcome()
     resource.setrlimit(resource.RLIMIT_AS, (held + ROOM, held + ROOM))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -98,6 +98,7 @@ def _read_all(
             os.pwrite(place.fileno(), number.to_bytes(8, "little"), 0)
             path = paths[number % len(paths)]
             path.write_bytes(mutated(whole[path], number))
+            before_it = len(outcome.faults)
             began = time.process_time()
             signal.alarm(LONGEST_BY_CLOCK)  # ends the process
             try:
@@ -114,7 +115,8 @@ def _read_all(
                 outcome.faults.append((number, path.name, f"{time.process_time() - began:.1f} seconds"))
             path.write_bytes(whole[path])
             outcome.grown = _peak() - before
-            if number % 100 == 99 or number + 1 == numbers.stop:
+            whole_hundred = number % 100 == 99 or number + 1 == numbers.stop
+            if whole_hundred or len(outcome.faults) > before_it:
                 _write(told, outcome)
         if outcome.grown > LARGEST_GROWTH:
             outcome.faults.append((numbers.start, "", f"memory grew by {outcome.grown >> 20} MiB"))
