@@ -26,8 +26,8 @@ METAL = 0.5
 """Metallic above which a place is taken for metal."""
 SCALE = 0.33
 """Mean base colour of both fits: the scale of light and base colour is no part of the question."""
-WORTH = 0.01
-"""Relative error that GGX must save."""
+WORTH = 0.0
+"""Relative error that GGX must save: any that is not chance, as it costs nothing."""
 
 
 @torch.no_grad()

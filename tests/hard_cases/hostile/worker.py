@@ -88,7 +88,7 @@ def attack(reader: Reader, folder: Path, first: int, count: int) -> Outcome:
 def _read_all(
     reader: Reader, capture: Path, whole: dict[Path, bytes], numbers: range, told: Path, at: Path
 ) -> None:
-    """In a copy of the process, which this ends. Faults are written down at once, counts every hundred inputs."""
+    """In a copy of the process, which ends. Faults are written down at once, counts every hundred inputs."""
     held, paths, outcome = _address_space(), list(whole), Outcome()
     resource.setrlimit(resource.RLIMIT_AS, (held + ROOM, held + ROOM))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
