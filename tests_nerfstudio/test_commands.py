@@ -49,7 +49,7 @@ def test_the_command_line_reaches_the_settings() -> None:
     assert config.pipeline.datamanager.dataparser.test_every == 3
 
 
-@pytest.mark.parametrize("dependency", ["OpenEXR", "lightning_fabric", "nerfstudio"])
+@pytest.mark.parametrize("dependency", ["OpenEXR", "nerfstudio"])
 def test_a_broken_dependency_raises_nowhere(dependency: str) -> None:
     # A module that is None in sys.modules cannot be imported: as if it were missing or broken.
     code = (

@@ -125,7 +125,7 @@ def test_the_same_scene_seed_and_steps_give_the_same_weights_in_both_loops(
     data: Path, tmp_path: Path, settings: NeilfConfig
 ) -> None:
     inside = ns_train(trainer_config(data, tmp_path / "inside", settings))
-    standalone = small_training(data, tmp_path / "standalone", settings)
+    standalone = small_training(data, tmp_path / "standalone", settings, patches=0)
     train(standalone)
     assert differences(weights(inside), dict(standalone.model.state_dict())) == []
 
@@ -135,7 +135,7 @@ def test_the_same_scene_seed_and_steps_give_the_same_quality_in_both_loops(
 ) -> None:
     settings = with_steps(SETTINGS, sdf_steps=60, material_steps=20, joint_steps=5)
     ns = evaluated(ns_train(trainer_config(data, tmp_path / "inside", settings)), tmp_path)
-    standalone = small_training(data, tmp_path / "standalone", settings)
+    standalone = small_training(data, tmp_path / "standalone", settings, patches=0)
     train(standalone)
     capture, steps = standalone.pixels.capture, sum(stage_steps(settings.train).values())
     own = evaluate(Run(tmp_path, settings, capture, standalone.model.facts, standalone.model.eval(), steps))

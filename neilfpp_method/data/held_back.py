@@ -26,7 +26,7 @@ TRIES = 64
 """Places that are tried for a patch: others may leave no room, or lie on a border."""
 
 
-def hold_back(pixels: PixelDataset, seed: int) -> PixelBatch:
+def hold_back(pixels: PixelDataset, seed: int, patches: int = PATCHES) -> PixelBatch:
     """Take patches of pixels out of all later draws of `pixels`, and return those of their pixels that are
     valid and on the object.
 
@@ -36,10 +36,11 @@ def hold_back(pixels: PixelDataset, seed: int) -> PixelBatch:
     Args:
         pixels: of the training views; it draws the patches no more.
         seed: of the training.
+        patches: how many at most.
     """
     bits = pixels.store.bits
     of_object = PixelSet(bits, VALID | MASK, VALID | MASK)
-    count = min(PATCHES, int(MAX_SHARE * of_object.count) // SIDE**2)
+    count = min(patches, int(MAX_SHARE * of_object.count) // SIDE**2)
     chosen: list[Int[np.ndarray, " N"]] = []
     taken: set[int] = set()
     in_view: Counter[int] = Counter()

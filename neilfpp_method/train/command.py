@@ -19,7 +19,7 @@ from torch import Tensor
 from neilfpp_method.budget.durations import in_words as time_in_words
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.environment_map import check_environment
-from neilfpp_method.data.held_back import hold_back
+from neilfpp_method.data.held_back import PATCHES, hold_back
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import at_scale, scale_for_rays
 from neilfpp_method.effects.asked import Asked, check_asked
@@ -61,7 +61,7 @@ from neilfpp_method.train.optimizer import seed_step
 from neilfpp_method.train.pace import Pace
 from neilfpp_method.train.preview import write_preview
 from neilfpp_method.train.progress import Reporter, reporting
-from neilfpp_method.train.quality import Quality
+from neilfpp_method.train.quality import Quality, has_looks
 from neilfpp_method.train.reading import load_pixels
 from neilfpp_method.train.run import (
     PIXELS,
@@ -210,7 +210,9 @@ def run_training(
         reporting(out, console, fabric.is_global_zero) as reporter,
         _stop_request(continue_with) as stopped,
     ):
-        held_back = hold_back(pixels, config.train.seed)
+        # What began without, in nerfstudio, goes on with all pixels.
+        holds_back = begins or has_looks(out)
+        held_back = hold_back(pixels, config.train.seed, PATCHES if holds_back else 0)
         preview = _preview(out, capture, fabric, reporter)
         solver, watch = model.light_solver(), _watch(pixels, config, reporter)
         training = Training(

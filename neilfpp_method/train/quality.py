@@ -125,6 +125,11 @@ def write_looks(run: Path, quality: Quality) -> None:
     write_json(run / FILE, {"format": FORMAT, "pixels": len(quality.pixels), "looks": looks})
 
 
+def has_looks(run: Path) -> bool:
+    """Whether a run holds pixels back."""
+    return (run / FILE).exists()
+
+
 def read_looks(run: Path, before: int | None = None) -> Sequence[Look]:
     """The looks of a run at its first `before` steps; none: all. Empty where the run has no record.
 

@@ -10,7 +10,7 @@ from lightning_fabric import Fabric
 from rich.console import Console
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.held_back import hold_back
+from neilfpp_method.data.held_back import PATCHES, hold_back
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.asked import Asked
 from neilfpp_method.effects.plan import Plan
@@ -65,8 +65,8 @@ class Listener(Reporter):
         self.said.append(text)
 
 
-def small_training(root: Path, out: Path, config: NeilfConfig) -> Training:
-    """A training of a capture that is ready to begin."""
+def small_training(root: Path, out: Path, config: NeilfConfig, patches: int = PATCHES) -> Training:
+    """A training of a capture that is ready to begin; so many patches are held back."""
     capture = load_capture(root)
     pixels = PixelDataset(capture, capture.train_views)
     seed_step(config.train.seed, step=-1)
@@ -75,7 +75,7 @@ def small_training(root: Path, out: Path, config: NeilfConfig) -> Training:
     solver, watch = model.light_solver(), Watch(pixels.sample(64), listener.warn)
     plan = Plan.begin(Asked("as-set"), config)
     quiet = (lambda: False, lambda model, stage: None, "")
-    quality = Quality(hold_back(pixels, config.train.seed), capture.hdr)
+    quality = Quality(hold_back(pixels, config.train.seed, patches), capture.hdr)
     return Training(out, config, model, pixels, fabric, listener, *quiet, solver, watch, plan, quality)
 
 
