@@ -211,8 +211,7 @@ def run_training(
         _stop_request(continue_with) as stopped,
     ):
         # What began without, in nerfstudio, goes on with all pixels.
-        holds_back = begins or has_looks(out)
-        held_back = hold_back(pixels, config.train.seed, PATCHES if holds_back else 0)
+        held_back = hold_back(pixels, config.train.seed, PATCHES if begins or has_looks(out) else 0)
         preview = _preview(out, capture, fabric, reporter)
         solver, watch = model.light_solver(), _watch(pixels, config, reporter)
         training = Training(

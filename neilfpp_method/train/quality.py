@@ -28,7 +28,7 @@ from neilfpp_method.shading.color import tone_map
 from neilfpp_method.structures import PixelBatch
 from neilfpp_method.train.run import read_json, write_json
 
-__all__ = ["FILE", "Look", "Quality", "read_looks", "write_looks"]
+__all__ = ["FILE", "Look", "Quality", "has_looks", "read_looks", "write_looks"]
 
 FORMAT = 1
 FILE = "quality.json"
