@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -80,6 +81,14 @@ class PixelDataset:
 
     def _shown(self, i: int) -> Bool[np.ndarray, " N"]:
         return self._rays.shown(i).cpu().numpy()
+
+    def on(self, device: torch.device | str) -> PixelDataset:
+        """The same pixels, with batches on another device."""
+        other = copy.copy(self)
+        other.device = torch.device(device)
+        cameras = [self.capture.normalisation.camera(view.camera) for view in self.views]
+        other._rays = CameraRays(cameras, device)
+        return other
 
     def __len__(self) -> int:
         return len(self.store)

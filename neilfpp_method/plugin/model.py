@@ -19,6 +19,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.effects.asked import Asked
+from neilfpp_method.effects.first_light import start_with
+from neilfpp_method.effects.looks import look_at_light
+from neilfpp_method.effects.plan import Plan
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.health.cases import Health
@@ -117,6 +121,7 @@ class NeilfMethod(Model):
                     f"{self.config.host} traces no rays cheaply: a proxy of its surface, gathered from the "
                     "training rays, traces shadows and light between surfaces"
                 )
+        self.pixels = pixels
         self.light_solver = self.neilf.light_solver()
         seed_step(settings.train.seed, step=-2)
         self.watch = Watch(pixels.sample(LOOKED_AT, gradients=False), CONSOLE.log)
@@ -181,11 +186,24 @@ class NeilfMethod(Model):
         self.step = step
         position = stage_at(step, settings)
         if self.set_up_for is not position.stage:
+            if self.neilf.stages[position.stage].moves_material and self.light_solver.seeks_start:
+                self._start_light(step)
             self.neilf.freeze_for(position.stage)
             self.set_up_for = position.stage
         for optimizer in optimizers.optimizers.values():
             set_rates(optimizer, self.rates, position)
         seed_step(settings.seed, step)
+
+    def _start_light(self, step: int) -> None:
+        """Find the light that a material is learned under first, as the standalone loop does."""
+        settings = self.config.neilf
+        seed_step(settings.train.seed, -4 - step)
+        plan, pixels = Plan.begin(Asked("as-set"), settings), self.pixels.on(self.device)
+        _, found = look_at_light(plan, self.neilf, pixels, step)
+        if found is not None:
+            CONSOLE.log(found.in_words())
+            start_with(self.neilf, found)
+            self.light_solver.start(found.observed, found.material, self.neilf.scene)
 
     def _solve_light(self, step: int) -> None:
         """After the optimiser, as the standalone loop does."""
