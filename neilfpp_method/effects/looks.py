@@ -32,6 +32,8 @@ __all__ = [
 
 LOOKED_AT = 1024
 """Training pixels whose surface points are measured: the standard error of a 1 % share is 0.3 %."""
+MIN_PHOTOGRAPHS = 8
+"""Training views from which a light is found to start with: fewer tell too little of its scale."""
 LIGHT_PIXELS = 4096
 """Training pixels among which places are looked for that many views show."""
 PLACES, VIEWS, MIN_VIEWS = 1200, 20, 4
@@ -86,6 +88,8 @@ def look_at_light(
 
     Arguments as of `look_at_surface`; the model computes as the plan says afterwards.
     """
+    if len(pixels.views) < MIN_PHOTOGRAPHS:
+        return [], None
     mode = model.training
     model.eval()
     surface = _shown_surface(model, pixels.sample(LIGHT_PIXELS, gradients=False)).observed
