@@ -62,9 +62,13 @@ class Transport:
         """No sources: these, of a strength that is known, count as the scene's."""
         return Transport(self.sources[..., :0], self.scene + self.sources @ strength)
 
+    def arriving(self, strength: Float[Tensor, "T 3"]) -> Float[Tensor, "K N 3"]:
+        """The sum over all sources of this strength and the scene, before any color of the material."""
+        return _SumOverSources.apply(self.sources, strength) + self.scene
+
     def outgoing(self, material: Material, strength: Float[Tensor, "T 3"]) -> Float[Tensor, "N 3"]:
         """L_o under sources of this strength, with the colours of `material` (roughness is fixed)."""
-        diffuse, *reflected = _SumOverSources.apply(self.sources, strength) + self.scene
+        diffuse, *reflected = self.arriving(strength)
         color = diffuse_reflectance(material, bool(reflected)) * diffuse
         if reflected:
             facing, grazing = reflected
