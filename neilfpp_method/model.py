@@ -56,7 +56,7 @@ __all__ = ["NeilfModel"]
 CLEAR_OPACITY = 0.01
 """Opacity below which a ray counts as missing the scene, so that its pixel shows the light behind it."""
 SURFACE_OPACITY = 0.5
-"""Opacity above which `maps` shades a ray, including edges that mix two surfaces: images have no holes there."""
+"""Opacity above which `maps` shades a ray. Edges that mix two surfaces count, too: images have no holes."""
 
 
 class NeilfModel(nn.Module):
