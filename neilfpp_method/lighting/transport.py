@@ -247,5 +247,5 @@ def _chunks(
     observed: Observed, roughness: Float[Tensor, "N 1"], sources: int
 ) -> list[tuple[Observed, Tensor]]:
     rows = max(1, PAIRS_AT_ONCE // max(1, sources))
-    spans = [slice(start, start + rows) for start in range(0, len(observed), rows)]
+    spans = [slice(start, start + rows) for start in range(0, max(1, len(observed)), rows)]
     return [(observed[span], roughness[span]) for span in spans]
