@@ -234,7 +234,9 @@ def _test_views(
     else:
         every = TEST_EVERY if test_every is None else test_every
         if every < 0:
-            raise UserError(f"every {every}-th view cannot be held out", "give 2 or more, or 0 for none")
+            raise UserError(
+                f"every {every}-th view cannot be held out", "give 2 or more, or 0 to hold out no view"
+            )
         held_out = frozenset(view.name for view in views[every - 1 :: every]) if every else frozenset()
     if len(held_out) == len(views):
         raise UserError(f"{root}: all {len(views)} views are held out for testing", "leave some to train on")
