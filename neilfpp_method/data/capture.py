@@ -106,7 +106,8 @@ class Capture:
             [
                 f"{self.root.resolve().name} ({self.format}): {len(self.views)} views of {size}, "
                 f"{len(self.train_views)} to train on and {len(self.test_views)} to test on",
-                f"pixels: {'linear HDR' if self.hdr else 'display values (sRGB)'}; masks: {masks or 'none'}; "
+                f"pixels: {'linear HDR' if self.hdr else 'display values (sRGB)'}; "
+                f"mask files: {masks or 'none'}; "
                 f"point cloud: {self.point_cloud.name if self.point_cloud else 'none'}",
                 f"scene: centre ({x:.3g}, {y:.3g}, {z:.3g}), 1 scene unit = {self.normalisation.scale:.4g} "
                 "world units" + FOUND[self.scene_from],

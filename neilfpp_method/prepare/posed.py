@@ -99,6 +99,6 @@ def _usable(view: View, developed: Path) -> View:
         write_exr(image, {"RGBA": np.concatenate([picture.pixels, picture.alpha[..., None]], axis=-1)})
     usable = picture.valid
     if view.valid is not None:
-        usable = usable & (read_image(view.valid).pixels.min(axis=-1) > 0.5)
+        usable = usable & (read_image(view.valid).mask > 0.5)
     write_png(valid, np.where(usable, 255, 0).astype(np.uint8))
     return replace(view, image=image, valid=valid)
