@@ -84,8 +84,8 @@ def in_words(config: FreeLightConfig | MapLightConfig, fits: Sequence[LightFit])
     last = fits[-1]
     if last.points < MIN_POINTS:
         return f"{map_kind}; lamps were not decided on, with only {last.points} held-back points"
-    change = f"error {-100 * last.gain:+.1f} ± {100 * last.deviation:.1f} % at {last.points} held-back points"
-    change = change.replace("-", "\N{MINUS SIGN}")
+    size = f"{-100 * last.gain:+.1f} ± {100 * last.deviation:.1f} %".replace("-", "\N{MINUS SIGN}")
+    change = f"error {size} at {last.points} held-back points"
     if last.lamps:
         return f"{map_kind} and {last.lamps} near lamp{'s' if last.lamps > 1 else ''} ({change} with lamps)"
     return f"{map_kind} without lamps ({change} with lamps)"
