@@ -40,30 +40,26 @@ class Train:
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
     """Settings from a .yaml or .json file, such as a run folder's config.json; other options override it."""
     host: Literal["volsdf", "mesh"] = "volsdf"
-    """Source of geometry. volsdf: recovered from the images. mesh: given, and only material and light are
-    recovered."""
+    """Source of geometry: recovered from the images (volsdf), or a given mesh."""
     mesh: Path | None = None
     """Mesh for --host mesh, in the capture's world frame; default: the capture's inputs/model/mesh.ply."""
     light: Path | None = None
-    """A known environment map (linear EXR, see docs/light.md), in the radiance of the images; default: the
-    light is recovered.
-    """
+    """A known environment map (linear EXR, docs/light.md); default: recovered."""
     resume: bool = False
     """Continue the run in --out from its last checkpoint, with the same result as without a stop."""
     format: str | None = None
     """Format of the capture (see docs/captures.md); default: recognised from the files."""
     test_every: int | None = None
-    """Hold out every k-th view for testing; default: the capture's split.json, or every 8th view."""
+    """Hold out every k-th view for testing; default: split.json, or every 8th."""
     response: Literal["auto", "linear", "srgb"] = "auto"
     """What the pixels hold: linear radiance (HDR) or sRGB (LDR); auto: as the files say."""
     scale: float | None = None
-    """Image size relative to the files; 1 for full size; default: as large as the rays of the training can
-    use."""
+    """Image size relative to the files; default: as large as the training can use."""
     effects: str | None = None
     """Effects to simulate: auto, all, none, as-set, or a list such as auto,-lamps (docs/effects.md)."""
     budget: str | None = None
     """Time for the whole command, such as 90s, 10m or 1h; the steps are planned for it (docs/budget.md).
-    Default: as many steps as the settings say.
+    Default: no limit.
     """
     strict: bool = False
     """Exit with status 1 if the result is unusable (docs/health.md)."""
