@@ -63,7 +63,7 @@ def test_nothing_can_be_run(tmp_path, words, clock, capsys):
     ("options", "complaint"),
     [
         (["--budgets", "soon"], "not a duration"),
-        (["--budgets", "1m,60s"], "given twice"),
+        (["--budgets", "1m,60s"], "contains a budget twice"),
         (["--budgets", ","], "--budgets is empty"),
         (["--seeds", "0"], "--seeds is 0"),
     ],
@@ -78,5 +78,5 @@ def test_seeds_count_on(tmp_path):
     found = rows_of(tmp_path, tmp_path, small_config(seed=3), [180.0, 60.0], 2, "cpu")
     assert [row.name for row in found] == ["1m-seed3", "1m-seed4", "3m-seed3", "3m-seed4"]
     assert [row.config.train.seed for row in found] == [3, 4, 3, 4]
-    with pytest.raises(UserError, match="given twice"):
+    with pytest.raises(UserError, match="contains a budget twice"):
         rows.rows_of(tmp_path, tmp_path, small_config(), [60.0, 60.0], 1, "cpu")
