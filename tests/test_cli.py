@@ -305,7 +305,7 @@ def refused(capfd, arguments: list[object], *words: object, leaves: Path) -> Non
         (["train", "--test-every", "often"], ("--test-every", "'often'")),
         (["train"], ("--data",)),
         (["train", "--resume"], ("--resume needs the run's folder", "--out")),
-        (["eval"], ("The run's folder", "neilfpp eval --help")),
+        (["eval"], ("The run folder", "neilfpp eval --help")),
         (["eval", "a", "b"], ("b", "neilfpp eval --help")),
         (["export", "a", "--checkpoint", "first"], ("--checkpoint", "sdf_init")),
         (["render", "a", "--views", "best"], ("--views", "test")),
@@ -492,7 +492,7 @@ def test_a_place_that_cannot_be_written(tmp_path, capfd, capture, trained, name)
     (tmp_path / "file").write_text("")
     out = tmp_path / "file" / "out"
     options = ["--data", capture, "--preset", "tiny"] if name == "train" else [trained]
-    complaint = f"cannot be written, for nothing can be made in {tmp_path / 'file'}"
+    complaint = f"cannot be written, because {tmp_path / 'file'} is not a writable folder"
     refused(capfd, [name, *options, "--out", out, "--device", "cpu"], out, complaint, leaves=tmp_path)
 
 
@@ -500,7 +500,7 @@ def test_a_place_that_cannot_be_written(tmp_path, capfd, capture, trained, name)
     ("options", "words"),
     [
         (["export", "--what", "mesh", "light"], ("no light yet at step 4",)),
-        (["render", "--what", "light"], ("no light to show at step 4",)),
+        (["render", "--what", "light"], ("the run has no light yet at step 4",)),
         (["render", "--confidence"], ("no material at step 4",)),
     ],
 )
