@@ -40,8 +40,7 @@ __all__ = ["FLIP", "LAYOUT", "Frame", "read", "read_frames", "recognise"]
 
 LAYOUT = "transforms.json"
 FLIP = np.array([1.0, -1.0, -1.0, 1.0])
-"""Signs that convert between OpenCV's (x right, y down, z forward) and OpenGL's axes (x right, y up, z
-back)."""
+"""Signs that convert between OpenCV's (x right, y down, z forward) and OpenGL's axes (y up, z back)."""
 MODELS = ("OPENCV", FISHEYE, "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 """Accepted values of `camera_model`."""
 
