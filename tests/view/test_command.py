@@ -49,7 +49,7 @@ def test_the_page_is_served_until_it_is_ended(found, port):
 
     command.view(request(found, port), said.append, once)
     assert served == [200]
-    assert said == [f"open http://127.0.0.1:{port} in a browser; Ctrl-C ends"]
+    assert said == [f"open http://127.0.0.1:{port} in a browser; press Ctrl-C to stop"]
     check_free("127.0.0.1", port)  # nothing is left
 
 
