@@ -65,6 +65,11 @@ def evaluate(
 
     Raises:
         UserError: no view is held out, a file of the truth is damaged, or the run has no surface to compare.
+
+    Example::
+
+        run = load_run(Path("runs/teapot"), "cpu")
+        write_metrics(run.path / "metrics.json", run, evaluate(run))
     """
     rendered = rendered or render_test_views(run, lambda share: on_progress(RENDERING * share))
     known = known_test_views(run, rendered)

@@ -76,6 +76,12 @@ def render_picture(
         seed: the same seed and number of samples give the same image.
         on_progress: called with the fraction of the work that is done.
         clock: returns the time in seconds.
+
+    Example::
+
+        surface, sky = surface_of_run(run, resolution=256), sky_of_run(run.model.light)
+        scene = Scene(surface, run.model.materials, run.model.lobe, sky)
+        picture = render_picture(scene, camera, Budget(samples=64), bounces=4)
     """
     device = scene.sky.radiance.device
     pixels, begun = camera.width * camera.height, clock()
