@@ -78,7 +78,7 @@ def test_an_open_door_is_told(found, port):
     pytest.importorskip("viser")
     said = []
     command.view(request(found, port, host="0.0.0.0"), said.append, lambda _: True)
-    assert said[0].startswith("warning: anybody")
+    assert said[0].startswith("warning: everybody")
 
 
 def test_a_busy_port_is_one_line(capsys, found, port):
