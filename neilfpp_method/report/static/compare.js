@@ -12,16 +12,20 @@
   const strips = [...document.querySelectorAll(".strip[data-view]")];
 
   function show() {
-    const view = +chosen("view"), layer = +chosen("layer"); const { title, note, largest, cells } =
-    data.layers[layer], cell = cells[view]; const pictures = { truth: cell.truth, photograph:
-    data.photographs[view], error: cell.error }; for (const input of
-    document.querySelectorAll("input[name=beside]")) input.disabled = !pictures[input.value]; let kind =
-    chosen("beside"); if (!pictures[kind]) kind = "photograph"; before.src = pictures[kind]; before.alt =
-    `${title}, ${kind}, view ${data.names[view]}`; after.src =
-    strips[view].querySelectorAll("img")[layer].src; after.alt = `${title}, estimate, view
-    ${data.names[view]}`; left.textContent = kind; right.textContent = "estimate"; const scale = kind ===
-    "error" ? ` The brightest colour is an error of ${largest} or more.` : ""; caption.textContent = `${title}
-    (${note}), view ${data.names[view]}: ${kind} on the left, estimate on the right.${scale}`;
+    const view = +chosen("view"), layer = +chosen("layer");
+    const { title, note, largest, cells } = data.layers[layer], cell = cells[view];
+    const pictures = { truth: cell.truth, photograph: data.photographs[view], error: cell.error };
+    for (const input of document.querySelectorAll("input[name=beside]")) input.disabled = !pictures[input.value];
+    let kind = chosen("beside");
+    if (!pictures[kind]) kind = "photograph";
+    before.src = pictures[kind];
+    before.alt = `${title}, ${kind}, view ${data.names[view]}`;
+    after.src = strips[view].querySelectorAll("img")[layer].src;
+    after.alt = `${title}, estimate, view ${data.names[view]}`;
+    left.textContent = kind;
+    right.textContent = "estimate";
+    const scale = kind === "error" ? ` The brightest colour is an error of ${largest} or more.` : "";
+    caption.textContent = `${title} (${note}), view ${data.names[view]}: ${kind} on the left, estimate on the right.${scale}`;
     strips.forEach((strip, i) => { strip.hidden = i !== view; });
   }
   slider.addEventListener("input", () => stage.style.setProperty("--at", `${slider.value}%`));
