@@ -1,5 +1,4 @@
-"""Scattering at surface vertices: the package's BRDF, and directions sampled approximately in proportion to
-it.
+"""Scattering at surface vertices: the package's BRDF, and directions sampled in approximate proportion to it.
 
 A direction is sampled from the specular lobe with probability `share`, and otherwise in proportion to the
 cosine. Its density is that of the mixture, so every direction of the BRDF can be sampled and weights are

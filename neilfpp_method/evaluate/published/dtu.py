@@ -1,8 +1,8 @@
-"""The Chamfer distance of DTU, after jzhangbs/DTUeval-python `eval.py`, which follows the dataset's Matlab
-code.
+"""The Chamfer distance of DTU.
 
-The truth is read from the capture's folder or its parent, in the layout of the dataset's SampleSet. The
-number of the scan is the last number in the name of the capture's folder:
+It is computed as in jzhangbs/DTUeval-python `eval.py`, which follows the Matlab code of the dataset. The
+truth is read from the capture's folder or its parent, in the layout of the dataset's SampleSet. The number of
+the scan is the last number in the name of the capture's folder:
 
     ObsMask/ObsMask<scan>_10.mat, ObsMask/Plane<scan>.mat, Points/stl/stl<scan, 3 digits>_total.ply
 

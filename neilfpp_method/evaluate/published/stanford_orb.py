@@ -1,5 +1,6 @@
-"""The protocol of Stanford-ORB: StanfordORB/Stanford-ORB, `orb/utils/metrics.py`, `orb/utils/test.py` and
-`orb/utils/preprocess.py`.
+"""The protocol of Stanford-ORB.
+
+Source: StanfordORB/Stanford-ORB, `orb/utils/metrics.py`, `orb/utils/test.py` and `orb/utils/preprocess.py`.
 
 The capture is a folder of `blender_HDR`; masks of the test views are in its `test_mask`. The other truth is
 in `ground_truth/<capture>`, two folders above the capture: `pseudo_gt_albedo/<view>.png`,

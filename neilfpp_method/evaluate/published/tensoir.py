@@ -1,5 +1,7 @@
-"""The protocol of TensoIR on TensoIR-Synthetic: Haian-Jin/TensoIR, `renderer.py` (`evaluation_iter_TensoIR`,
-`compute_rescale_ratio`), `dataLoader/tensoIR_rotation_setting.py` and `utils.py` (`rgb_ssim`).
+"""The protocol of TensoIR on TensoIR-Synthetic.
+
+Source: Haian-Jin/TensoIR, `renderer.py` (`evaluation_iter_TensoIR`, `compute_rescale_ratio`),
+`dataLoader/tensoIR_rotation_setting.py` and `utils.py` (`rgb_ssim`).
 
 The layout is that of the dataset: a folder for each view with `rgba_<light>.png`, `albedo.png` and
 `normal.png`.
