@@ -20,7 +20,7 @@ import trimesh
 from neilfpp_method.cli import COMMANDS, main
 from neilfpp_method.commands.evaluate import Eval
 from neilfpp_method.data.images import read_image, write_exr, write_png
-from neilfpp_method.evaluate import protocols
+from neilfpp_method.evaluate import scene_metrics
 from neilfpp_method.evaluate.published import PROTOCOLS
 from neilfpp_method.settings.presets import PRESETS
 from tests.data.make_capture import CENTRE, RADIUS, make_capture
@@ -80,8 +80,8 @@ def test_train_says_what_it_does_and_leaves_a_run(trained):
 
 
 def test_eval_writes_flat_finite_figures(trained, tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(protocols, "SURFACE_POINTS", 1000)
-    monkeypatch.setattr(protocols, "MESH_RESOLUTION", 32)
+    monkeypatch.setattr(scene_metrics, "SURFACE_POINTS", 1000)
+    monkeypatch.setattr(scene_metrics, "MESH_RESOLUTION", 32)
     assert main(["eval", str(trained), "--device", "cpu"]) == 0
     said = capfd.readouterr()
     assert said.err == ""

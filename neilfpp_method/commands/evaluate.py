@@ -54,7 +54,7 @@ def run(options: Eval) -> None:
 def _published(options: Eval) -> None:
     from neilfpp_method.evaluate.published import PROTOCOLS
     from neilfpp_method.evaluate.published.protocol import write_figures
-    from neilfpp_method.evaluate.size import at_size, size_in_words
+    from neilfpp_method.evaluate.size import at_size, describe_size
     from neilfpp_method.evaluate.views import render_test_views
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.device import pick_device
@@ -69,8 +69,8 @@ def _published(options: Eval) -> None:
     check_writable(out)
     protocol.check(run)
     console = terminal()
-    if protocol.side is None and (size := size_in_words(run)):
-        console.print(f"{size}; published results use the full size of the files", soft_wrap=True)
+    if protocol.side is None and (size := describe_size(run)):
+        console.print(f"{size}; published figures are at the size of the files", soft_wrap=True)
     with computing_fast(), progress_bar("evaluating") as advance:
         figures = protocol.measure(run, render_test_views(run, advance) if protocol.needs_views else ())
         advance(1.0)
@@ -85,7 +85,7 @@ def _published(options: Eval) -> None:
 
 def _own(options: Eval) -> None:
     from neilfpp_method.evaluate.protocols import evaluate, write_metrics
-    from neilfpp_method.evaluate.size import at_size, size_in_words
+    from neilfpp_method.evaluate.size import at_size, describe_size
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.device import pick_device
     from neilfpp_method.train.run import check_writable, load_run
@@ -96,7 +96,7 @@ def _own(options: Eval) -> None:
     out = options.out or options.run / "metrics.json"
     check_writable(out)
     console = terminal()
-    if size := size_in_words(run):
+    if size := describe_size(run):
         console.print(size, soft_wrap=True)
     with computing_fast(), progress_bar("evaluating") as advance:
         metrics = evaluate(run, advance)

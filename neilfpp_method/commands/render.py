@@ -46,7 +46,7 @@ class Render:
 def run(options: Render) -> None:
     from neilfpp_method.evaluate.render_views import render_run
     from neilfpp_method.evaluate.sheet import write_light_picture
-    from neilfpp_method.evaluate.size import at_size, size_in_words
+    from neilfpp_method.evaluate.size import at_size, describe_size
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.device import pick_device
     from neilfpp_method.train.run import check_writable, load_run
@@ -56,7 +56,7 @@ def run(options: Render) -> None:
     )
     out = options.out or options.run / "renders"
     check_writable(out)
-    if size := size_in_words(run):
+    if size := describe_size(run):
         terminal().print(size, soft_wrap=True)
     if "maps" in options.what:
         with computing_fast(), progress_bar("rendering") as advance:
