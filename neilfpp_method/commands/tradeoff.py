@@ -26,7 +26,7 @@ class Tradeoff:
     """
     seeds: int = 1
     """Runs of each budget, which differ in their random numbers; from two on the figure has error bars."""
-    preset: Literal["fast", "paper-mlp", "paper-ngp", "paper-ngp-hdr"] = "fast"
+    preset: Literal["fast", "balanced", "best", "paper-mlp", "paper-ngp", "paper-ngp-hdr"] = "fast"
     """The settings of all runs."""
     host: Literal["volsdf", "mesh"] = "volsdf"
     """Where geometry comes from, as of neilfpp train; mesh: the capture's inputs/model/mesh.ply."""

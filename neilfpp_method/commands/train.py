@@ -33,8 +33,8 @@ class Train:
     out: Path | None = None
     """The run's folder; none: runs/CAPTURE-PRESET."""
     preset: str | None = None
-    """fast (minutes on a laptop's CPU), paper-mlp, paper-ngp or paper-ngp-hdr (the published settings); none:
-    fast.
+    """fast (minutes on a laptop's CPU), balanced or best (the same method with more steps, more rays and
+    finer grids: docs/budget.md), or paper-mlp, paper-ngp, paper-ngp-hdr (the published settings); none: fast.
     """
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
     """Settings from a .yaml or .json file, such as a run folder's config.json; options here override it."""
