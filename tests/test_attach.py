@@ -263,7 +263,7 @@ def test_a_nerfstudio_model_is_told_by_its_shape(monkeypatch):
 
 
 def test_what_is_no_host_is_named():
-    with pytest.raises(UserError, match="list is no host; give an object with render"):
+    with pytest.raises(UserError, match="list is not a host; give an object with render"):
         attach_neilf([1, 2, 3])
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Float64
 
 from neilfpp_method.data.focus import axes_of, find_focus, meeting_point
 from neilfpp_method.data.silhouettes import AGREEMENT, Outline, agreement, read_outlines
-from neilfpp_method.data.views import Normalisation, SceneSource, View
+from neilfpp_method.data.views import Normalisation, SceneSource, View, check_camera
 from neilfpp_method.errors import UserError
 
 __all__ = ["SceneBox", "box_of_cameras", "box_of_focus", "box_of_points", "find_box"]
@@ -54,8 +54,10 @@ def find_box(views: Sequence[View], points: Float64[np.ndarray, "P 3"] | None = 
             masks, only points within them count.
 
     Raises:
-        UserError: a mask cannot be read, or nothing tells where the scene is.
+        UserError: a camera is malformed, a mask cannot be read, or nothing tells where the scene is.
     """
+    for view in views:
+        check_camera(view.camera, str(view.image))
     outlines = read_outlines(views)
     if points is not None and outlines:
         points = points[agreement(outlines, points) >= AGREEMENT]

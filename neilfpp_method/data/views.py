@@ -42,6 +42,8 @@ MAX_TABULATED = 2**26
 """Pixels of different lenses whose rays are kept in memory: half a gigabyte."""
 PLANE_PART = 2**20
 """Pixels whose rays are computed together: bounds the memory."""
+MIN_FOCAL, LARGEST = 1e-3, 1e12
+"""Smallest focal length, pixels, and the largest number of a camera: rays are computed in float32."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +86,11 @@ def check_camera(camera: Camera, where: str) -> None:
         raise UserError(f"{where}: the camera has a number that is not finite", "export the cameras again")
     if min(camera.fx, camera.fy) <= 0:
         raise UserError(f"{where}: the focal length is not positive", "give it in pixels")
+    if min(camera.fx, camera.fy) < MIN_FOCAL or max(*abs(camera.intrinsics), abs(camera.w2c).max()) > LARGEST:
+        raise UserError(
+            f"{where}: the camera has a focal length below {MIN_FOCAL:g} px or a number beyond {LARGEST:g}",
+            "export the cameras again",
+        )
     if min(camera.width, camera.height) < 1:
         raise UserError(f"{where}: the image size is not positive", "give width and height in pixels")
     rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0

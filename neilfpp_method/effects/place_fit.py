@@ -153,7 +153,7 @@ def _neighbours(places: Places) -> Int[Tensor, "P K"]:
 def place_errors(fit: PlaceFit, places: Places, transport: Transport, typical: float) -> Float[Tensor, " N"]:
     """Relative error of each pixel, at most 1, mean of its channels."""
     shown = _at_roughness(transport, fit.roughness[places.place])
-    sent = torch.einsum("knt,tc->knc", shown.sources, fit.radiance) + shown.scene
+    sent = shown.arriving(fit.radiance)
     material = fit.material(places.place)
     outgoing = _outgoing(sent, material.base_color, material.metallic)
     return _relative_error(outgoing, places, typical).abs().clamp_max(1).mean(-1)
@@ -190,7 +190,6 @@ def _better_light(
     """The light by descent, and the base colours with it, at the roughness and metallic that places have."""
     shown = _at_roughness(transport, fit.roughness[places.place])
     metallic = fit.material(places.place).metallic
-    flat = shown.sources.flatten(0, 1)
     log_radiance = fit.log_radiance.clone().requires_grad_()
     gain = torch.zeros_like(fit.base_color, requires_grad=True)
     groups = [{"params": [log_radiance], "lr": RATE}, {"params": [gain], "lr": GAIN_RATE}]
@@ -198,7 +197,7 @@ def _better_light(
     with torch.enable_grad():
         for _ in range(steps):
             base_color = fit.base_color * gain.exp()
-            sent = (flat @ form(log_radiance).exp().flatten(1).t()).view_as(shown.scene) + shown.scene
+            sent = shown.arriving(form(log_radiance).exp().flatten(1).t())
             error = _relative_error(
                 _outgoing(sent, base_color.clamp(0, 1)[places.place], metallic), places, typical
             )

@@ -62,9 +62,13 @@ class Transport:
         """No sources: these, of a strength that is known, count as the scene's."""
         return Transport(self.sources[..., :0], self.scene + self.sources @ strength)
 
+    def arriving(self, strength: Float[Tensor, "T 3"]) -> Float[Tensor, "K N 3"]:
+        """The sum over all sources of this strength and the scene, before any color of the material."""
+        return _SumOverSources.apply(self.sources, strength) + self.scene
+
     def outgoing(self, material: Material, strength: Float[Tensor, "T 3"]) -> Float[Tensor, "N 3"]:
         """L_o under sources of this strength, with the colours of `material` (roughness is fixed)."""
-        diffuse, *reflected = _SumOverSources.apply(self.sources, strength) + self.scene
+        diffuse, *reflected = self.arriving(strength)
         color = diffuse_reflectance(material, bool(reflected)) * diffuse
         if reflected:
             facing, grazing = reflected
@@ -243,5 +247,5 @@ def _chunks(
     observed: Observed, roughness: Float[Tensor, "N 1"], sources: int
 ) -> list[tuple[Observed, Tensor]]:
     rows = max(1, PAIRS_AT_ONCE // max(1, sources))
-    spans = [slice(start, start + rows) for start in range(0, len(observed), rows)]
+    spans = [slice(start, start + rows) for start in range(0, max(1, len(observed)), rows)]
     return [(observed[span], roughness[span]) for span in spans]

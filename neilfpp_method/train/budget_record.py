@@ -9,7 +9,6 @@ and steps of each stage
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +18,7 @@ from neilfpp_method.budget.plan import Costs, StageCost
 from neilfpp_method.errors import UserError
 from neilfpp_method.schedule import Stage
 from neilfpp_method.settings.plain import from_dict
-from neilfpp_method.train.json_files import read_json, write_json
+from neilfpp_method.train.json_files import is_finite_number, read_json, write_json
 
 __all__ = ["FILE", "BudgetPlan", "Revision", "read_budget", "write_budget"]
 
@@ -113,7 +112,7 @@ def _sensible(plan: BudgetPlan) -> bool:
     return (
         same
         and set(plan.costs.stages) <= set(STAGES)
-        and all(isinstance(n, int | float) and math.isfinite(n) and n >= 0 for n in seconds)
+        and all(is_finite_number(n) and n >= 0 for n in seconds)
         and all(isinstance(n, int) and n >= 0 for n in counts)
         and plan.size in ("small", "usual", "large")
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 from neilfpp_method.data.images import replacing
 from neilfpp_method.errors import UserError
 
-__all__ = ["read_json", "write_json"]
+__all__ = ["is_finite_number", "read_json", "write_json"]
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
@@ -27,10 +28,15 @@ def read_json(path: Path) -> dict[str, Any]:
     """
     try:
         value = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(
             f"{path}: not readable as JSON ({error})", "restore the file or train again"
         ) from error
     if not isinstance(value, dict):
         raise UserError(f"{path}: holds no JSON object", "restore the file or train again")
     return value
+
+
+def is_finite_number(value: object) -> bool:
+    """Whether a value from JSON is a number that a float can hold; an integer of JSON may have any length."""
+    return isinstance(value, int | float) and abs(value) <= sys.float_info.max

@@ -26,7 +26,7 @@ from neilfpp_method.schedule import StagePosition
 from neilfpp_method.settings.plain import from_dict
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.structures import PixelBatch
-from neilfpp_method.train.run import read_json, write_json
+from neilfpp_method.train.json_files import is_finite_number, read_json, write_json
 
 __all__ = ["FILE", "Look", "Quality", "has_looks", "read_looks", "write_looks"]
 
@@ -151,7 +151,7 @@ def read_looks(run: Path, before: int | None = None) -> Sequence[Look]:
             f"{path}: not a complete record ({error})", "remove the file, or train again"
         ) from error
     if not all(
-        math.isfinite(n) for look in looks for n in (look.seconds, look.radiance, look.physical or 0.0)
+        is_finite_number(n) for look in looks for n in (look.seconds, look.radiance, look.physical or 0.0)
     ):
         raise UserError(f"{path}: a number that is not finite", "remove the file, or train again")
     return [look for look in looks if before is None or look.step <= before]

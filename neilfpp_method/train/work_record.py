@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import torch
 
 from neilfpp_method.errors import UserError
 from neilfpp_method.timing.ledger import WORK, Ledger
-from neilfpp_method.train.run import read_json, write_json
+from neilfpp_method.train.json_files import is_finite_number, read_json, write_json
 
 __all__ = ["FILE", "read_work", "waiting", "write_work"]
 
@@ -42,7 +41,7 @@ def read_work(run: Path) -> dict[str, dict[str, float]]:
         raise UserError(f"{path}: not a complete record", "remove the file, or train again")
     for stage, parts in stages.items():
         for work, seconds in parts.items():
-            good = isinstance(seconds, int | float) and math.isfinite(seconds) and seconds >= 0
+            good = is_finite_number(seconds) and seconds >= 0
             if work not in WORK or not good:
                 raise UserError(
                     f"{path}: {stage}.{work}: no time of a known kind", "remove the file, or train again"

@@ -33,9 +33,9 @@ def laplace_density(sdf: Float[Tensor, "*shape"], beta: Float[Tensor, "*#shape"]
         Density, 1 / scene unit.
     """
     scaled = sdf / beta
-    # Ψ(−x) = ½ (e^{−max(x, 0)} − expm1(min(x, 0))). The parts share the kink: the slope at 0 is −½.
-    outside = torch.relu(scaled)
-    inside = scaled - outside
+    # Ψ(−x) = ½ (e^{−max(x, 0)} − expm1(min(x, 0))). relu has slope 0 at 0 and clamp_max slope 1, so
+    # the slope of Ψ there is −½. scaled − outside would be NaN if the quotient overflows (float16).
+    outside, inside = torch.relu(scaled), scaled.clamp_max(0.0)
     return 0.5 * (torch.exp(-outside) - torch.expm1(inside)) / beta
 
 
@@ -64,8 +64,7 @@ def laplace_depth(
         tensor([5.])
     """
     scaled = sdf.to(torch.promote_types(sdf.dtype, torch.float32)) / beta
-    outside = torch.relu(scaled)
-    inside = scaled - outside
+    outside, inside = torch.relu(scaled), scaled.clamp_max(0.0)
     # The terms of F are subtracted apart: deep inside, the first is large and would absorb the second.
     rise = inside.diff(dim=-1) - 0.5 * torch.exp(inside - outside).diff(dim=-1)
     step = scaled.diff(dim=-1)

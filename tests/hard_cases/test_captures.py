@@ -90,6 +90,7 @@ def box(transform) -> Callable[[dict], None]:
 
 
 MIRROR = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
+AWAY = [[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 BROKEN_SCENES = {
     "no views": (lambda s: (tracks(s).clear(), files(s).clear()), "no images"),
     "no valid views": (lambda s: [t.update(flg=0) for t in tracks(s).values()], "no images"),
@@ -114,6 +115,9 @@ BROKEN_SCENES = {
     "projective": (extrinsic([*np.eye(4)[:3].tolist(), [0, 0, 1, 0]]), "the extrinsic is no rotation"),
     "negative focal": (intrinsic(focal=[-25.0, 25.0]), "003.exr: the focal length is not positive"),
     "zero focal": (intrinsic(focal=0), "003.exr: the focal length is not positive"),
+    "focal of almost nothing": (intrinsic(focal=1e-300), "003.exr: the camera has a focal length below"),
+    "principal point far away": (intrinsic(ppt=[1e300, 9]), "003.exr: the camera has a focal length below"),
+    "camera far away": (extrinsic(AWAY), "003.exr: the camera has a focal length below"),
     "three focals": (intrinsic(focal=[1, 2, 3]), "focal: not 1 or 2 finite numbers"),
     "infinite principal point": (intrinsic(ppt=[float("inf"), 9]), "ppt: not 2 finite numbers"),
     "other size": (size([18, 24]), "003.exr: 24×18 pixels where the camera has 18×24"),

@@ -81,7 +81,7 @@ def test_the_file_of_a_run_folder_gives_its_settings(tmp_path, config):
         ("a.json", "{", "a.json:1: not JSON"),
         ("a.json", "[1]", "a.json: holds no settings"),
         ("a.json", '{"format": 2, "config": 3}', "a.json: holds no settings"),
-        ("a.toml", "", "a.toml: settings are read from .yaml and .json files"),
+        ("a.toml", "", "a.toml: not a .yaml, .yml or .json file"),
         ("a.yaml", "train.ray: 3", "a.yaml.train: unknown setting 'ray'; did you mean 'rays'?"),
         ("a.yaml", "preset: quick", "unknown preset 'quick'"),
         ("a.yaml", "preset: 3", "a.yaml.preset: 3 where a name belongs"),

@@ -46,11 +46,22 @@ def test_the_seconds_of_a_run_that_was_stopped_add_up_to_the_clock(tmp_path, mon
 
 @pytest.mark.parametrize(
     "damage",
-    [{"format": 9}, {"format": 1}, {"format": 1, "seconds": {"joint": {"tea": 1.0}}}],
-    ids=["format", "none", "kind"],
+    [
+        {"format": 9},
+        {"format": 1},
+        {"format": 1, "seconds": {"joint": {"tea": 1.0}}},
+        {"format": 1, "seconds": {"joint": {"rendering": 10**400}}},
+    ],
+    ids=["format", "none", "kind", "longer than a float"],
 )
 def test_a_damaged_record_is_named(tmp_path, damage):
     assert read_work(tmp_path) == {}
     write_json(tmp_path / FILE, damage)
     with pytest.raises(UserError, match=r"work\.json"):
+        read_work(tmp_path)
+
+
+def test_json_that_is_nested_without_end_is_refused(tmp_path):
+    (tmp_path / FILE).write_text("[" * 100_000)
+    with pytest.raises(UserError, match="not readable as JSON"):
         read_work(tmp_path)

@@ -91,7 +91,8 @@ def open_model(folder: Path) -> pycolmap.Reconstruction:
         check_sizes(folder)
         model = pycolmap.Reconstruction(folder)
         for i in model.reg_image_ids():
-            model.image(i)  # an error where a frame speaks of an image that is not there
+            # Raises if a frame names an image that is not there, or if a name is not UTF-8.
+            model.image(i).name  # noqa: B018
         return model
     except (ValueError, IndexError, RuntimeError, MemoryError, OSError) as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]

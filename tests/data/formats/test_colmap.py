@@ -215,6 +215,23 @@ def test_a_frame_without_its_image(tmp_path: Path) -> None:
     refused(tmp_path, "sparse", "image 5 in frame 5 does not exist")
 
 
+def test_a_name_that_is_not_utf_8(tmp_path: Path) -> None:
+    write(material(tmp_path, masks=None), reconstruction(colmap_camera("PINHOLE")))
+    path = tmp_path / "sparse" / "0" / "images.bin"
+    path.write_bytes(path.read_bytes().replace(b"004.png", b"00\xff.png"))
+    refused(tmp_path, "sparse", "utf-8")
+
+
+def test_a_pose_of_which_nothing_is_finite(tmp_path: Path) -> None:
+    write(material(tmp_path, masks=None), reconstruction(colmap_camera("PINHOLE")))
+    path = tmp_path / "sparse" / "0" / "frames.bin"
+    data = path.read_bytes()
+    quaternion = np.array(pycolmap.Rigid3d(POSES[2][:3]).rotation.quat)[[3, 0, 1, 2]].tobytes()
+    assert quaternion in data
+    path.write_bytes(data.replace(quaternion, np.full(4, np.nan).tobytes()))
+    refused(tmp_path, "the camera has a number that is not finite")
+
+
 def test_a_model_without_images_and_a_panorama(tmp_path: Path) -> None:
     write(material(tmp_path, masks=None), pycolmap.Reconstruction())
     refused(tmp_path, "no registered image")

@@ -1,9 +1,11 @@
 """The table of damaged files in docs/stability.md.
 
-    python -m tests.hard_cases.hostile.campaign 10000            print it
-    python -m tests.hard_cases.hostile.campaign 10000 --write    and write it into the document
+    python -m tests.hard_cases.hostile.campaign 10000                    print the table
+    python -m tests.hard_cases.hostile.campaign 10000 --keep FOLDER      continue a campaign that was stopped
+    python -m tests.hard_cases.hostile.campaign 0 --keep FOLDER --write  write the table into the document
 
-The number is that of the inputs of a reader; those whose inputs cost milliseconds get a fifth of it.
+The number is that of the inputs of a cheap reader; readers whose inputs cost milliseconds get a fifth of it.
+All readers take turns, a chunk of inputs each, so a campaign that is stopped early has tried them evenly.
 """
 
 from __future__ import annotations
@@ -12,58 +14,98 @@ import json
 import re
 import sys
 import tempfile
-from collections.abc import Mapping
+import warnings
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import tyro
 
 from tests.hard_cases.hostile.readers import READERS
-from tests.hard_cases.hostile.worker import main as attack_all
+from tests.hard_cases.hostile.worker import Outcome, attack
 
 DOCUMENT = Path(__file__).parents[3] / "docs" / "stability.md"
 MARKED = re.compile(r"(<!-- hostile -->\n).*?(<!-- end -->)", re.DOTALL)
+CHUNK = 500
+"""Inputs of a cheap reader between two saves."""
 
 
-def table(outcomes: Mapping[str, Mapping[str, Any]]) -> str:
+@dataclass
+class Progress:
+    """What became of the inputs of each reader so far, and how many of them there were."""
+
+    outcomes: dict[str, Outcome] = field(default_factory=dict)
+    done: dict[str, int] = field(default_factory=dict)
+
+    @staticmethod
+    def read(path: Path) -> Progress:
+        """The progress that `write` saved; an empty one if there is no such file."""
+        if not path.exists():
+            return Progress()
+        saved = json.loads(path.read_text())
+        return Progress({name: Outcome(**o) for name, o in saved["outcomes"].items()}, saved["done"])
+
+    def write(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_suffix(".new")
+        temporary.write_text(json.dumps(asdict(self), indent=1))
+        temporary.replace(path)
+
+    def add(self, name: str, count: int, outcome: Outcome) -> None:
+        """Add the outcome of `count` more inputs of a reader."""
+        total = self.outcomes.setdefault(name, Outcome())
+        total.read += outcome.read
+        total.refused += outcome.refused
+        total.faults += outcome.faults
+        total.grown = max(total.grown, outcome.grown)
+        self.done[name] = self.done.get(name, 0) + count
+
+
+def table(progress: Progress) -> str:
     """What became of the inputs of each reader, in Markdown."""
     rows = [
         "| reader | inputs | gave a value | refused in one line | faults | memory, MiB |",
         "|---|---|---|---|---|---|",
     ]
-    for name, o in outcomes.items():
-        inputs = o["read"] + o["refused"]
-        figures = (inputs, o["read"], o["refused"], len(o["faults"]), o["grown"] >> 20)
+    for name in filter(progress.done.get, READERS):
+        o = progress.outcomes[name]
+        figures = (progress.done[name], o.read, o.refused, len(o.faults), o.grown >> 20)
         rows.append(f"| {name} | {' | '.join(f'{figure:,}' for figure in figures)} |")
-    total = sum(o["read"] + o["refused"] for o in outcomes.values())
-    faults = sum(len(o["faults"]) for o in outcomes.values())
+    total = sum(progress.done.values())
+    faults = sum(len(o.faults) for o in progress.outcomes.values())
     return "\n".join(rows) + f"\n\n{total:,} inputs, {faults} faults.\n"
 
 
-def main(count: tyro.conf.Positional[int], first: int = 0, write: bool = False) -> int:
-    """Read damaged files with every reader; exit status 1 where there is a fault.
+def main(count: tyro.conf.Positional[int], keep: Path | None = None, write: bool = False) -> int:
+    """Read damaged files with every reader; exit status 1 if there is a fault.
 
     Args:
-        count: inputs of a cheap reader.
-        first: number of the first input; the same numbers are the same damage.
+        count: inputs of a cheap reader, numbered from 0; the same numbers are the same damage.
+        keep: folder in which the progress is saved, and from which a stopped campaign continues.
         write: put the table into docs/stability.md.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        report = Path(folder) / "report.json"
-        counts = {name: max(1, round(count * reader.share)) for name, reader in READERS.items()}
-        attack_all(Path(folder), report, first, counts)
-        outcomes = json.loads(report.read_text())
-    print(table(outcomes))
-    for name, outcome in outcomes.items():
-        for number, file, what in outcome["faults"]:
+    warnings.simplefilter("ignore")
+    record = keep / "progress.json" if keep else None
+    progress = Progress.read(record) if record else Progress()
+    for turn in range(CHUNK, count + CHUNK, CHUNK):
+        for name, reader in READERS.items():
+            begin, end = progress.done.get(name, 0), max(1, round(min(turn, count) * reader.share))
+            if begin >= end:
+                continue
+            with tempfile.TemporaryDirectory() as folder:
+                progress.add(name, end - begin, attack(reader, Path(folder) / "files", begin, end - begin))
+            if record:
+                progress.write(record)
+    print(table(progress))
+    for name, outcome in progress.outcomes.items():
+        for number, file, what in outcome.faults:
             print(f"{name}, input {number}, {file}: {what}")
     if write:
-        command = f"`python -m tests.hard_cases.hostile.campaign {count} --first {first}`"
-        told = f"{table(outcomes)}\n{command}\n"
+        command = f"`python -m tests.hard_cases.hostile.campaign {max(progress.done.values())}`"
+        section = f"{table(progress)}\n{command}\n"
         DOCUMENT.write_text(
-            MARKED.sub(lambda m: f"{m[1]}\n{told}{m[2]}", DOCUMENT.read_text("utf-8")), "utf-8"
+            MARKED.sub(lambda m: f"{m[1]}\n{section}{m[2]}", DOCUMENT.read_text("utf-8")), "utf-8"
         )
-    return int(any(outcome["faults"] for outcome in outcomes.values()))
+    return int(any(outcome.faults for outcome in progress.outcomes.values()))
 
 
 if __name__ == "__main__":
