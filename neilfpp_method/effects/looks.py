@@ -21,7 +21,10 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.structures import Observed, PixelBatch
 
 __all__ = [
+    "FEWEST_PIXELS",
     "LOOKED_AT",
+    "MIN_PHOTOGRAPHS",
+    "MOST_PIXELS",
     "after_fit",
     "look_at_light",
     "look_at_surface",
@@ -40,8 +43,14 @@ PLACES, VIEWS, MIN_VIEWS = 1200, 20, 4
 """How many places the light starts from at most, and how many views of each; fewer views than these do not
 tell materials apart. 10,000 pixels take 200 MB.
 """
+USUAL_VIEWS = 8
+"""Views that show a place in a capture from all around it: of so many pixels a place is made."""
 AT_ONCE = 512
 """Rays that are rendered together; bounds the memory."""
+FEWEST_PIXELS = MIN_PLACES * USUAL_VIEWS
+"""Pixels without which the first light is not looked for."""
+MOST_PIXELS = PLACES * VIEWS
+"""Pixels that the places of the first light have at most."""
 
 
 def note_facts(plan: Plan, facts: SceneFacts) -> None:
@@ -82,19 +91,21 @@ def wants_surface(plan: Plan) -> bool:
 
 @torch.no_grad()
 def look_at_light(
-    plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int
+    plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int, most: int = MOST_PIXELS
 ) -> tuple[list[Decision], FirstLight | None]:
     """Decide on the lobe of highlights where that is open, and find the light that training starts with.
 
-    Arguments as of `look_at_surface`; the model computes as the plan says afterwards.
+    Arguments as of `look_at_surface`, and `most`: pixels that the places have at most; with too few for
+    `MIN_PLACES` nothing is looked for. The model computes as the plan says afterwards.
     """
-    if len(pixels.views) < MIN_PHOTOGRAPHS:
+    if len(pixels.views) < MIN_PHOTOGRAPHS or most < FEWEST_PIXELS:
         return [], None
     mode = model.training
     model.eval()
     surface = _shown_surface(model, pixels.sample(LIGHT_PIXELS, gradients=False)).observed
-    position, normal = surface.position[:PLACES], surface.normal[:PLACES]
-    places = gather_places(model, pixels, position, normal, VIEWS).in_views(MIN_VIEWS)
+    count = min(PLACES, most // USUAL_VIEWS)
+    position, normal = surface.position[:count], surface.normal[:count]
+    places = gather_places(model, pixels, position, normal, VIEWS).in_views(MIN_VIEWS).first(most)
     typical, decisions = model.facts.median_radiance, []
     if len(places.place.unique()) < MIN_PLACES:
         model.train(mode)

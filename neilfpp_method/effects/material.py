@@ -12,7 +12,6 @@ uneven light or its colours save is less than what they are worth.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -28,13 +27,13 @@ from neilfpp_method.effects.place_fit import (
     METALLICS,
     ROUGHNESSES,
     ROUNDS,
-    ROWS,
     STEPS,
     PlaceFit,
     any_map,
     fit_places,
     place_errors,
     place_transport,
+    seconds_of_step,
 )
 from neilfpp_method.effects.places import Places, gather_places
 from neilfpp_method.lighting.transport import Transport
@@ -51,9 +50,9 @@ MIN_VIEWS = 4
 """Views that must show a place: fewer do not tell materials apart."""
 WORTH = 0.01
 """Relative error that an effect must save."""
-FITS, TRIED, REST = 50, 3, 0.5
-"""An estimate of how long looks at places take: so many fits of this size for materials, lobe and the light
-that training starts with; steps of a descent that are tried; and the share that other work adds.
+FITS, REST = 20, 0.5
+"""Of the estimate of how long a look at places takes: the number of fits (16, and some for the noise of lobe
+sampling), and the share that other work adds to their descents.
 """
 METAL = 0.5
 """Metallic above which a place is taken for metal."""
@@ -111,18 +110,11 @@ def material_evidence(
 
 
 def seconds_of_evidence(device: torch.device) -> float:
-    """About how long looks at places take here, where all of them are seen by many views.
+    """Estimate how long one look at places takes here, if all of them are seen by many views.
 
-    Most of it are products of the transport to all pixels with the texels of the map, and back, one of each
-    in every step of the light's descent; two are measured. `REST` of that is added for all else.
+    It is the time of the light's descents (`seconds_of_step`), and `REST` of that for all else.
     """
-    rows, texels = 3 * PLACES * VIEWS * (FOLDS - 1) // FOLDS, 2 * ROWS**2
-    transport, light = torch.ones(rows, texels, device=device), torch.ones(texels, 3, device=device)
-    began = time.perf_counter()
-    for _ in range(TRIED):
-        back = transport.T @ (transport @ light)
-    back.sum().item()  # waits for a device
-    step = (time.perf_counter() - began) / TRIED
+    step = seconds_of_step(PLACES * VIEWS * (FOLDS - 1) // FOLDS, device)
     return (1 + REST) * FITS * (FIRST_STEPS + (ROUNDS - 1) * STEPS) * step
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -25,7 +26,14 @@ from neilfpp_method.lighting.transport import Transport, from_texels_at
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import Material, SceneTracer
 
-__all__ = ["PlaceFit", "any_map", "fit_places", "place_errors", "place_transport"]
+__all__ = [
+    "PlaceFit",
+    "any_map",
+    "fit_places",
+    "place_errors",
+    "place_transport",
+    "seconds_of_step",
+]
 
 ROUGHNESSES = (0.08, 0.14, 0.2, 0.28, 0.36, 0.45, 0.55, 0.66, 0.8, 1.0)
 """Of the grid; the lobe's width changes by about a half from one to the next."""
@@ -57,6 +65,8 @@ START_BASE_COLOR, START_ROUGHNESS = 0.3, 4
 """What places start as; roughness by its number."""
 MIN_BASE_COLOR = 0.01
 """Darker places count as this dark."""
+TRIED = 3
+"""Products that `seconds_of_step` measures."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +102,20 @@ def place_transport(places: Places, lobe: Lobe, scene: SceneTracer | None) -> Tr
         for name in ("sources", "scene")
     )
     return Transport(sources, scene_light)
+
+
+def seconds_of_step(pixels: int, device: torch.device) -> float:
+    """Measure about how long one step of the light's descent takes for so many pixels.
+
+    Most of a step are the products of the transport to all pixels with the texels of the map, and back.
+    """
+    transport = torch.ones(3 * pixels, 2 * ROWS**2, device=device)
+    light = torch.ones(2 * ROWS**2, 3, device=device)
+    began = time.perf_counter()
+    for _ in range(TRIED):
+        back = transport.T @ (transport @ light)
+    back.sum().item()  # waits for a device
+    return (time.perf_counter() - began) / TRIED
 
 
 def any_map(log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:

@@ -159,8 +159,8 @@ class MapSolver(nn.Module):
         self.memory.wait()
         if self.config.kind == "distant":
             return None
-        before = self.light.light.log_radiance.clone()
-        measured = self._solve(observed, material, scene, first=True, benefit_of_doubt=True)
+        before, rows = self.light.light.log_radiance.clone(), slice(self.config.fit.points)
+        measured = self._solve(observed[rows], material[rows], scene, first=True, benefit_of_doubt=True)
         if not self.light.lamps.lit:
             self.light.light.log_radiance.copy_(before)
         return measured

@@ -183,7 +183,7 @@ def fast() -> NeilfConfig:
     return changed(NeilfConfig(), FAST)
 
 
-# Beside fast: twice the steps with a material and of the surface, each with twice the rays and directions.
+# Beside fast.
 BALANCED: Mapping[str, Any] = {
     "preset": "balanced",
     "encoding.log2_entries": 17,
@@ -202,8 +202,9 @@ BALANCED: Mapping[str, Any] = {
 
 
 def balanced() -> NeilfConfig:
-    """The method and the learning rates of `fast` with more steps, rays and directions, and finer grids
-    (`docs/budget.md` has the time that it takes).
+    """`fast` with more steps, more rays and directions, and finer grids.
+
+    Method and learning rates are the same. docs/budget.md has the time that it takes.
     """
     return changed(fast(), BALANCED)
 
@@ -229,7 +230,7 @@ BEST: Mapping[str, Any] = {
 
 
 def best() -> NeilfConfig:
-    """`balanced` with still more of each: for a GPU, or a night of many cores (`docs/budget.md`)."""
+    """`balanced` with more of each again, for a GPU or a night of computation (docs/budget.md)."""
     return changed(balanced(), BEST)
 
 

@@ -1,7 +1,7 @@
 """The plan of a run with a budget, in `RUN/plan.json`: what the trial measured, what was planned, and every
 time that the clock changed it.
 
-format; budget, seconds; size; costs; places_looked_at; took, seconds, at the end
+format; budget, seconds; size; costs; places_looked_at; light_pixels; took, seconds, at the end
 revisions, in order, of which the first is the plan that the training began with: seconds of the run, step,
 and steps of each stage
 """
@@ -45,6 +45,8 @@ class BudgetPlan:
         size: of a step (`budget.sizes`).
         costs: as the trial measured them.
         places_looked_at: whether evidence of places decides about materials and light, where that is open.
+        light_pixels: pixels from which the first light is found at most; 0: it is not looked for; None: as
+            without a budget.
         revisions: in order; the last one counts.
         took: seconds of the whole command, report included; none: it has not come to its end.
     """
@@ -53,6 +55,7 @@ class BudgetPlan:
     size: Literal["small", "usual", "large"]
     costs: Costs
     places_looked_at: bool
+    light_pixels: int | None = None
     revisions: list[Revision] = field(default_factory=list)
     took: float | None = None
 
@@ -93,6 +96,7 @@ def read_budget(run: Path) -> BudgetPlan | None:
 def _plan(stored: Mapping[str, Any], where: str) -> BudgetPlan:
     stages = {name: from_dict(StageCost, cost, where) for name, cost in stored["costs"]["stages"].items()}
     plain = {name: stored[name] for name in ("budget", "size", "places_looked_at", "took")}
+    plain["light_pixels"] = stored.get("light_pixels")
     revisions = [
         Revision(float(entry["seconds"]), entry["step"], dict(entry["steps"]))
         for entry in stored["revisions"]
@@ -106,6 +110,7 @@ def _sensible(plan: BudgetPlan) -> bool:
     seconds += [revision.seconds for revision in plan.revisions] + [plan.took or 0.0]
     counts = [
         *(cost.steps for cost in costs),
+        plan.light_pixels or 0,
         *(n for r in plan.revisions for n in (r.step, *r.steps.values())),
     ]
     same = all(list(revision.steps) == list(plan.costs.stages) for revision in plan.revisions)

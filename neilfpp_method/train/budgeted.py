@@ -30,6 +30,10 @@ TRIAL_SHARE, MAX_TRIAL = 0.03, 10.0
 """Of the budget, and seconds, that the steps of a trial may take, about."""
 PLACES_SHARE = 0.1
 """Of the budget that looks at places may take; else materials and light are as the settings have them."""
+LIGHT_SHARE = 0.2
+"""Share of the budget that the search for the initial light may take; for more it uses fewer places."""
+LONG_TAILS = "long-tails"
+"""The effect that the search for the initial light decides."""
 
 
 def plan_budget(
@@ -68,8 +72,8 @@ def plan_budget(
         if size not in trials:
             limit = min(TRIAL_SHARE * budget, MAX_TRIAL)
             changed = sized(config, size)
-            places = PLACES_SHARE * budget
-            trials[size] = try_out(capture, changed, asked, device, limit, places, report, wait)
+            places, light = PLACES_SHARE * budget, LIGHT_SHARE * budget
+            trials[size] = try_out(capture, changed, asked, device, limit, places, light, report, wait)
         return share_for(trials[size].costs, budget, ledger.total)
 
     size: Size = "usual"
@@ -84,7 +88,7 @@ def plan_budget(
             f"{in_words(trial.costs.once)} go to what does not depend on the number of steps",
             f"the smallest that makes sense on this machine, as it is now, is --budget {in_words(needed)}",
         )
-    plan = BudgetPlan(budget, size, trial.costs, trial.places > 0.0)
+    plan = BudgetPlan(budget, size, trial.costs, trial.places > 0.0, trial.light_pixels)
     plan.revisions.append(Revision(ledger.total, 0, steps_for(trial.costs, found)))
     say(_in_words(plan))
     return plan
@@ -102,6 +106,9 @@ def planned_effects(plan: BudgetPlan, effects: Plan) -> None:
     for name in JUDGED:
         if effects.is_open(name) and not plan.places_looked_at:
             effects.decisions.append(Decision(0, name, effects.is_on(name), "settings", reason))
+    if effects.is_open(LONG_TAILS) and plan.light_pixels == 0:
+        reason = f"evidence would take more than {LIGHT_SHARE:.0%} of the budget"
+        effects.decisions.append(Decision(0, LONG_TAILS, effects.is_on(LONG_TAILS), "settings", reason))
 
 
 def _in_words(plan: BudgetPlan) -> str:

@@ -16,7 +16,13 @@ from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.first_light import start_with
-from neilfpp_method.effects.looks import after_fit, look_at_light, look_at_surface, wants_surface
+from neilfpp_method.effects.looks import (
+    MOST_PIXELS,
+    after_fit,
+    look_at_light,
+    look_at_surface,
+    wants_surface,
+)
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.errors import Diverged, Stopped, UserError
 from neilfpp_method.health.guard import MAX_SKIPPED_IN_A_ROW
@@ -203,7 +209,7 @@ def _start_light(run: Training, model: NeilfModel, step: int) -> None:
     decisions: list[Decision] = []
     if run.fabric.is_global_zero:
         seed_step(run.config.train.seed, -4 - step)
-        decisions, found = look_at_light(run.plan, model, run.pixels, step)
+        decisions, found = look_at_light(run.plan, model, run.pixels, step, _light_pixels(run))
         _tell(run, decisions)
         if found is not None:
             run.reporter.say(found.in_words())
@@ -213,6 +219,12 @@ def _start_light(run: Training, model: NeilfModel, step: int) -> None:
             _tell(run, after_fit(run.plan, measured, model.lamps.lit, step))
     _share_light(run, model)
     _share_decisions(run, model, decisions)
+
+
+def _light_pixels(run: Training) -> int:
+    """How many pixels the first light is found from at most; a budget may leave time for few or none."""
+    most = None if run.pace is None else run.pace.plan.light_pixels
+    return MOST_PIXELS if most is None else most
 
 
 @doing("looks", apart=True)

@@ -9,11 +9,9 @@ by the clock (`budget.plan`).
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import torch
 
@@ -22,7 +20,14 @@ from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import PIXELS_OF_A_VIEW, at_scale, scale_for_pixels
 from neilfpp_method.effects.asked import Asked
-from neilfpp_method.effects.looks import look_at_surface, note_facts
+from neilfpp_method.effects.first_light import seconds_of_pixel
+from neilfpp_method.effects.looks import (
+    FEWEST_PIXELS,
+    MIN_PHOTOGRAPHS,
+    MOST_PIXELS,
+    look_at_surface,
+    note_facts,
+)
 from neilfpp_method.effects.material import JUDGED, seconds_of_evidence
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.health.look import look
@@ -34,7 +39,7 @@ from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.optimizer import make_optimizer, seed_step, set_rates
-from neilfpp_method.train.preview import write_preview
+from neilfpp_method.train.preview import preview_pixels
 
 __all__ = ["Trial", "try_out"]
 
@@ -46,6 +51,12 @@ FIT_EVERY, FIT_PART = 2, 8
 """Steps between the fits of a trial, and one in how many points they have: a whole first fit takes as long as
 a hundred steps. Time and points are taken to be proportional.
 """
+LOOSE = 1e-3
+"""Least concentration of a hit in a trial. The surface of an untrained field is fog, and with the least
+concentration of the settings nothing would be shaded, and no light be fitted.
+"""
+WARM_RAYS, PICTURE_RAYS = 32, 1024
+"""Rays that are rendered before those that are timed, and those; a picture is estimated from their time."""
 REPORT = 12.0
 """Time of the report over that of a picture, which has an eighth of the pixels of the report's views; the
 rest is for its surface. An estimate, not measured.
@@ -59,10 +70,13 @@ class Trial:
     Attributes:
         costs: of a training.
         places: of them, those of looks at places; 0 where there are none.
+        light_pixels: pixels that the places of the first light may have; 0 if there is no time for it; None
+            if the training does not look for it.
     """
 
     costs: Costs
     places: float
+    light_pixels: int | None
 
 
 @dataclass
@@ -78,6 +92,7 @@ def try_out(
     device: torch.device,
     limit: float,
     most_for_places: float,
+    most_for_light: float,
     report: bool,
     wait: Callable[[], object] = lambda: None,
 ) -> Trial:
@@ -90,6 +105,8 @@ def try_out(
         device: where to compute.
         limit: seconds that the steps of all stages may take together, about.
         most_for_places: seconds that looks at places may take; if they take more there are none.
+        most_for_light: seconds that the search for the first light may take; it is given as many pixels as
+            fit.
         report: whether the run will end with its page.
         wait: returns when the device has done its work.
     """
@@ -100,10 +117,10 @@ def try_out(
     facts = scene_facts(small, pixels, config)
     note_facts(plan, facts)
     config = plan.config_of_model
-    often, larger = config, 1.0
+    often, larger = changed(config, {"shading.hit_share": LOOSE}), 1.0
     if config.light.kind != "free":
         points = max(1, config.light.fit.points // FIT_PART)
-        often = changed(config, {"light.fit.every": FIT_EVERY, "light.fit.points": points})
+        often = changed(often, {"light.fit.every": FIT_EVERY, "light.fit.points": points})
         larger = config.light.fit.points / points
     seed_step(config.train.seed, step=-1)
     model = build_model(small, facts, often).to(device).train()
@@ -113,32 +130,44 @@ def try_out(
 
     lengths = {stage: steps for stage, steps in stage_steps(config.train).items() if steps}
     judged = model.lobe is not None and any(plan.is_open(name) for name in JUDGED)
-    places = seconds_of_evidence(device) if judged else 0.0
-    if places > most_for_places:
-        places = 0.0
+    place_look = seconds_of_evidence(device) if judged else 0.0
+    with_material = [stage for stage in lengths if model.stages[stage].moves_material]
+    if place_look * len(with_material) > most_for_places:
+        place_look = 0.0
+    light_pixels, light = None, 0.0
+    if solver.seeks_start and len(capture.train_views) >= MIN_PHOTOGRAPHS and with_material:
+        rate = seconds_of_pixel(device, plan.is_open("long-tails"))
+        light_pixels = min(MOST_PIXELS, int(most_for_light / rate))
+        light_pixels = 0 if light_pixels < FEWEST_PIXELS else light_pixels
+        light = rate * light_pixels
     surface = _timed(lambda: _look_at_surface(plan, model, pixels), wait)
     costs, picture, fitted = {}, 0.0, False
     for stage, steps in lengths.items():
         moves = model.stages[stage].moves_material
         seconds = _steps(model, solver, optimizer, pixels, often, stage, limit / len(lengths), wait)
         model.eval()
-        picture = _timed(lambda stage=stage: _preview(model, small, stage), wait)
+        picture = _picture_seconds(model, small, pixels, moves, wait)
         seen = pixels.sample(LOOKED_AT, gradients=False)
         looked = _timed(lambda seen=seen, moves=moves: look(model, seen, moves), wait)
         model.train()
         first, later = (seconds.fits[:1] or [0.0])[0], (seconds.fits[-1:] or [0.0])[0]
         every = 1 if config.light.kind == "free" else config.light.fit.every
         step = sum(seconds.steps) / len(seconds.steps)
+        begins = moves and not fitted
+        # The search for the first light ends with the solver's first fit, which else comes within the stage.
+        first_fit = larger * first if begins else 0.0
+        before = (light + first_fit if light_pixels else 0.0) if begins else 0.0
         costs[stage.value] = StageCost(
             steps,
             step,
             fit=larger * later / every,
-            start=(surface if moves else 0.0) + (places if moves and not fitted else 0.0),
+            start=(surface + place_look if moves else 0.0) + before,
             end=picture + 2 * looked,
-            first_fit=0.0 if fitted else larger * first,
+            first_fit=0.0 if light_pixels else first_fit,
         )
         fitted = fitted or moves
-    return Trial(Costs(costs, REPORT * picture if report else 0.0), places)
+    places = place_look * len(with_material)
+    return Trial(Costs(costs, REPORT * picture if report else 0.0), places, light_pixels)
 
 
 def _some(capture: Capture) -> tuple:
@@ -197,9 +226,18 @@ def _look_at_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset) -> Non
         look_at_surface(Plan(plan.asked, plan.settings, decided), model, pixels, 0)
 
 
-def _preview(model: NeilfModel, capture: Capture, stage: Stage) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        write_preview(model, capture, stage, Path(folder) / "preview.png")
+def _picture_seconds(
+    model: NeilfModel,
+    capture: Capture,
+    pixels: PixelDataset,
+    with_material: bool,
+    wait: Callable[[], object],
+) -> float:
+    """Estimate the time of the picture at the end of a stage from that of some of its rays."""
+    warm, timed = (pixels.sample(count, gradients=False).rays for count in (WARM_RAYS, PICTURE_RAYS))
+    once = _timed(lambda: model.maps(warm, with_material), wait)
+    part = _timed(lambda: model.maps(timed, with_material), wait)
+    return once + part * preview_pixels(capture) / PICTURE_RAYS
 
 
 def _timed(work: Callable[[], object], wait: Callable[[], object]) -> float:
