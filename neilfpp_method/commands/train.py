@@ -67,7 +67,11 @@ class Train:
     device: Device = "auto"
     """Where to train; auto takes a GPU where there is one."""
     devices: int = 1
-    """Processes that share the work, one per GPU (or CPU process)."""
+    """Processes on this machine that share the work, one per GPU (or CPU process)."""
+    nodes: int = 1
+    """Machines that share the work, each with --devices processes, started by torchrun
+    (docs/performance.md).
+    """
 
 
 @dataclass
@@ -108,6 +112,7 @@ def run(options: TrainWithSettings) -> None:
             scale=options.scale,
             device=options.device,
             devices=options.devices,
+            nodes=options.nodes,
             strict=options.strict,
             effects=asked,
             budget=budget,

@@ -64,7 +64,7 @@ def plan_budget(
             are asked for.
     """
     if devices > 1:
-        raise UserError("--budget plans for one process", "leave --devices out")
+        raise UserError("--budget plans for one process", "leave --devices and --nodes out")
     wait = waiting(device) or (lambda: None)
     trials: dict[Size, Trial] = {}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import shutil
 import signal
@@ -89,6 +90,7 @@ def run_training(
     device: str,
     devices: int,
     console: Console,
+    nodes: int = 1,
     format: str | None = None,
     scale: float | None = None,
     strict: bool = False,
@@ -101,6 +103,7 @@ def run_training(
 
     Args:
         config: the settings; none, with `resume`: those of the run.
+        nodes: machines that share the work, each with `devices` processes that torchrun starts.
         format: the capture's format; none: told from what is in the folder.
         scale: size of the images over that of their files; none: as large as the rays of the training can
             use.
@@ -156,18 +159,18 @@ def run_training(
         if budget is not None:
             with_page = at_end is not None
             planned = plan_budget(
-                budget, capture, config, asked, place, devices, ledger, with_page, console.print
+                budget, capture, config, asked, place, devices * nodes, ledger, with_page, console.print
             )
             config = planned_settings(planned, config)
         settings, plan = config, Plan.begin(asked, config)
         if planned is not None:
             planned_effects(planned, plan)
         config = plan.config
-        rays = config.train.rays * devices * sum(stage_steps(config.train).values())
+        rays = config.train.rays * devices * nodes * sum(stage_steps(config.train).values())
         source = replace(source, scale=scale_for_rays(capture.train_views, rays) if scale is None else scale)
         capture = at_scale(capture, source.scale)
     check_training_memory(capture)
-    fabric = _launch(place, devices)
+    fabric = _launch(place, devices, nodes)
     with listening(ledger), _nothing_left_on_failure(out), alone_in(out):
         pixels = load_pixels(capture, out / PIXELS, fabric, console)
         if resume:
@@ -203,7 +206,7 @@ def run_training(
         if started and fabric.is_global_zero:
             console.print(started.text, style="yellow" if started.warning else None, soft_wrap=True)
     fabric.barrier()
-    continue_with = _continue_with(command, out, device, devices)
+    continue_with = _continue_with(command, out, device, devices, nodes)
     with (
         alone_in(out),
         listening(ledger),
@@ -306,24 +309,44 @@ def _is_finished(out: Path, config: NeilfConfig) -> bool:
     return last.exists() and load_checkpoint(last)["step"] >= sum(stage_steps(config.train).values())
 
 
-def _continue_with(command: str, out: Path, device: str, devices: int) -> str:
+def _continue_with(command: str, out: Path, device: str, devices: int, nodes: int) -> str:
     chosen = ["--device", device] if device != "auto" else []
     chosen += ["--devices", str(devices)] if devices != 1 else []
+    chosen += ["--nodes", str(nodes)] if nodes != 1 else []
     return f"{command} {shlex.join(['--out', str(out), '--resume', *chosen])}"
 
 
-def _launch(place: torch.device, devices: int) -> Fabric:
+def _launch(place: torch.device, devices: int, nodes: int) -> Fabric:
     if devices < 1:
         raise UserError(f"{devices} processes cannot share the work", "set --devices to 1 or more")
+    if nodes < 1:
+        raise UserError(f"{nodes} nodes cannot share the work", "set --nodes to 1 or more")
+    _check_torchrun(devices, nodes)
     if place.type == "cuda" and devices > (torch.cuda.device_count() if place.index is None else 1):
         raise UserError(
             f"{place} is not {devices} GPUs", "use --device cuda, and --devices up to the number of GPUs"
         )
     chosen = devices if place.index is None else [place.index]
-    strategy = DDPStrategy(find_unused_parameters=True) if devices > 1 else "auto"
-    fabric = Fabric(accelerator=place.type, devices=chosen, strategy=strategy)
+    strategy = DDPStrategy(find_unused_parameters=True) if devices * nodes > 1 else "auto"
+    fabric = Fabric(accelerator=place.type, devices=chosen, num_nodes=nodes, strategy=strategy)
     fabric.launch()
     return fabric
+
+
+def _check_torchrun(devices: int, nodes: int) -> None:
+    """That the processes of torchrun, if it started this one, are those that the options name."""
+    started = int(os.environ.get("WORLD_SIZE", "1")) if "TORCHELASTIC_RUN_ID" in os.environ else None
+    if started is None and nodes > 1:
+        raise UserError(
+            f"--nodes {nodes}: one command starts the processes of one machine only",
+            "start it with torchrun on each machine (docs/performance.md)",
+        )
+    if started is not None and started != devices * nodes:
+        raise UserError(
+            f"torchrun started {started} processes, and --devices {devices} --nodes {nodes} make "
+            f"{devices * nodes}",
+            "set --devices to torchrun's --nproc-per-node and --nodes to its --nnodes",
+        )
 
 
 def _check(config: NeilfConfig) -> None:

@@ -31,7 +31,7 @@ def alone_in(folder: Path) -> Iterator[None]:
     Raises:
         UserError: another training holds it.
     """
-    if fcntl is None or os.environ.get("LOCAL_RANK", "0") != "0":
+    if fcntl is None or not _is_first_process():
         yield
         return
     folder.mkdir(parents=True, exist_ok=True)
@@ -42,6 +42,15 @@ def alone_in(folder: Path) -> Iterator[None]:
         with suppress(OSError):
             (folder / LOCK).unlink()
         os.close(held)
+
+
+def _is_first_process() -> bool:
+    """Whether this is the first process of a parallel training.
+
+    torchrun numbers the processes of all nodes by RANK; those that the training starts itself have a
+    LOCAL_RANK only.
+    """
+    return os.environ.get("RANK", os.environ.get("LOCAL_RANK", "0")) == "0"
 
 
 def _taken(folder: Path) -> int:
