@@ -26,7 +26,7 @@ class Tradeoff:
     """
     seeds: int = 1
     """Number of runs per budget with different seeds; with two or more the figure has error bars."""
-    preset: Literal["fast", "paper-mlp", "paper-ngp", "paper-ngp-hdr"] = "fast"
+    preset: Literal["fast", "balanced", "best", "paper-mlp", "paper-ngp", "paper-ngp-hdr"] = "fast"
     """Preset of all runs."""
     host: Literal["volsdf", "mesh"] = "volsdf"
     """Source of geometry, as in neilfpp train; mesh: the capture's inputs/model/mesh.ply."""

@@ -34,8 +34,8 @@ class Train:
     out: Path | None = None
     """The run folder; default: runs/CAPTURE-PRESET."""
     preset: str | None = None
-    """fast (minutes on a laptop's CPU), paper-mlp, paper-ngp or paper-ngp-hdr (the published settings);
-    default: fast.
+    """fast (minutes on a laptop's CPU), balanced or best (more steps, more rays and finer grids:
+    docs/budget.md), or paper-mlp, paper-ngp, paper-ngp-hdr (the published settings); default: fast.
     """
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
     """Settings from a .yaml or .json file, such as a run folder's config.json; other options override it."""
@@ -66,7 +66,9 @@ class Train:
     device: Device = "auto"
     """Device to train on; auto selects a GPU if there is one."""
     devices: int = 1
-    """Number of processes, each on its own GPU, or all on the CPU."""
+    """Number of processes on this machine, each on its own GPU, or all on the CPU."""
+    nodes: int = 1
+    """Number of machines, each with --devices processes that torchrun starts (docs/performance.md)."""
 
 
 @dataclass
@@ -107,6 +109,7 @@ def run(options: TrainWithSettings) -> None:
             scale=options.scale,
             device=options.device,
             devices=options.devices,
+            nodes=options.nodes,
             strict=options.strict,
             effects=asked,
             budget=budget,

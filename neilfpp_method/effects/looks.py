@@ -24,7 +24,10 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.structures import Observed, PixelBatch
 
 __all__ = [
+    "FEWEST_PIXELS",
     "LOOKED_AT",
+    "MIN_PHOTOGRAPHS",
+    "MOST_PIXELS",
     "after_fit",
     "look_at_light",
     "look_at_surface",
@@ -49,6 +52,12 @@ MIN_VIEWS = 4
 """Minimum number of views per place: fewer do not distinguish materials."""
 AT_ONCE = 512
 """Maximum number of rays that are rendered at once; it bounds memory."""
+USUAL_VIEWS = 8
+"""Number of views per place that is assumed when a number of pixels is converted to a number of places."""
+FEWEST_PIXELS = MIN_PLACES * USUAL_VIEWS
+"""Minimum number of pixels for an initial light."""
+MOST_PIXELS = PLACES * VIEWS
+"""Maximum number of pixels of the places for the initial light."""
 
 
 def note_facts(plan: Plan, facts: SceneFacts) -> None:
@@ -88,23 +97,25 @@ def wants_surface(plan: Plan) -> bool:
 
 @torch.no_grad()
 def look_at_light(
-    plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int
+    plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int, most: int = MOST_PIXELS
 ) -> tuple[list[Decision], FirstLight | None]:
     """Decide on the specular lobe if that is open, and find an initial light.
 
-    The model uses the settings of the plan afterwards. The arguments are those of `look_at_surface`.
+    The model uses the settings of the plan afterwards. The arguments are those of `look_at_surface`, and
+    `most`, the maximum number of pixels of the places; below `FEWEST_PIXELS` nothing is measured.
 
     Returns:
         The decisions, and the initial light; the light is None if there are too few views or places, or if
         surfaces have no specular lobe.
     """
-    if len(pixels.views) < MIN_PHOTOGRAPHS:
+    if len(pixels.views) < MIN_PHOTOGRAPHS or most < FEWEST_PIXELS:
         return [], None
     mode = model.training
     model.eval()
     surface = _shown_surface(model, pixels.sample(LIGHT_PIXELS, gradients=False)).observed
-    position, normal = surface.position[:PLACES], surface.normal[:PLACES]
-    places = gather_places(model, pixels, position, normal, VIEWS).in_views(MIN_VIEWS)
+    count = min(PLACES, most // USUAL_VIEWS)
+    position, normal = surface.position[:count], surface.normal[:count]
+    places = gather_places(model, pixels, position, normal, VIEWS).in_views(MIN_VIEWS).first(most)
     typical, decisions = model.facts.median_radiance, []
     if len(places.place.unique()) < MIN_PLACES:
         model.train(mode)

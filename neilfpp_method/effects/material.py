@@ -12,7 +12,6 @@ about the light, and the benefit of an environment map and of its colours is und
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -28,13 +27,13 @@ from neilfpp_method.effects.place_fit import (
     METALLICS,
     ROUGHNESSES,
     ROUNDS,
-    ROWS,
     STEPS,
     PlaceFit,
     any_map,
     fit_places,
     place_errors,
     place_transport,
+    seconds_of_step,
 )
 from neilfpp_method.effects.places import Places, gather_places
 from neilfpp_method.lighting.transport import Transport
@@ -55,10 +54,10 @@ MIN_VIEWS = 4
 """Minimum number of views per place: fewer do not distinguish materials."""
 WORTH = 0.01
 """Reduction of the relative error above which an effect is worth its cost."""
-FITS = 50
-"""Number of fits of this size to which all measurements at places of a training amount (estimate)."""
-TRIED = 3
-"""Number of descent steps that are timed for that estimate."""
+FITS = 20
+"""Number of fits of this size to which the measurements at places before one stage amount (estimate): 16
+fits, and the noise of lobe sampling.
+"""
 REST = 0.5
 """Time of all work other than descent, as a share of that of descent (estimate)."""
 METAL = 0.5
@@ -117,19 +116,12 @@ def material_evidence(
 
 
 def seconds_of_evidence(device: torch.device) -> float:
-    """Estimate the time of all measurements at places of a training on this machine, in seconds.
+    """Estimate the time of the measurements at places before one stage on this machine, in seconds.
 
     The estimate assumes that every place has `VIEWS` views. Most of the time goes to the descent on the
-    light, which multiplies the transport matrix and its transpose once per step; these products are timed.
+    light, whose steps are timed (`place_fit.seconds_of_step`).
     """
-    rows, texels = 3 * PLACES * VIEWS * (FOLDS - 1) // FOLDS, 2 * ROWS**2
-    transport, light = torch.ones(rows, texels, device=device), torch.ones(texels, 3, device=device)
-    began = time.perf_counter()
-    for _ in range(TRIED):
-        back = transport.T @ (transport @ light)
-    # `item` waits for the device.
-    back.sum().item()
-    step = (time.perf_counter() - began) / TRIED
+    step = seconds_of_step(PLACES * VIEWS * (FOLDS - 1) // FOLDS, device)
     return (1 + REST) * FITS * (FIRST_STEPS + (ROUNDS - 1) * STEPS) * step
 
 

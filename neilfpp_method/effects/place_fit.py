@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -25,7 +26,14 @@ from neilfpp_method.lighting.transport import Transport, from_texels_at
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import Material, SceneTracer
 
-__all__ = ["PlaceFit", "any_map", "fit_places", "place_errors", "place_transport"]
+__all__ = [
+    "PlaceFit",
+    "any_map",
+    "fit_places",
+    "place_errors",
+    "place_transport",
+    "seconds_of_step",
+]
 
 ROUGHNESSES = (0.08, 0.14, 0.2, 0.28, 0.36, 0.45, 0.55, 0.66, 0.8, 1.0)
 """Grid of roughness. The width of the lobe changes by about a half from one value to the next."""
@@ -67,6 +75,8 @@ START_ROUGHNESS = 4
 """Index of the initial roughness of all places."""
 MIN_BASE_COLOR = 0.01
 """Smallest base colour, so that its logarithm is finite."""
+TRIED = 3
+"""Number of descent steps that `seconds_of_step` times."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +122,21 @@ def place_transport(places: Places, lobe: Lobe, scene: SceneTracer | None) -> Tr
         for name in ("sources", "scene")
     )
     return Transport(sources, scene_light)
+
+
+def seconds_of_step(pixels: int, device: torch.device) -> float:
+    """Measure the approximate time of one descent step on the light for this number of pixels, in seconds.
+
+    Most of a step is the multiplication of the transport matrix and of its transpose, which is timed.
+    """
+    transport = torch.ones(3 * pixels, 2 * ROWS**2, device=device)
+    light = torch.ones(2 * ROWS**2, 3, device=device)
+    began = time.perf_counter()
+    for _ in range(TRIED):
+        back = transport.T @ (transport @ light)
+    # `item` waits for the device.
+    back.sum().item()
+    return (time.perf_counter() - began) / TRIED
 
 
 def any_map(log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:

@@ -55,6 +55,11 @@ class Places:
         views = torch.bincount(self.place, minlength=self.count)
         return self.where(torch.nonzero(views[self.place] >= least)[:, 0])
 
+    def first(self, most: int) -> Places:
+        """The first places, as many as have at most `most` pixels together."""
+        total = torch.bincount(self.place, minlength=self.count).cumsum(0)
+        return self.where(torch.nonzero(total[self.place] <= most)[:, 0])
+
     def mean(self, values: Float[Tensor, "N ..."]) -> Float[Tensor, "P ..."]:
         """Mean of values over the pixels of each place; 0 for a place without pixels."""
         sums = values.new_zeros(self.count, *values.shape[1:]).index_add(0, self.place, values)

@@ -168,8 +168,8 @@ class MapSolver(nn.Module):
         self.memory.wait()
         if self.config.kind == "distant":
             return None
-        before = self.light.light.log_radiance.clone()
-        measured = self._solve(observed, material, scene, first=True, lamps_if_undecided=True)
+        before, rows = self.light.light.log_radiance.clone(), slice(self.config.fit.points)
+        measured = self._solve(observed[rows], material[rows], scene, first=True, lamps_if_undecided=True)
         if not self.light.lamps.lit:
             self.light.light.log_radiance.copy_(before)
         return measured

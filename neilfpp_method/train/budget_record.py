@@ -51,6 +51,8 @@ class BudgetPlan:
         costs: costs that the trial measured.
         places_looked_at: whether there is time to measure evidence at places (`effects.material`), which
             decides open effects of material and light.
+        light_pixels: maximum number of pixels for the search of the initial light; 0 for no search; None for
+            the number without a budget.
         revisions: all plans in order, from the one before training; the last one holds.
         took: time of the whole command including the report, in seconds; None until it has ended.
     """
@@ -59,6 +61,7 @@ class BudgetPlan:
     size: Literal["small", "usual", "large"]
     costs: Costs
     places_looked_at: bool
+    light_pixels: int | None = None
     revisions: list[Revision] = field(default_factory=list)
     took: float | None = None
 
@@ -102,6 +105,7 @@ def read_budget(run: Path) -> BudgetPlan | None:
 def _plan(stored: Mapping[str, Any], where: str) -> BudgetPlan:
     stages = {name: from_dict(StageCost, cost, where) for name, cost in stored["costs"]["stages"].items()}
     plain = {name: stored[name] for name in ("budget", "size", "places_looked_at", "took")}
+    plain["light_pixels"] = stored.get("light_pixels")
     revisions = [
         Revision(float(entry["seconds"]), entry["step"], dict(entry["steps"]))
         for entry in stored["revisions"]
@@ -116,6 +120,7 @@ def _sensible(plan: BudgetPlan) -> bool:
     seconds += [revision.seconds for revision in plan.revisions] + [plan.took or 0.0]
     counts = [
         *(cost.steps for cost in costs),
+        plan.light_pixels or 0,
         *(n for r in plan.revisions for n in (r.step, *r.steps.values())),
     ]
     same_stages = all(list(revision.steps) == list(plan.costs.stages) for revision in plan.revisions)

@@ -34,6 +34,10 @@ PLACES_SHARE = 0.1
 """Share of the budget that measurements at places may take. If they take more they are left out, and the
 effects that they would decide stay as in the settings.
 """
+LIGHT_SHARE = 0.2
+"""Share of the budget that the search for the initial light may take; it uses as many places as fit."""
+LONG_TAILS = "long-tails"
+"""The effect that is decided together with the initial light."""
 
 
 def plan_budget(
@@ -65,7 +69,7 @@ def plan_budget(
             more than one process.
     """
     if devices > 1:
-        raise UserError("--budget plans for one process", "leave --devices out")
+        raise UserError("--budget plans for one process", "leave --devices and --nodes out")
     wait = waiting(device) or (lambda: None)
     trials: dict[Size, Trial] = {}
 
@@ -73,8 +77,8 @@ def plan_budget(
         if size not in trials:
             limit = min(TRIAL_SHARE * budget, MAX_TRIAL)
             changed = sized(config, size)
-            places = PLACES_SHARE * budget
-            trials[size] = try_out(capture, changed, asked, device, limit, places, report, wait)
+            places, light = PLACES_SHARE * budget, LIGHT_SHARE * budget
+            trials[size] = try_out(capture, changed, asked, device, limit, places, light, report, wait)
         return share_for(trials[size].costs, budget, ledger.total)
 
     size: Size = "usual"
@@ -89,7 +93,7 @@ def plan_budget(
             f"{in_words(trial.costs.once)} are needed for work that does not depend on the number of steps",
             f"the smallest usable budget on this machine at its present load is --budget {in_words(needed)}",
         )
-    plan = BudgetPlan(budget, size, trial.costs, trial.places > 0.0)
+    plan = BudgetPlan(budget, size, trial.costs, trial.places > 0.0, trial.light_pixels)
     plan.revisions.append(Revision(ledger.total, 0, steps_for(trial.costs, affordable)))
     say(_in_words(plan))
     return plan
@@ -107,6 +111,9 @@ def planned_effects(plan: BudgetPlan, effects: Plan) -> None:
     for name in JUDGED:
         if effects.is_open(name) and not plan.places_looked_at:
             effects.decisions.append(Decision(0, name, effects.is_on(name), "settings", reason))
+    if effects.is_open(LONG_TAILS) and plan.light_pixels == 0:
+        reason = f"evidence would take more than {LIGHT_SHARE:.0%} of the budget"
+        effects.decisions.append(Decision(0, LONG_TAILS, effects.is_on(LONG_TAILS), "settings", reason))
 
 
 def _in_words(plan: BudgetPlan) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import shutil
 import signal
@@ -89,6 +90,7 @@ def run_training(
     device: str,
     devices: int,
     console: Console,
+    nodes: int = 1,
     format: str | None = None,
     scale: float | None = None,
     strict: bool = False,
@@ -107,7 +109,8 @@ def run_training(
         test_every: every how many views one is held out, if the capture does not say; None for the default.
         response: what pixels hold: "linear", "srgb", or "auto" for what the files say.
         device: name of the device (`train.device`).
-        devices: number of processes, each with a GPU of its own if the device is "cuda".
+        devices: number of processes on this machine, each with a GPU of its own if the device is "cuda".
+        nodes: number of machines, each with `devices` processes that torchrun has started.
         console: where progress is printed.
         format: format of the capture; None to recognise it from the files.
         scale: size of the images relative to their files; None for the largest that the rays of the training
@@ -168,18 +171,26 @@ def run_training(
         if budget is not None:
             with_report = at_end is not None
             planned = plan_budget(
-                budget, capture, config, asked, torch_device, devices, ledger, with_report, console.print
+                budget,
+                capture,
+                config,
+                asked,
+                torch_device,
+                devices * nodes,
+                ledger,
+                with_report,
+                console.print,
             )
             config = planned_settings(planned, config)
         settings, plan = config, Plan.begin(asked, config)
         if planned is not None:
             planned_effects(planned, plan)
         config = plan.config
-        rays = config.train.rays * devices * sum(stage_steps(config.train).values())
+        rays = config.train.rays * devices * nodes * sum(stage_steps(config.train).values())
         source = replace(source, scale=scale_for_rays(capture.train_views, rays) if scale is None else scale)
         capture = at_scale(capture, source.scale)
     check_training_memory(capture)
-    fabric = _launch(torch_device, devices)
+    fabric = _launch(torch_device, devices, nodes)
     with listening(ledger), _nothing_left_on_failure(out), alone_in(out):
         pixels = load_pixels(capture, out / PIXELS, fabric, console)
         if resume:
@@ -215,7 +226,7 @@ def run_training(
         if start and fabric.is_global_zero:
             console.print(start.text, style="yellow" if start.warning else None, soft_wrap=True)
     fabric.barrier()
-    continue_with = _continue_with(command, out, device, devices)
+    continue_with = _continue_with(command, out, device, devices, nodes)
     with (
         alone_in(out),
         listening(ledger),
@@ -320,17 +331,21 @@ def _is_finished(out: Path, config: NeilfConfig) -> bool:
     return last.exists() and load_checkpoint(last)["step"] >= sum(stage_steps(config.train).values())
 
 
-def _continue_with(command: str, out: Path, device: str, devices: int) -> str:
+def _continue_with(command: str, out: Path, device: str, devices: int, nodes: int) -> str:
     """The command line that continues a stopped run."""
     options = ["--device", device] if device != "auto" else []
     options += ["--devices", str(devices)] if devices != 1 else []
+    options += ["--nodes", str(nodes)] if nodes != 1 else []
     return f"{command} {shlex.join(['--out', str(out), '--resume', *options])}"
 
 
-def _launch(device: torch.device, devices: int) -> Fabric:
+def _launch(device: torch.device, devices: int, nodes: int) -> Fabric:
     """Start the processes of the training."""
     if devices < 1:
         raise UserError(f"--devices is {devices}", "set it to 1 or more")
+    if nodes < 1:
+        raise UserError(f"--nodes is {nodes}", "set it to 1 or more")
+    _check_torchrun(devices, nodes)
     if device.type == "cuda" and devices > (torch.cuda.device_count() if device.index is None else 1):
         raise UserError(
             f"--device {device} has fewer than {devices} GPUs",
@@ -339,10 +354,31 @@ def _launch(device: torch.device, devices: int) -> Fabric:
     fabric = Fabric(
         accelerator=device.type,
         devices=devices if device.index is None else [device.index],
-        strategy=DDPStrategy(find_unused_parameters=True) if devices > 1 else "auto",
+        num_nodes=nodes,
+        strategy=DDPStrategy(find_unused_parameters=True) if devices * nodes > 1 else "auto",
     )
     fabric.launch()
     return fabric
+
+
+def _check_torchrun(devices: int, nodes: int) -> None:
+    """Check that torchrun, if it started this process, started as many as the options say.
+
+    Raises:
+        UserError: if it did not, or if there are several nodes and no torchrun.
+    """
+    started = int(os.environ.get("WORLD_SIZE", "1")) if "TORCHELASTIC_RUN_ID" in os.environ else None
+    if started is None and nodes > 1:
+        raise UserError(
+            f"--nodes {nodes}: one command starts the processes of one machine only",
+            "start it with torchrun on each machine (docs/performance.md)",
+        )
+    if started is not None and started != devices * nodes:
+        raise UserError(
+            f"torchrun started {started} processes, and --devices {devices} --nodes {nodes} make "
+            f"{devices * nodes}",
+            "set --devices to torchrun's --nproc-per-node and --nodes to its --nnodes",
+        )
 
 
 def _check(config: NeilfConfig) -> None:

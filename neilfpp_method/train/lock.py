@@ -32,7 +32,7 @@ def alone_in(folder: Path) -> Iterator[None]:
     Raises:
         UserError: if another training holds the lock.
     """
-    if fcntl is None or os.environ.get("LOCAL_RANK", "0") != "0":
+    if fcntl is None or not _is_first_process():
         yield
         return
     folder.mkdir(parents=True, exist_ok=True)
@@ -43,6 +43,15 @@ def alone_in(folder: Path) -> Iterator[None]:
         with suppress(OSError):
             (folder / LOCK).unlink()
         os.close(lock)
+
+
+def _is_first_process() -> bool:
+    """Whether this is the first process of a parallel training.
+
+    torchrun numbers the processes of all nodes by RANK. Processes that the training starts itself have only a
+    LOCAL_RANK.
+    """
+    return os.environ.get("RANK", os.environ.get("LOCAL_RANK", "0")) == "0"
 
 
 def _acquire(folder: Path) -> int:

@@ -20,7 +20,13 @@ from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.first_light import start_with
-from neilfpp_method.effects.looks import after_fit, look_at_light, look_at_surface, wants_surface
+from neilfpp_method.effects.looks import (
+    MOST_PIXELS,
+    after_fit,
+    look_at_light,
+    look_at_surface,
+    wants_surface,
+)
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.errors import Diverged, Stopped, UserError
 from neilfpp_method.health.guard import MAX_SKIPPED_IN_A_ROW
@@ -231,7 +237,7 @@ def _start_light(run: Training, model: NeilfModel, step: int) -> None:
     decisions: list[Decision] = []
     if run.fabric.is_global_zero:
         seed_step(run.config.train.seed, -4 - step)
-        decisions, first = look_at_light(run.plan, model, run.pixels, step)
+        decisions, first = look_at_light(run.plan, model, run.pixels, step, _light_pixels(run))
         _report(run, decisions)
         if first is not None:
             run.reporter.say(first.in_words())
@@ -241,6 +247,12 @@ def _start_light(run: Training, model: NeilfModel, step: int) -> None:
             _report(run, after_fit(run.plan, evidence, model.lamps.lit, step))
     _share_light(run, model)
     _share_decisions(run, model, decisions)
+
+
+def _light_pixels(run: Training) -> int:
+    """Maximum number of pixels for the search of the initial light; a budget may limit it."""
+    most = None if run.pace is None else run.pace.plan.light_pixels
+    return MOST_PIXELS if most is None else most
 
 
 @doing("looks", apart=True)

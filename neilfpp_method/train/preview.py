@@ -19,7 +19,7 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.structures import RayBatch
 
-__all__ = ["write_preview"]
+__all__ = ["preview_pixels", "write_preview"]
 
 MAX_SIDE = 160
 """Longest side of a panel, in pixels."""
@@ -40,8 +40,7 @@ def write_preview(model: NeilfModel, capture: Capture, stage: Stage, path: Path)
     Returns:
         The picture, (H, W, 3) uint8.
     """
-    view = (capture.test_views or capture.train_views)[0]
-    view = scaled_view(view, min(1.0, MAX_SIDE / max(file_size(view))))
+    view = _small_view(capture)
     shape = (view.camera.height, view.camera.width, 3)
     panels = [_photograph(view, capture.hdr)]
     rays = camera_rays(capture.normalisation.camera(view.camera))
@@ -52,6 +51,17 @@ def write_preview(model: NeilfModel, capture: Capture, stage: Stage, path: Path)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_png(path, picture)
     return picture
+
+
+def preview_pixels(capture: Capture) -> int:
+    """How many pixels a panel of the picture has."""
+    camera = _small_view(capture).camera
+    return camera.width * camera.height
+
+
+def _small_view(capture: Capture) -> View:
+    view = (capture.test_views or capture.train_views)[0]
+    return scaled_view(view, min(1.0, MAX_SIDE / max(file_size(view))))
 
 
 def _photograph(view: View, hdr: bool) -> np.ndarray:

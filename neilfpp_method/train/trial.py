@@ -8,11 +8,9 @@ final geometry; the plan is therefore revised from measured times (`budget.plan`
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import torch
 
@@ -21,7 +19,14 @@ from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import PIXELS_OF_A_VIEW, at_scale, scale_for_pixels
 from neilfpp_method.effects.asked import Asked
-from neilfpp_method.effects.looks import look_at_surface, note_facts
+from neilfpp_method.effects.first_light import seconds_of_pixel
+from neilfpp_method.effects.looks import (
+    FEWEST_PIXELS,
+    MIN_PHOTOGRAPHS,
+    MOST_PIXELS,
+    look_at_surface,
+    note_facts,
+)
 from neilfpp_method.effects.material import JUDGED, seconds_of_evidence
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.health.look import look
@@ -33,7 +38,7 @@ from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.optimizer import make_optimizer, seed_step, set_rates
-from neilfpp_method.train.preview import write_preview
+from neilfpp_method.train.preview import preview_pixels
 
 __all__ = ["Trial", "try_out"]
 
@@ -51,6 +56,14 @@ FIT_PART = 8
 """A fit of a trial uses one in this many points, because a full first fit takes as long as a hundred steps.
 The time of a fit is assumed to be proportional to the number of points.
 """
+LOOSE = 1e-3
+"""Minimum concentration of a hit in a trial. The density of an untrained field is spread out, so with the
+value of the settings no point would be shaded and no light fitted.
+"""
+WARM_RAYS = 32
+"""Rays that are rendered first, which includes work that a picture needs once."""
+PICTURE_RAYS = 1024
+"""Rays from whose time that of a preview is estimated."""
 REPORT = 12.0
 """Time of the report as a multiple of that of a preview (estimate). A preview has an eighth of the pixels of
 the report's views; the rest is for the surface of the report.
@@ -64,10 +77,13 @@ class Trial:
     Attributes:
         costs: costs of the training.
         places: time of the measurements at places within these costs, in seconds; 0 if there are none.
+        light_pixels: number of pixels for which the search of the initial light has time; 0 if there is no
+            time for it; None if the training does not search.
     """
 
     costs: Costs
     places: float
+    light_pixels: int | None
 
 
 @dataclass
@@ -85,6 +101,7 @@ def try_out(
     device: torch.device,
     limit: float,
     most_for_places: float,
+    most_for_light: float,
     report: bool,
     wait: Callable[[], object] = lambda: None,
 ) -> Trial:
@@ -99,6 +116,8 @@ def try_out(
         limit: approximate time that the steps of all stages may take together, in seconds.
         most_for_places: maximum time of the measurements at places, in seconds. If they would take more they
             are left out.
+        most_for_light: maximum time of the search for the initial light, in seconds. It determines the number
+            of pixels of the search.
         report: whether the command ends by writing the report.
         wait: returns when the device has finished its work.
     """
@@ -109,10 +128,10 @@ def try_out(
     facts = scene_facts(small, pixels, config)
     note_facts(plan, facts)
     config = plan.config_of_model
-    trial_config, fit_scale = config, 1.0
+    trial_config, fit_scale = changed(config, {"shading.hit_share": LOOSE}), 1.0
     if config.light.kind != "free":
         points = max(1, config.light.fit.points // FIT_PART)
-        trial_config = changed(config, {"light.fit.every": FIT_EVERY, "light.fit.points": points})
+        trial_config = changed(trial_config, {"light.fit.every": FIT_EVERY, "light.fit.points": points})
         fit_scale = config.light.fit.points / points
     seed_step(config.train.seed, step=-1)
     model = build_model(small, facts, trial_config).to(device).train()
@@ -122,32 +141,45 @@ def try_out(
 
     lengths = {stage: steps for stage, steps in stage_steps(config.train).items() if steps}
     measures_places = model.lobe is not None and any(plan.is_open(name) for name in JUDGED)
-    places = seconds_of_evidence(device) if measures_places else 0.0
-    if places > most_for_places:
-        places = 0.0
+    place_look = seconds_of_evidence(device) if measures_places else 0.0
+    with_material = [stage for stage in lengths if model.stages[stage].moves_material]
+    if place_look * len(with_material) > most_for_places:
+        place_look = 0.0
+    light_pixels, light = None, 0.0
+    if solver.seeks_start and len(capture.train_views) >= MIN_PHOTOGRAPHS and with_material:
+        rate = seconds_of_pixel(device, plan.is_open("long-tails"))
+        light_pixels = min(MOST_PIXELS, int(most_for_light / rate))
+        light_pixels = 0 if light_pixels < FEWEST_PIXELS else light_pixels
+        light = rate * light_pixels
     surface = _timed(lambda: _look_at_surface(plan, model, pixels), wait)
     costs, picture, fitted = {}, 0.0, False
     for stage, steps in lengths.items():
         moves = model.stages[stage].moves_material
         seconds = _steps(model, solver, optimizer, pixels, trial_config, stage, limit / len(lengths), wait)
         model.eval()
-        picture = _timed(lambda stage=stage: _preview(model, small, stage), wait)
+        picture = _picture_seconds(model, small, pixels, moves, wait)
         sample = pixels.sample(LOOKED_AT, gradients=False)
         looked = _timed(lambda sample=sample, moves=moves: look(model, sample, moves), wait)
         model.train()
         first, later = (seconds.fits[:1] or [0.0])[0], (seconds.fits[-1:] or [0.0])[0]
         every = 1 if config.light.kind == "free" else config.light.fit.every
         step = sum(seconds.steps) / len(seconds.steps)
+        begins = moves and not fitted
+        # The search for the initial light ends with the solver's first fit. Without the search, the first fit
+        # is made within the stage.
+        first_fit = fit_scale * first if begins else 0.0
+        before = (light + first_fit if light_pixels else 0.0) if begins else 0.0
         costs[stage.value] = StageCost(
             steps,
             step,
             fit=fit_scale * later / every,
-            start=(surface if moves else 0.0) + (places if moves and not fitted else 0.0),
+            start=(surface + place_look if moves else 0.0) + before,
             end=picture + 2 * looked,
-            first_fit=0.0 if fitted else fit_scale * first,
+            first_fit=0.0 if light_pixels else first_fit,
         )
         fitted = fitted or moves
-    return Trial(Costs(costs, REPORT * picture if report else 0.0), places)
+    places = place_look * len(with_material)
+    return Trial(Costs(costs, REPORT * picture if report else 0.0), places, light_pixels)
 
 
 def _some(capture: Capture) -> tuple:
@@ -208,9 +240,18 @@ def _look_at_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset) -> Non
         look_at_surface(Plan(plan.asked, plan.settings, decided), model, pixels, 0)
 
 
-def _preview(model: NeilfModel, capture: Capture, stage: Stage) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        write_preview(model, capture, stage, Path(folder) / "preview.png")
+def _picture_seconds(
+    model: NeilfModel,
+    capture: Capture,
+    pixels: PixelDataset,
+    with_material: bool,
+    wait: Callable[[], object],
+) -> float:
+    """Estimate the time of the picture at the end of a stage from that of some of its rays."""
+    warm, timed = (pixels.sample(count, gradients=False).rays for count in (WARM_RAYS, PICTURE_RAYS))
+    once = _timed(lambda: model.maps(warm, with_material), wait)
+    part = _timed(lambda: model.maps(timed, with_material), wait)
+    return once + part * preview_pixels(capture) / PICTURE_RAYS
 
 
 def _timed(work: Callable[[], object], wait: Callable[[], object]) -> float:
