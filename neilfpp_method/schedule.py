@@ -15,6 +15,7 @@ a surface light field and is trained together with the material. For a host that
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -22,7 +23,7 @@ from enum import Enum
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.settings.types import NeilfConfig, OptimizerConfig, TrainConfig
+from neilfpp_method.settings.types import NeilfConfig, OptimizerConfig, TrainConfig, VolumeConfig
 from neilfpp_method.structures import LossTerms
 
 __all__ = [
@@ -38,6 +39,7 @@ __all__ = [
     "rate_factor",
     "stage_at",
     "stage_steps",
+    "surface_width_limit",
     "total_steps",
     "weigh",
 ]
@@ -210,6 +212,24 @@ def rate_factor(config: OptimizerConfig, position: StagePosition) -> float:
         decayed = position.share
     warm_up = WARM_UP_START ** max(0.0, 1.0 - position.step / config.warm_up) if config.warm_up else 1.0
     return (config.joint if position.stage is Stage.JOINT else 1.0) * warm_up * final**decayed
+
+
+def surface_width_limit(config: VolumeConfig, position: StagePosition) -> float:
+    """The largest β of a step, scene units: it falls from `beta_init` to `beta_final` in SDF init.
+
+    Photographs that the radiance field cannot explain sharply are explained best by fog, and a β that is
+    only learned then stays large. BakedSDF (Yariv et al. 2023) prescribes β; here it is bounded, so a
+    surface may become sharp earlier.
+
+    Example:
+        >>> halfway = StagePosition(Stage.SDF_INIT, step=50, length=100)
+        >>> round(surface_width_limit(VolumeConfig(beta_init=0.04, beta_final=0.01), halfway), 6)
+        0.02
+    """
+    if config.beta_final == 0.0:
+        return math.inf
+    share = position.share if position.stage is Stage.SDF_INIT else 1.0
+    return config.beta_init * (config.beta_final / config.beta_init) ** share
 
 
 def active_losses(

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import pytest
 import torch
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.schedule import Stage, StagePosition, active_losses, rate_factor, stage_at, weigh
+from neilfpp_method.schedule import (
+    Stage,
+    StagePosition,
+    active_losses,
+    rate_factor,
+    stage_at,
+    surface_width_limit,
+    weigh,
+)
 from neilfpp_method.settings.plain import from_dict, to_dict
 from neilfpp_method.settings.presets import PRESETS, preset
 from neilfpp_method.settings.types import OptimizerConfig, TrainConfig
@@ -126,3 +135,13 @@ def test_an_unknown_preset_is_named():
     names = "fast, balanced, best, paper-mlp, paper-ngp, paper-ngp-hdr"
     with pytest.raises(UserError, match=f"unknown preset 'turbo'; choose one of {names}"):
         preset("turbo")
+
+
+def test_the_surface_is_bound_to_become_thin_in_sdf_init_and_to_stay_so():
+    fast = preset("fast").volume
+    widths = [surface_width_limit(fast, StagePosition(Stage.SDF_INIT, k, 100)) for k in (0, 50, 99)]
+    assert widths[0] == pytest.approx(fast.beta_init)
+    assert widths[1] == pytest.approx(math.sqrt(fast.beta_init * fast.beta_final))
+    assert widths[1] > widths[2] > fast.beta_final
+    assert surface_width_limit(fast, StagePosition(Stage.JOINT, 0, 100)) == fast.beta_final
+    assert surface_width_limit(preset("paper-mlp").volume, StagePosition(Stage.SDF_INIT, 99, 100)) == math.inf

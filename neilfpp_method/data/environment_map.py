@@ -11,12 +11,16 @@ from torch import Tensor
 from neilfpp_method.data.images import image_header, read_image
 from neilfpp_method.errors import UserError
 
-__all__ = ["check_environment", "read_environment"]
+__all__ = ["check_environment", "check_radiance", "read_environment"]
 
 MIN_ROWS, MIN_COLUMNS = 4, 8
 """Smallest size of a map, in texels."""
 MAX_ROWS, MAX_COLUMNS = 2048, 4096
 """Largest size of a map, in texels; bounds the memory."""
+RINGING = 0.01
+"""Largest magnitude of negative texels that count as 0, relative to the mean. Filters that sharpen produce
+them: three of four photographed skies have some.
+"""
 
 
 def check_environment(path: Path) -> None:
@@ -40,16 +44,32 @@ def check_environment(path: Path) -> None:
 def read_environment(path: Path) -> Float[Tensor, "3 H W"]:
     """Read the linear radiance of a lat-long map, with rows from +z downwards; a single channel is repeated.
 
+    Slightly negative texels are set to 0.
+
     Raises:
-        UserError: as `check_environment`, or the pixels cannot be read, are NaN, infinite or negative, or all
+        UserError: as `check_environment` and `check_radiance`, or the pixels cannot be read, or the map is
             black.
     """
     check_environment(path)
     radiance = torch.from_numpy(read_image(path).pixels).permute(2, 0, 1)
-    if not radiance.isfinite().all() or radiance.amin() < 0:
-        raise UserError(f"{path}: a texel is NaN, infinite or negative", "store radiance as it is, from 0 on")
+    check_radiance(radiance, path)
+    radiance = radiance.clamp_min(0)
     if not radiance.any():
         raise UserError(
             f"{path}: the environment map is black", "give the light that was there, or leave --light out"
         )
     return radiance.expand(3, -1, -1)
+
+
+def check_radiance(radiance: Float[Tensor, ...], path: Path) -> None:
+    """Check that the texels of a map can be radiance; negative ones as small as `RINGING` are accepted.
+
+    Raises:
+        UserError: a texel is NaN, infinite or negative.
+    """
+    if not radiance.isfinite().all():
+        raise UserError(f"{path}: a texel is NaN or infinite", "store linear radiance, 0 or larger")
+    if radiance.amin() < -RINGING * radiance.mean().clamp_min(0):
+        raise UserError(
+            f"{path}: a texel is negative ({radiance.amin():.3g})", "store linear radiance, 0 or larger"
+        )

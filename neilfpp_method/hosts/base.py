@@ -28,6 +28,7 @@ __all__ = [
     "KnowsMisses",
     "KnowsRadiance",
     "LightsItself",
+    "LimitsSurfaceWidth",
     "ReadsOutputs",
     "Regularised",
     "RegularisedHits",
@@ -122,6 +123,15 @@ class HasSurfaceWidth(Protocol):
 
     def surface_width(self) -> Float[Tensor, ""]:
         """Width of the layer, scene units (VolSDF's β)."""
+        ...
+
+
+@runtime_checkable
+class LimitsSurfaceWidth(Protocol):
+    """A host whose soft layer can be kept thin. Without it nothing keeps a surface from staying fog."""
+
+    def limit_surface_width(self, width: float) -> None:
+        """Lower the width of the layer to `width` (scene units) if it is larger."""
         ...
 
 

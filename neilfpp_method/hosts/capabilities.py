@@ -74,6 +74,13 @@ CAPABILITIES = (
         reported=True,
     ),
     Capability(
+        "limit_surface_width",
+        base.LimitsSurfaceWidth,
+        "training loops",
+        "train.optimizer",
+        "the host's own training decides how thin the surface becomes",
+    ),
+    Capability(
         "may_meet",
         base.KnowsMisses,
         "L_ref",

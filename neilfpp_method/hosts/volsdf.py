@@ -156,6 +156,10 @@ class VolSdfHost(nn.Module):
         """β, the scale of the Laplace density, without gradient."""
         return self.density.beta().detach()
 
+    def limit_surface_width(self, width: float) -> None:
+        """Lower β to `width` if it is larger."""
+        self.density.limit_(width)
+
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
         """The parameters by field."""
         groups = {

@@ -51,6 +51,10 @@ QUADRATIC_BELOW = 1e-2
 """Scale below which absolute differences of logarithms become quadratic, so that the gradient is continuous
 at 0.
 """
+WHITENESS = 0.05
+"""Weight of the tint of all light that reaches the points, relative to the relative error: images hardly
+determine how the tint is shared between light and surfaces.
+"""
 LINEAR_SHARE = 0.02
 """Share of all light below which the sparsity prior of a lamp is about linear; above, it is logarithmic."""
 NEIGHBOURS = 4
@@ -150,7 +154,7 @@ class Objective:
         """
         share = contribution / all_light.mean()
         lamps = SPARSITY * (share / LINEAR_SHARE).log1p().sum()
-        return lamps + self.config.whiteness * tint(all_light)
+        return lamps + WHITENESS * tint(all_light)
 
 
 def error_unit(pixel: Float[Tensor, "*B 3"], response: str, typical: float) -> Float[Tensor, "*B 3"]:

@@ -44,7 +44,7 @@ from neilfpp_method.shading.sampling import sample_directions
 from neilfpp_method.structures import Maps, RayBatch, StepResult
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.health_record import write_findings
-from neilfpp_method.train.optimizer import adam, seed_step, set_rates
+from neilfpp_method.train.optimizer import adam, limit_surface_width, seed_step, set_rates
 
 __all__ = ["FieldAdamConfig", "NeilfMethod", "NeilfMethodConfig"]
 
@@ -193,7 +193,9 @@ class NeilfMethod(Model):
             self.neilf.freeze_for(position.stage)
             self.set_up_for = position.stage
         for optimizer in optimizers.optimizers.values():
-            set_rates(optimizer, self.rates, position)
+            far_points = self.neilf.facts.far_points
+            set_rates(optimizer, self.rates, position, background_waits=not far_points)
+        limit_surface_width(self.neilf.host, self.config.neilf.volume, position)
         seed_step(settings.seed, step)
 
     def _start_light(self, step: int) -> None:

@@ -10,6 +10,7 @@ from typing import Literal
 
 import torch
 
+from neilfpp_method.data.environment_map import check_radiance
 from neilfpp_method.data.images import image_header, read_image
 from neilfpp_method.data.views import plain_name
 from neilfpp_method.errors import UserError
@@ -22,10 +23,6 @@ Layout = Literal["ours", "common"]
 
 MIN_ROWS, MAX_ROWS = 4, 4096
 """Smallest and largest number of rows."""
-RINGING = 0.01
-"""Largest magnitude of negative texels that are set to 0, relative to the mean. Sharpening filters produce
-them.
-"""
 QUARTER_TURN = math.pi / 2
 """Azimuth between both layouts: the centre of the common layout is +x with −y to its right, and the left edge
 of this package's layout is +y.
@@ -78,13 +75,8 @@ def read_map(path: Path, layout: Layout, rotate: float = 0.0, exposure: float = 
     radiance = torch.from_numpy(file.pixels)
     if not file.hdr:
         radiance = srgb_to_linear(radiance)
-    if not radiance.isfinite().all():
-        raise UserError(f"{path}: a texel is NaN or infinite", "store linear radiance, 0 or larger")
+    check_radiance(radiance, path)
     negative = radiance < 0
-    if radiance.amin() < -RINGING * radiance.mean().clamp_min(0):
-        raise UserError(
-            f"{path}: a texel is negative ({radiance.amin():.3g})", "store linear radiance, 0 or larger"
-        )
     radiance = radiance.clamp_min(0).expand(-1, -1, 3) * 2.0**exposure
     if not (radiance.any() and radiance.isfinite().all()):
         raise UserError(f"{path}: the environment map is black, or overflows", "check --exposure and the map")

@@ -131,6 +131,7 @@ FAST: Mapping[str, Any] = {
     "background.samples": 16,
     "volume.radius": 1.75,
     "volume.beta_init": 0.05,
+    "volume.beta_final": 0.005,
     "volume.skip_empty": True,
     "volume.initial_samples": 64,
     "volume.rounds": 2,

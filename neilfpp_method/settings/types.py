@@ -110,8 +110,6 @@ class LightFitConfig:
     """Optimization steps of a fit."""
     smoothness: float = 0.03
     """Weight of the total variation of log radiance per texel."""
-    whiteness: float = 0.05
-    """Weight of the tint of all light, which images hardly separate from the tint of the surfaces."""
     evenness: float = 0.3
     """Weight of the mean difference of log base color between neighboring points; a fit also estimates the
     base color of each point. With 0 it only estimates a factor per channel on the base color of B.
@@ -216,6 +214,8 @@ class VolumeConfig:
     """Radius of the scene sphere, at which rays end."""
     beta_init: float = 0.1
     """Initial scale β of the Laplace density."""
+    beta_final: float = 0.0
+    """Upper bound of β from the end of SDF init on; until then it falls from `beta_init`. 0: no bound."""
     skip_empty: bool = False
     """Whether rays skip parts that a coarse grid of the SDF shows to be empty, in training and evaluation."""
     initial_samples: int = 128

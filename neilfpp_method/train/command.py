@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import shlex
 import shutil
-import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -13,7 +10,6 @@ from pathlib import Path
 
 import torch
 from lightning_fabric import Fabric
-from lightning_fabric.strategies import DDPStrategy
 from rich.console import Console
 from torch import Tensor
 
@@ -27,7 +23,7 @@ from neilfpp_method.effects.asked import Asked, check_asked
 from neilfpp_method.effects.looks import note_exposures, note_facts
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.table import table
-from neilfpp_method.errors import Stopped, Unsound, UserError
+from neilfpp_method.errors import Unsound, UserError
 from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.health.watch import LOOKED_AT, Watch
 from neilfpp_method.inspection.findings import problems_of_poses
@@ -54,9 +50,10 @@ from neilfpp_method.train.build import (
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.health_record import in_words as health_in_words
+from neilfpp_method.train.launch import launch
 from neilfpp_method.train.light_record import in_words
 from neilfpp_method.train.lock import alone_in
-from neilfpp_method.train.loop import Training, train
+from neilfpp_method.train.loop import train
 from neilfpp_method.train.memory import check_training_memory
 from neilfpp_method.train.optimizer import seed_step
 from neilfpp_method.train.pace import Pace
@@ -74,6 +71,8 @@ from neilfpp_method.train.run import (
     read_description,
 )
 from neilfpp_method.train.start import start_geometry
+from neilfpp_method.train.stopping import continue_command, stop_request
+from neilfpp_method.train.training import Training
 from neilfpp_method.train.work_record import read_work, waiting, write_work
 
 __all__ = ["run_training"]
@@ -190,7 +189,7 @@ def run_training(
         source = replace(source, scale=scale_for_rays(capture.train_views, rays) if scale is None else scale)
         capture = at_scale(capture, source.scale)
     check_training_memory(capture)
-    fabric = _launch(torch_device, devices, nodes)
+    fabric = launch(torch_device, devices, nodes)
     with listening(ledger), _nothing_left_on_failure(out), alone_in(out):
         pixels = load_pixels(capture, out / PIXELS, fabric, console)
         if resume:
@@ -226,12 +225,12 @@ def run_training(
         if start and fabric.is_global_zero:
             console.print(start.text, style="yellow" if start.warning else None, soft_wrap=True)
     fabric.barrier()
-    continue_with = _continue_with(command, out, device, devices, nodes)
+    continue_with = continue_command(command, out, device, devices, nodes)
     with (
         alone_in(out),
         listening(ledger),
         reporting(out, console, fabric.is_global_zero) as reporter,
-        _stop_request(continue_with) as stopped,
+        stop_request(continue_with) as stopped,
     ):
         # A run that began without held-back pixels, in nerfstudio, continues to train on all pixels.
         held_back = hold_back(pixels, config.train.seed, PATCHES if is_new or has_looks(out) else 0)
@@ -331,56 +330,6 @@ def _is_finished(out: Path, config: NeilfConfig) -> bool:
     return last.exists() and load_checkpoint(last)["step"] >= sum(stage_steps(config.train).values())
 
 
-def _continue_with(command: str, out: Path, device: str, devices: int, nodes: int) -> str:
-    """The command line that continues a stopped run."""
-    options = ["--device", device] if device != "auto" else []
-    options += ["--devices", str(devices)] if devices != 1 else []
-    options += ["--nodes", str(nodes)] if nodes != 1 else []
-    return f"{command} {shlex.join(['--out', str(out), '--resume', *options])}"
-
-
-def _launch(device: torch.device, devices: int, nodes: int) -> Fabric:
-    """Start the processes of the training."""
-    if devices < 1:
-        raise UserError(f"--devices is {devices}", "set it to 1 or more")
-    if nodes < 1:
-        raise UserError(f"--nodes is {nodes}", "set it to 1 or more")
-    _check_torchrun(devices, nodes)
-    if device.type == "cuda" and devices > (torch.cuda.device_count() if device.index is None else 1):
-        raise UserError(
-            f"--device {device} has fewer than {devices} GPUs",
-            "use --device cuda, and --devices up to the number of GPUs",
-        )
-    fabric = Fabric(
-        accelerator=device.type,
-        devices=devices if device.index is None else [device.index],
-        num_nodes=nodes,
-        strategy=DDPStrategy(find_unused_parameters=True) if devices * nodes > 1 else "auto",
-    )
-    fabric.launch()
-    return fabric
-
-
-def _check_torchrun(devices: int, nodes: int) -> None:
-    """Check that torchrun, if it started this process, started as many as the options say.
-
-    Raises:
-        UserError: if it did not, or if there are several nodes and no torchrun.
-    """
-    started = int(os.environ.get("WORLD_SIZE", "1")) if "TORCHELASTIC_RUN_ID" in os.environ else None
-    if started is None and nodes > 1:
-        raise UserError(
-            f"--nodes {nodes}: one command starts the processes of one machine only",
-            "start it with torchrun on each machine (docs/performance.md)",
-        )
-    if started is not None and started != devices * nodes:
-        raise UserError(
-            f"torchrun started {started} processes, and --devices {devices} --nodes {nodes} make "
-            f"{devices * nodes}",
-            "set --devices to torchrun's --nproc-per-node and --nodes to its --nnodes",
-        )
-
-
 def _check(config: NeilfConfig) -> None:
     """Check the settings of a new run.
 
@@ -433,31 +382,3 @@ def _preview(
             reporter.picture(0, f"preview/{stage.value}", pixels)
 
     return preview
-
-
-@contextmanager
-def _stop_request(continue_with: str) -> Iterator[Callable[[], bool]]:
-    """Handle Ctrl-C and SIGTERM; yields a function that returns whether a stop has been requested.
-
-    The first signal requests a stop after the current step. A second one stops at once and loses the steps
-    since the last checkpoint.
-    """
-    received = []
-
-    def handle(number: int, _frame: object) -> None:
-        if received:
-            raise KeyboardInterrupt
-        received.append(number)
-
-    try:
-        previous = {s: signal.signal(s, handle) for s in (signal.SIGINT, signal.SIGTERM)}
-    except ValueError:
-        # Signal handlers can only be set in the main thread.
-        previous = {}
-    try:
-        yield lambda: bool(received)
-    except KeyboardInterrupt:
-        raise Stopped("stopped at once", f"continue from the last checkpoint with: {continue_with}") from None
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

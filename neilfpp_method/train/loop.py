@@ -10,31 +10,15 @@ import dataclasses
 import math
 import shlex
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Mapping
 
 import torch
-from lightning_fabric import Fabric
 from torch import Tensor
 
-from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.effects.first_light import start_with
-from neilfpp_method.effects.looks import (
-    MOST_PIXELS,
-    after_fit,
-    look_at_light,
-    look_at_surface,
-    wants_surface,
-)
-from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.errors import Diverged, Stopped, UserError
 from neilfpp_method.health.guard import MAX_SKIPPED_IN_A_ROW
-from neilfpp_method.health.watch import Watch
-from neilfpp_method.lighting.solver import LightSolver
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import (
-    Stage,
     StagePosition,
     Total,
     active_losses,
@@ -44,71 +28,29 @@ from neilfpp_method.schedule import (
     weigh,
 )
 from neilfpp_method.settings.facts import RadianceUnits
-from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.structures import LossTerms, StepResult
-from neilfpp_method.timing.ledger import Ledger, doing
+from neilfpp_method.structures import LossTerms
+from neilfpp_method.timing.ledger import doing
 from neilfpp_method.train.effects_record import read_plan, write_plan
+from neilfpp_method.train.evidence import apply_plan, look_before_stage, solve_light
 from neilfpp_method.train.health_record import read_findings, write_findings
-from neilfpp_method.train.light_record import LightFit, note_fit, read_fits, write_fits
-from neilfpp_method.train.optimizer import gradient_norms, make_optimizer, seed_step, set_rates
-from neilfpp_method.train.pace import Pace
-from neilfpp_method.train.progress import Reporter
-from neilfpp_method.train.quality import Quality, read_looks, write_looks
+from neilfpp_method.train.light_record import read_fits, write_fits
+from neilfpp_method.train.optimizer import (
+    gradient_norms,
+    limit_surface_width,
+    make_optimizer,
+    seed_step,
+    set_rates,
+)
+from neilfpp_method.train.quality import read_looks, write_looks
 from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, save_checkpoint, write_json
 from neilfpp_method.train.skipped import Moment, keep_step
+from neilfpp_method.train.training import Training
 from neilfpp_method.train.work_record import write_work
 
-__all__ = ["Training", "train"]
+__all__ = ["train"]
 
 LOG_EVERY = 50
 """Steps between two entries in the TensorBoard log. The longest preset then has about a thousand."""
-
-
-@dataclass
-class Training:
-    """The state of a run in progress.
-
-    Attributes:
-        path: the run folder.
-        config: the settings, with the current numbers of steps.
-        model: the model.
-        pixels: the training pixels.
-        fabric: device and processes.
-        reporter: progress output.
-        should_stop: whether a stop has been requested; asked once per step.
-        preview: writes the preview picture at the end of a stage.
-        continue_with: command line that continues the run after a stop.
-        light_solver: fits the light.
-        watch: health checks.
-        plan: the effects that are simulated.
-        quality: measurements at held-back pixels.
-        ledger: the clock.
-        pace: adapts the number of steps to a time budget; None without a budget.
-        fits: results of the fits of the light so far.
-        skipped: number of steps skipped so far because they were not finite.
-        skipped_in_a_row: number of steps skipped since the last one that was not.
-        seconds: time of each stage.
-    """
-
-    path: Path
-    config: NeilfConfig
-    model: NeilfModel
-    pixels: PixelDataset
-    fabric: Fabric
-    reporter: Reporter
-    should_stop: Callable[[], bool]
-    preview: Callable[[NeilfModel, Stage], None]
-    continue_with: str
-    light_solver: LightSolver
-    watch: Watch
-    plan: Plan
-    quality: Quality
-    ledger: Ledger = field(default_factory=Ledger)
-    pace: Pace | None = None
-    fits: list[LightFit] = field(default_factory=list)
-    skipped: int = 0
-    skipped_in_a_row: int = 0
-    seconds: dict[str, float] = field(default_factory=dict)
 
 
 def train(run: Training) -> None:
@@ -125,7 +67,7 @@ def train(run: Training) -> None:
     step = _restore(run, optimizer)
     optimizer = run.fabric.setup_optimizers(optimizer)
     if step == 0:
-        _look(run, model, 0)
+        look_before_stage(run, model, 0)
     while step < total_steps(run.config.train):
         position = stage_at(step, run.config.train)
         step = _train_stage(run, model, optimizer, step, position)
@@ -134,7 +76,7 @@ def train(run: Training) -> None:
                 run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
         if step < total_steps(run.config.train):
             with doing("looks", apart=True):
-                _look(run, model, step)
+                look_before_stage(run, model, step)
         _save(run, optimizer, step, also=position.stage.value)
         with doing("looks", apart=True):
             model.eval()
@@ -163,13 +105,14 @@ def _train_stage(
             seed_step(settings.seed, step, run.fabric.global_rank)
             at = StagePosition(stage, number, length)
             set_rates(optimizer, run.config.optimizer, at, background_waits=not run.model.facts.far_points)
+            limit_surface_width(model.host, run.config.volume, at)
             with doing("data"):
                 batch = run.pixels.sample(settings.rays, gradients)
             moment = Moment.before_step(model, batch, at)
             computed = wrapped(batch, stage)
             total = weigh(computed.terms, active_losses(stage, model.config, model.stages, at.share))
             stop = _update(run, model, optimizer, computed.terms, total, moment, step)
-            _solve_light(run, model, computed, step)
+            solve_light(run, model, computed, step)
         run.watch.after_step(model.stages[stage], computed, step)
         number, step = number + 1, step + 1
         length = _keep_pace(run, StagePosition(stage, number, length), step)
@@ -196,106 +139,10 @@ def _keep_pace(run: Training, position: StagePosition, step: int) -> int:
     return stage_steps(revised)[position.stage]
 
 
-def _solve_light(run: Training, model: NeilfModel, computed: StepResult, step: int) -> None:
-    """Pass a step to the light solver, which fits the light when that is due.
-
-    The first process does this for all.
-    """
-    fabric, solver = run.fabric, run.light_solver
-    if fabric.is_global_zero:
-        with doing("light_fits"):
-            solver.observe(computed)
-    if not fabric.broadcast(solver.due):
-        return
-    if fabric.is_global_zero:
-        run.watch.after_fit(solver.points, step)
-        with doing("light_fits", apart=True):
-            evidence = solver.solve(model.brdf, model.scene)
-        note_fit(run.fits, evidence, model.lamps.lit, step)
-        _report(run, after_fit(run.plan, evidence, model.lamps.lit, step + 1))
-    _share_light(run, model)
-
-
-def _share_light(run: Training, model: NeilfModel) -> None:
-    """Copy the light of the first process to all others."""
-    if run.fabric.world_size > 1:
-        for part in (model.light, model.lamps):
-            part.load_state_dict(run.fabric.broadcast(part.state_dict()))
-
-
-def _look(run: Training, model: NeilfModel, step: int) -> None:
-    """Take the measurements before a stage that trains material."""
-    if model.stages[stage_at(step, run.config.train).stage].moves_material:
-        _look_at_effects(run, model, step)
-        _start_light(run, model, step)
-
-
-def _start_light(run: Training, model: NeilfModel, step: int) -> None:
-    """Set the initial light before a material is trained. The first process does this for all."""
-    if not run.light_solver.seeks_start:
-        return
-    decisions: list[Decision] = []
-    if run.fabric.is_global_zero:
-        seed_step(run.config.train.seed, -4 - step)
-        decisions, first = look_at_light(run.plan, model, run.pixels, step, _light_pixels(run))
-        _report(run, decisions)
-        if first is not None:
-            run.reporter.say(first.in_words())
-            start_with(model, first)
-            evidence = run.light_solver.start(first.observed, first.material, model.scene)
-            note_fit(run.fits, evidence, model.lamps.lit, step)
-            _report(run, after_fit(run.plan, evidence, model.lamps.lit, step))
-    _share_light(run, model)
-    _share_decisions(run, model, decisions)
-
-
-def _light_pixels(run: Training) -> int:
-    """Maximum number of pixels for the search of the initial light; a budget may limit it."""
-    most = None if run.pace is None else run.pace.plan.light_pixels
-    return MOST_PIXELS if most is None else most
-
-
 @doing("looks", apart=True)
 def _look_at_quality(run: Training, model: NeilfModel, position: StagePosition, step: int) -> None:
     if run.fabric.is_global_zero:
         run.quality.look_when_due(model, position, step, run.ledger.total)
-
-
-def _look_at_effects(run: Training, model: NeilfModel, step: int) -> None:
-    """Decide open effects by evidence. The first process does this for all."""
-    if not wants_surface(run.plan):
-        return
-    decisions: list[Decision] = []
-    if run.fabric.is_global_zero:
-        seed_step(run.config.train.seed, -3 - step)
-        decisions = look_at_surface(run.plan, model, run.pixels, step)
-        _report(run, decisions)
-    _share_decisions(run, model, decisions)
-
-
-def _share_decisions(run: Training, model: NeilfModel, decisions: Sequence[Decision]) -> None:
-    """Apply the decisions of the first process in all processes."""
-    decisions = run.fabric.broadcast(decisions)
-    if not run.fabric.is_global_zero:
-        run.plan.decisions += decisions
-    _use(run, model)
-
-
-def _use(run: Training, model: NeilfModel) -> None:
-    """Apply the plan of effects to the model and the light solver; it may remove the joint stage."""
-    config = run.plan.config
-    if not config.train.joint_steps:
-        run.config = dataclasses.replace(
-            run.config, train=dataclasses.replace(run.config.train, joint_steps=0)
-        )
-    model.use(config)
-    run.light_solver.use(config.light, model.lobe)
-
-
-def _report(run: Training, decisions: Sequence[Decision]) -> None:
-    """Print decisions on effects, a line each."""
-    for decision in decisions:
-        run.reporter.say(f"effects: {decision.effect} {'on' if decision.on else 'off'}, {decision.reason}")
 
 
 @doing("optimiser")
@@ -417,7 +264,7 @@ def _restore(run: Training, optimizer: torch.optim.Optimizer) -> int:
     run.fits += read_fits(run.path, saved["step"])
     run.plan = read_plan(run.path, run.plan.settings, saved["step"])
     run.quality.looks += read_looks(run.path, saved["step"])
-    _use(run, run.model)
+    apply_plan(run, run.model)
     run.watch.findings |= {finding.case: finding for finding in read_findings(run.path) or ()}
     return saved["step"]
 

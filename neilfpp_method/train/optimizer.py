@@ -7,11 +7,12 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from neilfpp_method.hosts.base import Host, LimitsSurfaceWidth
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.schedule import Stage, StagePosition, rate_factor
-from neilfpp_method.settings.types import OptimizerConfig
+from neilfpp_method.schedule import Stage, StagePosition, rate_factor, surface_width_limit
+from neilfpp_method.settings.types import OptimizerConfig, VolumeConfig
 
-__all__ = ["adam", "gradient_norms", "make_optimizer", "seed_step", "set_rates"]
+__all__ = ["adam", "gradient_norms", "limit_surface_width", "make_optimizer", "seed_step", "set_rates"]
 
 
 def make_optimizer(model: NeilfModel, config: OptimizerConfig) -> torch.optim.Optimizer:
@@ -58,6 +59,15 @@ def set_rates(
     for group in optimizer.param_groups:
         name = group["name"]
         group["lr"] = 0.0 if waits and name == "background" else getattr(config, name) * factor
+
+
+def limit_surface_width(host: Host, config: VolumeConfig, position: StagePosition) -> None:
+    """Keep the surface of a host as thin as the schedule asks for (`schedule.surface_width_limit`).
+
+    Hosts whose surface is not a soft layer of their own are left alone.
+    """
+    if isinstance(host, LimitsSurfaceWidth):
+        host.limit_surface_width(surface_width_limit(config, position))
 
 
 def seed_step(seed: int, step: int, rank: int = 0) -> None:

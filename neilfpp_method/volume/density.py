@@ -107,6 +107,12 @@ class LaplaceDensity(nn.Module):
         """The scale β, scene units."""
         return self.above_floor.abs() + self.beta_floor
 
+    @torch.no_grad()
+    def limit_(self, beta: float) -> None:
+        """Lower the scale to `beta` if it is larger; the floor stays."""
+        largest = max(beta - self.beta_floor, 0.0)
+        self.above_floor.clamp_(-largest, largest)
+
     def forward(self, sdf: Float[Tensor, "N M"], distances: Float[Tensor, "N M"]) -> Float[Tensor, "N M-1"]:
         """Optical depth between the samples of rays, see `laplace_depth`."""
         return laplace_depth(sdf, distances, self.beta())

@@ -39,9 +39,9 @@ def spoilt(value: float) -> np.ndarray:
 @pytest.mark.parametrize(
     ("pixels", "complaint"),
     [
-        (spoilt(np.nan), "NaN, infinite or negative"),
-        (spoilt(np.inf), "NaN, infinite or negative"),
-        (spoilt(-0.1), "NaN, infinite or negative"),
+        (spoilt(np.nan), "NaN or infinite"),
+        (spoilt(np.inf), "NaN or infinite"),
+        (spoilt(-0.1), "negative"),
         (np.zeros((4, 8, 3)), "black"),
         (np.ones((3, 8, 3)), "3 rows and 8 columns"),
         (np.ones((4, 7, 3)), "4 rows and 7 columns"),
@@ -53,6 +53,12 @@ def test_what_is_no_light_is_refused(tmp_path, pixels, complaint):
         read_environment(path)
     assert str(path) in str(caught.value)
     assert caught.value.remedy
+
+
+def test_ringing_of_a_filter_counts_as_black(tmp_path):
+    radiance = read_environment(write(tmp_path / "sky.exr", spoilt(-1e-3)))
+    assert radiance[1, 2, 3] == 0
+    assert radiance.amin() == 0
 
 
 def test_the_size_is_refused_before_pixels_are_read(tmp_path, monkeypatch):

@@ -17,7 +17,8 @@ import torch
 from neilfpp_method.data.images import read_image, write_exr
 from neilfpp_method.data.point_cloud import read_oriented_ply, write_oriented_ply
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.train.loop import Training, train
+from neilfpp_method.train.loop import train
+from neilfpp_method.train.training import Training
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import small_config, small_training, solved_light
 

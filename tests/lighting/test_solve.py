@@ -23,7 +23,7 @@ from neilfpp_method.structures import Material, Observed
 from tests.lighting.surfaces import material, patches
 
 CONFIG = MapLightConfig(kind="auto", environment_height=12, fit=LightFitConfig(points=800, steps=150))
-KNOWN = dataclasses.replace(CONFIG, fit=dataclasses.replace(CONFIG.fit, evenness=0.0, whiteness=0.0))
+KNOWN = dataclasses.replace(CONFIG, fit=dataclasses.replace(CONFIG.fit, evenness=0.0))
 """Base colour is what surfaces have learned, and nothing else is known of the tint of light."""
 LAMP = torch.tensor([[0.3, -0.2, 0.5]])
 BULB = LampPlaces(LAMP, torch.zeros(1, 3))

@@ -18,10 +18,10 @@ from neilfpp_method.health.watch import Watch
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts
-from neilfpp_method.train.loop import Training
 from neilfpp_method.train.optimizer import seed_step
 from neilfpp_method.train.progress import Reporter
 from neilfpp_method.train.quality import Quality
+from neilfpp_method.train.training import Training
 from tests.scenes import tiny_config
 
 

@@ -18,7 +18,8 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.structures import LossTerm
 from neilfpp_method.train import loop
-from neilfpp_method.train.loop import Training, train
+from neilfpp_method.train.loop import train
+from neilfpp_method.train.training import Training
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import differences, small_config, small_training
 

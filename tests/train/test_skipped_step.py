@@ -14,10 +14,11 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.structures import LossTerm
 from neilfpp_method.train.first_not_finite import OriginsOfNotFinite
-from neilfpp_method.train.loop import Training, train
+from neilfpp_method.train.loop import train
 from neilfpp_method.train.rerun import in_words, rerun_step
 from neilfpp_method.train.run import CaptureSource, create_run
 from neilfpp_method.train.skipped import FOLDER, MAX_KEPT, load_step
+from neilfpp_method.train.training import Training
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import small_config, small_training
 

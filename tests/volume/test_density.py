@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -91,3 +93,15 @@ def test_beta_starts_where_told_and_stays_above_its_floor():
 def test_beta_at_its_floor_is_refused():
     with pytest.raises(UserError, match="beta_init"):
         LaplaceDensity(beta_init=1e-4, beta_floor=1e-4)
+
+
+def test_a_limit_lowers_the_scale_and_never_below_its_floor():
+    density = LaplaceDensity(0.1, beta_floor=1e-3)
+    density.limit_(0.2)
+    assert density.beta().item() == pytest.approx(0.1)
+    density.limit_(0.02)
+    assert density.beta().item() == pytest.approx(0.02)
+    density.limit_(1e-6)
+    assert density.beta().item() == pytest.approx(1e-3)
+    density.limit_(math.inf)
+    assert density.beta().item() == pytest.approx(1e-3)

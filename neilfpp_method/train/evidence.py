@@ -1,0 +1,124 @@
+"""The part of the loop that measures: effects and the initial light before a stage, fits of the light in it.
+
+The first process measures and decides for all.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+from neilfpp_method.effects.first_light import start_with
+from neilfpp_method.effects.looks import (
+    MOST_PIXELS,
+    after_fit,
+    look_at_light,
+    look_at_surface,
+    wants_surface,
+)
+from neilfpp_method.effects.plan import Decision
+from neilfpp_method.model import NeilfModel
+from neilfpp_method.schedule import stage_at
+from neilfpp_method.structures import StepResult
+from neilfpp_method.timing.ledger import doing
+from neilfpp_method.train.light_record import note_fit
+from neilfpp_method.train.optimizer import seed_step
+from neilfpp_method.train.training import Training
+
+__all__ = ["apply_plan", "look_before_stage", "solve_light"]
+
+
+def solve_light(run: Training, model: NeilfModel, computed: StepResult, step: int) -> None:
+    """Pass a step to the light solver, which fits the light when that is due.
+
+    The first process does this for all.
+    """
+    fabric, solver = run.fabric, run.light_solver
+    if fabric.is_global_zero:
+        with doing("light_fits"):
+            solver.observe(computed)
+    if not fabric.broadcast(solver.due):
+        return
+    if fabric.is_global_zero:
+        run.watch.after_fit(solver.points, step)
+        with doing("light_fits", apart=True):
+            evidence = solver.solve(model.brdf, model.scene)
+        note_fit(run.fits, evidence, model.lamps.lit, step)
+        _report(run, after_fit(run.plan, evidence, model.lamps.lit, step + 1))
+    _share_light(run, model)
+
+
+def _share_light(run: Training, model: NeilfModel) -> None:
+    """Copy the light of the first process to all others."""
+    if run.fabric.world_size > 1:
+        for part in (model.light, model.lamps):
+            part.load_state_dict(run.fabric.broadcast(part.state_dict()))
+
+
+def look_before_stage(run: Training, model: NeilfModel, step: int) -> None:
+    """Take the measurements before a stage that trains material."""
+    if model.stages[stage_at(step, run.config.train).stage].moves_material:
+        _look_at_effects(run, model, step)
+        _start_light(run, model, step)
+
+
+def _start_light(run: Training, model: NeilfModel, step: int) -> None:
+    """Set the initial light before a material is trained. The first process does this for all."""
+    if not run.light_solver.seeks_start:
+        return
+    decisions: list[Decision] = []
+    if run.fabric.is_global_zero:
+        seed_step(run.config.train.seed, -4 - step)
+        decisions, first = look_at_light(run.plan, model, run.pixels, step, _light_pixels(run))
+        _report(run, decisions)
+        if first is not None:
+            run.reporter.say(first.in_words())
+            start_with(model, first)
+            evidence = run.light_solver.start(first.observed, first.material, model.scene)
+            note_fit(run.fits, evidence, model.lamps.lit, step)
+            _report(run, after_fit(run.plan, evidence, model.lamps.lit, step))
+    _share_light(run, model)
+    _share_decisions(run, model, decisions)
+
+
+def _light_pixels(run: Training) -> int:
+    """Maximum number of pixels for the search of the initial light; a budget may limit it."""
+    most = None if run.pace is None else run.pace.plan.light_pixels
+    return MOST_PIXELS if most is None else most
+
+
+def _look_at_effects(run: Training, model: NeilfModel, step: int) -> None:
+    """Decide open effects by evidence. The first process does this for all."""
+    if not wants_surface(run.plan):
+        return
+    decisions: list[Decision] = []
+    if run.fabric.is_global_zero:
+        seed_step(run.config.train.seed, -3 - step)
+        decisions = look_at_surface(run.plan, model, run.pixels, step)
+        _report(run, decisions)
+    _share_decisions(run, model, decisions)
+
+
+def _share_decisions(run: Training, model: NeilfModel, decisions: Sequence[Decision]) -> None:
+    """Apply the decisions of the first process in all processes."""
+    decisions = run.fabric.broadcast(decisions)
+    if not run.fabric.is_global_zero:
+        run.plan.decisions += decisions
+    apply_plan(run, model)
+
+
+def apply_plan(run: Training, model: NeilfModel) -> None:
+    """Apply the plan of effects to the model and the light solver; it may remove the joint stage."""
+    config = run.plan.config
+    if not config.train.joint_steps:
+        run.config = dataclasses.replace(
+            run.config, train=dataclasses.replace(run.config.train, joint_steps=0)
+        )
+    model.use(config)
+    run.light_solver.use(config.light, model.lobe)
+
+
+def _report(run: Training, decisions: Sequence[Decision]) -> None:
+    """Print decisions on effects, a line each."""
+    for decision in decisions:
+        run.reporter.say(f"effects: {decision.effect} {'on' if decision.on else 'off'}, {decision.reason}")
