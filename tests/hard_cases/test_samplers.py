@@ -17,7 +17,7 @@ from tests.shading.test_sampling import NORMALS, density, points
 
 SAMPLES = 1_000_000
 PER_POINT = {"mis": 2}
-"""Directions per point, else one: those of a point share a turned lattice, and χ² asks for independent ones."""
+"""Directions per point, else one: those of a point share a turned lattice, and χ² wants independent ones."""
 # The even sampler has a density that jumps at the horizon, which must be an edge of the cells.
 CASES = [
     ("fibonacci", "ggx", "frontal"),
