@@ -1,4 +1,4 @@
-# `make demo` and `make test` are all that a fresh machine needs; each makes its virtual environment first.
+# `make demo` and `make test` work on a fresh machine: each first creates the virtual environment .venv.
 
 PYTHON ?= python3
 VENV := .venv
@@ -7,7 +7,7 @@ INSTALL = $(RUN)/python -m pip install --quiet --disable-pip-version-check --con
 
 .PHONY: demo demo-short test test-slow test-hard lint results clean test-nerfstudio package test-pythons
 
-# What running needs, and nothing for tests; the second adds that.
+# The first target installs what the package needs to run, the second adds what the tests need.
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(RUN)/python || $(PYTHON) -m venv $(VENV)
 	$(INSTALL) .
@@ -23,19 +23,19 @@ demo: $(VENV)/.installed
 demo-short: $(VENV)/.installed
 	$(RUN)/neilfpp demo --short --out build/demo-short
 
-# The tensors of the tests are small: a second thread costs more than it brings, many times more on a busy machine.
-# Two processes instead, each with whole modules, so that what a module prepares is prepared once.
+# The tensors of the tests are small, so a second thread slows them down, especially on a busy machine. Two
+# processes are used instead. Each takes whole modules, so that the fixtures of a module are made once.
 test: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(RUN)/python -m pytest -m "not slow and not hard" -n 2 --dist loadscope
 
 test-slow: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(RUN)/python -m pytest -m slow
 
-# Thousands of damaged files, commands that are killed, planted faults: docs/stability.md. Ends with their counts.
+# Thousands of damaged files, killed commands and planted faults (docs/stability.md); prints their counts.
 test-hard: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(RUN)/python -m pytest tests/hard_cases -m hard -n 2 --dist load
 
-# Nerfstudio pins another OpenCV, so it has an environment of its own.
+# Nerfstudio pins a different OpenCV package, so its tests have a separate environment.
 NERFSTUDIO := .venv-nerfstudio
 NERFSTUDIO_PINS := tests_nerfstudio/requirements.txt tests_nerfstudio/requirements-no-deps.txt
 
@@ -49,18 +49,20 @@ $(NERFSTUDIO)/.installed: pyproject.toml $(NERFSTUDIO_PINS)
 test-nerfstudio: $(NERFSTUDIO)/.installed
 	OMP_NUM_THREADS=1 $(NERFSTUDIO)/bin/python -m pytest tests_nerfstudio -m "not slow"
 
-# Wheel and source distribution, and the wheel's command in an empty environment.
+# Builds the wheel and the source distribution, and runs the command of the wheel in an empty environment.
 package:
 	$(PYTHON) scripts/check_package.py
 
-# The pins of constraints.txt and the start of the command, on every Python from 3.10 that is on the machine.
+# Resolves the pins of constraints.txt and starts the command on every installed Python from 3.10.
 test-pythons:
 	$(PYTHON) scripts/check_pythons.py
 
 lint: $(VENV)/.installed-dev
 	$(RUN)/ruff check .
 
-results: $(VENV)/.installed  ## make results CAPTURES="DIR DIR" [OPTIONS="--save NAME"]; none: only the tables
+# make results CAPTURES="DIR DIR" [OPTIONS="--save NAME"]: measure the captures and write the tables of docs/.
+# Without CAPTURES, only write the tables.
+results: $(VENV)/.installed
 	$(if $(CAPTURES),$(RUN)/python -m benchmarks.results $(CAPTURES) $(OPTIONS))
 	$(RUN)/python -m benchmarks.tables
 

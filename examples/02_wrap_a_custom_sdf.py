@@ -1,5 +1,8 @@
-"""A distance field of your own as a host: `render` is all that it takes, and `check_host` says whether it is
-right.
+"""Use your own signed distance field as a host, and check it with `check_host`.
+
+    python examples/02_wrap_a_custom_sdf.py
+
+The host needs one method, `render`. This one also has `parameter_groups`, so it is trained with the material.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from neilfpp_method.structures import RayBatch, SurfaceHits
 
 
 class Blob(nn.Module):
-    """A sphere with a learned offset, found by sphere tracing."""
+    """A sphere with a learned offset, rendered by sphere tracing."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -37,13 +40,14 @@ class Blob(nn.Module):
         distance, gradient = self.sdf(x), vmap(grad(lambda point: self.sdf(point[None])[0]))(x)
         hit = distance.detach().abs() < 1e-3
         normal = torch.where(hit[:, None], normalize(gradient, dim=-1), 0.0)
-        # The hit slides along its ray as the surface moves.
+        # The traced depth has no gradient; this line gives the position one: it slides along the ray.
         slope = (normal.detach() * rays.directions).sum(-1).clamp_max(-0.1)
         position = x - ((distance - distance.detach()) / slope)[:, None] * rays.directions
         color = torch.where(hit[:, None], self.paint(torch.cat([position, normal], dim=-1)), 0.0)
         return SurfaceHits(color, position, normal, hit.to(color.dtype), hit.to(color.dtype))
 
-    def parameter_groups(self):  # says: train these with the rest, there is no other trainer
+    # A host with this method is trained together with the material; without it, the host is borrowed.
+    def parameter_groups(self):
         return {"geometry": list(self.offset.parameters()), "radiance": list(self.paint.parameters())}
 
 
@@ -51,9 +55,8 @@ origins = 3.0 * normalize(torch.randn(256, 3), dim=-1)
 rays = RayBatch(origins, normalize(0.3 * torch.randn(256, 3) - origins, dim=-1))
 batch = pixel_batch(rays.origins, rays.directions, torch.tensor([[0.4, 0.3, 0.2]]).expand(256, 3))
 print(check_host(host := Blob(), rays))
-neilf = attach_neilf(
-    host, free_light(preset("fast"))
-)  # the light of the paper: nothing is fitted in so few steps
+# The free light of the paper is used, because the few steps here include no fit of an environment map.
+neilf = attach_neilf(host, free_light(preset("fast")))
 optimizer = torch.optim.Adam(neilf.parameters(), lr=2e-3)
 for stage in Stage:
     for _ in range(30):

@@ -1,8 +1,9 @@
-"""Material and light on top of nerfstudio's NeuS: first NeuS alone, then the add-on in the same loop.
+"""Attach material and light to nerfstudio's NeuS: train NeuS first, then the material on top of it.
 
     python examples/03_attach_to_nerfstudio_neus.py [steps]
 
-NeuS's hash grid is tiny-cuda-nn's, so this needs a GPU: set DEVICE.
+`steps` is the number of steps of each of the two loops (default 2000). The hash grid of NeuS comes from
+tiny-cuda-nn, so this example needs a GPU.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ pixels = PixelDataset(capture, capture.train_views, device=DEVICE)
 box = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 neus = NeuSModelConfig().setup(scene_box=box, num_train_data=len(pixels.views)).to(DEVICE)
 
-# Your trainer, whatever it is. This one is six lines.
+# Stand-in for your own trainer of the host.
 trained = [p for group in neus.get_param_groups().values() for p in group if p.requires_grad]
 optimizer = torch.optim.Adam(trained, 5e-4)
 own = NerfstudioHost(neus, response="linear")
@@ -40,8 +41,8 @@ for _ in range(STEPS):
     loss.backward()
     optimizer.step()
 
-# The add-on: three lines, and the same kind of step. The host is trained already, so its stage has no steps.
-# NeuS traces no rays cheaply: a proxy of its surface does.
+# The add-on. The host is trained already, so the first stage has no steps. NeuS cannot trace rays cheaply, so
+# a proxy of its surface traces shadows and inter-reflection.
 config = preset("fast")
 train = dataclasses.replace(config.train, sdf_steps=0, material_steps=STEPS)
 config = dataclasses.replace(config, train=train)

@@ -1,4 +1,4 @@
-"""Material and light on top of a rasteriser that draws whole images and answers no rays, as splats do."""
+"""Attach material and light to a rasteriser that renders whole images, such as Gaussian splatting."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from neilfpp_method.settings.types import LightFitConfig
 
 
 class Surfels(nn.Module):
-    """Stands for your splats: soft discs on a ball. `render_image` is all that it takes."""
+    """Stand-in for your splats: soft discs on a ball. A rasteriser needs one method, `render_image`."""
 
     def __init__(self, count: int = 300) -> None:
         super().__init__()
@@ -54,7 +54,8 @@ torch.manual_seed(0)
 host, red = Surfels(), torch.tensor([0.4, 0.1, 0.05])
 cameras = [camera_at(2.5 * np.array([np.cos(a), np.sin(a), 0.4])) for a in np.arange(0.0, 6.0, 1.0)]
 settings = preset("fast")
-fit = LightFitConfig(points=128, every=30, steps=20)  # a small map, seldom fitted, for an example of seconds
+# A small environment map that is fitted rarely keeps this example short.
+fit = LightFitConfig(points=128, every=30, steps=20)
 settings = dataclasses.replace(
     settings,
     light=dataclasses.replace(settings.light, kind="distant", environment_height=8, fit=fit),
@@ -67,12 +68,11 @@ for group in neilf.param_groups():  # 2
     optimizer.add_param_group(group)
 for step in range(36):
     rays, hits = camera_rays(camera := cameras[step % 6]), host.render_image(camera)
-    photograph = (
-        (0.7 + 0.3 * hits.normal[:, 2:]) * red * hits.opacity[:, None].detach()
-    )  # a red ball under a soft sky
+    # The photograph: a red ball under a soft sky.
+    photograph = (0.7 + 0.3 * hits.normal[:, 2:]) * red * hits.opacity[:, None].detach()
     own, rows = (hits.color - photograph).abs().mean(), torch.randperm(len(rays))[:200]
     batch = pixel_batch(rays.origins, rays.directions, photograph.detach())[rows]
-    total = neilf.losses(batch, step, hits[rows])  # what is drawn already is not drawn again
+    total = neilf.losses(batch, step, hits[rows])  # pass the rendered hits, so nothing is rendered twice
     optimizer.zero_grad()
     (own + total.loss).backward()  # 3
     optimizer.step()

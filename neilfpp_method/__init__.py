@@ -1,6 +1,6 @@
 """NeILF++ for any host: geometry, material and light from posed images.
 
-The public names load their rooms when they are first asked for, so that `import neilfpp_method` is light.
+Public names import their modules on first access, so that `import neilfpp_method` is fast.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 __version__ = "0.1.0"
 __all__ = ["NeilfConfig", "NeilfModel", "__version__", "attach_neilf", "load_run", "preset"]
 
-_ROOMS = {
+_MODULES = {
     "NeilfConfig": "neilfpp_method.settings.types",
     "NeilfModel": "neilfpp_method.model",
     "attach_neilf": "neilfpp_method.attach",
@@ -21,11 +21,11 @@ _ROOMS = {
 
 
 def __dir__() -> list[str]:
-    """The public names: those above are not attributes before somebody asks for them."""
+    """The public names, which become attributes only on first access."""
     return sorted(__all__)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _ROOMS:
+    if name not in _MODULES:
         raise AttributeError(f"module 'neilfpp_method' has no attribute '{name}'")
-    return getattr(import_module(_ROOMS[name]), name)
+    return getattr(import_module(_MODULES[name]), name)

@@ -1,6 +1,6 @@
-"""`attach_neilf`: material and light on top of another system's geometry and radiance, in its own loop.
+"""`attach_neilf`: add material and light to another system's geometry and radiance, in its training loop.
 
-Three lines, the last one in every step:
+It takes three lines, the last of them in every training step:
 
     neilf = attach_neilf(host)
     for group in neilf.param_groups(): optimizer.add_param_group(group)
@@ -45,27 +45,28 @@ from neilfpp_method.structures import Maps, Material, PixelBatch, RayBatch, Shad
 __all__ = ["AttachedNeilf", "CallableHost", "attach_neilf", "missing_capabilities", "pixel_batch"]
 
 RADIANCE_SCALE = {"linear": 3.0, "srgb": 1.0}
-"""METHOD §5: how far R's sigmoid reaches for HDR and for LDR images."""
+"""Largest radiance of R by kind of image, HDR and LDR (METHOD §5)."""
 
 log = logging.getLogger(__name__)
 
 
 class AttachedNeilf(nn.Module):
-    """Material and light of a scene whose geometry and radiance a host knows.
+    """Material and light of a scene whose geometry and radiance come from a host. Made by `attach_neilf`.
 
-    A host that offers `parameter_groups` is trained with the rest: `parameters()` holds its parameters, and
-    all three stages of the paper run. Any other is borrowed: nothing of it is in `parameters()`,
-    `state_dict()`, `to()` or `train()`, and nothing is computed in the first stage, which is its own
-    trainer's. In the material stage it is asked without gradients. In the joint stage gradients reach it.
+    A host with `parameter_groups` is trained together with material and light: `parameters()` includes its
+    parameters, and all three stages of the paper run. Every other host is borrowed: `parameters()`,
+    `state_dict()`, `to()` and `train()` do not include it, and nothing is computed in the first stage, for
+    which its own trainer is responsible. A borrowed host is rendered without gradients in the material stage
+    and with gradients in the joint stage.
 
     Attributes:
         model: the method itself.
-        proxy: stands in for the surface where the host cannot trace it cheaply; `proxy.report()` says how
-            well. None: the host traces, or the settings ask for no rays between surfaces.
-        light_solver: remembers what steps showed, and solves for the light now and then.
-        missing: the optional methods that the host does not have, and what is lost without each.
-        step_guard: leaves out steps that are not finite, of optimisers that `guard` has named.
-        watch: what was found to be wrong so far; `health()` sums it up.
+        proxy: traces rays between surfaces if the host cannot do it cheaply; `proxy.report()` measures its
+            error. None: the host traces them, or the settings need none.
+        light_solver: stores surface points of the training steps and solves for the light at intervals.
+        missing: the optional methods that the host does not have, and the consequence of each.
+        step_guard: skips steps of guarded optimizers (`guard`) whose losses or gradients are not finite.
+        watch: problems found so far; `health()` summarises them.
     """
 
     def __init__(self, model: NeilfModel, proxy: SurfaceProxy | None = None) -> None:
@@ -80,47 +81,53 @@ class AttachedNeilf(nn.Module):
         self.step_guard = StepGuard(log.warning)
         self.watch = Watch(None, log.warning)
         self._steps, self._with_material = 0, False
-        self._shown: tuple[PixelBatch, SurfaceHits] | None = None
+        self._last_rendered: tuple[PixelBatch, SurfaceHits] | None = None
         model.observers.append(self._observe)
 
     def forward(self, batch: PixelBatch, step: int | Stage | str, hits: Rendered | None = None) -> Total:
-        """`losses`, under the name that data-parallel wrappers call."""
+        """Alias of `losses`: the wrappers of data-parallel training call `forward`."""
         return self.losses(batch, step, hits)
 
     def losses(self, batch: PixelBatch, step: int | Stage | str, hits: Rendered | None = None) -> Total:
-        """The weighted sum of the losses of a step, to add to your own loss, and each term before its weight.
+        """Compute the losses of a training step; add `.loss` to the loss of your loop.
+
+        In training mode this also updates the light solver and the health checks.
 
         Args:
             batch: pixels with their rays in the scene frame; see `pixel_batch`.
-            step: the number of the step, from 0, which `config.train` places in its stage; or a stage by
-                name, "joint" say.
-            hits: what the host has rendered of these rays already, in any form that `hosts.answers` reads:
-                the rays are then not rendered again. In the joint stage gradients go back through it.
+            step: index of the step, counted from 0, from which `config.train` determines the stage; or the
+                name of a stage, for example "joint".
+            hits: what the host rendered for these rays, in any form that `hosts.answers` reads; if None, the
+                host is rendered here. In the joint stage gradients flow back through it.
+
+        Returns:
+            The weighted sum of the losses, and each term before its weight.
 
         Raises:
-            UserError: the host returned what cannot be used, or the batch cannot be, or is on another device.
+            UserError: the batch or the output of the host is invalid, or on another device.
         """
         check_batch(batch)
-        self._check_place(batch.rays)
+        self._check_device_and_dtype(batch.rays)
         self.first_look.pixels(batch)
         position = self._position(step)
         weights = active_losses(position.stage, self.model.config, self.model.stages, position.share)
         if not weights:
-            # A loop without a loss of its own may still call backward.
+            # A zero that requires a gradient: a loop without a loss of its own may still call backward.
             return Total(torch.zeros((), device=batch.origins.device, requires_grad=True), {})
         moves_host = self.model.stages[position.stage].moves_host
-        computed = self.model(batch, position.stage, self._rendered(batch.rays, hits, moves_host))
-        total = weigh(computed.terms, weights)
+        result = self.model(batch, position.stage, self._host_hits(batch.rays, hits, moves_host))
+        total = weigh(result.terms, weights)
         if self.training:
             number = self._steps if isinstance(step, str) else int(step)
             self._steps = number + 1
             self.step_guard.begin_step(total.terms, number)
-            self._look_after(computed, position, number)
+            self._after_step(result, position, number)
         return total
 
     def guard(self, optimizer: torch.optim.Optimizer) -> None:
-        """Leave out the steps of an optimiser in which a loss of ours or any of its gradients is not finite.
-        Each is warned of; ten in a row end the training by `errors.Diverged`, raised by `optimizer.step()`.
+        """Skip steps of an optimizer in which a NeILF++ loss or one of its gradients is not finite.
+
+        Each skipped step logs a warning. After ten in a row `optimizer.step()` raises `errors.Diverged`.
 
         Example:
             >>> neilf.guard(optimizer)                                                     # doctest: +SKIP
@@ -128,26 +135,24 @@ class AttachedNeilf(nn.Module):
         self.step_guard.watch(optimizer)
 
     def health(self) -> Health:
-        """Whether what was learned is sound, by the pixels of the last step (docs/health.md). It renders
-        nothing.
-        """
-        if self._shown is not None:
-            batch, hits = self._shown
+        """Judge the result by the pixels of the last step (docs/health.md), without rendering anything."""
+        if self._last_rendered is not None:
+            batch, hits = self._last_rendered
             on_object = hits[torch.nonzero(batch.mask > 0.5)[:, 0]]
-            seen = look_at_hits(self.model, on_object, self._with_material)
-            self.watch.judge(seen, self.step_guard.skipped, self._steps)
+            look = look_at_hits(self.model, on_object, self._with_material)
+            self.watch.judge(look, self.step_guard.skipped, self._steps)
         return Health.of(self.watch.findings.values())
 
     def maps(self, rays: RayBatch | Camera, hits: Rendered | None = None) -> Maps:
-        """Every map of a view, a row per ray: material, shading, normal, depth (`structures.Maps`).
+        """Render all maps of a view, one row per ray: material, shading, normal, depth (`structures.Maps`).
 
         Args:
-            rays: in the scene frame; bound the memory by their number. Or a camera, of a host that draws
-                whole images.
-            hits: what the host has rendered of them already.
+            rays: rays in the scene frame; or a camera, if the host draws whole images. Memory grows with the
+                number of rays.
+            hits: what the host rendered for these rays; if None, the host is rendered here.
 
         Raises:
-            UserError: as of `losses`.
+            UserError: as in `losses`.
         """
         if isinstance(rays, Camera):
             if not isinstance(self.model.host, ForeignHost):
@@ -156,17 +161,17 @@ class AttachedNeilf(nn.Module):
                 )
             with torch.no_grad():
                 rays, hits = self.model.host.image_hits(rays, next(self.model.brdf.parameters()))
-        self._check_place(rays)
-        rendered = self._rendered(rays, hits, moves_host=False)
+        self._check_device_and_dtype(rays)
+        rendered = self._host_hits(rays, hits, moves_host=False)
         if rendered is None:
             return self.model.maps(rays)
-        at_once = self.model.config.train.eval_chunk
-        starts = range(0, max(len(rays), 1), at_once)
-        parts = [self.model.maps(rays[i : i + at_once], hits=rendered[i : i + at_once]) for i in starts]
+        chunk = self.model.config.train.eval_chunk
+        starts = range(0, max(len(rays), 1), chunk)
+        parts = [self.model.maps(rays[i : i + chunk], hits=rendered[i : i + chunk]) for i in starts]
         return Maps(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Maps)))
 
     def param_groups(self) -> list[dict[str, Any]]:
-        """Groups for `optimizer.add_param_group`, a field each with its learning rate of `config.optimizer`.
+        """Groups for `optimizer.add_param_group`, one per field, with the learning rates of the settings.
 
         Example:
             >>> for group in neilf.param_groups():
@@ -179,44 +184,44 @@ class AttachedNeilf(nn.Module):
         ]
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
-        """The parameters by field, for a learning rate each (`config.optimizer`)."""
+        """The parameters by field."""
         return self.model.parameter_groups()
 
     def materials(self, x: Float[Tensor, "N 3"]) -> Material:
-        """Base colour, roughness and metallic at points of the scene frame."""
+        """Base color, roughness and metallic at points of the scene frame."""
         check_points("x", x)
         return self.model.materials(x)
 
     def incident_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
-        """Linear radiance that arrives at x from wi."""
+        """Linear radiance that arrives at surface points x from directions wi."""
         check_points("x", x)
         check_points("wi", wi, axes=3)
         return self.model.incident_light(x, wi)
 
     def shade(self, hits: SurfaceHits, wo: Float[Tensor, "N 3"]) -> Shading:
-        """What the rendering equation sends towards wo from the hits of rays; zero where there is no hit."""
+        """Outgoing radiance of hits towards wo by the rendering equation; 0 for rays without a hit."""
         settings = self.model.config.shading
         rows = torch.nonzero(hits.is_hit(settings.hit_share))[:, 0]
         position = hits.position[rows]
         samples = settings.train_samples if self.training else settings.eval_samples
         normal = self.model.shading_normals(position, hits.normal[rows])
         shading = self.model.shade(position, normal, wo[rows], self.materials(position), samples)
-        nothing = torch.zeros_like(wo)
+        black = torch.zeros_like(wo)
         return Shading(
-            *(nothing.index_put((rows,), part) for part in (shading.color, shading.diffuse, shading.specular))
+            *(black.index_put((rows,), part) for part in (shading.color, shading.diffuse, shading.specular))
         )
 
     # ------------------------------------------------------------------------------------------ inside a step
 
-    def _look_after(self, computed: StepResult, position: StagePosition, number: int) -> None:
-        """What follows a training step: the light, when it is time, and whether all is well."""
-        self.light_solver.observe(computed)
+    def _after_step(self, result: StepResult, position: StagePosition, number: int) -> None:
+        """Solve for the light if it is due, and check the health of the training."""
+        self.light_solver.observe(result)
         if self.light_solver.due:
             self.watch.after_fit(self.light_solver.points, number)
         self.light_solver.solve(self.model.brdf, self.model.scene)
         plan = self.model.stages[position.stage]
         self._with_material = plan.moves_material
-        self.watch.after_step(plan, computed, number)
+        self.watch.after_step(plan, result, number)
         if position.step + 1 == position.length:
             self.health()
 
@@ -228,21 +233,25 @@ class AttachedNeilf(nn.Module):
         names = [stage.value for stage in Stage]
         if step not in names:
             raise UserError(
-                f"'{step}' is no stage", f"give the number of the step, or one of {', '.join(names)}"
+                f"unknown stage '{step}'", f"give the index of the step, or one of {', '.join(names)}"
             )
-        return StagePosition(Stage(step), 0, 2)  # a stage without an end
+        # The position of a stage by name is unknown: step 0 of 2 never is the last step of the stage.
+        return StagePosition(Stage(step), 0, 2)
 
-    def _check_place(self, rays: RayBatch) -> None:
+    def _check_device_and_dtype(self, rays: RayBatch) -> None:
         own = next(self.model.brdf.parameters())
         if rays.origins.device != own.device:
-            places = f"rays on {rays.origins.device}, material and light on {own.device}"
-            raise UserError(places, "move one of them: neilf.to(device)")
+            devices = f"rays on {rays.origins.device}, material and light on {own.device}"
+            raise UserError(devices, "move one of them, for example neilf.to(device)")
         if rays.origins.dtype != own.dtype:
-            types = f"rays are {rays.origins.dtype}, material and light {own.dtype}"
-            raise UserError(types, "give rays.float(), or compute in the other: neilf.double()")
+            dtypes = f"rays are {rays.origins.dtype}, material and light {own.dtype}"
+            raise UserError(dtypes, "give rays.float(), or convert the other with neilf.double()")
 
-    def _rendered(self, rays: RayBatch, hits: Rendered | None, moves_host: bool) -> SurfaceHits | None:
-        """What the host says of camera rays, where the model is not to ask it; none: it is."""
+    def _host_hits(self, rays: RayBatch, hits: Rendered | None, moves_host: bool) -> SurfaceHits | None:
+        """The host's hits of camera rays, given or rendered; None if the model renders the host itself.
+
+        A host that answers camera rays only is rendered here, because its `render` uses the proxy.
+        """
         host = self.model.host
         if hits is not None:
             return host.read(rays, hits) if isinstance(host, ForeignHost) else as_hits(host, rays, hits)
@@ -253,7 +262,7 @@ class AttachedNeilf(nn.Module):
 
     def _observe(self, batch: PixelBatch, hits: SurfaceHits) -> None:
         self.first_look.hits(batch, hits)
-        self._shown = batch, hits.detach()
+        self._last_rendered = batch, hits.detach()
         if isinstance(self.model.host, ForeignHost):
             self.model.host.show_proxy(batch.rays, hits)
 
@@ -267,24 +276,30 @@ def attach_neilf(
     radiance_scale: float | None = None,
     open_scene: bool = False,
 ) -> AttachedNeilf:
-    """Put the material field, the light and their losses on top of a host. One line of the log says what the
-    host lacks, and when its material starts. The global random state stays as it is.
+    """Put the material field, the light and their losses on top of a host.
+
+    One log line names the optional methods that the host lacks and the step at which its material starts. The
+    global random state is not changed.
 
     Args:
-        host: an object with `render(rays) -> SurfaceHits`, or `render_image(camera) -> SurfaceHits` where it
-            draws whole images; a function (origins, directions) → (color, position, normal); or a nerfstudio
-            model. In a frame where the object lies in the unit sphere. docs/hosts.md has a recipe for each.
-        config: the settings; none: the preset `fast`, and for a host that belongs to another trainer material
-            from step 0.
-        response: what the pixels are: "linear" (HDR) or "srgb" (LDR).
-        median_radiance: median linear luminance of the object in the images; sets the light's first guess.
-        radiance_scale: the range of the host's radiance; none: 3 for HDR, 1 for LDR.
-        open_scene: pixels of rays that meet nothing show the light from far away, not a backdrop; a map keeps
-            to them.
+        host: an object with `render(rays) -> SurfaceHits`; an object with `render_image(camera) ->
+            SurfaceHits` that draws whole images; a function (origins, directions) → (color, position,
+            normal); or a nerfstudio model. The object must lie in the unit sphere of the host's frame.
+            docs/hosts.md has a recipe for each.
+        config: the settings. None: the preset `fast`; for a borrowed host (without `parameter_groups`)
+            without its first stage, so that the material starts at step 0.
+        response: meaning of pixel values: "linear" (HDR) or "srgb" (LDR).
+        median_radiance: median linear luminance of the object in the images; sets the initial light.
+        radiance_scale: largest radiance of the host. None: 3 for HDR, 1 for LDR.
+        open_scene: whether pixels of rays that miss the scene show the distant light, to which an environment
+            map is then fitted, and not a backdrop.
+
+    Returns:
+        A module with the losses, maps and parameters of material and light.
 
     Raises:
-        UserError: the host is none of these, a fact cannot be right, or the environment map that the settings
-            name cannot be used.
+        UserError: the host has none of these forms, an argument is out of range, or the environment map that
+            the settings name cannot be used.
     """
     if response not in RADIANCE_SCALE:
         raise UserError(
@@ -292,12 +307,12 @@ def attach_neilf(
             "choose linear (pixels are radiance) or srgb (8-bit images, divided by 255)",
         )
     scale = RADIANCE_SCALE[response] if radiance_scale is None else radiance_scale
-    for name, value in {"median_radiance": median_radiance, "radiance_scale": scale}.items():
-        if not 0 < value < math.inf:
-            raise UserError(
-                f"{name} is {value}",
-                "give the median linear luminance of the object, or of the host's largest",
-            )
+    if not 0 < median_radiance < math.inf:
+        raise UserError(
+            f"median_radiance is {median_radiance}", "give the median linear luminance of the object, above 0"
+        )
+    if not 0 < scale < math.inf:
+        raise UserError(f"radiance_scale is {scale}", "give the largest radiance of the host, above 0")
     borrowed = not isinstance(host, HasParameterGroups)
     if config is None:
         config = preset("fast")
@@ -306,63 +321,63 @@ def attach_neilf(
     facts = SceneFacts(response, median_radiance, scale, "inverted_sphere" if open_scene else "constant")
     with torch.random.fork_rng(range(torch.cuda.device_count()) if torch.cuda.is_initialized() else []):
         proxy = proxy_for(adapted, config)
-        whole = adapted if isinstance(adapted, LightsItself) else ForeignHost(adapted, borrowed, proxy)
-        attached = AttachedNeilf(NeilfModel(whole, config, facts, borrowed=borrowed), proxy)
+        complete = adapted if isinstance(adapted, LightsItself) else ForeignHost(adapted, borrowed, proxy)
+        attached = AttachedNeilf(NeilfModel(complete, config, facts, borrowed=borrowed), proxy)
     if config.known_map is not None:
         attached.model.light.show(read_environment(Path(config.known_map)))
-    log.warning("NeILF++ attached to %s: %s", host_name(adapted), _what_comes(attached, borrowed))
+    log.warning("NeILF++ attached to %s: %s", host_name(adapted), _attachment_summary(attached, borrowed))
     return attached
 
 
 def missing_capabilities(host: object) -> Mapping[str, str]:
-    """The optional methods that most hosts could have and this one does not, and what is lost without each;
-    `hosts.capabilities` has all.
+    """The optional methods that most hosts could have and this one lacks, with the consequence of each.
+
+    `hosts.capabilities` lists all optional methods.
     """
-    return {c.method: c.without for c in CAPABILITIES if c.told and not hasattr(host, c.method)}
+    return {c.method: c.without for c in CAPABILITIES if c.reported and not hasattr(host, c.method)}
 
 
 def pixel_batch(origins: Tensor, directions: Tensor, color: Tensor, mask: Tensor | None = None) -> PixelBatch:
-    """Pixels of a loop that knows rays and colours, and perhaps where the object is: 1 on it and 0 off it.
+    """Make a `PixelBatch` from the tensors of another training loop.
+
+    Args:
+        origins: ray origins (N, 3), scene frame.
+        directions: unit ray directions (N, 3).
+        color: pixel values (N, 3), linear or sRGB as declared to `attach_neilf`.
+        mask: 1 on the object and 0 off it (N,). None: all pixels may show the object.
 
     Raises:
-        UserError: something has another shape, or integers.
+        UserError: a tensor has another shape, or holds integers.
     """
     for name, rows in {"origins": origins, "directions": directions, "color": color}.items():
         check_rows(name, rows, len(origins), 3)
     if mask is not None:
         check_rows("mask", mask, len(origins))
-    nothing = torch.zeros_like(origins[:, 0])
+    zeros, ones = torch.zeros_like(origins[:, 0]), torch.ones_like(origins[:, 0])
     return PixelBatch(
         origins=origins,
         directions=directions,
         color=color,
-        mask=nothing + 1.0 if mask is None else mask,
-        mask_known=nothing if mask is None else nothing + 1.0,
-        image_gradient=nothing,
-        view=nothing.long(),
+        mask=ones if mask is None else mask,
+        mask_known=zeros if mask is None else ones,
+        image_gradient=zeros,
+        view=zeros.long(),
     )
 
 
-def _what_comes(attached: AttachedNeilf, borrowed: bool) -> str:
-    """What a person must know of an attachment, in one line."""
-    train = attached.model.config.train
-    parts = []
-    if borrowed:
-        start = train.sdf_steps
-        parts += (
-            [f"nothing is computed before step {start} (train.sdf_steps)"]
-            if start
-            else ["material from step 0"]
-        )
-        parts += (
-            [f"the host moves with it from step {start + train.material_steps}"] if train.joint_steps else []
-        )
+def _attachment_summary(attached: AttachedNeilf, borrowed: bool) -> str:
+    """One line for the log: when training of the material starts, the proxy, and missing capabilities."""
+    train, parts = attached.model.config.train, []
+    if borrowed and train.sdf_steps:
+        parts.append(f"nothing is computed before step {train.sdf_steps} (train.sdf_steps)")
+    elif borrowed:
+        parts.append("the material is trained from step 0")
+    if borrowed and train.joint_steps:
+        parts.append(f"the host gets gradients from step {train.sdf_steps + train.material_steps}")
     if attached.proxy is not None:
-        parts += [
-            "a proxy of its surface, gathered from the training rays, traces the light between surfaces"
-        ]
-    parts += [f"no {name}: {loss}" for name, loss in attached.missing.items()]
-    return "; ".join(parts) or "it has all that a host can have"
+        parts.append("a proxy of its surface, built from the training rays, traces light between surfaces")
+    parts += [f"no {method}: {consequence}" for method, consequence in attached.missing.items()]
+    return "; ".join(parts) or "it has all optional methods"
 
 
 def _inner(host: object) -> object:
@@ -379,6 +394,6 @@ def _adapt(host: object, response: str) -> Host | ImageHost:
     if callable(host):
         return CallableHost(host)
     raise UserError(
-        f"{type(host).__name__} is no host",
+        f"{type(host).__name__} is not a host",
         "give an object with render(rays) or render_image(camera), or a function of (origins, directions)",
     )

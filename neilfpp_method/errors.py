@@ -1,4 +1,4 @@
-"""How a command ends early: what is wrong or was asked, where, and what to do about it, in one line."""
+"""Exceptions that end a command with one line of text and an exit status, instead of a traceback."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ __all__ = ["Diverged", "EarlyEnd", "Stopped", "Unsound", "UserError"]
 
 
 LONGEST_HEAD, LONGEST_TAIL = 1200, 300
-"""Characters of a problem that are shown: a path, and what a library says of the file."""
+"""Characters kept of the beginning and the end of a long problem. The beginning has room for a path, the end
+for the last line of a library's message.
+"""
 
 
 def _short(text: str) -> str:
@@ -17,15 +19,21 @@ def _short(text: str) -> str:
 
 
 def _printable(text: str) -> str:
-    """One line that does nothing to a terminal, whatever a file says or is called: control characters, and
-    bytes that are no text, are written as escapes.
+    """Escape control characters, line breaks and undecodable bytes.
+
+    Names and contents of files may hold escape sequences that would act on a terminal.
     """
-    hidden = {sign for sign in text if unicodedata.category(sign) in ("Cc", "Cf", "Cs", "Zl", "Zp")}
-    return text.translate({ord(sign): sign.encode("unicode_escape").decode() for sign in hidden})
+    unsafe = {char for char in text if unicodedata.category(char) in ("Cc", "Cf", "Cs", "Zl", "Zp")}
+    return text.translate({ord(char): char.encode("unicode_escape").decode() for char in unsafe})
 
 
 class EarlyEnd(Exception):
-    """The command line prints the problem and the remedy as one line and exits with `status`."""
+    """Base of errors that the command line prints as one line, "problem; remedy", and exits with `status`.
+
+    Args:
+        problem: what is wrong, and where.
+        remedy: what to do about it.
+    """
 
     status = 1
 
@@ -37,20 +45,20 @@ class EarlyEnd(Exception):
 
 
 class UserError(EarlyEnd):
-    """Bad input that a person can mend."""
+    """Bad input that the user can correct."""
 
     status = 2
 
 
 class Stopped(EarlyEnd):
-    """A person asked to stop; nothing is lost."""
+    """The user stopped the command; what was computed is saved."""
 
     status = 130
 
 
 class Diverged(EarlyEnd):
-    """Training met too many steps in a row without a finite loss and gradient."""
+    """Training diverged: too many steps in a row had a loss or gradient that is not finite."""
 
 
 class Unsound(EarlyEnd):
-    """Training came to its end, and its result is of no use."""
+    """Training finished, but its result is unusable."""

@@ -1,4 +1,4 @@
-"""The losses of METHOD §4, each unreduced and unweighted; `schedule.py` weighs and adds them up."""
+"""The loss terms of METHOD §4, unreduced and unweighted; `schedule.weigh` reduces, weights and sums them."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ __all__ = [
 def photometric(
     radiance: Float[Tensor, "N 3"], pixel: Float[Tensor, "N 3"], response: str, unit: float = 1.0
 ) -> LossTerm:
-    """L_vol and L_phys: L1 between a render and the pixel; at a clipped one as far as the render is darker.
+    """L_vol and L_phys: L1 distance between a rendered color and the pixel.
 
     Args:
-        radiance: what the model sees, linear.
-        pixel: what the file holds, in the capture's `response`.
-        response: "linear" compares radiance; "srgb" encodes the render first, and takes a pixel at the upper
-            end of the range for a lower bound (`shading.color.residual`; METHOD §6 clips the render, which
-            has no gradient where it is too bright).
-        unit: what the difference is measured in: with the range of an output activation, the gradient keeps
-            its size.
+        radiance: rendered linear radiance.
+        pixel: pixel value in the capture's `response`.
+        response: "linear" compares radiance. "srgb" encodes the render first. A clipped pixel is then a lower
+            bound: only a darker render has a loss (`shading.color.residual`). METHOD §6 clips the render
+            instead, which has no gradient where the render is too bright.
+        unit: unit of the difference. With the range of R's output activation as unit, the gradient does not
+            depend on that range.
     """
     return LossTerm(residual(radiance, pixel, response).abs() / unit)
 
@@ -50,39 +50,46 @@ def mask(
     object_mask: Float[Tensor, " N"],
     known: Float[Tensor, " N"],
 ) -> LossTerm:
-    """On the object 1 − opacity; off it ln(1 + τ), τ the optical depth; where the mask is known.
+    """Mask loss: 1 − opacity on the object and ln(1 + τ) off it, where τ is the optical depth of the ray.
 
-    Opacity itself has no slope behind a solid, 1 − e^−τ: what stands where nothing may stand would stay there
-    for good, painted like the background. The cross-entropy of IDR is τ, and its slope grows without bound as
-    surfaces become sharp, which is what a mask that is wrong by a pixel brings about along every silhouette.
+    Off the object, a loss on the opacity 1 − e^−τ would have no gradient behind a solid surface: geometry in
+    known empty space would stay and be painted like the background. The cross-entropy of IDR equals τ there;
+    its gradient grows without bound as surfaces become sharp, and masks that are wrong by a pixel along the
+    silhouettes would carve the object.
+
+    Args:
+        opacity: opacity of each ray.
+        depth: optical depth τ of each ray.
+        object_mask: 1 on the object, 0 off it.
+        known: 1 where the mask is known; the loss is 0 elsewhere.
     """
     return LossTerm(known * (object_mask * (1 - opacity) + (1 - object_mask) * depth.log1p()))
 
 
 def exposure(drift: Float[Tensor, "V 3"]) -> LossTerm:
-    """The squares of how far the log gains of photographs are from what they started as."""
+    """Prior on the gains of photographs: the squared drift of their logarithms from the initial values."""
     return LossTerm(drift.square())
 
 
 def eikonal(gradient: Float[Tensor, "P 3"]) -> LossTerm:
-    """L_Eik = |‖∇G‖ − 1|; finite gradients where ∇G = 0."""
+    """L_Eik = |‖∇G‖ − 1|. Its gradient is finite where ∇G = 0."""
     return LossTerm((_safe_norm(gradient) - 1.0).abs())
 
 
 def hessian(matrix: Float[Tensor, "P 3 3"]) -> LossTerm:
-    """L_Hess = ‖H G‖₁, element-wise: flat surfaces cost nothing, noise does."""
+    """L_Hess = ‖H G‖₁, element-wise on the Hessian of G: 0 for planes, large for noisy surfaces."""
     return LossTerm(matrix.abs())
 
 
 def surface(distance: Float[Tensor, ...], epsilon: float) -> LossTerm:
-    """L_surf = δ_ε(G), δ_ε(z) = ε / (π (ε² + z²)): the zero set's area, against unseen surfaces."""
+    """L_surf = δ_ε(G) with δ_ε(z) = ε / (π (ε² + z²)): the area of the zero set, against unseen surfaces."""
     return LossTerm(epsilon / (math.pi * (epsilon**2 + distance**2)))
 
 
 def point_cloud(
     distance: Float[Tensor, " P"], gradient: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]
 ) -> LossTerm:
-    """L_pcd = |G(x_D)| + 1 − cos∠(n_D, ∇G(x_D)) at the points x_D of an oriented cloud."""
+    """L_pcd = |G(x_D)| + 1 − cos∠(n_D, ∇G(x_D)) at points x_D with normals n_D of an oriented point cloud."""
     cosine = (functional.normalize(gradient, dim=-1, eps=1e-6) * normal).sum(-1)
     return LossTerm(distance.abs() + (1.0 - cosine))
 
@@ -93,9 +100,13 @@ def inter_reflection(
     unit: float = 1.0,
     monochrome: bool = False,
 ) -> LossTerm:
-    """L_ref = ‖L(x₁, ωi) − R(x₂, −ωi)‖₁ for rays from x₁ along ωi that hit at x₂, in a unit of radiance.
+    """L_ref = ‖L(x₁, ωi) − R(x₂, −ωi)‖₁ for rays from x₁ along ωi that hit the scene at x₂.
 
-    A light without colour is compared by luminance: no L can meet three channels that differ.
+    Args:
+        incident: L(x₁, ωi), linear.
+        outgoing: R(x₂, −ωi), linear.
+        unit: radiance by which the difference is divided.
+        monochrome: L has one channel, so the luminances are compared.
     """
     if monochrome:
         incident, outgoing = luminance(incident)[:, None], luminance(outgoing)[:, None]
@@ -107,19 +118,19 @@ def smoothness(
     metallic_gradient: Float[Tensor, "N 3"],
     image_gradient: Float[Tensor, " N"],
 ) -> LossTerm:
-    """L_smth = (‖∇r‖ + ‖∇m‖) exp(−‖∇I‖): roughness and metallic change where the image does."""
+    """L_smth = (‖∇r‖ + ‖∇m‖) exp(−‖∇I‖): roughness and metallic are smooth where the image is smooth."""
     return LossTerm(
         (_safe_norm(roughness_gradient) + _safe_norm(metallic_gradient)) * torch.exp(-image_gradient)
     )
 
 
 def lambertian(material: Material) -> LossTerm:
-    """L_Lam = |r − 1| + |m|: without evidence a surface is rough and not a metal."""
+    """L_Lam = |r − 1| + |m|: without evidence to the contrary a surface is rough and not metallic."""
     return LossTerm((material.roughness - 1.0).abs() + material.metallic.abs())
 
 
 def scale_gradient(value: Tensor, scale: float) -> Tensor:
-    """The same value with its gradient times `scale`; 0 detaches it."""
+    """Return `value` with its gradient multiplied by `scale`; 0 detaches it."""
     if scale == 1.0:
         return value
     if scale == 0.0:
@@ -128,5 +139,5 @@ def scale_gradient(value: Tensor, scale: float) -> Tensor:
 
 
 def _safe_norm(vector: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-    # The floor keeps the derivative of the root finite at zero and moves no length that matters.
+    # The floor keeps the derivative of the square root finite at 0; it changes lengths below 1e-6 only.
     return vector.square().sum(-1).clamp_min(1e-12).sqrt()

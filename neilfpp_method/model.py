@@ -1,6 +1,6 @@
-"""NeILF++: a host that knows geometry and radiance, and the material and the light that explain what it sees.
+"""NeILF++: material and light on top of a host that provides geometry and outgoing radiance.
 
-One training step reads top to bottom in `NeilfModel.step`, in the order of the paper's §4.2.
+`NeilfModel.step` is one training step. It reads from top to bottom in the order of the paper's §4.2.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from neilfpp_method.incident import (
 )
 from neilfpp_method.lighting.replay import Replay
 from neilfpp_method.lighting.solver import LightSolver, make_light_solver
-from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, StagePlan, active_losses
+from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, StagePlan, StageTable, active_losses
 from neilfpp_method.settings.check import check_config
 from neilfpp_method.settings.facts import SceneFacts, radiance_units
 from neilfpp_method.settings.types import NeilfConfig, ShadingConfig
@@ -54,68 +54,69 @@ from neilfpp_method.timing.ledger import doing
 __all__ = ["NeilfModel"]
 
 CLEAR_OPACITY = 0.01
-"""Opacity below which a ray shows what lies beyond the scene."""
+"""Opacity below which a ray counts as missing the scene, so that its pixel shows the light behind it."""
 SURFACE_OPACITY = 0.5
-"""Opacity above which a picture shows a surface, also where a pixel mixes two: a picture has no holes."""
+"""Opacity above which `maps` shades a ray. Edges that mix two surfaces count, too: images have no holes."""
 
 
 class NeilfModel(nn.Module):
-    """The method on top of any host.
+    """The method on top of any host: fields B and L, the rendering equation, and the losses of a step.
 
     Args:
-        host: renders rays (`hosts.base.Host`); its parameters train with ours where it offers
-            `parameter_groups`.
+        host: renders rays (`hosts.base.Host`). If it has `parameter_groups`, its parameters are trained
+            together with the model's own.
         config: the settings.
-        facts: what the images decided.
-        borrowed: the host belongs to another trainer. Its parameters, its device and its mode are then none
-            of this module's, though gradients reach it in the joint stage.
+        facts: what was measured on the images before training.
+        borrowed: whether the host belongs to another trainer. If so, it is not a submodule: its parameters,
+            device and train/eval mode are left alone. Gradients still reach it in the joint stage.
 
     Attributes:
-        host: geometry and outgoing radiance R.
+        host: geometry G and outgoing radiance R.
         brdf: B, the material at every point.
-        gains: how much brighter each photograph is than the others; none where all are taken to be alike.
-        light, lamps: L, what arrives where nothing stands in the way, and small lamps close by, perhaps none.
-        lobe: distribution of the specular reflection; none for Lambertian surfaces.
-        stages: which losses count and what moves in each stage, for this kind of host.
-        units: what errors of radiance are measured in.
-        replay: surface points of earlier steps, for stages in which no surface moves.
-        check_outputs: refuses what a host must not return.
-        observers: called with the rays of every training step and what the host says of them, before anything
-            is shaded.
+        light, lamps: L, the light that arrives at unoccluded points, and the small lamps near the scene.
+        gains: gain of each photograph relative to the mean; None if all photographs are taken as equal.
+        lobe: distribution of the specular reflection; None for Lambertian surfaces.
+        stages: stage table for this kind of host: active losses and trained fields of each stage.
+        units: units in which the losses measure radiance.
+        replay: surface points of earlier steps, reused in stages in which no surface moves.
+        check_outputs: rejects host outputs that break the contract.
+        observers: callbacks that get the batch and the host's hits of every training step, before shading.
 
     Raises:
-        UserError: settings that do not go together (`settings.check`).
+        UserError: settings that exclude each other (`settings.check`).
     """
 
     def __init__(self, host: Host, config: NeilfConfig, facts: SceneFacts, borrowed: bool = False) -> None:
         super().__init__()
         check_config(config)
         if borrowed:
-            object.__setattr__(self, "host", host)  # past nn.Module, which would take it in
+            # Bypass nn.Module, which would register the host as a submodule.
+            object.__setattr__(self, "host", host)
         else:
             self.host = host
         self.facts, self.borrowed = facts, borrowed
         self.units = radiance_units(config, facts)
-        self.stages = host.stages if isinstance(host, HasStages) else BORROWED_HOST if borrowed else STAGES
+        self.stages = _stage_table(host, borrowed)
         self.check_outputs = OutputCheck(host, config.shading.hit_share)
         self.observers: list[Callable[[PixelBatch, SurfaceHits], None]] = []
         self.brdf = BrdfField(config.brdf, config.encoding, config.volume.radius)
-        albedo = initial_albedo(
-            config.brdf.initial_base_color, config.brdf.initial_metallic, _lobe_of(config.shading)
-        )
         has_gains = config.optimizer.exposure > 0 and len(facts.log_gains) > 0
         self.gains = PhotographGains(torch.tensor(facts.log_gains).view(-1, 3)) if has_gains else None
+        # The light starts at the radiance under which the initial material has the images' median radiance.
+        albedo = initial_albedo(
+            config.brdf.initial_base_color, config.brdf.initial_metallic, _specular_lobe(config.shading)
+        )
         parts = make_light(config, facts.response, facts.median_radiance / albedo)
         self.light, self.lamps = parts.light, parts.lamps
         self.use(config)
-        # The surface of a borrowed host moves as its own trainer likes.
-        stands_still = not borrowed and not self.stages[Stage.MATERIAL_INIT].moves_host
-        self.replay = Replay(config.train.fresh if stands_still else 1.0, config.train.rays)
+        # The trainer of a borrowed host may move its surface in any step: then no point is reused.
+        surface_is_fixed = not borrowed and not self.stages[Stage.MATERIAL_INIT].moves_host
+        self.replay = Replay(config.train.fresh if surface_is_fixed else 1.0, config.train.rays)
 
     def use(self, config: NeilfConfig) -> None:
-        """Compute with these settings from now on. Effects change; the sizes of fields stay."""
+        """Switch to other settings. Effects may change; the sizes of the fields must not."""
         self.config = config
-        self.lobe = _lobe_of(config.shading)
+        self.lobe = _specular_lobe(config.shading)
         self.brdf.use(config.brdf)
         if isinstance(self.light, EnvironmentLight):
             self.light.be_even(config.light.environment_height == 1)
@@ -123,92 +124,109 @@ class NeilfModel(nn.Module):
     # ----------------------------------------------------------------------------------------------- one step
 
     def forward(self, batch: PixelBatch, stage: Stage, hits: SurfaceHits | None = None) -> StepResult:
-        """`step`, under the name that data-parallel wrappers call."""
+        """Alias of `step`: the wrappers of data-parallel training call `forward`."""
         return self.step(batch, stage, hits)
 
     def losses(self, batch: PixelBatch, stage: Stage, hits: SurfaceHits | None = None) -> LossTerms:
-        """The losses of a step alone, before their weights."""
+        """Only the loss terms of `step`, before their weights."""
         return self.step(batch, stage, hits).terms
 
     def step(self, batch: PixelBatch, stage: Stage, hits: SurfaceHits | None = None) -> StepResult:
-        """The losses that count in a stage, for a batch of pixels, and what the step showed of surface and
-        sky. `hits` are what the host has rendered of the batch already; none: it is asked.
+        """Compute the active losses of a stage for a batch of pixels, in the six steps of the paper's §4.2.
+
+        Args:
+            batch: training pixels with their camera rays.
+            stage: the stage of training; it determines the active losses and which fields get gradients.
+                Steps 2 to 6 are skipped in a stage that does not train material and light.
+            hits: what the host rendered for this batch; if None, the host is rendered here.
+
+        Returns:
+            The loss terms, and the surface and background pixels from which the light is solved.
         """
-        plan, names = self.stages[stage], active_losses(stage, self.config, self.stages)
-        if not names:
-            return StepResult.of({}, SurfacePixels.none_of(batch), batch[:0])
-        settings, units = self.config.shading, self.units
-        replays = self.training and not plan.moves_host
-        if replays:
-            batch, hits = self._first_rays(batch, hits)
+        plan, active = self.stages[stage], active_losses(stage, self.config, self.stages)
+        if not active:
+            return StepResult.of({}, SurfacePixels.empty_like(batch), batch[:0])
+        reuses_points = self.training and not plan.moves_host
+        if reuses_points:
+            batch, hits = self._rays_to_render(batch, hits)
 
-        # 1. The host renders colour, hit position and normal.
-        hits, terms = self._render_host(batch, plan, names, hits)
-        if "volume" in names:
-            color = hits.color
-            if self.gains is not None:
-                color = color * self.gains(batch.view)
-                terms["exposure"] = losses.exposure(self.gains.drift())
-            terms["volume"] = losses.photometric(color, batch.color, self.facts.response, units.volume)
+        # 1. Geometry G and outgoing radiance R: render color, hit position and normal of each camera ray.
+        hits, terms = self._render_host(batch, plan, active, hits)
+        if "volume" in active:
+            terms |= self._volume_losses(batch, hits)
         if not plan.moves_material:
-            return StepResult.of(terms, SurfacePixels.none_of(batch), batch[:0])
-        # From here on all photographs are as one of mean exposure. R, which sees all pixels, finds the gains.
-        color = at_mean_exposure(self.gains, batch.color, batch.view, self.facts.response)
-        batch = replace(batch, color=color)
+            return StepResult.of(terms, SurfacePixels.empty_like(batch), batch[:0])
 
-        # 2. Rays that meet one surface, on the object, are shaded. The gradient to their hits is scaled.
-        rows = torch.nonzero(hits.is_hit(settings.hit_share) & (batch.mask > 0.5))[:, 0]
+        # 2. Surface points: rays on the object that hit a single surface.
+        batch = self._at_mean_exposure(batch)
+        is_surface = hits.is_hit(self.config.shading.hit_share) & (batch.mask > 0.5)
+        rows = torch.nonzero(is_surface)[:, 0]
         rendered = self._surface_pixels(hits[rows], batch[rows])
-        surface = self.replay.beside_earlier(rendered) if replays else rendered
+        surface = self.replay.beside_earlier(rendered) if reuses_points else rendered
+        position, normal, wo = surface.position, surface.normal, surface.wo
 
-        # 3. The BRDF field says what the surface is made of.
-        material, priors = self._material_and_priors(surface, names)
+        # 3. Material: query the BRDF field B at the surface points.
+        material, priors = self._material_and_priors(surface, active)
         terms |= priors
 
-        # 4. Light, lamps and scene say what arrives.
-        position, normal, wo = surface.position, surface.normal, surface.wo
-        incident = self._arriving(position, normal, wo, material, settings.train_samples)
+        # 4. Incident light L: sample directions wi and compute the radiance that arrives along them.
+        incident = self._incident(position, normal, wo, material, self.config.shading.train_samples)
 
-        # 5. The rendering equation says what leaves towards the camera.
+        # 5. Rendering equation: outgoing radiance towards wo, compared with the pixel.
         with doing("shading"):
             shading = shade(material, normal, wo, incident, self.lobe)
         terms["physical"] = losses.photometric(
-            shading.color, surface.pixel, self.facts.response, units.physical
+            shading.color, surface.pixel, self.facts.response, self.units.physical
         )
 
-        # 6. What arrives from another surface is what that surface sends.
-        if "inter_reflection" in names:
+        # 6. Inter-reflection: where a ray along wi hits the scene again, L here must equal R there.
+        if "inter_reflection" in active:
             terms["inter_reflection"] = self._inter_reflection(position, normal)
-        return StepResult.of(terms, rendered, self._beyond(batch, hits))
+        return StepResult.of(terms, rendered, self._background_pixels(batch, hits))
 
-    def _first_rays(
+    def _rays_to_render(
         self, batch: PixelBatch, hits: SurfaceHits | None
     ) -> tuple[PixelBatch, SurfaceHits | None]:
-        """The part of a batch that is rendered; points of earlier steps stand in for the rest."""
-        first = slice(math.ceil(self.replay.share * len(batch)))
-        return batch[first], None if hits is None else hits[first]
+        """The part of a batch that is rendered; replayed points of earlier steps stand in for the rest."""
+        rendered = slice(math.ceil(self.replay.share * len(batch)))
+        return batch[rendered], None if hits is None else hits[rendered]
 
     @doing("rendering")
     def _render_host(
-        self, batch: PixelBatch, plan: StagePlan, names: Mapping[str, float], hits: SurfaceHits | None
+        self, batch: PixelBatch, plan: StagePlan, active: Mapping[str, float], hits: SurfaceHits | None
     ) -> tuple[SurfaceHits, dict[str, LossTerm]]:
-        """Hits, and the host's own losses; constants in a stage that does not move the host."""
+        """Hits and the host's own active losses; without gradients if the stage does not train the host."""
         with torch.set_grad_enabled(torch.is_grad_enabled() and plan.moves_host):
             if hits is not None:
                 hits, terms = hits if torch.is_grad_enabled() else hits.detach(), {}
             elif isinstance(self.host, Regularised):
-                rendered = self.host.render_regularised(batch, names)
-                hits, terms = rendered.hits, dict(rendered.terms)
+                regularised = self.host.render_regularised(batch, active)
+                hits, terms = regularised.hits, dict(regularised.terms)
             else:
                 hits, terms = self.host.render(batch.rays), {}
-            self.check_outputs(batch.rays, hits, color_moves="volume" in names and torch.is_grad_enabled())
+            self.check_outputs(batch.rays, hits, color_moves="volume" in active and torch.is_grad_enabled())
         if self.training:
             for observe in self.observers:
                 observe(batch, hits)
         return hits, terms
 
+    def _volume_losses(self, batch: PixelBatch, hits: SurfaceHits) -> dict[str, LossTerm]:
+        """L_vol of the host's color and, if photographs have gains of their own, the prior on the gains."""
+        terms, color = {}, hits.color
+        if self.gains is not None:
+            terms["exposure"] = losses.exposure(self.gains.drift())
+            color = color * self.gains(batch.view)
+        terms["volume"] = losses.photometric(color, batch.color, self.facts.response, self.units.volume)
+        return terms
+
+    def _at_mean_exposure(self, batch: PixelBatch) -> PixelBatch:
+        """Bring pixels to the mean exposure. Gains are constants here: L_vol, on all pixels, trains them."""
+        color = at_mean_exposure(self.gains, batch.color, batch.view, self.facts.response)
+        return replace(batch, color=color)
+
     @doing("shading")
     def _surface_pixels(self, hits: SurfaceHits, pixels: PixelBatch) -> SurfacePixels:
+        """Surface points to shade; the gradients of position and normal are scaled by the settings."""
         settings = self.config.loss
         return SurfacePixels(
             position=losses.scale_gradient(hits.position, settings.position_gradient),
@@ -222,23 +240,25 @@ class NeilfModel(nn.Module):
 
     @doing("shading")
     def _material_and_priors(
-        self, surface: SurfacePixels, names: Mapping[str, float]
+        self, surface: SurfacePixels, active: Mapping[str, float]
     ) -> tuple[Material, dict[str, LossTerm]]:
-        """The material of surface points, and those of its priors that count."""
+        """The material of surface points, and its active priors L_smth and L_Lam."""
         priors = {}
-        if "smoothness" in names:
+        if "smoothness" in active:
             with doing("regularisers"):
                 sample = self.brdf.with_gradients(surface.position)
-            material, slopes = sample.material, (sample.roughness_gradient, sample.metallic_gradient)
-            priors["smoothness"] = losses.smoothness(*slopes, surface.image_gradient)
+            material = sample.material
+            priors["smoothness"] = losses.smoothness(
+                sample.roughness_gradient, sample.metallic_gradient, surface.image_gradient
+            )
         else:
             material = self.brdf(surface.position)
-        if "lambertian" in names:
+        if "lambertian" in active:
             priors["lambertian"] = losses.lambertian(material)
         return material, priors
 
     @doing("shading")
-    def _arriving(
+    def _incident(
         self,
         position: Float[Tensor, "N 3"],
         normal: Float[Tensor, "N 3"],
@@ -246,24 +266,25 @@ class NeilfModel(nn.Module):
         material: Material,
         samples: int,
     ) -> Incident:
-        """What arrives at surface points along `samples` directions each, drawn without gradients."""
-        about, roughness, sampler = normal.detach(), material.roughness.detach(), self.config.shading.sampler
-        drawn = draw_directions(sampler, self.light, about, wo, roughness, samples, self.lobe, self.training)
+        """Incident light along `samples` directions per point; no gradient flows through their choice."""
+        n, roughness, sampler = normal.detach(), material.roughness.detach(), self.config.shading.sampler
+        drawn = draw_directions(sampler, self.light, n, wo, roughness, samples, self.lobe, self.training)
         return arriving(self.sources, position, drawn)
 
     @doing("tracing")
     def _inter_reflection(self, position: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]) -> LossTerm:
+        """L_ref on random rays from surface points, at those that hit the scene."""
         traced = trace_light(
             self.host, position, normal, self.config.inter_reflection, self.config.shading.hit_share
         )
-        hit = torch.nonzero(traced.hit)[:, 0]
-        incident = self.light.radiance(traced.position[hit], traced.wi[hit][:, None])[:, 0]
+        rows = torch.nonzero(traced.hit)[:, 0]
+        incident = self.light.radiance(traced.position[rows], traced.wi[rows][:, None])[:, 0]
         return losses.inter_reflection(
-            incident, traced.radiance[hit], self.units.incident, self.config.light.monochrome
+            incident, traced.radiance[rows], self.units.incident, self.config.light.monochrome
         )
 
-    def _beyond(self, batch: PixelBatch, hits: SurfaceHits) -> PixelBatch:
-        """Pixels off the object, as far as masks tell, whose rays pass the scene by."""
+    def _background_pixels(self, batch: PixelBatch, hits: SurfaceHits) -> PixelBatch:
+        """Pixels that a mask does not assign to the object and whose rays miss the scene."""
         off_object = (batch.mask < 0.5) | (batch.mask_known == 0)
         return batch[torch.nonzero(off_object & (hits.opacity.detach() < CLEAR_OPACITY))[:, 0]]
 
@@ -271,36 +292,36 @@ class NeilfModel(nn.Module):
 
     @property
     def scene(self) -> SceneTracer | None:
-        """What the scene's own surfaces send, where inter-reflection is traced (hard); else none."""
+        """Traces light between surfaces of the scene; None unless inter-reflection is hard."""
         if self.config.inter_reflection.mode != "hard":
             return None
         return scene_tracer(self.host, self.config.inter_reflection, self.config.shading.hit_share)
 
     @property
     def sources(self) -> Sources:
-        """Everything that sends light to a surface point."""
+        """Everything that sends light to a surface point: light, lamps, and the scene itself."""
         return Sources(self.light, self.lamps, self.scene)
 
     def light_solver(self) -> LightSolver:
-        """A new solver for this model's light, for the training loop: see `lighting.solver`."""
+        """Make a new solver for this model's light; training loops call it (`lighting.solver`)."""
         light = LightModel(self.light, self.lamps)
         return make_light_solver(self.config.light, self.facts, self.units, light, self.lobe)
 
     def materials(self, x: Float[Tensor, "N 3"]) -> Material:
-        """Base colour, roughness and metallic at points of the scene frame."""
+        """Base color, roughness and metallic at points of the scene frame."""
         return self.brdf(x)
 
     def shading_normals(
         self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
-        """Unit normals that hits are shaded with; their gradient is that of the hits' normals."""
+        """Unit normals for shading: smoothed by the host if it can, with the gradient of `normal`."""
         if not isinstance(self.host, SmoothsNormals):
             return normal
         smooth = self.host.smooth_normals(position.detach(), normal.detach())
         return smooth + (normal - normal.detach())
 
     def incident_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
-        """Linear radiance that arrives at x from wi: from light and lamps, or from the scene before them."""
+        """Linear radiance that arrives at x from wi: from light and lamps, or from surfaces before them."""
         return incident_radiance(self.sources, x, wi)
 
     @doing("shading")
@@ -312,16 +333,18 @@ class NeilfModel(nn.Module):
         material: Material,
         samples: int,
     ) -> Shading:
-        """Outgoing radiance towards wo by the rendering equation, from `samples` directions a point."""
-        incident = self._arriving(position, normal, wo, material, samples)
+        """Outgoing radiance towards wo by the rendering equation, from `samples` directions per point."""
+        incident = self._incident(position, normal, wo, material, samples)
         return shade(material, normal, wo, incident, self.lobe)
 
     @torch.no_grad()
     def maps(self, rays: RayBatch, with_material: bool = True, hits: SurfaceHits | None = None) -> Maps:
-        """Everything that the rays show, for pictures and metrics. Bound the memory by the number of rays.
+        """Render all maps of rays, for images and metrics. Split large images: memory grows with the rays.
 
-        `with_material` off asks neither the BRDF nor the light: `rgb` is then the host's colour. `hits` are
-        what the host has rendered of the rays already; none: it is asked.
+        Args:
+            rays: scene frame.
+            with_material: False: neither BRDF nor light is evaluated, and `rgb` is the host's color.
+            hits: what the host rendered for these rays; if None, the host is rendered here.
         """
         hits = self.host.render(rays) if hits is None else hits.detach()
         maps = Maps.of_host(rays, hits)
@@ -333,8 +356,8 @@ class NeilfModel(nn.Module):
         material = self.brdf(position)
         shading = self.shade(position, normal, wo, material, self.config.shading.eval_samples)
 
-        def on_surface(other: Float[Tensor, "N C"], value: Float[Tensor, "P C"]) -> Float[Tensor, "N C"]:
-            return other.index_put((rows,), value.to(other.dtype))
+        def on_surface(whole: Float[Tensor, "N C"], value: Float[Tensor, "P C"]) -> Float[Tensor, "N C"]:
+            return whole.index_put((rows,), value.to(whole.dtype))
 
         return replace(
             maps,
@@ -350,21 +373,27 @@ class NeilfModel(nn.Module):
     # --------------------------------------------------------------------------------------------- parameters
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Parameters by field, the host's among them where it offers them and is not borrowed."""
-        offered = isinstance(self.host, HasParameterGroups) and not self.borrowed
-        host = self.host.parameter_groups() if offered else {}
+        """Parameters by field: the model's own and, unless borrowed, those that the host offers."""
+        trains_host = isinstance(self.host, HasParameterGroups) and not self.borrowed
+        host = self.host.parameter_groups() if trains_host else {}
         own = {"brdf": self.brdf, "light": self.light}
         if self.gains is not None:
             own["exposure"] = self.gains
         return {**host, **{name: list(field.parameters()) for name, field in own.items()}}
 
     def freeze_for(self, stage: Stage) -> None:
-        """Let exactly the fields move that the stage moves; the others get no gradient."""
+        """Set `requires_grad` of exactly the fields that a stage trains, and clear all gradients."""
         for name, parameters in self.parameter_groups().items():
             for parameter in parameters:
                 parameter.requires_grad_(name in self.stages[stage].moves)
                 parameter.grad = None
 
 
-def _lobe_of(shading: ShadingConfig) -> Lobe | None:
+def _stage_table(host: Host, borrowed: bool) -> StageTable:
+    if isinstance(host, HasStages):
+        return host.stages
+    return BORROWED_HOST if borrowed else STAGES
+
+
+def _specular_lobe(shading: ShadingConfig) -> Lobe | None:
     return LOBES[shading.lobe] if shading.specular else None

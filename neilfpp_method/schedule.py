@@ -1,15 +1,16 @@
-"""The three stages and the loss table (METHOD §4, Table 1 of the paper), as data.
+"""The three training stages and their losses as data (METHOD §4, Table 1 of the paper).
 
-    stage          L_ref L_vol L_Eik L_Hess L_surf L_pcd L_phys L_smth L_Lam | moves
+    stage          L_ref L_vol L_Eik L_Hess L_surf L_pcd L_phys L_smth L_Lam | trains
     SDF init         -     x     x     x      x     (x)    -      -      -   | G, R
     material init    x     -     -     -      -      -     x      x      x   | B, L
     joint            x     x     x     low    low    -     x      x      x   | G, R, B, L
 
-Where photographs have gains of their own, their prior goes with L_vol.
+"low" means a lower weight than in SDF init. If photographs have gains of their own, the prior on the gains is
+active whenever L_vol is.
 
-Two more tables are for hosts whose geometry is not ours to train: where it is given, R is a surface light
-field and moves with the material; where the host belongs to another trainer, that one sees to the first
-stage.
+Two more tables are for hosts whose geometry is not trained here. With given geometry (`FIXED_GEOMETRY`), R is
+a surface light field and is trained together with the material. For a host that belongs to another trainer
+(`BORROWED_HOST`), that trainer is responsible for the first stage.
 """
 
 from __future__ import annotations
@@ -55,18 +56,25 @@ GEOMETRY = LIGHT_FIELD | {"geometry", "beta"}
 MATERIAL = frozenset({"brdf", "light"})
 
 EXPOSURE_PRIOR = 0.1
-"""Weight of the squares of how far log gains come from their start: the same gain in all pixels of a view is
-otherwise nearly free, as what it sends into each direction is learned as well.
+"""Weight of the prior that keeps the log gains of photographs near their initial values. Without it they are
+nearly undetermined: R, which depends on the direction, can compensate a gain that all pixels of a view share.
 """
 
-# Losses of the material stages and the settings that weigh them, relative to L_phys at 1.
 MATERIAL_LOSSES = {name: name for name in ("inter_reflection", "smoothness", "lambertian")}
+"""Losses of the material stages, with the settings that hold their weights relative to L_phys, whose weight
+is 1.
+"""
 
 
 @dataclass(frozen=True)
 class StagePlan:
-    """One row of the table: for each loss that counts the setting that weighs it, and the fields that move;
-    for each loss whose weight grows in the course of the stage the setting that says by how much.
+    """One row of a stage table.
+
+    Attributes:
+        weights: for each loss of the stage, the name of the setting in `LossConfig` that holds its weight.
+        moves: parameter groups that the stage trains.
+        grows: for each loss whose weight changes during the stage, the setting with the factor by which it
+            has changed at the end of the stage.
     """
 
     weights: Mapping[str, str]
@@ -75,10 +83,12 @@ class StagePlan:
 
     @property
     def moves_host(self) -> bool:
+        """Whether any parameter of the host is trained."""
         return bool(self.moves & GEOMETRY)
 
     @property
     def moves_material(self) -> bool:
+        """Whether material and light are trained."""
         return bool(self.moves & MATERIAL)
 
 
@@ -111,16 +121,16 @@ STAGES: StageTable = {
     ),
 }
 
-TOGETHER = StagePlan({"volume": "volume", **MATERIAL_LOSSES}, LIGHT_FIELD | MATERIAL)
+RADIANCE_AND_MATERIAL = StagePlan({"volume": "volume", **MATERIAL_LOSSES}, LIGHT_FIELD | MATERIAL)
 
-# Geometry is given (a mesh). The first stage, where somebody wants it, is R alone.
+# For given geometry (a mesh). The optional first stage trains only R.
 FIXED_GEOMETRY: StageTable = {
     Stage.SDF_INIT: StagePlan({"volume": "volume"}, LIGHT_FIELD),
-    Stage.MATERIAL_INIT: TOGETHER,
-    Stage.JOINT: TOGETHER,
+    Stage.MATERIAL_INIT: RADIANCE_AND_MATERIAL,
+    Stage.JOINT: RADIANCE_AND_MATERIAL,
 }
 
-# Another trainer owns the host. Before there is a material nothing is computed: it costs nothing.
+# For a host that another trainer owns. The first stage has no loss, so nothing is computed in it.
 BORROWED_HOST: StageTable = {
     Stage.SDF_INIT: StagePlan({}, frozenset()),
     Stage.MATERIAL_INIT: STAGES[Stage.MATERIAL_INIT],
@@ -129,7 +139,7 @@ BORROWED_HOST: StageTable = {
 
 
 def stage_steps(config: TrainConfig) -> Mapping[Stage, int]:
-    """Steps of each stage, in order."""
+    """Number of steps of each stage, in order."""
     return {
         Stage.SDF_INIT: config.sdf_steps,
         Stage.MATERIAL_INIT: config.material_steps,
@@ -138,18 +148,18 @@ def stage_steps(config: TrainConfig) -> Mapping[Stage, int]:
 
 
 def total_steps(config: TrainConfig) -> int:
-    """Of all stages together."""
+    """Number of steps of all stages together."""
     return sum(stage_steps(config).values())
 
 
 def has_material(steps: int, config: TrainConfig) -> bool:
-    """Whether the first `steps` steps moved material and light, which keep their start before that."""
+    """Whether material and light have been trained after `steps` steps."""
     return steps > config.sdf_steps
 
 
 @dataclass(frozen=True)
 class StagePosition:
-    """Where a global step lies: its stage, its number within the stage, and the stage's length."""
+    """Position of a global step: its stage, its index within the stage, and the stage's number of steps."""
 
     stage: Stage
     step: int
@@ -157,12 +167,12 @@ class StagePosition:
 
     @property
     def share(self) -> float:
-        """Of the stage, what is over."""
+        """Share of the stage that is completed, in [0, 1]."""
         return self.step / self.length
 
 
 def stage_at(step: int, config: TrainConfig) -> StagePosition:
-    """The stage of a global step (from 0); one past the end of the last stage when training is over."""
+    """Position of a global step, counted from 0. After training it is the end of the last stage."""
     start = 0
     lengths = [(stage, n) for stage, n in stage_steps(config).items() if n > 0]
     for stage, length in lengths:
@@ -174,32 +184,44 @@ def stage_at(step: int, config: TrainConfig) -> StagePosition:
 
 
 WARM_UP_START = 0.1
-"""Rate at the first step of a warm-up over the rate that it rises to (published code)."""
+"""Ratio of the learning rate at the first step of a warm-up to the rate after it (published code)."""
 
 
 def rate_factor(config: OptimizerConfig, position: StagePosition) -> float:
-    """The factor on a learning rate at a step of a stage: the stage's own, its decay and its warm-up.
+    """Factor on the learning rates at a step: warm-up times decay times the factor of the joint stage.
+
+    The decay is exponential, from 1 to `config.final` at the end of the stage: continuous if `config.drops`
+    is 0 for the stage, else in that many equal drops.
 
     Example:
         >>> halfway = StagePosition(Stage.SDF_INIT, step=50, length=100)
         >>> rate_factor(OptimizerConfig(final=(0.01, 1.0, 1.0)), halfway)
         0.1
-        >>> rate_factor(OptimizerConfig(final=(0.01, 1.0, 1.0), drops=(1, 0, 0)), halfway)  # at once
+        >>> rate_factor(OptimizerConfig(final=(0.01, 1.0, 1.0), drops=(1, 0, 0)), halfway)
         0.01
     """
-    stage = list(Stage).index(position.stage)
-    final, drops = config.final[stage], config.drops[stage]
-    fallen = min(position.step * (drops + 1) // position.length, drops) / drops if drops else position.share
-    start = WARM_UP_START ** max(0.0, 1.0 - position.step / config.warm_up) if config.warm_up else 1.0
-    return (config.joint if position.stage is Stage.JOINT else 1.0) * start * final**fallen
+    index = list(Stage).index(position.stage)
+    final, drops = config.final[index], config.drops[index]
+    if drops:
+        decayed = min(position.step * (drops + 1) // position.length, drops) / drops
+    else:
+        decayed = position.share
+    warm_up = WARM_UP_START ** max(0.0, 1.0 - position.step / config.warm_up) if config.warm_up else 1.0
+    return (config.joint if position.stage is Stage.JOINT else 1.0) * warm_up * final**decayed
 
 
 def active_losses(
     stage: Stage, config: NeilfConfig, stages: StageTable = STAGES, share: float = 0.0
 ) -> Mapping[str, float]:
-    """The losses that count in a stage, with their weights when `share` of it is over.
+    """The active losses of a stage with their weights.
 
-    One of weight 0, or whose effect is switched off, is absent: nothing computes it.
+    A loss with weight 0, or of an effect that is switched off, is absent and is never computed.
+
+    Args:
+        stage: the stage of training.
+        config: the settings.
+        stages: the stage table of the host.
+        share: share of the stage that is completed, in [0, 1].
     """
     plan = stages[stage]
     weights = {loss: getattr(config.loss, setting) for loss, setting in plan.weights.items()}
@@ -213,27 +235,28 @@ def active_losses(
     if config.inter_reflection.mode != "soft":
         weights.pop("inter_reflection", None)
     if not config.shading.specular:
-        # A Lambertian surface has neither roughness nor metallic, and sends what it gets times its colour.
+        # A Lambertian surface has neither roughness nor metallic, on which these losses act.
         for loss in ("smoothness", "lambertian"):
             weights.pop(loss, None)
     if not (config.brdf.varying_roughness or config.brdf.metals):
-        weights.pop("smoothness", None)  # There is nothing whose slope it could lower.
+        # Neither roughness nor metallic varies in space: their gradients are 0.
+        weights.pop("smoothness", None)
     return {loss: weight for loss, weight in weights.items() if weight > 0}
 
 
 @dataclass(frozen=True)
 class Total:
-    """The weighted sum that is minimised, and each reduced term before its weight, for the log."""
+    """The weighted sum that is minimised, and each term reduced but unweighted, for the log."""
 
     loss: Float[Tensor, ""]
     terms: Mapping[str, Float[Tensor, ""]]
 
 
 def weigh(terms: LossTerms, weights: Mapping[str, float]) -> Total:
-    """Reduce the terms and add them up.
+    """Reduce each term to its mean and sum them with their weights.
 
     Raises:
-        KeyError: a term has no weight: somebody computed a loss that does not count in this stage.
+        KeyError: a term has no weight: it is not active in this stage and must not be computed.
     """
     reduced = {name: term.mean() for name, term in terms.items()}
     total = sum(weights[name] * value for name, value in reduced.items())

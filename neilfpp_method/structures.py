@@ -1,8 +1,8 @@
-"""What travels between the rooms of the package.
+"""Data structures that the modules of the package exchange.
 
-N rays or surface points, S incident directions per point. Positions are in the scene frame (the object lies
-in the unit sphere, see docs/conventions.md); directions are unit vectors in that frame; radiance is linear
-RGB.
+N is the number of rays or surface points, S the number of incident directions per point. Positions are in the
+scene frame (the object lies in the unit sphere, see docs/conventions.md), directions are unit vectors in that
+frame, and radiance is linear RGB.
 """
 
 from __future__ import annotations
@@ -39,13 +39,19 @@ __all__ = [
 ]
 
 PDF_FLOOR = 1e-6
-"""Smallest density divided by, per steradian; it acts on under 2π · 1e-6 of a sampler's directions."""
+"""Lower bound on a pdf before dividing by it, per steradian. Directions whose density is below it make up
+less than 2π · 1e-6 of what a sampler draws, so the estimate is not changed noticeably.
+"""
 
 Structure = TypeVar("Structure", bound="Indexable")
 
 
 class Indexable:
-    """Tensors that share their first axis: row selection and moves between devices in one call."""
+    """Base of dataclasses whose tensors share their first axis.
+
+    `structure[rows]`, `structure.to(device)` and `structure.detach()` apply to every tensor; `len(structure)`
+    is the number of rows.
+    """
 
     def _map(self: Structure, function) -> Structure:
         tensors = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -66,7 +72,7 @@ class Indexable:
 
 @dataclass(frozen=True)
 class RayBatch(Indexable):
-    """Rays in the scene frame; `directions` are unit vectors, so a distance along the ray is a length."""
+    """Rays in the scene frame. `directions` are unit vectors: ray parameters are distances in scene units."""
 
     origins: Float[Tensor, "N 3"]
     directions: Float[Tensor, "N 3"]
@@ -74,13 +80,18 @@ class RayBatch(Indexable):
 
 @dataclass(frozen=True)
 class PixelBatch(Indexable):
-    """Rays with what the images say about them.
+    """Pixels of the training images with their camera rays.
 
-    `color` is linear radiance for an HDR capture, on the scale that its views share, and display values
-    (sRGB) for an LDR one. `mask` is 1 on the object and 0 off it, as far as `mask_known` is 1: everywhere in
-    a capture with masks, only where the image shows exactly its background in one without (there the other
-    pixels have mask 1). `image_gradient` is the length of the gradient of the image's luminance at the pixel,
-    by Scharr's filter: 32 times the change per pixel; 0 where no loss needs it.
+    Attributes:
+        origins, directions: the camera ray of each pixel, scene frame.
+        color: pixel values: linear radiance for an HDR capture, on one scale for all views; display values
+            (sRGB) for an LDR capture.
+        mask: 1 on the object, 0 off it. Meaningful only where `mask_known` is 1.
+        mask_known: 1 everywhere if the capture has masks. Without masks it is 1 only at pixels that show
+            exactly the background color; all other pixels have `mask` 1.
+        image_gradient: length of the gradient of the image's luminance by Scharr's filter without
+            normalisation, that is 32 times the change per pixel; 0 if no loss needs it.
+        view: index of the training view.
     """
 
     origins: Float[Tensor, "N 3"]
@@ -98,7 +109,7 @@ class PixelBatch(Indexable):
 
 @dataclass(frozen=True)
 class OrientedPoints(Indexable):
-    """Points on the surface with their unit normals, away from it, in the scene frame."""
+    """Surface points and their outward unit normals, in the scene frame."""
 
     position: Float[Tensor, "P 3"]
     normal: Float[Tensor, "P 3"]
@@ -106,13 +117,15 @@ class OrientedPoints(Indexable):
 
 @dataclass(frozen=True)
 class SurfaceHits(Indexable):
-    """Where rays meet the surface, and what they see there.
+    """What a host renders for each ray.
 
-    `color` is the linear radiance that the host renders for the whole ray, background included; `position`
-    and `normal` are blended along the ray and `normal` is unit, away from the surface; `opacity` is the share
-    of the ray that the surface stops; `concentration` is the share of the blending weight that lies close to
-    `position` (1 for a host with a sharp surface), which tells a hit from a miss and from an average over two
-    surfaces. The normal of a miss is zero.
+    Attributes:
+        color: linear radiance of the whole ray, background included.
+        position: hit position, blended along the ray with the rendering weights.
+        normal: outward unit normal, blended in the same way; zero for a miss.
+        opacity: sum of the rendering weights, in [0, 1].
+        concentration: share of the rendering weight that lies close to `position`; 1 for a hit of a sharp
+            surface. A low value means a miss or an average over two surfaces.
     """
 
     color: Float[Tensor, "N 3"]
@@ -122,13 +135,13 @@ class SurfaceHits(Indexable):
     concentration: Float[Tensor, " N"]
 
     def is_hit(self, share: float) -> Bool[Tensor, " N"]:
-        """Which rays meet one surface: at least `share` of their weight lies close to the hit."""
+        """Which rays hit a single surface: at least `share` of their weight lies close to `position`."""
         return self.concentration >= share
 
 
 @dataclass(frozen=True)
 class Material(Indexable):
-    """Simplified Disney parameters at a point, each in [0, 1]; `roughness` r has microfacet width r²."""
+    """Parameters of the simplified Disney BRDF, each in [0, 1]. Roughness r means microfacet width α = r²."""
 
     base_color: Float[Tensor, "N 3"]
     roughness: Float[Tensor, "N 1"]
@@ -137,11 +150,11 @@ class Material(Indexable):
 
 @dataclass(frozen=True)
 class IncidentSamples(Indexable):
-    """Directions towards the light with the density that drew them.
+    """Sampled incident directions and their density.
 
-    `wi` points away from the surface. `pdf` is per steradian and is that of the whole set, so that the mean
-    over S of f(wi)/pdf(wi) estimates the integral of f over the hemisphere, whatever the sampler. A direction
-    below the horizon is allowed; the shading gives it no weight. Directions that all points share have N = 1.
+    `wi` points away from the surface. `pdf`, per steradian, is the density of the whole sample set, so for
+    every sampler the mean over S of f(wi)/pdf(wi) estimates the integral of f over the hemisphere. Directions
+    below the horizon are allowed: shading gives them weight 0. N is 1 if all points share their directions.
     """
 
     wi: Float[Tensor, "N S 3"]
@@ -149,7 +162,7 @@ class IncidentSamples(Indexable):
 
 
 class Source(IntEnum):
-    """Where incident light comes from, as `Incident.source` numbers it; lamp k is `LAMPS` + k."""
+    """Values of `Incident.source`: where incident light comes from. Lamp k has the value `LAMPS` + k."""
 
     LIGHT = 0
     SCENE = 1
@@ -158,11 +171,14 @@ class Source(IntEnum):
 
 @dataclass(frozen=True)
 class Incident(Indexable):
-    """Light that arrives at N points along S directions.
+    """Light that arrives at N surface points along S directions.
 
-    `radiance` is linear; `weight` is the solid angle that a direction stands for, steradians, so that the sum
-    over S of weight · radiance · f · cos is the estimate of the rendering equation; `source` is a `Source`,
-    or more for a lamp.
+    Attributes:
+        wi: incident directions, away from the surface.
+        radiance: linear incident radiance.
+        weight: solid angle that each direction stands for, steradians. The sum over S of
+            weight · radiance · f · cos θ estimates the rendering equation.
+        source: a `Source`; lamp k has `Source.LAMPS` + k.
     """
 
     wi: Float[Tensor, "N S 3"]
@@ -174,14 +190,20 @@ class Incident(Indexable):
     def of(
         drawn: IncidentSamples, radiance: Float[Tensor, "#N S 3"], source: Int[Tensor, "N S"] | None = None
     ) -> Incident:
-        """What arrives along drawn directions, 1/(S · pdf) each. No `source`: all from the light."""
+        """Incident light along sampled directions, each with weight 1/(S · pdf).
+
+        Args:
+            drawn: the sampled directions with their pdf.
+            radiance: linear incident radiance.
+            source: origin of each sample; None: `Source.LIGHT` for all.
+        """
         weight = 1 / (drawn.pdf.clamp_min(PDF_FLOOR) * drawn.pdf.shape[1])
         if source is None:
             source = torch.zeros((), dtype=torch.long, device=weight.device).expand(weight.shape)
         return Incident(drawn.wi, radiance, weight, source)
 
     def beside(self, other: Incident) -> Incident:
-        """The directions of both."""
+        """Concatenate the directions of both, for the same N points."""
         return Incident(
             *(torch.cat((getattr(self, f.name), getattr(other, f.name)), 1) for f in fields(self))
         )
@@ -189,7 +211,7 @@ class Incident(Indexable):
 
 @dataclass(frozen=True)
 class Shading(Indexable):
-    """Outgoing radiance of a point to the viewer and its parts: `color` = `diffuse` + `specular`."""
+    """Outgoing radiance towards the viewer, `color` = `diffuse` + `specular`, linear RGB."""
 
     color: Float[Tensor, "N 3"]
     diffuse: Float[Tensor, "N 3"]
@@ -198,9 +220,12 @@ class Shading(Indexable):
 
 @dataclass(frozen=True)
 class SceneLight(Indexable):
-    """What the scene itself sends to N points from S directions: where a direction meets the scene, how far
-    away, and the linear radiance that arrives from there. Where it meets nothing the distance is infinite and
-    the radiance zero.
+    """Light that the scene's own surfaces send to N points along S directions.
+
+    Attributes:
+        hit: whether the ray from the point along the direction meets a surface.
+        radiance: linear radiance that arrives from there; 0 without a hit.
+        distance: distance to the surface, scene units; infinite without a hit.
     """
 
     hit: Bool[Tensor, "N S"]
@@ -209,20 +234,21 @@ class SceneLight(Indexable):
 
 
 SceneTracer = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N S 3"]], SceneLight]
-"""What the scene sends to points from directions."""
+"""Traces rays from surface points x along directions wi and returns the light from the scene's surfaces."""
 
 
 class LossTerm(NamedTuple):
     """A loss before reduction: `values` of any shape, and optional `weights` that broadcast to it.
 
-    A named tuple: wrappers of data-parallel training find tensors there, not in frozen dataclasses.
+    This is a named tuple because the wrappers of data-parallel training look for tensors in tuples, but not
+    in frozen dataclasses.
     """
 
     values: Float[Tensor, ...]
     weights: Float[Tensor, ...] | Bool[Tensor, ...] | None = None
 
     def mean(self) -> Float[Tensor, ""]:
-        """The weighted mean; 0, with a zero gradient, when nothing counts."""
+        """The weighted mean; 0 with a zero gradient if there are no values or all weights are 0."""
         if self.weights is None:
             return self.values.mean() if self.values.numel() else self.values.sum()
         weights = self.weights.to(self.values.dtype).expand_as(self.values)
@@ -230,11 +256,15 @@ class LossTerm(NamedTuple):
 
 
 LossTerms = Mapping[str, LossTerm]
+"""Loss terms by name."""
 
 
 @dataclass(frozen=True)
 class Observed(Indexable):
-    """Surface points and their pixels: `pixel` in the capture's response, `wo` towards the camera."""
+    """Surface points with the pixels that show them.
+
+    `wo` points towards the camera; `pixel` is the pixel value in the capture's response (linear or sRGB).
+    """
 
     position: Float[Tensor, "N 3"]
     normal: Float[Tensor, "N 3"]
@@ -244,27 +274,28 @@ class Observed(Indexable):
 
 @dataclass(frozen=True)
 class SurfacePixels(Observed):
-    """Surface points, what an image holds of each, and how fast that changes from pixel to pixel."""
+    """Observed surface points with the image gradient of `PixelBatch` at their pixels."""
 
     image_gradient: Float[Tensor, " N"]
 
     @staticmethod
-    def none_of(batch: PixelBatch) -> SurfacePixels:
-        """No points, on the device of a batch."""
-        nothing = batch.color[:0]
-        return SurfacePixels(nothing, nothing, nothing, nothing, batch.image_gradient[:0])
+    def empty_like(batch: PixelBatch) -> SurfacePixels:
+        """Zero surface points, with the device and dtype of a batch."""
+        no_rows = batch.color[:0]
+        return SurfacePixels(no_rows, no_rows, no_rows, no_rows, batch.image_gradient[:0])
 
 
 class StepResult(NamedTuple):
-    """What a training step computed: its losses, and constants for those who solve for the light.
+    """What a training step computed: its losses, and constants from which the light is solved.
 
-    Wrappers of data-parallel training skip frozen dataclasses, so points travel as rows of tensors.
+    Points are stored as rows of tensors because the wrappers of data-parallel training skip frozen
+    dataclasses.
 
     Attributes:
-        terms: the losses that count in the stage, before their weights.
-        surface_rows: position, normal, wo and pixel of the surface points that the step rendered; none before
-            the material stages.
-        beyond_rows: direction and pixel of the rays that pass the scene by; none before the material stages.
+        terms: the active losses of the stage, before their weights.
+        surface_rows: position, normal, wo and pixel of the surface points that this step rendered; no rows
+            in a stage without material.
+        beyond_rows: direction and pixel of the rays that miss the scene; no rows in a stage without material.
     """
 
     terms: LossTerms
@@ -273,22 +304,23 @@ class StepResult(NamedTuple):
 
     @staticmethod
     def of(terms: LossTerms, surface: Observed, beyond: PixelBatch) -> StepResult:
-        """The result of a step that rendered these surface points, and these pixels beyond the scene."""
+        """Pack loss terms, rendered surface points, and pixels whose rays miss the scene."""
         points = (surface.position, surface.normal, surface.wo, surface.pixel)
         pixels = (beyond.directions, beyond.color)
         return StepResult(terms, torch.cat(points, -1).detach(), torch.cat(pixels, -1))
 
     @property
     def surface(self) -> Observed:
-        """The surface points that the step rendered, as they are shaded."""
+        """The surface points that this step rendered, with their shading normals."""
         return Observed(*self.surface_rows.split(3, -1))
 
 
 @dataclass(frozen=True)
 class Maps:
-    """Everything that rays show, one row a ray; colours are linear.
+    """All maps of an image, one row per ray; colors are linear.
 
-    Where a ray meets no surface, `rgb` is the host's colour and the material is 0.
+    `rgb` is shaded by the rendering equation and `rgb_volume` is the host's color. For a ray without a
+    surface, `rgb` equals `rgb_volume` and the material is 0.
     """
 
     rgb: Float[Tensor, "N 3"]
@@ -304,7 +336,7 @@ class Maps:
 
     @staticmethod
     def of_host(rays: RayBatch, hits: SurfaceHits) -> Maps:
-        """What the host alone says: no material anywhere."""
+        """Maps from the host's output only: `rgb` is its color, and there is no material."""
         color, parameter = torch.zeros_like(hits.color), torch.zeros_like(hits.color[:, :1])
         depth = ((hits.position - rays.origins) * rays.directions).sum(-1, keepdim=True)
         return Maps(

@@ -170,7 +170,7 @@ def test_a_host_of_images_learns_a_material_from_what_is_handed_in():
     torch.manual_seed(0)
     view, host = camera(), Splats()
     neilf = attach_neilf(host, hard_config(), median_radiance=0.3)
-    with pytest.raises(UserError, match="Splats draws whole images, not rays; hand in what it has drawn"):
+    with pytest.raises(UserError, match="Splats draws whole images, not rays; pass its hits"):
         neilf.losses(pixels(camera_rays(view)), 0)
     rays, hits = camera_rays(view), host.render_image(view)
     batch = pixel_batch(rays.origins, rays.directions, hits.color)
@@ -257,7 +257,8 @@ def test_a_borrowed_host_starts_with_its_material_or_says_when(caplog):
     first, second = (record.message for record in caplog.records)
     assert now.model.config.train.sdf_steps == 0
     assert (
-        "Ball: material from step 0; the host moves with it from step 1500; a proxy of its surface" in first
+        "Ball: the material is trained from step 0; the host gets gradients from step 1500; "
+        "a proxy of its surface" in first
     )
     assert "nothing is computed before step 4 (train.sdf_steps)" in second
     assert now.model.config.light.kind == "auto"  # the light of the preset, on any host
@@ -281,7 +282,7 @@ def test_facts_that_cannot_be_right_are_named(arguments, message):
 def test_a_stage_is_one_of_three():
     neilf = attach_neilf(Ball(), tiny_config())
     with pytest.raises(
-        UserError, match="'late' is no stage; give the number of the step, or one of sdf_init, material_init"
+        UserError, match="unknown stage 'late'; give the index of the step, or one of sdf_init, material_init"
     ):
         neilf.losses(pixels(ball_rays(4)), "late")
     with pytest.raises(UserError, match="step -1; count steps from 0"):

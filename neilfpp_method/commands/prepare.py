@@ -1,4 +1,4 @@
-"""`neilfpp prepare`; its options lie with what they decide."""
+"""`neilfpp prepare`; its options are defined in `prepare.options`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COMMAND = Command(
     run,
     [
         "neilfpp prepare photos/teapot --out captures/teapot",
-        "neilfpp prepare photos/teapot --out captures/teapot --dense --also nerfstudio neilf",
+        "neilfpp prepare photos/teapot --out captures/teapot --also nerfstudio neilf",
         "neilfpp prepare scans/colmap-project --out captures/teapot   (keeps the poses)",
     ],
 )

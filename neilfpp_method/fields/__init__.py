@@ -1,1 +1,1 @@
-"""The four fields of the method and the background, with their encodings and networks (METHOD §5)."""
+"""The four fields G, R, B and L and the background, with their encodings and networks (METHOD §5)."""

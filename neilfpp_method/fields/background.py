@@ -1,4 +1,4 @@
-"""What lies beyond the scene sphere: an inverted-sphere radiance field (NeRF++, Zhang et al. 2020, §4)."""
+"""Radiance beyond the scene sphere: an inverted-sphere radiance field (NeRF++, Zhang et al. 2020, §4)."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from neilfpp_method.volume.compositing import composite, render_weights
 
 __all__ = ["InvertedSphere", "field_beyond"]
 
-POSITION_OCTAVES = 10
-DIRECTION_OCTAVES = 4
+POSITION_OCTAVES, DIRECTION_OCTAVES = 10, 4
+"""Octaves of the frequency encodings of positions and directions (NeRF++)."""
 MIN_START = 1e-2
-"""Share of the largest radiance that the field starts away from both ends of its sigmoid, at least."""
+"""Smallest distance of the initial radiance from both ends of the sigmoid's range, relative to the range."""
 START_SCALE = 1e-3
-"""Of the weights that make it vary at the start."""
+"""Factor on the initial weights of the last layer, so that the field starts as an almost constant color."""
 
 
 def field_beyond(
     kind: str, config: BackgroundConfig, radius: float, scale: float, start: Float[Tensor, " 3"]
 ) -> InvertedSphere | None:
-    """What lies beyond the scene sphere, where `kind` says that it is an inverted sphere; see there."""
+    """Make an `InvertedSphere` if `kind` is "inverted_sphere"; otherwise return None."""
     return InvertedSphere(config, radius, scale, start) if kind == "inverted_sphere" else None
 
 
 class InvertedSphere(nn.Module):
-    """A point at distance r > radius from the origin is (x/r, 1/r): unbounded space in a bounded chart.
+    """Radiance field outside of the scene sphere in the coordinates (x/r, 1/r), r the distance to the origin.
 
-    Density is per unit of 1/r, and samples are the midpoints of equal steps of 1/r from the sphere to
-    infinity. What passes them all has the colour of the last.
+    Density is per unit of 1/r. Samples are the midpoints of equal steps of 1/r from the sphere to infinity.
+    Light that passes all samples has the color of the last one.
 
     Args:
         config: the settings.
-        radius: of the scene sphere.
-        scale: the largest radiance that it can reach.
-        start: linear RGB that it starts as, all around; none: half of the largest.
+        radius: radius of the scene sphere.
+        scale: largest radiance.
+        start: initial linear RGB, the same in all directions. None: half of the largest radiance.
     """
 
     def __init__(
@@ -67,17 +67,18 @@ class InvertedSphere(nn.Module):
     def forward(
         self, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
-        """Radiance in [0, scale] that reaches the sphere along each ray from outside.
+        """Radiance in [0, scale] that enters the sphere along each ray from outside.
 
         Args:
-            origins: inside the sphere.
-            directions: unit vectors, from the origin out.
+            origins: ray origins inside the sphere.
+            directions: unit ray directions.
         """
         inverse = self._inverse_radii(origins)
         points = _on_sphere(origins, directions, 1 / inverse)
         chart = torch.cat((points, inverse[None, :, None].expand(len(points), -1, 1)), -1)
         trunk = self.trunk(self.position(chart))
-        # In units of 1/radius, the chart's length: a fresh field stops half the light, so all samples count.
+        # Scaled by the radius, as 1/r spans [0, 1/radius]: initially half of the light passes all samples, so
+        # that all of them get a gradient.
         density = self.radius * functional.softplus(trunk[..., 0])
         towards_viewer = self.direction(-directions)[:, None].expand(-1, self.samples, -1)
         color = self.scale * torch.sigmoid(self.head(torch.cat((trunk[..., 1:], towards_viewer), -1)))
@@ -93,10 +94,8 @@ class InvertedSphere(nn.Module):
 def _on_sphere(
     origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"], radii: Float[Tensor, " M"]
 ) -> Float[Tensor, "N M 3"]:
-    """Where rays from within cross spheres around the origin, as unit vectors."""
+    """Where rays from inside cross spheres around the origin, as unit vectors."""
     along = (origins * directions).sum(-1, keepdim=True)
-    missed = (
-        origins.square().sum(-1, keepdim=True) - along.square()
-    )  # squared distance of the line from the origin
-    distance = (radii.square() - missed).clamp_min(0).sqrt() - along
+    line_distance_squared = origins.square().sum(-1, keepdim=True) - along.square()
+    distance = (radii.square() - line_distance_squared).clamp_min(0).sqrt() - along
     return (origins[:, None] + distance[..., None] * directions[:, None]) / radii[:, None]

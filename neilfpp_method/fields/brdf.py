@@ -1,4 +1,4 @@
-"""B: position → base colour, roughness, metallic (METHOD §5)."""
+"""The BRDF field B: position → base color, roughness, metallic (METHOD §5)."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from neilfpp_method.structures import Material
 __all__ = ["BrdfField", "BrdfSample"]
 
 START_RANGE = (0.05, 0.95)
-"""Where every parameter starts: at 0 and at 1 it would have no slope."""
+"""Range of initial parameters in `start_at`: at 0 and 1 the tanh has no gradient."""
 
 
 @dataclass(frozen=True)
 class BrdfSample:
-    """The material at N points and how two of its parameters change in space, per scene unit."""
+    """The material at N points, and the spatial gradients of roughness and metallic, per scene unit."""
 
     material: Material
     roughness_gradient: Float[Tensor, "N 3"]
@@ -30,17 +30,23 @@ class BrdfSample:
 
 
 class BrdfField(nn.Module):
-    """Every parameter is ½ + ½ tanh of a network output; roughness starts near ½, the others as set.
+    """Network of position whose outputs y give the material parameters as ½ + ½ tanh(y).
 
-    `metals` off: metallic is 0 everywhere, with no gradient. `varying_roughness` off: roughness is the same
-    everywhere, and is learned as the bias of its output; switched on again, it goes on from there.
+    Roughness starts near ½; base color and metallic start as the settings say. Without `metals`, metallic is
+    0 everywhere and has no gradient. Without `varying_roughness`, roughness is the same everywhere and is
+    learned as the bias of its output; it keeps this value if it is later allowed to vary.
+
+    Args:
+        config: the settings of B.
+        encoding: encoding of positions.
+        radius: radius of the scene sphere, scene units.
     """
 
     def __init__(self, config: BrdfConfig, encoding: FrequencyConfig | HashGridConfig, radius: float) -> None:
         super().__init__()
         self.use(config)
         self.encoding = position_encoding(encoding, radius)
-        # Sines reach the detail that six octaves do not; a grid has it already (NeILF++ §5).
+        # Sine layers add the detail that a frequency encoding of six octaves lacks (NeILF++ §5).
         activation = "sine" if isinstance(encoding, FrequencyConfig) else "relu"
         skip = middle_skip(config.layers)
         self.mlp = Mlp(
@@ -52,14 +58,15 @@ class BrdfField(nn.Module):
             self.mlp.layers[-1].bias[4] = math.atanh(2 * config.initial_metallic - 1)
 
     def use(self, config: BrdfConfig) -> None:
-        """Whether there are metals, and whether roughness varies, from now on."""
+        """Switch metals and varying roughness on or off."""
         self.metals, self.varying_roughness = config.metals, config.varying_roughness
 
     def forward(self, x: Float[Tensor, "N 3"]) -> Material:
+        """The material at points of the scene frame."""
         return self._material(torch.tanh(self.mlp(self.encoding(x))))
 
     def with_gradients(self, x: Float[Tensor, "N 3"]) -> BrdfSample:
-        """The material and the gradients of roughness and metallic; losses on them need first order only."""
+        """The material with gradients of roughness and metallic; losses on them need first-order autograd."""
         encoded = self.encoding.with_jacobian(x)
         sample = self.mlp.with_gradient(encoded.features, slice(3, 5))
         saturation = torch.tanh(sample.value)
@@ -73,7 +80,7 @@ class BrdfField(nn.Module):
 
     @torch.no_grad()
     def start_at(self, material: Material) -> None:
-        """Be of one material everywhere, up to what the untrained network adds; N is 1."""
+        """Set the output biases so that an untrained field has this material (N = 1) everywhere."""
         values = torch.cat((material.base_color, material.roughness, material.metallic), -1)[0]
         self.mlp.layers[-1].bias.copy_(torch.atanh(2 * values.clamp(*START_RANGE) - 1))
 

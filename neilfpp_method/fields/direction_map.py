@@ -1,4 +1,4 @@
-"""Maps over the sphere of directions, in latitude and longitude about +z.
+"""Latitude-longitude maps over the sphere of directions, with +z as the pole.
 
 Row j is at the angle θ = π j/(h − 1) from +z, column i at the azimuth φ = 2π (i + ½)/w, and the direction
 there is (sin φ sin θ, cos φ sin θ, cos θ): the layout of environment maps (docs/conventions.md).
@@ -17,10 +17,10 @@ __all__ = ["interpolate", "map_directions", "texels_of"]
 
 
 def interpolate(values: Float[Tensor, "C H W"], wi: Float[Tensor, "M S 3"]) -> Float[Tensor, "M S C"]:
-    """The map at unit directions, bilinear between its texels and closed in azimuth."""
+    """Interpolate a map bilinearly at unit directions; it is periodic in azimuth."""
     _, height, width = values.shape
     column, row = _columns_and_rows(wi, height, width)
-    # One column more on each side closes the map; the azimuth of a column is at its middle.
+    # One more column on each side makes the map periodic. The azimuth of a column is that of its middle.
     closed = torch.cat((values[..., -1:], values, values[..., :1]), -1)
     at = torch.stack((2 * (column + 1) / (width + 1) - 1, 2 * row / (height - 1) - 1), -1)
     return functional.grid_sample(closed[None], at[None].to(closed.dtype), align_corners=True)[0].permute(
@@ -29,7 +29,7 @@ def interpolate(values: Float[Tensor, "C H W"], wi: Float[Tensor, "M S 3"]) -> F
 
 
 def texels_of(wi: Float[Tensor, "*B 3"], height: int, width: int) -> Int[Tensor, "*B"]:
-    """The number of the texel that a unit direction lies in, row by row."""
+    """Row-major index of the texel that contains a unit direction."""
     column, row = _columns_and_rows(wi, height, width)
     return (row + 0.5).long().clamp(0, height - 1) * width + (column + 0.5).floor().long() % width
 
@@ -45,7 +45,7 @@ def map_directions(height: int, width: int) -> Float[Tensor, "height width 3"]:
 def _columns_and_rows(
     wi: Float[Tensor, "*B 3"], height: int, width: int
 ) -> tuple[Float[Tensor, "*B"], Float[Tensor, "*B"]]:
-    """Where a direction lies in a map, in texels: column in [−½, w − ½), row in [0, h − 1]."""
+    """Continuous position of a direction in a map, in texels: column in [−½, w − ½), row in [0, h − 1]."""
     x, y, z = wi.unbind(-1)
     turn = torch.atan2(x, y) / (2 * math.pi)
     return (turn - turn.floor()) * width - 0.5, torch.acos(z.clamp(-1, 1)) / math.pi * (height - 1)

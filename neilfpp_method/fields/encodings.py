@@ -1,7 +1,8 @@
 """Encodings of positions and directions.
 
-A position encoding has a `width`, a `forward`, a `with_jacobian` and a `step`: the length over which a finite
-difference resolves its finest detail. The position itself leads every position encoding.
+A position encoding has `forward`, `with_jacobian`, a `width` (number of features) and a `step`: the step size
+of finite differences that resolves its finest detail, in scene units. The first three features are always the
+position itself.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ __all__ = [
 ]
 
 POSITION_OCTAVES = 6
-"""Of the frequency encoding of positions (NeILF++ §5); the finest wave is 1/32 of the coarsest."""
+"""Octaves of the frequency encoding of positions (NeILF++ §5); the shortest wave is 1/32 of the longest."""
 
 
 def pull_back(gradient: Float[Tensor, "N K F"], encoded: Encoded) -> Float[Tensor, "N K 3"]:
-    """The chain rule: from the gradient of K outputs with respect to the encoding to that of x."""
+    """Chain rule: turn the gradient of K outputs with respect to an encoding into that with respect to x."""
     return torch.einsum("nkf,nfj->nkj", gradient, encoded.jacobian)
 
 
@@ -40,7 +41,7 @@ def pull_back(gradient: Float[Tensor, "N K F"], encoded: Encoded) -> Float[Tenso
 
 
 class Raw(nn.Module):
-    """The position as it is."""
+    """The position without an encoding."""
 
     width = 3
     step = 1e-3
@@ -58,7 +59,8 @@ class FrequencyEncoding(nn.Module):
     def __init__(self, octaves: int, dimensions: int = 3) -> None:
         super().__init__()
         self.width = dimensions * (1 + 2 * octaves)
-        self.step = 0.02 / 2 ** max(octaves - 1, 0)  # the finest wave turns by 0.02 rad
+        # The phase of the shortest wave changes by 0.02 rad per step.
+        self.step = 0.02 / 2 ** max(octaves - 1, 0)
         self.register_buffer("frequencies", 2.0 ** torch.arange(octaves), persistent=False)
 
     def forward(self, x: Float[Tensor, "... D"]) -> Float[Tensor, "... F"]:
@@ -68,7 +70,7 @@ class FrequencyEncoding(nn.Module):
     def with_jacobian(self, x: Float[Tensor, "N 3"]) -> Encoded:
         angles, frequencies = self._angles(x), self.frequencies.to(x.dtype)[:, None]
         sin, cos = angles.sin(), angles.cos()
-        # Each wave runs along one axis: the Jacobian is a column of diagonal blocks.
+        # Each feature depends on one coordinate: the Jacobian is a column of diagonal blocks.
         slopes = torch.cat((torch.ones_like(x)[:, None], frequencies * cos, -frequencies * sin), 1)
         features = torch.cat((x, sin.flatten(1), cos.flatten(1)), 1)
         return Encoded(features, slopes.diag_embed().flatten(1, 2))
@@ -78,9 +80,13 @@ class FrequencyEncoding(nn.Module):
 
 
 class HashGrid(nn.Module):
-    """The position and the features of a multiresolution hash grid over the cube around the scene sphere.
+    """The position, and features of a multiresolution hash grid over the cube around the scene sphere.
 
-    The features start at U(−1e−4, 1e−4) (Müller et al. 2022, §4).
+    The table is initialised with U(−1e−4, 1e−4) (Müller et al. 2022, §4).
+
+    Args:
+        spec: sizes and backend of the grid.
+        radius: radius of the scene sphere, scene units.
     """
 
     def __init__(self, spec: GridSpec, radius: float) -> None:
@@ -112,9 +118,12 @@ def _identity(x: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3 3"]:
 def position_encoding(
     config: FrequencyConfig | HashGridConfig, radius: float, log2_entries: int | None = None
 ) -> FrequencyEncoding | HashGrid:
-    """The position encoding that a configuration names, for positions within `radius`.
+    """Make the position encoding of a configuration.
 
-    `log2_entries`: the table size of one level of a grid, as a power of two; none: `config.log2_entries`.
+    Args:
+        config: kind and sizes.
+        radius: radius of the scene sphere, which contains the positions.
+        log2_entries: binary logarithm of the table size of one grid level; None: `config.log2_entries`.
     """
     if isinstance(config, FrequencyConfig):
         return FrequencyEncoding(POSITION_OCTAVES)
@@ -127,12 +136,15 @@ def position_encoding(
 
 
 class SphericalHarmonics(nn.Module):
-    """The first `degree` bands of the real spherical harmonics, without Condon–Shortley phase; unit vectors.
+    """Encoding of unit vectors by real spherical harmonics, without Condon–Shortley phase.
 
-    Bands follow one another, each by rising order m. They are orthonormal over the sphere.
+    The functions are sorted by band, and within a band by ascending order m. They are orthonormal.
+
+    Args:
+        degree: number of bands, 1 to 5.
 
     Raises:
-        UserError: more than five bands, or none.
+        UserError: the number of bands is out of range.
     """
 
     def __init__(self, degree: int) -> None:
@@ -147,7 +159,8 @@ class SphericalHarmonics(nn.Module):
         return torch.stack([value for band in BANDS[: self.degree] for value in band(x, y, z)], -1)
 
 
-# In powers of x, y, z with x² + y² + z² = 1; the square of each integrates to 1 over the sphere.
+# The bands as polynomials in x, y, z with x² + y² + z² = 1. The square of each integrates to 1 over the
+# sphere.
 BANDS: tuple[Callable[[Tensor, Tensor, Tensor], list[Tensor]], ...] = (
     lambda x, y, z: [torch.full_like(x, 0.28209479177387814)],
     lambda x, y, z: [0.4886025119029199 * y, 0.4886025119029199 * z, 0.4886025119029199 * x],
@@ -184,5 +197,5 @@ BANDS: tuple[Callable[[Tensor, Tensor, Tensor], list[Tensor]], ...] = (
 def direction_encoding(
     kind: Literal["frequency", "spherical_harmonics"], octaves: int, bands: int
 ) -> FrequencyEncoding | SphericalHarmonics:
-    """The direction encoding that a configuration names."""
+    """Make a direction encoding: frequencies with `octaves`, or spherical harmonics with `bands`."""
     return FrequencyEncoding(octaves) if kind == "frequency" else SphericalHarmonics(bands)

@@ -1,6 +1,6 @@
-"""L for light from far away: an environment map, the same at every point, which can be importance-sampled.
+"""L for distant light: an environment map, the same at every point, with importance sampling.
 
-The map is laid out as `direction_map` says.
+`direction_map` defines the layout of the map.
 """
 
 from __future__ import annotations
@@ -22,34 +22,37 @@ from neilfpp_method.structures import IncidentSamples
 __all__ = ["EVEN_ROWS", "EnvironmentLight", "TexelDirections"]
 
 UNIFORM_SHARE = 0.1
-"""Share of the samples spread evenly over the sphere, so that every direction has a density."""
+"""Share of the samples that are uniform over the sphere, so that the density is positive everywhere."""
 MEAN_OF_CELL = (1 / 8, 3 / 4)
-"""Mean over a cell of what is linear between cell middles: shares of each neighbour, and of the cell."""
+"""Weights of each neighbor and of the cell itself in the mean, over a cell, of the linear interpolation
+between cell centers.
+"""
 EVEN_ROWS = 16
-"""Rows of an even light: of its texels only the directions count, in which a fit looks for it."""
+"""Rows of the map of an even light. Its texels are all equal; they are the directions that a fit samples."""
 MIN_RADIANCE = 1e-6
-"""Of the mean of a map that is shown: what is darker counts as this, as radiance is kept as its logarithm."""
+"""Lower bound on the radiance of a given map, relative to its mean, because logarithms are stored."""
 
 
 @dataclass(frozen=True)
 class TexelDirections:
-    """One direction within each of T texels, for each of N points, and the texels' solid angles."""
+    """One direction in each of T texels, for each of N points, and the solid angles of the texels (sr)."""
 
     wi: Float[Tensor, "N T 3"]
     solid_angle: Float[Tensor, " T"]
 
 
 class EnvironmentLight(nn.Module):
-    """A grid of log radiance; bilinear between the texels in radiance, so that power is conserved.
+    """An environment map: a grid of log radiance whose radiance is interpolated bilinearly.
 
-    The map is no parameter: what surfaces send is linear in it, so `lighting` solves for it.
+    The map is a buffer, not a parameter: outgoing radiance is linear in its radiance, so `lighting` solves
+    for it.
 
-    `even` on, the light is one colour from everywhere: all texels are alike, none is looked up, and there is
-    nothing to sample.
+    An even light (`even`) has the same radiance from all directions: all texels are equal, and there is
+    nothing to sample by importance.
 
     Args:
         height: rows of the map; it has twice as many columns.
-        initial_radiance: what every texel starts at.
+        initial_radiance: initial radiance of all texels.
     """
 
     def __init__(self, height: int, initial_radiance: float) -> None:
@@ -57,12 +60,12 @@ class EnvironmentLight(nn.Module):
         self.register_buffer("log_radiance", torch.full((3, height, 2 * height), math.log(initial_radiance)))
         self.register_buffer("cos_edges", _cos_edges(height), persistent=False)
         self.even = False
-        # A map that was shown has a size that no setting knows.
+        # The size of a given map is not in the settings: take it from the checkpoint.
         self.register_load_state_dict_pre_hook(_take_size)
 
     @torch.no_grad()
     def be_even(self, even: bool) -> None:
-        """From now on be one colour, the mean of the texels by their solid angles, or a map again."""
+        """Make the light even, with the mean radiance of the map over solid angle, or a map again."""
         self.even = even
         if even and (self.log_radiance != self.log_radiance[:, :1, :1]).any():
             share = self._texel_solid_angles() / (4 * math.pi)
@@ -70,13 +73,16 @@ class EnvironmentLight(nn.Module):
 
     @torch.no_grad()
     def show(self, radiance: Float[Tensor, "3 H W"]) -> None:
-        """Be this map, of any size from 2 rows on, and not all black; its device stays."""
+        """Replace the map by linear radiance of any size with at least 2 rows, not all black.
+
+        The device does not change.
+        """
         self._resize(*radiance.shape[1:])
         self.log_radiance.copy_(radiance.clamp_min(MIN_RADIANCE * radiance.mean()).log())
 
     @torch.no_grad()
     def at_most(self, height: int) -> EnvironmentLight:
-        """This map; where it has more rows, one of so many, whose texels are area means."""
+        """This light, or, if its map has more rows, a light with `height` rows of area means."""
         _, rows, columns = self.log_radiance.shape
         if rows <= height:
             return self
@@ -95,15 +101,15 @@ class EnvironmentLight(nn.Module):
         return coarse
 
     def radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "#N S 3"]) -> Float[Tensor, "#N S 3"]:
-        """Radiance > 0 from wi, whatever x; what stands between is not this model's."""
+        """Radiance > 0 from directions wi. It does not depend on x, and ignores occlusion."""
         if self.even:
             return self.log_radiance[:, 0, 0].exp().expand(*wi.shape[:-1], 3)
         return interpolate(self.log_radiance.exp(), wi)
 
     def technique(self, normal: Float[Tensor, "N 3"]) -> Technique | None:
-        """Directions in proportion to the radiance, for points of these normals; some below horizons.
+        """Sampling of directions in proportion to the radiance; some lie below the horizon of a normal.
 
-        None for an even light, of which all directions bring the same.
+        None for an even light.
         """
         if self.even:
             return None
@@ -111,7 +117,7 @@ class EnvironmentLight(nn.Module):
 
     @torch.no_grad()
     def sample(self, like: Float[Tensor, "N 3"], count: int, stochastic: bool) -> IncidentSamples:
-        """`count` directions a row of `like`, in proportion to the radiance; half may be below a horizon."""
+        """Sample `count` directions of the sphere per row of `like`, in proportion to the radiance."""
         shape = (len(like), count)
         strata = torch.arange(count, device=like.device, dtype=like.dtype)
         within = (
@@ -125,7 +131,7 @@ class EnvironmentLight(nn.Module):
 
     @torch.no_grad()
     def texel_directions(self, like: Float[Tensor, "N 3"]) -> TexelDirections:
-        """A random direction in every texel, row by row, for each row of `like`: the sphere in T strata."""
+        """Sample a random direction in every texel, for each row of `like`: T strata of the sphere."""
         _, height, width = self.log_radiance.shape
         cell = torch.arange(height * width, device=like.device).expand(len(like), -1)
         within = torch.rand(2, *cell.shape, device=like.device, dtype=like.dtype)
@@ -133,20 +139,20 @@ class EnvironmentLight(nn.Module):
 
     @torch.no_grad()
     def pdf(self, wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S"]:
-        """Density of `sample`, per steradian of the sphere: constant on each texel."""
+        """Density of `sample` per steradian over the sphere; constant within a texel."""
         return (self._texel_shares() / self._texel_solid_angles())[
             texels_of(wi, *self.log_radiance.shape[1:])
         ]
 
     def _resize(self, height: int, width: int) -> None:
-        """A map of this size, of which nothing is known."""
+        """Replace the map by one of this size, with undefined content."""
         self.log_radiance = self.log_radiance.new_zeros(3, height, width)
         self.cos_edges = _cos_edges(height).to(self.log_radiance)
 
     def _within(
         self, cell: Int[Tensor, "N S"], down: Float[Tensor, "N S"], across: Float[Tensor, "N S"]
     ) -> Float[Tensor, "N S 3"]:
-        """Directions in texels by number, at shares of height and width; even shares spread evenly."""
+        """Directions in texels, at shares of their height and width; uniform shares are uniform in area."""
         _, height, width = self.log_radiance.shape
         cell = cell.clamp_max(height * width - 1)
         row, column = cell // width, cell % width
@@ -161,7 +167,10 @@ class EnvironmentLight(nn.Module):
         return rows[:, None].expand(-1, width).reshape(-1)
 
     def _texel_shares(self) -> Float[Tensor, " T"]:
-        """The probability of each texel: of its bilinear radiance, also beside a lamp of one texel."""
+        """Probability of each texel: the mean of the interpolated radiance over it times its solid angle.
+
+        A neighbor of a bright texel gets its share, because interpolation makes it bright, too.
+        """
         solid_angles = self._texel_solid_angles()
         mean = luminance(self.log_radiance.detach().permute(1, 2, 0).exp())
         mean = MEAN_OF_CELL[0] * (mean.roll(1, 1) + mean.roll(-1, 1)) + MEAN_OF_CELL[1] * mean
@@ -172,12 +181,12 @@ class EnvironmentLight(nn.Module):
 
 
 def _cos_edges(height: int) -> Float[Tensor, " E"]:
-    """The cosines of the angles from +z between which the rows lie, halfway from row to row."""
+    """Cosines of the polar angles that bound the rows: halfway between neighboring rows."""
     return ((torch.arange(height + 1) - 0.5).clamp(0, height - 1) * math.pi / (height - 1)).cos()
 
 
 def _take_size(light: EnvironmentLight, state: Mapping[str, Any], prefix: str, *_: object) -> None:
-    """Before weights are loaded: the size of the map that they hold."""
+    """Resize the map to that of a checkpoint, before its values are loaded."""
     saved = state.get(f"{prefix}log_radiance")
     if isinstance(saved, Tensor) and saved.ndim == 3 and min(saved.shape[1:]) >= 2:
         light._resize(*saved.shape[1:])

@@ -1,7 +1,7 @@
-"""How much brighter each photograph is than the others: a gain for each view and channel.
+"""Gains of the photographs: one factor per view and channel, for differences in exposure and white balance.
 
-Exposure is a common factor of the three gains of a view, white balance is what is left. Their logarithms have
-the mean 0 over the views: radiance is known up to a factor for each channel anyway, which the light takes.
+The logarithms of the gains have mean 0 over the views: a factor per channel that all views share cannot be
+separated from the light.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ __all__ = ["PhotographGains", "at_mean_exposure"]
 
 
 class PhotographGains(nn.Module):
-    """The natural logarithms of the gains, as unknowns.
+    """Natural logarithms of the gains as parameters.
 
     Args:
-        start: what they start as and are held near; its mean over the views is taken out.
+        start: initial log gains; their mean over the views is subtracted.
     """
 
     def __init__(self, start: Float[Tensor, "V 3"]) -> None:
@@ -28,15 +28,15 @@ class PhotographGains(nn.Module):
         self.register_buffer("start", start - start.mean(0))
 
     def logarithms(self) -> Float[Tensor, "V 3"]:
-        """Of all views; the mean over the views is 0, whatever the parameters are."""
+        """Log gains of all views, with their mean over the views subtracted."""
         return self.log_gain - self.log_gain.mean(0)
 
     def forward(self, view: Int[Tensor, " N"]) -> Float[Tensor, "N 3"]:
-        """What the cameras of some views, by number, multiplied radiance by."""
+        """Gains by which the cameras of the given views multiplied radiance."""
         return self.logarithms().exp()[view]
 
     def drift(self) -> Float[Tensor, "V 3"]:
-        """How far the logarithms have come from their start."""
+        """Difference of the log gains from their initial values."""
         return self.logarithms() - self.start
 
 
@@ -44,7 +44,12 @@ class PhotographGains(nn.Module):
 def at_mean_exposure(
     gains: PhotographGains | None, color: Float[Tensor, "N 3"], view: Int[Tensor, " N"], response: str
 ) -> Float[Tensor, "N 3"]:
-    """Pixels of some views, by number, as a photograph of mean exposure would hold them, in the capture's
-    response; as they are where there are no gains.
+    """Pixel values as at the mean exposure of the photographs, in the capture's response.
+
+    Args:
+        gains: gains of the photographs; None: pixels are returned unchanged.
+        color: pixel values.
+        view: index of the view of each pixel.
+        response: "linear" or "srgb".
     """
     return color if gains is None else at_common_exposure(color, gains(view), response)

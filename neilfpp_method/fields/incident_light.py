@@ -1,7 +1,7 @@
-"""L: the incident light field, position and direction → linear RGB that arrives (METHOD §5).
+"""The incident light field L of the paper: position and direction → incident linear RGB (METHOD §5).
 
-Light is sharp in direction and smooth in position. So the direction enters encoded, at the first and at the
-middle layer, and the position raw, at the middle layer only.
+Incident light is sharp in direction and smooth in position. So the encoded direction enters at the first and
+the middle layer, and the plain position at the middle layer only.
 """
 
 from __future__ import annotations
@@ -18,20 +18,27 @@ from neilfpp_method.settings.types import FreeLightConfig, FrequencyConfig, Hash
 __all__ = ["IncidentLightField", "exponential"]
 
 
-MAX_EXPONENT = 20.0  # radiance stays within e^±20 of its start
+MAX_EXPONENT = 20.0
+"""Bound on the log of radiance relative to the initial radiance, against overflow."""
 DIRECTION_OCTAVES, DIRECTION_BANDS = 6, 5
-"""Of the encoding of directions: light is sharper in direction than what surfaces send (NeILF++ §5)."""
+"""Octaves or bands of the encoding of directions: more than in R, as L is sharper (NeILF++ §5)."""
 
 
 class IncidentLightField(nn.Module):
-    """radiance = initial_radiance · base^output. The outputs start near 0.
+    """A network with radiance = initial_radiance · base^output, whose outputs start near 0.
 
-    Beside a frequency encoding of positions directions are encoded by frequencies too, beside a hash grid by
-    spherical harmonics, as in R (NeILF++ §5).
+    As in R, directions are encoded by frequencies if `encoding` is the frequency encoding, and by spherical
+    harmonics if it is the hash grid (NeILF++ §5).
 
-    The middle layer is linear in what it sees, so the share of the direction and the share of the position
-    are computed apart and added: the position costs one small product per point, and the directions can be
-    shared between points.
+    The pre-activation of the middle layer is a sum of a term of the direction and a term of the position. The
+    two are computed separately: the position costs one small product per point, and directions that points
+    share are evaluated once.
+
+    Args:
+        config: the settings of the free light.
+        encoding: encoding of positions of the other fields, which determines that of the directions.
+        base: base of the exponential (METHOD §5).
+        initial_radiance: initial radiance from all directions.
     """
 
     def __init__(
@@ -57,7 +64,8 @@ class IncidentLightField(nn.Module):
             width, outputs, config.layers - middle - 1, width, config.activation, output_scale=0.1
         )
         nn.init.zeros_(self.tail.layers[-1].bias)
-        # Position and direction meet in one layer, so its weights start alike; those of the tail as well.
+        # The position's weights belong to the same layer as those of the direction: same initial range. The
+        # first layer of the tail is a hidden layer, not an input layer, of the whole network.
         bound = self.direction_part.layers[-1].weight.abs().max().item()
         nn.init.uniform_(self.position_part.weight, -bound, bound)
         self.tail.activation.init_(self.tail.layers[0])
@@ -65,7 +73,7 @@ class IncidentLightField(nn.Module):
     def radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "#N S 3"]) -> Float[Tensor, "N S 3"]:
         """Radiance > 0 that arrives at x from wi, which points away from x.
 
-        Directions that all points share, (1, S, 3), go through their part of the network once.
+        Directions of shape (1, S, 3), which all points share, are evaluated once.
         """
         directions = self.direction_part(self.direction(wi))
         middle = directions + self.position_part(x)[:, None]
@@ -74,14 +82,14 @@ class IncidentLightField(nn.Module):
         )
 
     def technique(self, normal: Float[Tensor, "N 3"]) -> None:
-        """None: a network cannot be sampled."""
+        """Return None: a network cannot be importance-sampled."""
         return None
 
 
 def exponential(exponent: Float[Tensor, "*B C"], initial_radiance: float) -> Float[Tensor, "*B 3"]:
-    """initial_radiance · e^exponent, one channel for all three colours where there is one.
+    """initial_radiance · e^exponent; a single channel is copied to all three colors.
 
-    The exponent is clamped, with derivative 1 everywhere: a value beyond the limit still feels the loss.
+    The exponent is clamped, but its derivative is 1 everywhere, so that values beyond the limit can return.
     """
     limited = exponent.clamp(-MAX_EXPONENT, MAX_EXPONENT).detach() + (exponent - exponent.detach())
     return (initial_radiance * limited.exp()).expand(*exponent.shape[:-1], 3)

@@ -1,4 +1,4 @@
-"""L for light from close by: a few small lamps, whose direction and strength depend on the place."""
+"""L for near light: a few small lamps, whose direction and irradiance depend on the surface point."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["LampPlaces", "LampRays", "Lamps", "rays_towards"]
 
 @dataclass(frozen=True)
 class LampPlaces(Indexable):
-    """Where M lamps are, and which way they send: a unit axis, or zero for all ways alike (`Lamps`)."""
+    """Positions of M lamps, and their unit axes; a zero axis means an isotropic lamp (see `Lamps`)."""
 
     position: Float[Tensor, "M 3"]
     axis: Float[Tensor, "M 3"]
@@ -25,8 +25,13 @@ class LampPlaces(Indexable):
 
 @dataclass(frozen=True)
 class LampRays:
-    """From N points towards K lamps: direction, distance, the solid angle of each lamp, and the share of its
-    intensity that it sends this way.
+    """Rays from N points towards K lamps.
+
+    Attributes:
+        wi: unit directions from the points to the lamps.
+        distance: distances to the centers of the lamps, scene units.
+        solid_angle: solid angles of the lamps as seen from the points, steradians.
+        emission: share of its intensity that a lamp sends towards the point, in [0, 1].
     """
 
     wi: Float[Tensor, "N K 3"]
@@ -35,20 +40,20 @@ class LampRays:
     emission: Float[Tensor, "N K"]
 
     def samples(self) -> IncidentSamples:
-        """One direction per lamp as an estimator's samples: the mean of f/pdf over K is the sum of lamps."""
+        """One direction per lamp as samples: the mean of f/pdf over K is the sum over the lamps."""
         return IncidentSamples(self.wi, 1 / (self.wi.shape[1] * self.solid_angle))
 
 
 class Lamps(nn.Module):
-    """Spheres of one radius; as many as are lit come first.
+    """A set of spherical lamps of one radius, the first `lit` of which emit light.
 
-    A lamp whose axis is zero sends the same light in all directions, as a bulb does; one with a unit axis
-    sends I cos θ at an angle θ from it and nothing backwards, as a small window or a flat panel does. Lamps
-    are no parameters: they are found together with the environment map (`lighting`).
+    A lamp with a zero axis is isotropic, like a bulb. A lamp with a unit axis has the intensity I cos θ at an
+    angle θ from its axis, and none backwards, like a small window or a flat panel. Lamps are buffers, not
+    parameters: they are solved for together with the environment map (`lighting`).
 
     Args:
-        most: how many there can be.
-        radius: of each, scene units. Only how sharp their reflections are depends on it.
+        most: maximum number of lamps.
+        radius: radius of each lamp, scene units. It only affects the sharpness of reflections.
     """
 
     def __init__(self, most: int, radius: float) -> None:
@@ -66,9 +71,12 @@ class Lamps(nn.Module):
         intensity: Float[Tensor, "K 3"],
         axis: Float[Tensor, "K 3"] | None = None,
     ) -> None:
-        """These lamps and no others, the first of them where they are too many.
+        """Replace all lamps by these, or by the first `most` of them.
 
-        `intensity` is power per solid angle, on the axis where there is one; no `axis`: isotropic.
+        Args:
+            position: centers, scene frame.
+            intensity: power per solid angle, on the axis if there is one.
+            axis: unit axes, or zeros; None: all lamps are isotropic.
         """
         self.lit = min(len(position), len(self.position))
         self.position.zero_()[: self.lit] = position[: self.lit]
@@ -78,21 +86,21 @@ class Lamps(nn.Module):
         self.intensity.zero_()[: self.lit] = intensity[: self.lit]
 
     def rays_from(self, x: Float[Tensor, "N 3"]) -> LampRays:
-        """Towards the middle of each lit lamp."""
+        """Rays from points towards the center of each lit lamp."""
         return rays_towards(x, self.position[: self.lit], self.axis[: self.lit], self.radius)
 
     def radiance(self) -> Float[Tensor, "K 3"]:
-        """What a lit lamp shows of itself, on its axis: intensity over the area of its disc."""
+        """Radiance of the lit lamps on their axes: intensity over the area of the disc."""
         return self.intensity[: self.lit] / (math.pi * self.radius**2)
 
     def arriving(self, rays: LampRays) -> Float[Tensor, "N K 3"]:
-        """Radiance along rays towards the lit lamps where nothing is in the way."""
+        """Radiance along rays from the lit lamps, without occlusion."""
         return rays.emission[..., None] * self.radiance()
 
     def met(
         self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"], before: Float[Tensor, "N S"]
     ) -> Float[Tensor, "N S 3"]:
-        """Radiance of the lamps that directions meet nearer than a distance; overlapping lamps add."""
+        """Radiance of the lamps that directions hit closer than `before`; overlapping lamps add up."""
         total = torch.zeros_like(wi)
         towards = self.position[: self.lit] - x[:, None]
         for offset, axis, radiance in zip(
@@ -105,18 +113,18 @@ class Lamps(nn.Module):
         return total
 
     def get_extra_state(self) -> dict[str, int]:
-        """How many are lit, for checkpoints."""
+        """Number of lit lamps, for checkpoints."""
         return {"lit": self.lit}
 
     def set_extra_state(self, state: dict[str, int]) -> None:
-        """The inverse of `get_extra_state`."""
+        """Restore what `get_extra_state` returned."""
         self.lit = state["lit"]
 
 
 def rays_towards(
     x: Float[Tensor, "N 3"], position: Float[Tensor, "K 3"], axis: Float[Tensor, "K 3"], radius: float
 ) -> LampRays:
-    """Towards lamps at `position`; within two radii of its middle, a lamp looks as from two radii away."""
+    """Rays from points towards lamps. The distance is at least two radii, which bounds the solid angle."""
     offset = position - x[:, None]
     distance = offset.square().sum(-1).clamp_min((2 * radius) ** 2).sqrt()
     wi = safe_normalize(offset)
@@ -124,6 +132,6 @@ def rays_towards(
 
 
 def _emission(wi: Float[Tensor, "N K 3"], axis: Float[Tensor, "*K 3"]) -> Float[Tensor, "N K"]:
-    """The share of its intensity that a lamp with this axis sends along −wi."""
-    bare = axis.square().sum(-1) == 0
-    return torch.where(bare, 1.0, (-(wi * axis).sum(-1)).clamp_min(0))
+    """Share of its intensity that a lamp with this axis sends along −wi."""
+    is_isotropic = axis.square().sum(-1) == 0
+    return torch.where(is_isotropic, 1.0, (-(wi * axis).sum(-1)).clamp_min(0))

@@ -1,4 +1,4 @@
-"""Which light the settings ask for: an environment map with lamps before it, or the paper's free field."""
+"""Make the light that the settings name: an environment map with lamps, or the paper's free light field."""
 
 from __future__ import annotations
 
@@ -18,36 +18,44 @@ from neilfpp_method.shading.sampling import Technique
 __all__ = ["Light", "LightModel", "make_light"]
 
 FREE_BASE = {"linear": 10.0, "srgb": math.e}
-"""Base of the exponential at the end of a free field, by what the pixels are (METHOD §5)."""
+"""Base of the exponential at the output of a free field, by the response of the images (METHOD §5)."""
 MAX_LAMPS = 8
-"""Lamps close by: more than photographs of one object tell apart."""
+"""Maximum number of lamps: more cannot be distinguished in photographs of one object."""
 LAMP_RADIUS = 0.06
-"""Of every lamp, scene units: a bulb beside a 1 m object. It decides how sharp its reflections are."""
+"""Radius of every lamp, scene units: a light bulb next to an object of 1 m. It determines how sharp the
+reflections of lamps are.
+"""
 
 
 @runtime_checkable
 class Light(Protocol):
-    """What arrives at surface points when nothing stands in the way."""
+    """Light that arrives at surface points without occlusion."""
 
     def radiance(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
         """Linear radiance > 0 that arrives at x from wi, which points away from x."""
         ...
 
     def technique(self, normal: Float[Tensor, "N 3"]) -> Technique | None:
-        """A way to draw directions in proportion to the radiance; none for a light that cannot be sampled."""
+        """Sampling of directions in proportion to the radiance; None if the light cannot be sampled."""
         ...
 
 
 @dataclass(frozen=True)
 class LightModel:
-    """The light of a scene: `light`, distant or free at every point, and near `lamps`, perhaps none."""
+    """The light of a scene: `light`, distant or free at every point, and near `lamps` (possibly none)."""
 
     light: nn.Module
     lamps: Lamps
 
 
 def make_light(config: NeilfConfig, response: str, initial_radiance: float) -> LightModel:
-    """An untrained light that sends `initial_radiance` from everywhere; `response` is "linear" or "srgb"."""
+    """Make an untrained light with `initial_radiance` from all directions.
+
+    Args:
+        config: the settings.
+        response: "linear" or "srgb"; it determines the output base of a free field.
+        initial_radiance: initial linear radiance.
+    """
     settings = config.light
     if isinstance(settings, FreeLightConfig):
         field = IncidentLightField(settings, config.encoding, FREE_BASE[response], initial_radiance)

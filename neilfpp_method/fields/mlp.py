@@ -1,7 +1,7 @@
-"""Multilayer perceptrons, and the gradient of their outputs with respect to their input.
+"""Multilayer perceptrons, and gradients of their outputs with respect to their input.
 
-That gradient is an adjoint pass written out in differentiable operations: a loss on it needs one ordinary
-backward pass, where autograd would have to differentiate its own backward pass.
+The gradient is computed by a reverse pass that is written out in differentiable operations. A loss on it
+needs one ordinary backward pass, whereas autograd would have to differentiate its own backward pass.
 """
 
 from __future__ import annotations
@@ -30,19 +30,21 @@ __all__ = [
     "weight_normalise_",
 ]
 
-SOFTPLUS_SHARPNESS = 100.0  # VolSDF, IDR
-SINE_FREQUENCY = 30.0  # SIREN's ω
-SPHERE_SAMPLES = 4096  # points at which the geometric start is corrected
-RIDGE = 1e-2  # price of that correction, relative to the mean square of a unit
+SOFTPLUS_SHARPNESS = 100.0
+"""Sharpness of softplus units (IDR, VolSDF)."""
+SINE_FREQUENCY = 30.0
+"""ω of sine units (SIREN)."""
+SPHERE_SAMPLES = 4096
+"""Points at which the geometric initialisation is corrected."""
+RIDGE = 1e-2
+"""Ridge penalty of that correction, relative to the mean square of a unit."""
 SKIP_FROM = 4
-"""Hidden layers from which a network sees its input once more, at the middle: deep ones forget it (DeepSDF),
-shallow ones have it close by.
-"""
+"""Number of hidden layers from which a network gets its input again, at the middle layer (DeepSDF)."""
 
 
 @dataclass(frozen=True)
 class Activation:
-    """A hidden unit, the same with its slope, and the start of the linear layer that feeds it."""
+    """An activation function, the same with its derivative, and the initialisation of the layer before it."""
 
     value: Callable[[Tensor], Tensor]
     with_slope: Callable[[Tensor], UnitSample]
@@ -76,17 +78,24 @@ ACTIVATIONS: Mapping[str, Activation] = {
 
 @dataclass(frozen=True)
 class MlpSample:
-    """All outputs, and the gradient of K of them with respect to the input."""
+    """All outputs of a network, and the gradients of K of them with respect to the input."""
 
     value: Float[Tensor, "N O"]
     gradient: Float[Tensor, "N K I"]
 
 
 class Mlp(nn.Module):
-    """`layers` hidden layers of `width` units and a linear output.
+    """A network of hidden layers and a linear output layer.
 
-    The input enters again, beside the hidden units, at layer `skip`; `skip = layers` is the output layer.
-    `output_scale` multiplies the weights that the output layer starts with.
+    Args:
+        inputs: number of inputs.
+        outputs: number of outputs.
+        layers: number of hidden layers.
+        width: units per hidden layer.
+        activation: activation of the hidden layers.
+        skip: index of the layer that gets the input concatenated to its own; `skip = layers` is the output
+            layer. None: no layer.
+        output_scale: factor on the initial weights of the output layer.
 
     Raises:
         UserError: the skip lies outside the network.
@@ -116,33 +125,32 @@ class Mlp(nn.Module):
         for layer in self.layers:
             self.activation.init_(layer)
         with torch.no_grad():
-            if (
-                activation == "sine"
-            ):  # SIREN's first layer: its input fills [−1, 1], not a sine's range of phases
+            if activation == "sine":
+                # SIREN initialises the first layer in its own way, as inputs fill [−1, 1].
                 self.layers[0].weight.uniform_(-1 / inputs, 1 / inputs)
             self.layers[-1].weight.mul_(output_scale)
 
     def forward(self, x: Float[Tensor, "... I"], outputs: slice = slice(None)) -> Float[Tensor, "... O"]:
-        """The chosen outputs."""
+        """The selected outputs."""
         last = self.layers[-1]
         return functional.linear(self.hidden(x), last.weight[outputs], last.bias[outputs])
 
     def hidden(self, x: Float[Tensor, "... I"]) -> Float[Tensor, "... H"]:
-        """What the output layer sees."""
+        """The input of the output layer."""
         hidden = x
         for number, layer in enumerate(self.layers[:-1]):
             hidden = self.activation.value(layer(self._with_skip(hidden, x, number)))
         return self._with_skip(hidden, x, len(self.layers) - 1)
 
     def with_gradient(self, x: Float[Tensor, "N I"], outputs: slice) -> MlpSample:
-        """All outputs, and the gradient of the chosen ones with respect to x.
+        """All outputs, and the gradients of the selected ones with respect to x.
 
-        With z_l = W_l h_l + b_l and h_{l+1} = a(z_l), the adjoint runs g ← (g ⊙ a'(z_l)) W_l from the last
-        layer to the first; where the input entered again, its share of g is set aside and added at the end.
+        With z_l = W_l h_l + b_l and h_{l+1} = a(z_l), the reverse pass is g ← (g ⊙ a'(z_l)) W_l from the last
+        layer to the first. At the skip layer the part of g that belongs to the input is split off, and it is
+        added at the end.
         """
-        weights = [
-            layer.weight for layer in self.layers
-        ]  # once: a normalised weight is computed when it is read
+        # Read once: a normalised weight is recomputed at each access.
+        weights = [layer.weight for layer in self.layers]
         hidden, slopes = x, []
         for number, layer in enumerate(self.layers[:-1]):
             units = self.activation.with_slope(
@@ -166,17 +174,17 @@ class Mlp(nn.Module):
 
 @torch.no_grad()
 def geometric_init_(mlp: Mlp, radius: float, extent: float, encoded: float) -> None:
-    """Start a softplus network as the signed distance to a sphere: ≈ ‖x‖ − radius where ‖x‖ ≤ extent.
+    """Initialise a softplus network as the signed distance to a sphere: ≈ ‖x‖ − radius for ‖x‖ ≤ extent.
 
-    The start of SAL (Atzmon & Lipman 2020, theorem 1) is exact for infinite width; at 64 units it is off by
-    tens of per cent. So the output row is then corrected by the smallest change that fits the distance: a
-    ridge regression.
+    The initialisation of SAL (Atzmon & Lipman 2020, theorem 1) is exact for infinite width; with 64 units it
+    is off by tens of per cent. So the weights of the first output are then corrected by a ridge regression to
+    the exact distance.
 
     Args:
-        mlp: its first three inputs are x.
-        radius: of the sphere.
-        extent: of the scene.
-        encoded: scale of the weights on the other inputs, at the first layer and at a skip.
+        mlp: the network; its first three inputs are x.
+        radius: radius of the sphere, scene units.
+        extent: radius of the scene, scene units.
+        encoded: factor on the weights of the other inputs, at the first layer and at the skip layer.
     """
     width = mlp.layers[0].out_features
     for number, layer in enumerate(mlp.layers[:-1]):
@@ -197,11 +205,11 @@ def geometric_init_(mlp: Mlp, radius: float, extent: float, encoded: float) -> N
 
 
 def weight_normalise_(mlp: Mlp) -> None:
-    """Split every weight row into length and direction (Salimans & Kingma 2016); same function."""
+    """Parametrise every weight row by length and direction (Salimans & Kingma 2016)."""
     for layer in mlp.layers:
         parametrizations.weight_norm(layer)
 
 
 def middle_skip(layers: int) -> int | None:
-    """The layer at which a network of so many hidden ones sees its input again; none for a shallow one."""
+    """Index of the skip layer of a network with `layers` hidden layers; None for a shallow network."""
     return layers // 2 if layers >= SKIP_FROM else None

@@ -1,4 +1,4 @@
-"""R: what the scene sends out, position and direction → linear RGB (METHOD §5)."""
+"""The outgoing radiance field R: position and direction → linear RGB (METHOD §5)."""
 
 from __future__ import annotations
 
@@ -15,14 +15,24 @@ from neilfpp_method.settings.types import FrequencyConfig, HashGridConfig, Outgo
 __all__ = ["MID_GREY", "OutgoingRadianceField"]
 
 MID_GREY = 0.2
+"""Default initial radiance: about 18 % grey, the mean of a well-exposed photograph."""
 DIRECTION_OCTAVES, DIRECTION_BANDS = 4, 4
-"""Of the encoding of directions (NeILF++ §5)."""
+"""Octaves or bands of the encoding of directions (NeILF++ §5)."""
 
 
 class OutgoingRadianceField(nn.Module):
-    """A sigmoid times `scale`, the largest radiance; starts near the radiance `start`, at most scale/2.
+    """A network whose output is a sigmoid times the largest radiance.
 
-    Positions may enter raw (`config.positions`) beside a feature of G, which encodes them (NeILF++ §5).
+    With `config.positions = "raw"` positions are not encoded here: the feature of G encodes them (NeILF++
+    §5).
+
+    Args:
+        config: the settings of R.
+        encoding: encoding of positions, which also determines that of the directions.
+        feature_width: length of the feature vector of G; 0 if there is none.
+        radius: radius of the scene sphere, scene units.
+        scale: largest radiance.
+        start: initial radiance; values above scale/2 count as scale/2.
     """
 
     def __init__(
@@ -56,12 +66,12 @@ class OutgoingRadianceField(nn.Module):
         normal: Float[Tensor, "N 3"],
         feature: Float[Tensor, "N F"],
     ) -> Float[Tensor, "N 3"]:
-        """Radiance that leaves x towards wo; `normal` and `feature` are those of the distance field at x."""
+        """Radiance that leaves x towards wo, given the normal and the feature vector of G at x."""
         inputs = torch.cat((self.position(x), *self._directions(wo, normal), normal, feature), -1)
         return self.scale * torch.sigmoid(self.mlp(inputs))
 
     def _directions(self, wo: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> tuple[Tensor, ...]:
-        """The encoded direction; a mirrored one with n·wo, for Fresnel's sake (Ref-NeRF §3)."""
+        """The encoded direction, and n·wo beside a mirrored one, for the Fresnel effect (Ref-NeRF §3)."""
         if not self.mirrored:
             return (self.direction(wo),)
         cosine = (normal * wo).sum(-1, keepdim=True)

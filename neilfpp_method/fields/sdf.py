@@ -1,4 +1,4 @@
-"""G: position → signed distance to the surface, negative inside, and a feature that R reads (METHOD §5)."""
+"""The signed distance field G: position → distance, negative inside, and a feature for R (METHOD §5)."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from neilfpp_method.settings.types import FrequencyConfig, HashGridConfig, SdfCo
 __all__ = ["SdfField", "SdfSample"]
 
 FIRST_RADIUS = 0.6
-"""Of the sphere that the field starts as, scene units: most of the unit sphere that holds the object."""
+"""Radius of the sphere that the field starts as, scene units. The object lies in the unit sphere."""
 
 
 @dataclass(frozen=True)
 class SdfSample:
-    """The field at N points. `gradient` is not normalised; it is where the eikonal loss looks."""
+    """Distance at N points in scene units, its gradient (not normalised), and the feature for R."""
 
     distance: Float[Tensor, " N"]
     gradient: Float[Tensor, "N 3"]
@@ -29,11 +29,15 @@ class SdfSample:
 
 
 class SdfField(nn.Module):
-    """Starts as a sphere around the origin, negative inside.
+    """A network of position that starts as a sphere around the origin.
 
-    Behind a frequency encoding (the paper's MLP setting) the waves start with no weight and the weights are
-    normalised, as in IDR and VolSDF. Behind a hash grid, whose features start near 0 themselves, neither is
-    called for.
+    With a frequency encoding (the paper's MLP setting) the encoded inputs start with weight 0 and the weights
+    are normalised, as in IDR and VolSDF. With a hash grid, whose features start near 0, neither is needed.
+
+    Args:
+        config: sizes of the network.
+        encoding: encoding of positions.
+        radius: radius of the scene sphere, scene units.
     """
 
     def __init__(self, config: SdfConfig, encoding: FrequencyConfig | HashGridConfig, radius: float) -> None:
@@ -49,7 +53,7 @@ class SdfField(nn.Module):
             weight_normalise_(self.mlp)
 
     def forward(self, x: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-        """The distance alone."""
+        """Signed distance only."""
         return self.mlp(self.encoding(x), slice(0, 1))[:, 0]
 
     def with_gradient(self, x: Float[Tensor, "N 3"]) -> SdfSample:
@@ -61,12 +65,15 @@ class SdfField(nn.Module):
     def hessian(
         self, x: Float[Tensor, "N 3"], method: Literal["analytic", "finite_difference"] | None = None
     ) -> Float[Tensor, "N 3 3"]:
-        """H_ij = ∂²G / ∂x_i ∂x_j; a loss on it reaches the parameters.
+        """Hessian H_ij = ∂²G / ∂x_i ∂x_j, differentiable in the parameters.
 
-        analytic: autograd through `with_gradient`. Exact, but inside a grid cell a trilinear function has no
-        curvature along the axes. finite_difference: forward differences of the gradient over one cell of the
-        finest grid (for waves, a fiftieth of a radian of the finest), which see the curvature that lies in
-        the kinks between cells. None: the former for waves, the latter for a grid.
+        Args:
+            x: points, scene frame.
+            method: "analytic" differentiates `with_gradient` by autograd. It is exact, but a trilinear
+                function has no curvature along the axes inside a cell. "finite_difference" takes forward
+                differences of the gradient over one cell of the finest grid (for frequencies, 0.02 rad of
+                the highest one), and so includes the kinks between cells. None: analytic for frequencies,
+                finite differences for a hash grid.
         """
         method = method or (
             "analytic" if isinstance(self.encoding, FrequencyEncoding) else "finite_difference"

@@ -1,4 +1,4 @@
-"""The optional methods of a host: who asks for each, and what happens without it.
+"""The optional methods of a host: what uses each, and what happens without it.
 
 `python -m neilfpp_method.hosts.capabilities` prints the table of docs/hosts.md.
 """
@@ -17,53 +17,53 @@ class Capability:
     """An optional method, or attribute, of a host.
 
     Attributes:
-        method: its name.
-        protocol: the class of `hosts.base` that has its signature.
-        asked_by: who asks for it, for people.
-        module: the module of this package that does.
+        method: name of the method.
+        protocol: the protocol in `hosts.base` with its signature.
+        used_by: description of what uses it, for the documentation.
+        module: the module of this package that uses it.
         without: what happens without it, a clause.
-        told: whether `attach_neilf` says that a host lacks it; the rest few hosts can have.
+        reported: whether `attach_neilf` logs that a host lacks it. False for methods that few hosts can have.
     """
 
     method: str
     protocol: type
-    asked_by: str
+    used_by: str
     module: str
     without: str
-    told: bool = False
+    reported: bool = False
 
 
 CAPABILITIES = (
     Capability(
         "parameter_groups",
         base.HasParameterGroups,
-        "optimisers of the training loops",
+        "the optimizer of the training loop",
         "model",
-        "its own trainer moves it",
-        told=True,
+        "the host is trained by its own trainer, or not at all",
+        reported=True,
     ),
     Capability(
         "render_regularised",
         base.Regularised,
-        "training steps that move the host",
+        "training steps that train the host",
         "model",
-        "no losses of its own on the geometry",
-        told=True,
+        "the geometry has no losses of the host's own",
+        reported=True,
     ),
     Capability(
         "scene_light",
         base.LightsItself,
-        "hard inter-reflection, shadows, the fit of map and lamps",
+        "hard inter-reflection, shadow rays, the fit of environment map and lamps",
         "incident.scene",
-        "hard inter-reflection is traced by a proxy",
-        told=True,
+        "a proxy traces hard inter-reflection",
+        reported=True,
     ),
     Capability(
         "radiance",
         base.KnowsRadiance,
         "the proxy",
         "hosts.foreign",
-        "surfaces send each other the mean of what the training rays saw there",
+        "light between surfaces is the mean radiance that training rays saw there",
     ),
     Capability(
         "surface_width",
@@ -71,7 +71,7 @@ CAPABILITIES = (
         "L_ref",
         "incident.scene",
         "rays for L_ref start at a fixed distance from the surface",
-        told=True,
+        reported=True,
     ),
     Capability(
         "may_meet",
@@ -85,38 +85,38 @@ CAPABILITIES = (
         base.SmoothsNormals,
         "shading",
         "model",
-        "surfaces are shaded with the normals of the hits",
+        "surfaces are shaded with the hit normals",
     ),
     Capability(
         "sdf",
         base.HasSdf,
         "`neilfpp export`, Chamfer distances",
         "export.mesh",
-        "no mesh to export",
-        told=True,
+        "no mesh can be exported",
+        reported=True,
     ),
     Capability(
         "read_outputs",
         base.ReadsOutputs,
-        "`losses` and `maps` with what is rendered already",
+        "`losses` and `maps`, if they are given rendered outputs",
         "hosts.answers",
-        "a dictionary is read by usual names (`hosts.answers`)",
+        "a dictionary is read by common names (`hosts.answers`)",
     ),
     Capability(
         "stages",
         base.HasStages,
         "training loops",
         "model",
-        "the stages of the paper; of a borrowed host those with a material",
+        "the paper's stages; for a borrowed host those that train material",
     ),
 )
-"""In the order of what they bring."""
+"""All optional methods, the most useful first."""
 
 
 def markdown() -> str:
-    """The table for people."""
-    rows = [f"| `{c.method}` | {c.asked_by} | {c.without} |" for c in CAPABILITIES]
-    return "\n".join(["| optional | asked for by | without it |", "|---|---|---|", *rows])
+    """The table of docs/hosts.md."""
+    rows = [f"| `{c.method}` | {c.used_by} | {c.without} |" for c in CAPABILITIES]
+    return "\n".join(["| optional | used by | without it |", "|---|---|---|", *rows])
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""The light that arrives at a surface point: from which direction, how much, and from which source.
+"""Incident light at surface points: its directions, radiance and sources.
 
-`directions` chooses the incident directions, `arriving` asks the light, the lamps and the scene what comes
-along them, `scene` traces rays through the host, and `traced` draws the rays that L_ref compares. Nothing
-here knows the model.
+`directions` samples incident directions, `arriving` evaluates light, lamps and scene along them, `scene`
+traces rays through the host, and `traced` samples and traces the rays of L_ref. Nothing here depends on
+`NeilfModel`.
 """
 
 from neilfpp_method.incident.arriving import Sources, arriving, incident_radiance

@@ -1,4 +1,4 @@
-"""What arrives along incident directions: the light, the scene that stands before it, and the lamps."""
+"""Incident radiance along given directions, from the light, the scene that may occlude it, and the lamps."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class Sources:
     """Everything that may send light to a surface point.
 
     Attributes:
-        light: an environment map, or a field that is free at every point.
-        lamps: small lamps close to the scene; perhaps none is lit.
-        scene: the scene's own surfaces, which stand before light and lamps; none: nothing is traced (a free
-            field holds what arrives from everywhere).
+        light: an environment map, or a light field that is free at every point.
+        lamps: small lamps near the scene, possibly none lit.
+        scene: traces the scene's own surfaces, which occlude light and lamps. None: nothing is traced, and
+            the light field itself holds all that arrives at a point.
     """
 
     light: Light
@@ -32,16 +32,16 @@ class Sources:
 
 
 def arriving(sources: Sources, x: Float[Tensor, "N 3"], drawn: IncidentSamples) -> Incident:
-    """What arrives at surface points along drawn directions, and from the lamps.
+    """Compute the light that arrives at surface points along sampled directions and from the lamps.
 
-    A drawn direction never meets a lamp: each lamp is a direction of its own, with a shadow ray where there
-    is a scene. So the sum over all directions of weight · radiance · f · cos estimates the integral of the
-    rendering equation.
+    Lamps are not seen by the sampled directions. Each lamp adds a direction of its own, with a shadow ray if
+    there is a scene. The sum over all directions of weight · radiance · f · cos θ then estimates the integral
+    of the rendering equation.
 
     Args:
-        sources: what may send light.
+        sources: light, lamps and scene.
         x: surface points, scene frame.
-        drawn: incident directions with the density that drew them.
+        drawn: sampled incident directions with their pdf.
 
     Returns:
         S incident directions per point, and one more for each lit lamp. Gradients reach the light.
@@ -53,7 +53,7 @@ def arriving(sources: Sources, x: Float[Tensor, "N 3"], drawn: IncidentSamples) 
 def incident_radiance(
     sources: Sources, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]
 ) -> Float[Tensor, "N S 3"]:
-    """Linear radiance that arrives at x from any directions wi, lamps that they meet included."""
+    """Linear radiance that arrives at x from directions wi, including lamps that a direction hits."""
     if sources.scene is None:
         radiance, nearest = sources.light.radiance(x, wi), torch.full_like(wi[..., 0], torch.inf)
     else:
@@ -83,7 +83,7 @@ def _from_lamps(sources: Sources, x: Float[Tensor, "N 3"]) -> Incident:
 def _behind_scene(
     scene: SceneLight, light: Light, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]
 ) -> Float[Tensor, "N S 3"]:
-    """The scene's radiance where a direction meets it, elsewhere the light's, which is asked only there."""
+    """The scene's radiance where a direction hits it, else the light's, which is only evaluated there."""
     point, direction = torch.nonzero(~scene.hit, as_tuple=True)
     beyond = light.radiance(x[point], wi[point, direction][:, None])[:, 0]
     return scene.radiance.index_put((point, direction), beyond)

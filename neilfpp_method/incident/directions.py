@@ -1,4 +1,4 @@
-"""Which incident directions a surface point is asked along."""
+"""Sample the incident directions along which light is evaluated."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from neilfpp_method.structures import IncidentSamples
 __all__ = ["directions_for_viewers", "draw_directions"]
 
 BY_COSINE, BY_LIGHT, BY_LOBE = 24, 24, 3
-"""Incident directions of `directions_for_viewers`: by cosine, by the light, and by each viewer's lobe."""
+"""Directions of `directions_for_viewers` by technique: cosine, light, and the lobe of each viewer."""
 
 WITHOUT_LOBE = {"mis": "no_lobe", "lobe": "cosine"}
-"""A Lambertian surface has no lobe to sample."""
+"""Samplers that replace those that sample the lobe, for Lambertian surfaces, which have none."""
 
 
 def draw_directions(
@@ -29,16 +29,16 @@ def draw_directions(
     lobe: Lobe | None,
     stochastic: bool,
 ) -> IncidentSamples:
-    """`count` incident directions per point for one viewer each.
+    """Sample `count` incident directions per point, for one viewer per point.
 
     Args:
-        sampler: by name, as of `ShadingConfig.sampler`.
-        light: takes part in "mis" where it can be sampled.
-        normal, wo: unit, away from the surface; constants.
-        roughness: of the surface, a constant.
+        sampler: name of the sampler, see `ShadingConfig.sampler`.
+        light: takes part in "mis" and "no_lobe" if it can be sampled.
+        normal, wo: unit vectors away from the surface, without gradient.
+        roughness: roughness of the surface, without gradient.
         count: directions per point.
-        lobe: of the specular reflection; none for Lambertian surfaces.
-        stochastic: off: the same directions at every call.
+        lobe: specular lobe; None for Lambertian surfaces.
+        stochastic: whether the directions are random; if False, every call returns the same ones.
     """
     kind = sampler if lobe is not None else WITHOUT_LOBE.get(sampler, sampler)
     return sample_directions(kind, normal, wo, roughness, count, lobe, stochastic, light.technique(normal))
@@ -51,9 +51,10 @@ def directions_for_viewers(
     roughness: Float[Tensor, "N 1"],
     lobe: Lobe | None,
 ) -> IncidentSamples:
-    """Incident directions that serve all V viewers of a point together, the same at every call.
+    """Choose incident directions for all V viewers of a point together, the same at every call.
 
-    Cosine, light and all viewers' lobes, by the balance heuristic. Arguments as of `draw_directions`.
+    Cosine, light and the lobes of all viewers are combined by the balance heuristic. Arguments as in
+    `draw_directions`.
     """
     techniques = [(cosine(normal), BY_COSINE)]
     towards_light = light.technique(normal)

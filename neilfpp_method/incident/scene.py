@@ -1,4 +1,4 @@
-"""What the scene's own surfaces send: rays that leave a surface, traced through the host (METHOD §2)."""
+"""Light from the scene's own surfaces: rays that start at a surface, traced through the host (METHOD §2)."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from neilfpp_method.timing.ledger import doing
 __all__ = ["off_surface", "scene_light", "scene_tracer"]
 
 HEIGHT_IN_WIDTHS = 4.0
-"""Height above a surface of scale β at which a ray starts, in β. A ray that leaves from a height h has the
-optical depth exp(−h/β) / (2 cos θ) before it: from four scales up that is 1 % along the normal and 5 % at
+"""Height above the surface at which a ray starts, in units of the density's scale β. A ray that starts at
+height h still crosses the optical depth exp(−h/β) / (2 cos θ): at 4 β that is 1 % along the normal and 5 % at
 80°.
 """
 
 MIN_COSINE = 0.1
-"""Directions closer to the surface than 6° start as far along as those at 6°."""
+"""Lower bound on cos θ in the displacement of the start; it acts within 6° of the surface."""
 
 RAYS_AT_ONCE = 2048
-"""Rays that a host without cheap tracing renders at once; bounds the memory."""
+"""Number of rays per batch for a host without cheap tracing; limits memory."""
 
 
 def scene_tracer(host: Host, config: InterReflectionConfig, hit_share: float) -> SceneTracer:
-    """`scene_light` of a host, for those who know surface points and directions alone."""
+    """`scene_light` of a host, as a function of surface points and directions."""
     return lambda x, wi: scene_light(host, x, wi, config, hit_share)
 
 
@@ -40,14 +40,16 @@ def scene_light(
     config: InterReflectionConfig,
     hit_share: float,
 ) -> SceneLight:
-    """What the scene itself sends to surface points: by the host's own tracing, or by rendering all N·S rays.
+    """Light from the scene's surfaces at surface points, without gradient.
+
+    It uses the host's own tracing (`LightsItself`) if there is one; otherwise it renders all N·S rays.
 
     Args:
         host: geometry and outgoing radiance.
         x: surface points, scene frame.
         wi: unit directions away from the surface.
-        config: `offset`, scene units, is where rays start where the host traces by rendering.
-        hit_share: smallest concentration of a ray's blending weight that counts as a hit.
+        config: `offset` is the distance from x at which rendered rays start, scene units.
+        hit_share: smallest concentration of the rendering weight that counts as a hit.
     """
     x = x.detach()
     if isinstance(host, LightsItself):
@@ -68,7 +70,7 @@ def scene_light(
 def off_surface(
     host: Host, x: Float[Tensor, "K 3"], normal: Float[Tensor, "K 3"], w: Float[Tensor, "K 3"], offset: float
 ) -> Float[Tensor, "K 3"]:
-    """Points along w above the soft layer of a host's surface, at `offset` plus four of its widths."""
+    """Move points along w to a height of `offset` + 4 β above the surface, β the width of its soft layer."""
     width = host.surface_width() if isinstance(host, HasSurfaceWidth) else 0.0
     cosine = (w * normal).sum(-1, keepdim=True).clamp_min(MIN_COSINE)
     return x + ((offset + HEIGHT_IN_WIDTHS * width) / cosine) * w

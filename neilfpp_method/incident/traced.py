@@ -1,4 +1,4 @@
-"""Rays for L_ref: what arrives from another surface, as the host renders it (METHOD §2, §4)."""
+"""Sample and trace the rays of L_ref, which compares L with R at other surfaces (METHOD §2, §4)."""
 
 from __future__ import annotations
 
@@ -19,19 +19,21 @@ from neilfpp_method.structures import RayBatch
 __all__ = ["TracedLight", "trace_light"]
 
 MAX_ANGLE_DEG = 80.0
-"""From the normal: a flatter ray stays within the soft layer of its own surface, and brings little light."""
+"""Largest angle of a ray from the normal. At larger angles a ray stays in the soft layer of its own surface,
+and brings little light.
+"""
 MAX_START = 0.2
-"""Distance from its point, scene units, beyond which no ray starts (published code). Further out it could
-start behind a neighbouring surface, and nearer than its angle asks for it would meet the layer that it
-leaves: it is left out.
+"""Largest distance of the start of a ray from its surface point, scene units (published code). A ray that has
+to start further away is left out: it could start behind a neighboring surface, and closer to its point it
+would hit the soft layer that it leaves.
 """
 
 
 @dataclass(frozen=True)
 class TracedLight:
-    """Rays that left the surface: origin, direction, the radiance that arrives, and which ones hit.
+    """Traced rays: their surface points and directions, the incident radiance, and which rays hit.
 
-    Rays that start too far away, or of which the host knows at once that they meet nothing, are left out.
+    Rays that would start too far away, or that the host knows to miss, are left out.
     """
 
     position: Float[Tensor, "K 3"]
@@ -49,18 +51,17 @@ def trace_light(
 ) -> TracedLight:
     """Trace random directions from random points through the host.
 
-    Directions are uniform in solid angle within `MAX_ANGLE_DEG` of the normal. A ray starts off the surface:
-    at a height of `config.offset` and four widths of the host's surface, so the displacement along the ray
-    grows as 1/cos. A ray that would have to start further than `MAX_START` from its point is left out.
-    Positions are constants: L_ref says what arrives at a point, not where the point is.
+    Directions are uniform in solid angle within `MAX_ANGLE_DEG` of the normal. A ray starts at a height of
+    `config.offset` plus four widths of the host's surface, so its displacement along the ray grows as 1/cos
+    θ. Rays that would start further than `MAX_START` from their point are left out. No gradient flows into
+    the positions: L_ref must not move the surface.
 
     Args:
-        host: renders the rays; its radiance gets a gradient scaled by `config.radiance_gradient`, none when
-            that is 0.
+        host: renders the rays. The gradient into its radiance is scaled by `config.radiance_gradient`.
         position: surface points, scene frame.
-        normal: unit normals, away from the surface.
-        config: how many, how far, how steep.
-        hit_share: smallest concentration of a hit.
+        normal: outward unit normals.
+        config: rays per point, offset, and gradient scale.
+        hit_share: smallest concentration of the rendering weight that counts as a hit.
     """
     position, normal = position.detach(), normal.detach()
     rows = _random_rows(position.shape[0], config.rays_per_point, position.device)
@@ -79,7 +80,7 @@ def trace_light(
 
 
 def _random_rows(points: int, per_point: float, device: torch.device) -> Tensor:
-    """Rows of the points that send a ray: every point ⌊per_point⌋ times, and a random choice for the rest."""
+    """Rows of the points at which rays start: each ⌊per_point⌋ times, and random points for the rest."""
     whole = int(per_point)
     rest = round(points * (per_point - whole))
     return torch.cat(

@@ -1,4 +1,4 @@
-"""A dense oriented cloud from posed images, on the CPU: a depth map for each view, and what they agree on."""
+"""A dense oriented point cloud of posed images, computed on the CPU: one depth map per view, fused."""
 
 from __future__ import annotations
 
@@ -11,47 +11,54 @@ from neilfpp_method.data.images import read_image, write_exr
 from neilfpp_method.data.point_cloud import WorldPoints
 from neilfpp_method.errors import UserError
 from neilfpp_method.prepare.depth_fusion import fuse
-from neilfpp_method.prepare.plane_sweep import choose_sources, grain, grey_view, sweep
+from neilfpp_method.prepare.plane_sweep import choose_sources, grey_view, inverse_depth_step, sweep
 from neilfpp_method.prepare.progress import Bars
 from neilfpp_method.prepare.sparse_cloud import without_outliers
 
 __all__ = ["dense_cloud"]
 
-SWEPT, ASKED = 4, 8
+STEREO_SOURCES = 4
+"""Number of views that a view is compared with to compute its depth map. The time grows in proportion."""
+
+FUSION_SOURCES = 8
+"""Number of views whose depth maps may confirm a depth of a view. A look-up is cheap, so there are more of
+them than views in the comparison of images."""
 
 
 def dense_cloud(capture: Capture, folder: Path, open_bar: Bars) -> WorldPoints:
-    """The oriented points of a capture by plane-sweep stereo, in the world frame.
+    """Compute an oriented point cloud of a capture by plane-sweep stereo, in the world frame.
 
     Args:
         capture: posed images with a scene box.
-        folder: where depth maps are kept, `NAME.exr`; those that are there are not computed again.
-        open_bar: for the progress.
+        folder: folder of the depth maps, `NAME.exr`. An existing depth map is read instead of computed again.
+        open_bar: opens a progress bar with a title and a total.
 
     Raises:
-        UserError: no two views are close enough to be compared, or nothing in them agrees.
+        UserError: no two views are close enough to be compared, or the depth maps agree nowhere.
     """
     views = [grey_view(view, capture.hdr) for view in capture.views]
     cameras = [view.camera for view in views]
     centre = np.array(capture.normalisation.centre)
-    sources = choose_sources(cameras, centre, SWEPT)
+    sources = choose_sources(cameras, centre, STEREO_SOURCES)
     if not any(sources):
-        raise UserError(f"{capture.root}: no two views see the scene from nearby", "leave out --dense")
+        raise UserError(f"{capture.root}: no two views see the scene from nearby", "use --cloud sparse")
     bar = open_bar("depth of each view", len(views))
     depths = []
-    for view, grey, others in zip(capture.views, views, sources, strict=True):
+    for view, reference, others in zip(capture.views, views, sources, strict=True):
         path = folder / f"{view.name}.exr"
         if not path.is_file():
-            write_exr(path, {"Z": sweep(grey, [views[j] for j in others], capture.normalisation)})
+            write_exr(path, {"Z": sweep(reference, [views[j] for j in others], capture.normalisation)})
         depths.append(read_image(path).pixels[..., 0])
         bar.advance()
-    grains = [
-        grain(camera, [cameras[j] for j in others]) for camera, others in zip(cameras, sources, strict=True)
+    steps = [
+        inverse_depth_step(camera, [cameras[j] for j in others])
+        for camera, others in zip(cameras, sources, strict=True)
     ]
-    asked = choose_sources(cameras, centre, ASKED)
-    points = fuse(cameras, depths, grains, asked, open_bar("fusing depth", len(views)).advance)
+    neighbours = choose_sources(cameras, centre, FUSION_SOURCES)
+    points = fuse(cameras, depths, steps, neighbours, open_bar("fusing depth", len(views)).advance)
     if not len(points.position):
         raise UserError(
-            f"{capture.root}: the views agree on no surface", "leave out --dense; stereo needs texture"
+            f"{capture.root}: the depth maps of the views agree on no surface",
+            "use --cloud sparse: stereo needs texture",
         )
     return without_outliers(points)

@@ -1,8 +1,8 @@
-"""Depth maps of many views become one oriented cloud: what several views agree on, once.
+"""Fusion of the depth maps of many views into one oriented point cloud.
 
-COLMAP's `stereo_fusion` takes the overlap of the views from the tracks of a sparse model, and a capture that
-came with its poses has none. What it does is short enough to be said here, and is the same for all sources of
-depth.
+COLMAP's `stereo_fusion` finds overlapping views by the tracks of a sparse model, which a capture that came
+with its poses does not have. This module does the same consistency check and averaging without tracks, for
+depth maps of any source.
 """
 
 from __future__ import annotations
@@ -19,62 +19,78 @@ from neilfpp_method.prepare.depth_planes import OrientedDepth, fit_planes
 
 __all__ = ["fuse"]
 
-AGREEMENT = 1.5
+MAX_DISPARITY = 1.5
+"""Largest difference of two inverse depths that agree, in steps of one pixel of disparity: the rounding of a
+position to a pixel of the other view and the error of the two depth maps, about half a pixel each."""
+
 MIN_COSINE = 0.7
-MIN_WITNESSES = 2
+"""Smallest cosine between two normals that agree: an angle of 45°."""
+
+MIN_VIEWS = 2
+"""Number of other views that must confirm a depth. A wrong depth rarely agrees with two others by chance."""
 
 
 def fuse(
     cameras: Sequence[Camera],
     depths: Sequence[Float32[np.ndarray, "H W"]],
-    grains: Sequence[float],
+    steps: Sequence[float],
     neighbours: Sequence[Sequence[int]],
     advance: Callable[[], None],
 ) -> WorldPoints:
-    """The oriented points on which at least two other views agree.
+    """Fuse depth maps into the oriented points that at least `MIN_VIEWS` other views confirm.
 
-    A view agrees with a point where the inverse depth that it has in the point's place differs by at most 1.5
-    grains, and the normals by at most 45°. Point and normal are the means over the views that agree; these
-    pixels make no point of their own.
+    A point of a view is projected into each neighbour. The neighbour confirms it if the inverse depth of its
+    depth map at that pixel differs by at most `MAX_DISPARITY` steps and the normals by at most 45°. The
+    position and normal of the fused point are the means over the view and the neighbours that confirm it, and
+    the pixels that were averaged make no further points.
 
     Args:
-        cameras: pinholes.
-        depths: depth maps along their axes, 0 where not known.
-        grains: the difference of inverse depth that each view's depth map can tell.
-        neighbours: for each view the others that are asked.
-        advance: called once per view.
+        cameras: the pinhole camera of each view.
+        depths: depth along the optical axis of each view, world units, 0 if unknown.
+        steps: for each view, the difference of inverse depth that its depth map can resolve.
+        neighbours: for each view, the indices of the views that may confirm its depths.
+        advance: called after each view, for a progress bar.
+
+    Returns:
+        Points and unit normals in the world frame; none if the depth maps agree nowhere.
     """
-    agreed = [
-        _witnesses(cameras, depths, i, grains[i], others) >= MIN_WITNESSES
+    confirmed = [
+        _count_confirmations(cameras, depths, i, steps[i], others) >= MIN_VIEWS
         for i, others in enumerate(neighbours)
     ]
-    trusted = [np.where(sure, depth, np.float32(0)) for sure, depth in zip(agreed, depths, strict=True)]
-    maps = [fit_planes(*view) for view in zip(cameras, trusted, grains, strict=True)]
-    taken = [depth.depth <= 0 for depth in maps]
+    filtered = [np.where(mask, depth, np.float32(0)) for mask, depth in zip(confirmed, depths, strict=True)]
+    maps = [fit_planes(*view) for view in zip(cameras, filtered, steps, strict=True)]
+    used = [depth_map.depth <= 0 for depth_map in maps]
     positions, normals = [], []
     for i, camera in enumerate(cameras):
-        rows, columns = np.nonzero(~taken[i])
+        rows, columns = np.nonzero(~used[i])
         position = _unproject(camera, rows, columns, maps[i].depth[rows, columns])
         normal = maps[i].normal[rows, columns].astype(np.float64)
-        total, direction, count = position.copy(), normal.copy(), np.ones(len(rows))
+        position_sum, normal_sum, count = position.copy(), normal.copy(), np.ones(len(rows))
         for j in neighbours[i]:
-            seen = _lookup(cameras[j], maps[j], position, grains[i])
-            agrees = seen.agrees & ((seen.normal * normal).sum(axis=1) >= MIN_COSINE)
-            total[agrees] += seen.position[agrees]
-            direction[agrees] += seen.normal[agrees]
+            other = _lookup(cameras[j], maps[j], position, steps[i])
+            agrees = other.agrees & ((other.normal * normal).sum(axis=1) >= MIN_COSINE)
+            position_sum[agrees] += other.position[agrees]
+            normal_sum[agrees] += other.normal[agrees]
             count += agrees
-            taken[j][seen.row[agrees], seen.column[agrees]] = True
-        kept = count > MIN_WITNESSES
-        positions.append(total[kept] / count[kept, None])
-        normals.append(direction[kept] / np.linalg.norm(direction[kept], axis=1, keepdims=True))
+            used[j][other.row[agrees], other.column[agrees]] = True
+        kept = count > MIN_VIEWS
+        positions.append(position_sum[kept] / count[kept, None])
+        normals.append(normal_sum[kept] / np.linalg.norm(normal_sum[kept], axis=1, keepdims=True))
         advance()
     return WorldPoints(np.concatenate(positions), np.concatenate(normals))
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What a view has in the place of points of the world: in which pixel, its own position and normal there,
-    and whether the depths agree.
+class _Surface:
+    """The surface of a view's depth map at the pixels onto which points of the world project.
+
+    Attributes:
+        row: row of each pixel.
+        column: column of each pixel.
+        position: position by the depth map, world frame.
+        normal: unit normal by the depth map, world frame.
+        agrees: whether the depth map has the depth of the point.
     """
 
     row: np.ndarray
@@ -84,57 +100,58 @@ class Seen:
     agrees: Bool[np.ndarray, " N"]
 
 
-def _lookup(camera: Camera, known: OrientedDepth, position: Float64[np.ndarray, "N 3"], grain: float) -> Seen:
-    row, column, depth = _project(camera, position)
-    there = known.depth[row, column].astype(np.float64)
-    normal = known.normal[row, column].astype(np.float64)
-    return Seen(row, column, _unproject(camera, row, column, there), normal, _agree(there, depth, grain))
-
-
-def _agree(
-    a: Float64[np.ndarray, " N"], b: Float64[np.ndarray, " N"], grain: float
-) -> Bool[np.ndarray, " N"]:
-    known = (a > 0) & (b > 0)
-    return known & (
-        np.abs(1.0 / np.where(known, a, 1.0) - 1.0 / np.where(known, b, 1.0)) <= AGREEMENT * grain
+def _lookup(
+    camera: Camera, depth_map: OrientedDepth, position: Float64[np.ndarray, "N 3"], step: float
+) -> _Surface:
+    row, column, expected = _project(camera, position)
+    depth = depth_map.depth[row, column].astype(np.float64)
+    normal = depth_map.normal[row, column].astype(np.float64)
+    return _Surface(
+        row, column, _unproject(camera, row, column, depth), normal, _agree(depth, expected, step)
     )
 
 
-def _witnesses(
+def _agree(a: Float64[np.ndarray, " N"], b: Float64[np.ndarray, " N"], step: float) -> Bool[np.ndarray, " N"]:
+    """Whether both depths are known and their inverses differ by at most `MAX_DISPARITY` steps."""
+    known = (a > 0) & (b > 0)
+    difference = np.abs(1.0 / np.where(known, a, 1.0) - 1.0 / np.where(known, b, 1.0))
+    return known & (difference <= MAX_DISPARITY * step)
+
+
+def _count_confirmations(
     cameras: Sequence[Camera],
     depths: Sequence[Float32[np.ndarray, "H W"]],
     i: int,
-    grain: float,
+    step: float,
     others: Sequence[int],
 ) -> Float32[np.ndarray, "H W"]:
-    """How many other views have the depth that each pixel of view i says."""
+    """For each pixel of view `i`, the number of other views whose depth maps agree with its depth."""
     rows, columns = np.nonzero(depths[i] > 0)
     position = _unproject(cameras[i], rows, columns, depths[i][rows, columns])
     count = np.zeros(depths[i].shape, np.float32)
     for j in others:
-        row, column, depth = _project(cameras[j], position)
-        count[rows, columns] += _agree(depths[j][row, column].astype(np.float64), depth, grain)
+        row, column, expected = _project(cameras[j], position)
+        count[rows, columns] += _agree(depths[j][row, column].astype(np.float64), expected, step)
     return count
 
 
 def _project(
     camera: Camera, position: Float64[np.ndarray, "N 3"]
 ) -> tuple[np.ndarray, np.ndarray, Float64[np.ndarray, " N"]]:
-    """Row, column and depth of points; a depth of −1 where the view does not show them, with some pixel."""
+    """Row, column and depth of points in a view. Outside of its image they are 0, 0 and −1."""
     local = position @ camera.w2c[:3, :3].T + camera.w2c[:3, 3]
     depth = local[:, 2]
-    pixel = (
-        local[:, :2] / np.where(depth > 0, depth, 1.0)[:, None] * camera.intrinsics[:2]
-        + camera.intrinsics[2:]
-    )
-    shown = (depth > 0) & (pixel >= 0).all(axis=1) & (pixel < [camera.width, camera.height]).all(axis=1)
-    column, row = np.where(shown[:, None], pixel, 0.0).astype(np.int64).T
-    return row, column, np.where(shown, depth, -1.0)
+    plane = local[:, :2] / np.where(depth > 0, depth, 1.0)[:, None]
+    pixel = plane * camera.intrinsics[:2] + camera.intrinsics[2:]
+    inside = (depth > 0) & (pixel >= 0).all(axis=1) & (pixel < [camera.width, camera.height]).all(axis=1)
+    column, row = np.where(inside[:, None], pixel, 0.0).astype(np.int64).T
+    return row, column, np.where(inside, depth, -1.0)
 
 
 def _unproject(
     camera: Camera, rows: np.ndarray, columns: np.ndarray, depth: np.ndarray
 ) -> Float64[np.ndarray, "N 3"]:
+    """World positions of pixel centres at the given depths."""
     plane = (np.stack([columns, rows], axis=1) + 0.5 - camera.intrinsics[2:]) / camera.intrinsics[:2]
     local = np.pad(plane, ((0, 0), (0, 1)), constant_values=1.0) * np.asarray(depth, np.float64)[:, None]
     return local @ camera.c2w[:, :3].T + camera.c2w[:, 3]

@@ -1,6 +1,9 @@
-"""Depth maps without CUDA: each view is compared with its neighbours, warped over planes in front of it.
+"""Plane-sweep stereo on the CPU: one depth map per view, from the comparison with a few source views.
 
-OpenCV does the warping and the windows' sums.
+For each plane of a stack of planes parallel to the image plane of the reference view, the source views are
+warped onto the reference view as if the scene lay on that plane. The plane at which warped and reference
+image correlate best in the window around a pixel gives the depth of that pixel (Collins, A Space-Sweep
+Approach to True Multi-Image Matching, CVPR 1996). OpenCV does the warping and the sums over windows.
 """
 
 from __future__ import annotations
@@ -18,32 +21,74 @@ from neilfpp_method.data.undistort import resample, straight_camera
 from neilfpp_method.data.views import Camera, Normalisation, View
 from neilfpp_method.shading.color import luminance
 
-__all__ = ["GreyView", "choose_sources", "grain", "grey_view", "sweep"]
+__all__ = ["GreyView", "choose_sources", "grey_view", "inverse_depth_step", "sweep"]
 
 MAX_SIDE = 640
+"""Longest side of the compared images, in pixels; a larger image is scaled down. Time and memory grow with
+the third power of it, because the number of planes grows as well."""
+
 WINDOW = 7
-MAX_ANGLE, BEST_ANGLE, MIN_ANGLE = 35.0, 12.0, 3.0
-MIN_PLANES, MAX_PLANES = 32, 224
+"""Side of the square correlation window, in pixels. A larger window is less sensitive to noise, but it blurs
+depth at the edges of objects."""
+
+BEST_ANGLE = 12.0
+"""Preferred angle between the directions in which two cameras see the scene's centre, in degrees: wide enough
+to measure depth, narrow enough that both images look alike."""
+
+MIN_ANGLE = 3.0
+"""Smallest angle between two cameras, in degrees. Below it, a pixel of disparity is a large step in depth."""
+
+MAX_ANGLE = 35.0
+"""Largest angle between two cameras, in degrees. Above it, perspective and occlusion change the images too
+much for a correlation of windows."""
+
+MIN_PLANES = 32
+"""Smallest number of planes, so that the parabola through three neighbouring scores is meaningful even if the
+cameras stand close together."""
+
+MAX_PLANES = 224
+"""Largest number of planes. It bounds the memory of the scores: for 640 × 480 pixels they take 275 MB."""
+
 MIN_SCORE = 0.6
-FLAT = 1e-5
-"""Variance below which a window shows nothing; grey values run from 0 to 1."""
-ROOM = 1.15
-MIN_DEPTH = 0.05
+"""Smallest normalised cross-correlation, at most 1, with which a depth is kept."""
+
+MIN_VARIANCE = 1e-5
+"""Smallest variance of a textured window, for grey values in [0, 1]: a standard deviation of 0.8 levels of an
+8-bit image, about its quantisation noise."""
+
+MARGIN = 1.15
+"""Half the depth range of the planes, in radii of the scene's sphere: a margin of 15 %, as the sphere of a
+capture is an estimate."""
+
+MIN_DEPTH_RATIO = 0.05
+"""Smallest depth of the nearest plane, as a share of the depth of the farthest one. It applies to cameras
+inside or close to the scene's sphere, for which the range would otherwise begin at or behind the camera."""
 
 
 @dataclass(frozen=True)
 class GreyView:
-    """A view as it is compared: a pinhole, small enough for a dense search, with grey values in [0, 1]."""
+    """The image of a view as stereo compares it.
+
+    Attributes:
+        camera: a pinhole of at most `MAX_SIDE` pixels a side.
+        grey: grey values in [0, 1], of the camera's size.
+    """
 
     camera: Camera
     grey: Float32[np.ndarray, "H W"]
 
 
 def grey_view(view: View, linear: bool) -> GreyView:
-    """Read a view, undo its lens and scale it down where it has more than 640 pixels a side.
+    """Read the image of a view, remove its lens distortion and scale it down to at most `MAX_SIDE` pixels a
+    side.
 
-    The square root of luminance evens out the noise of dark and bright pixels. Correlation does not see
-    brightness and contrast, so exposures need no care.
+    Exposure and white balance are not corrected, because the correlation of two windows does not depend on
+    brightness and contrast.
+
+    Args:
+        view: a view of a capture.
+        linear: whether pixels are linear radiance. If so, the square root of luminance is used, which makes
+            the noise of dark and bright pixels similar.
     """
     image = read_image(view.image).pixels
     usable = np.where(np.isfinite(image) & (image > 0), image, np.float32(0))
@@ -53,124 +98,150 @@ def grey_view(view: View, linear: bool) -> GreyView:
         color = resample(color, view.camera, camera)
     grey = luminance(torch.from_numpy(color)).numpy()
     grey = np.sqrt(grey / max(float(np.quantile(grey, 0.99)), 1e-9)).clip(0.0, 1.0) if linear else grey
-    share = min(1.0, MAX_SIDE / max(camera.width, camera.height))
-    width, height = round(camera.width * share), round(camera.height * share)
+    scale = min(1.0, MAX_SIDE / max(camera.width, camera.height))
+    width, height = round(camera.width * scale), round(camera.height * scale)
     if (width, height) != (camera.width, camera.height):
         grey = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
-        across, down = width / camera.width, height / camera.height
-        scaled = {
-            "fx": camera.fx * across,
-            "cx": camera.cx * across,
-            "fy": camera.fy * down,
-            "cy": camera.cy * down,
-        }
-        camera = replace(camera, **scaled, width=width, height=height)
+        scale_x, scale_y = width / camera.width, height / camera.height
+        camera = replace(
+            camera,
+            fx=camera.fx * scale_x,
+            fy=camera.fy * scale_y,
+            cx=camera.cx * scale_x,
+            cy=camera.cy * scale_y,
+            width=width,
+            height=height,
+        )
     return GreyView(camera, np.ascontiguousarray(grey, np.float32))
 
 
 def choose_sources(
     cameras: Sequence[Camera], centre: Float64[np.ndarray, " 3"], count: int
 ) -> list[list[int]]:
-    """For each camera at most `count` others to compare with: those at the best angles to it.
+    """Choose the source views of each view by the angle between the two cameras as seen from `centre`.
 
-    Wider angles tell depth better, narrower ones show the same picture. A camera may have none.
+    Args:
+        cameras: the cameras of all views, in the world frame.
+        centre: centre of the scene, in the world frame.
+        count: largest number of sources per view.
+
+    Returns:
+        For each camera the indices of its sources, best first: the angles between `MIN_ANGLE` and `MAX_ANGLE`
+        whose ratio to `BEST_ANGLE` is closest to 1. The list of a camera may be empty.
     """
     eyes = np.stack([camera.c2w[:, 3] for camera in cameras])
     directions = (eyes - centre) / np.linalg.norm(eyes - centre, axis=1, keepdims=True)
     angles = np.degrees(np.arccos(np.clip(directions @ directions.T, -1.0, 1.0)))
-    fit = np.abs(np.log(np.maximum(angles, 1e-3) / BEST_ANGLE))
-    fit[(angles < MIN_ANGLE) | (angles > MAX_ANGLE)] = np.inf
-    order = np.argsort(fit, axis=1)[:, :count]
-    return [[int(j) for j in row if np.isfinite(fit[i, j])] for i, row in enumerate(order)]
+    cost = np.abs(np.log(np.maximum(angles, 1e-3) / BEST_ANGLE))
+    cost[(angles < MIN_ANGLE) | (angles > MAX_ANGLE)] = np.inf
+    order = np.argsort(cost, axis=1)[:, :count]
+    return [[int(j) for j in row if np.isfinite(cost[i, j])] for i, row in enumerate(order)]
 
 
-def grain(camera: Camera, sources: Sequence[Camera]) -> float:
-    """The step of inverse depth that moves the farthest source's picture by a pixel; 0 without sources."""
-    return (
-        1.0 / (camera.fx * max(float(np.linalg.norm(s.c2w[:, 3] - camera.c2w[:, 3])) for s in sources))
-        if sources
-        else 0.0
-    )
+def inverse_depth_step(camera: Camera, sources: Sequence[Camera]) -> float:
+    """The change of inverse depth that moves a pixel by one pixel in the source with the longest baseline.
+
+    This is the resolution of a depth map by stereo: 1 / (focal length in pixels · baseline), in one over
+    world units. It is 0 without sources.
+    """
+    if not sources:
+        return 0.0
+    eye = camera.c2w[:, 3]
+    baseline = max(float(np.linalg.norm(source.c2w[:, 3] - eye)) for source in sources)
+    return 1.0 / (camera.fx * baseline)
 
 
 def sweep(reference: GreyView, sources: Sequence[GreyView], box: Normalisation) -> Float32[np.ndarray, "H W"]:
-    """The depth of each pixel along the camera's axis, world units; 0 where it is not known.
+    """Compute the depth map of a view by plane-sweep stereo.
 
-    Planes across the axis, evenly spaced in inverse depth, lie through the scene's sphere so that neighbours
-    move the picture by a pixel. Each source, warped over a plane, is correlated with the reference in
-    windows; the two best sources count, as others may be hidden. The plane of the highest mean correlation
-    wins, refined by a parabola. Without sources nothing is known.
+    The planes are evenly spaced in inverse depth, cover the scene's sphere, and are at most one pixel of
+    disparity apart unless that takes more than `MAX_PLANES`. The score of a plane is the normalised
+    cross-correlation of windows, averaged over the two best sources, because the surface may be hidden in the
+    others. The depth with the highest score is refined by a parabola through it and its two neighbours.
+
+    Args:
+        reference: the view whose depth is computed.
+        sources: the views that it is compared with. Without any, no depth is known.
+        box: centre and radius of the scene's sphere, in the world frame.
+
+    Returns:
+        Depth along the optical axis in world units; 0 if it is unknown: in windows without texture, with a
+        score below `MIN_SCORE`, or with the best score at the first or the last plane.
     """
     if not sources:
         return np.zeros_like(reference.grey)
-    inverse = _planes(reference, sources, box)
-    ours = _Windows(reference.grey)
-    volume = np.stack([_score(reference, sources, ours, float(value)) for value in inverse])
-    best = volume.argmax(axis=0)
-    inner = np.clip(best, 1, len(inverse) - 2)
-    below, peak, above = (np.take_along_axis(volume, inner[None] + step, axis=0)[0] for step in (-1, 0, 1))
-    curve = below - 2 * peak + above
-    offset = np.where(curve < -1e-6, (below - above) / (2 * np.minimum(curve, -1e-6)), 0.0).clip(-0.5, 0.5)
-    refined = inverse[0] + (inner + offset) * (inverse[1] - inverse[0])
-    known = (best == inner) & (peak >= MIN_SCORE) & ours.textured
+    inverse_depths = _planes(reference, sources, box)
+    windows = _Windows(reference.grey)
+    scores = np.stack([_score(reference, sources, windows, float(value)) for value in inverse_depths])
+    best = scores.argmax(axis=0)
+    inner = np.clip(best, 1, len(inverse_depths) - 2)
+    below, peak, above = (np.take_along_axis(scores, inner[None] + step, axis=0)[0] for step in (-1, 0, 1))
+    curvature = below - 2 * peak + above
+    peaked = curvature < -1e-6
+    offset = np.where(peaked, (below - above) / (2 * np.where(peaked, curvature, -1.0)), 0.0).clip(-0.5, 0.5)
+    refined = inverse_depths[0] + (inner + offset) * (inverse_depths[1] - inverse_depths[0])
+    known = (best == inner) & (peak >= MIN_SCORE) & windows.textured
     return np.where(known, 1.0 / refined, 0.0).astype(np.float32)
 
 
 class _Windows:
-    """Means and variances of a picture in windows."""
+    """Means and variances of an image in the window around each pixel."""
 
     def __init__(self, grey: Float32[np.ndarray, "H W"]) -> None:
         self.grey = grey
-        self.mean = _box(grey)
-        self.variance = np.maximum(_box(grey * grey) - self.mean**2, 0.0)
+        self.mean = _window_mean(grey)
+        self.variance = np.maximum(_window_mean(grey * grey) - self.mean**2, 0.0)
 
     @property
     def textured(self) -> Bool[np.ndarray, "H W"]:
-        return self.variance > FLAT
+        return self.variance > MIN_VARIANCE
 
 
 def _planes(
     reference: GreyView, sources: Sequence[GreyView], box: Normalisation
 ) -> Float64[np.ndarray, " D"]:
+    """The inverse depths of the planes, from the farthest to the nearest."""
     camera = reference.camera
-    middle = float(camera.w2c[2, :3] @ np.array(box.centre) + camera.w2c[2, 3])
-    far = middle + ROOM * box.scale
-    near = max(middle - ROOM * box.scale, MIN_DEPTH * far)
-    count = int((1 / near - 1 / far) / grain(camera, [source.camera for source in sources]))
+    centre_depth = float(camera.w2c[2, :3] @ np.array(box.centre) + camera.w2c[2, 3])
+    far = centre_depth + MARGIN * box.scale
+    near = max(centre_depth - MARGIN * box.scale, MIN_DEPTH_RATIO * far)
+    step = inverse_depth_step(camera, [source.camera for source in sources])
+    count = int((1 / near - 1 / far) / step)
     return np.linspace(1 / far, 1 / near, min(max(count, MIN_PLANES), MAX_PLANES))
 
 
 def _score(
-    reference: GreyView, sources: Sequence[GreyView], ours: _Windows, inverse_depth: float
+    reference: GreyView, sources: Sequence[GreyView], windows: _Windows, inverse_depth: float
 ) -> Float32[np.ndarray, "H W"]:
-    """The mean of the two highest correlations with the sources warped over a plane."""
-    first = np.full(ours.grey.shape, -1.0, np.float32)
+    """The mean of the two highest correlations of the reference with its sources warped over a plane."""
+    first = np.full(windows.grey.shape, -1.0, np.float32)
     second = first.copy()
     for source in sources:
-        correlation = _correlation(ours, _Windows(_warped(reference.camera, source, inverse_depth)))
+        correlation = _correlation(windows, _Windows(_warp(reference.camera, source, inverse_depth)))
         second = np.maximum(second, np.minimum(first, correlation))
         first = np.maximum(first, correlation)
     return 0.5 * (first + second) if len(sources) > 1 else first
 
 
-def _warped(camera: Camera, source: GreyView, inverse_depth: float) -> Float32[np.ndarray, "H W"]:
-    """What the camera would see of the source's picture, were it painted on the plane."""
+def _warp(camera: Camera, source: GreyView, inverse_depth: float) -> Float32[np.ndarray, "H W"]:
+    """Warp the image of a source into a camera by the homography of the plane z = 1 / `inverse_depth`."""
     motion = source.camera.w2c @ np.linalg.inv(camera.w2c)
     plane = motion[:3, :3] + np.outer(motion[:3, 3], [0.0, 0.0, inverse_depth])
-    homography = _pixels(source.camera) @ plane @ np.linalg.inv(_pixels(camera))
+    homography = _opencv_matrix(source.camera) @ plane @ np.linalg.inv(_opencv_matrix(camera))
     size = (camera.width, camera.height)
     return cv2.warpPerspective(source.grey, homography, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
 
 
-def _pixels(camera: Camera) -> Float64[np.ndarray, "3 3"]:
-    """The camera's matrix for OpenCV, which counts from the centre of the first pixel."""
+def _opencv_matrix(camera: Camera) -> Float64[np.ndarray, "3 3"]:
+    """The intrinsic matrix in OpenCV's convention, in which the centre of the first pixel is (0, 0)."""
     return np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1.0]])
 
 
 def _correlation(a: _Windows, b: _Windows) -> Float32[np.ndarray, "H W"]:
-    together = _box(a.grey * b.grey) - a.mean * b.mean
-    return together / np.sqrt(np.maximum(a.variance * b.variance, FLAT**2))
+    """The normalised cross-correlation of two images in each window."""
+    covariance = _window_mean(a.grey * b.grey) - a.mean * b.mean
+    return covariance / np.sqrt(np.maximum(a.variance * b.variance, MIN_VARIANCE**2))
 
 
-def _box(values: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
+def _window_mean(values: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
     return cv2.boxFilter(values, -1, (WINDOW, WINDOW), borderType=cv2.BORDER_REFLECT)

@@ -1,4 +1,4 @@
-"""What the images of a capture decide before training, and the units that radiance is compared in."""
+"""Facts about a capture that are measured before training, and the units in which losses measure radiance."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ __all__ = ["RadianceUnits", "SceneFacts", "radiance_units"]
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """What the images of a capture decide before training.
+    """Facts about a capture that are measured on its images before training.
 
     Attributes:
-        response: "linear" (HDR) or "srgb" (LDR): what a pixel is of radiance.
+        response: meaning of pixel values: "linear" (HDR radiance) or "srgb" (LDR display values).
         median_radiance: median linear luminance of the object's pixels; the first render matches it.
-        radiance_scale: the largest radiance that R can reach.
+        radiance_scale: largest radiance that R can represent.
         background: "none", "constant" or "inverted_sphere".
-        background_color: linear RGB of a constant background, and what an inverted sphere starts as.
-        far_points: points of the scene reach far beyond its box, to walls and trees: what lies behind has a
-            shape.
-        log_gains: natural logarithms of how much brighter the training views are than their mean, red, green
-            and blue of view after view; none: all are exposed alike.
+        background_color: linear RGB of a constant background, and initial color of an inverted sphere.
+        far_points: whether points of the scene reach far beyond its box, to walls and trees, so that the
+            background has a shape.
+        log_gains: natural logarithms of the gains of the training views relative to their mean, as red,
+            green, blue of one view after the other; empty if all views have the same exposure.
     """
 
     response: str
@@ -39,7 +39,13 @@ class SceneFacts:
 
 @dataclass(frozen=True)
 class RadianceUnits:
-    """Units of the losses on radiance, each in those that it compares (METHOD §4, last line)."""
+    """The value by which each loss on radiance is divided (METHOD §4, last line).
+
+    Attributes:
+        volume: unit of L_vol, in pixel values.
+        physical: unit of L_phys, in pixel values.
+        incident: unit of L_ref, in linear radiance.
+    """
 
     volume: float
     physical: float
@@ -47,11 +53,12 @@ class RadianceUnits:
 
 
 def radiance_units(config: NeilfConfig, facts: SceneFacts) -> RadianceUnits:
-    """The units that `config.loss.unit` names.
+    """The units for `config.loss.unit`.
 
-    "median": an error of as much as the median radiance is 1, whether the camera stores radiance or display
-    values. The sRGB curve halves all contrasts; in units of the pixel, what speaks against noise would count
-    twice as much.
+    "activation" divides L_vol by the range of R's output. "median" makes a relative error of radiance count
+    the same for linear and sRGB pixels: the unit of a pixel is its change per unit of log radiance at the
+    median. The sRGB curve halves contrasts, so in units of the pixel value the regularisers would weigh twice
+    as much.
     """
     if config.loss.unit == "activation":
         return RadianceUnits(facts.radiance_scale, 1.0, 1.0)

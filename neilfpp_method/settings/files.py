@@ -1,4 +1,4 @@
-"""Settings from a file: YAML or JSON, all or some of them; the `config.json` of a run folder is one."""
+"""Read settings from a YAML or JSON file: all or some of them. The `config.json` of a run folder is one."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from neilfpp_method.errors import UserError
 __all__ = ["read_settings"]
 
 MAX_BYTES = 1 << 20
-"""Bytes: a thousand times what all settings take."""
+"""Largest size of a settings file, in bytes: hundreds of times that of a file with all settings."""
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML with the plain values of YAML 1.2: `off`, `on`, `no` and `12:30` are words, `5e-4` is a number,
-    and no name comes twice in a mapping. (YAML 1.1 takes `mode: off` for false and `5e-4` for a word.)
+    """Loader with plain values as in YAML 1.2: `off`, `on`, `no`, `12:30` are strings and `5e-4` is a number.
+
+    YAML 1.1, which PyYAML implements, reads `mode: off` as False and `5e-4` as a string. A name that is set
+    twice in one mapping is an error.
     """
 
     yaml_implicit_resolvers: dict[str, list] = {}  # noqa: RUF012 (PyYAML keeps its resolvers in the class)
@@ -35,37 +37,35 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-PLAIN = {
+PLAIN_VALUES = {
     "null": (r"~|null|Null|NULL|none|None|", ["~", "n", "N", ""]),
     "bool": (r"true|True|TRUE|false|False|FALSE", list("tTfF")),
     "int": (r"[-+]?[0-9]+(_[0-9]+)*", list("-+0123456789")),
     "float": (r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", list("-+.0123456789")),
 }
-"""The plain values that are no words, and the characters that they begin with."""
-for _name, (_pattern, _first) in PLAIN.items():
+"""Types of plain values other than strings: the pattern of each, and the characters it can begin with."""
+for _name, (_pattern, _first) in PLAIN_VALUES.items():
     _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_name}", re.compile(f"^(?:{_pattern})$"), _first)
 _Loader.add_constructor("tag:yaml.org,2002:float", lambda loader, node: float(loader.construct_scalar(node)))
 _Loader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(loader.construct_scalar(node)))
 
 
 def read_settings(path: Path) -> Mapping[str, Any]:
-    """The settings in a file: nested, or with dotted names. A run folder's `config.json` works too.
+    """Read the settings of a file, as nested mappings or with dotted names.
 
     Raises:
-        UserError: there is no such file, or it holds no settings.
+        UserError: the file does not exist, cannot be parsed, or holds no settings.
     """
     if path.suffix not in (".yaml", ".yml", ".json"):
-        raise UserError(f"{path}: settings are read from .yaml and .json files", "give it one of these names")
+        raise UserError(f"{path}: not a .yaml, .yml or .json file", "name a settings file with --config")
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise UserError(
-                f"{path}: too large for a file of settings", "name the file of settings with --config"
-            )
+            raise UserError(f"{path}: too large for a settings file", "name a settings file with --config")
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
-        raise UserError(f"{path}: no such file", "name a file of settings with --config") from error
+        raise UserError(f"{path}: no such file", "name a settings file with --config") from error
     except UnicodeDecodeError as error:
-        raise UserError(f"{path}: not a text file", "name a file of settings with --config") from error
+        raise UserError(f"{path}: not a text file", "name a settings file with --config") from error
     try:
         content = json.loads(text) if path.suffix == ".json" else yaml.load(text, Loader=_Loader)
     except json.JSONDecodeError as error:
@@ -74,12 +74,12 @@ def read_settings(path: Path) -> Mapping[str, Any]:
         line = f":{error.problem_mark.line + 1}" if error.problem_mark else ""
         raise UserError(f"{path}{line}: not YAML ({error.problem})", "correct the file") from error
     except (yaml.YAMLError, RecursionError) as error:
-        raise UserError(f"{path}: not a file of settings", "correct the file") from error
+        raise UserError(f"{path}: not a settings file", "correct the file") from error
     if content is None:
         return {}
     if not isinstance(content, Mapping):
         raise UserError(f"{path}: holds no settings", "write names and values, such as `train: {rays: 512}`")
-    # What `train` writes into a run folder has the settings beside the format of the folder.
+    # The config.json of a run folder holds the folder's format version and, under "config", the settings.
     inner = content.get("config") if content.keys() <= {"format", "config"} else content
     if not isinstance(inner, Mapping):
         raise UserError(f"{path}: holds no settings", "write names and values, such as `train: {rays: 512}`")

@@ -1,4 +1,4 @@
-"""Settings to and from plain values (JSON, YAML), and changes to them; every value is checked."""
+"""Convert settings to and from plain values (JSON, YAML), and change some of them; every value is checked."""
 
 from __future__ import annotations
 
@@ -15,43 +15,45 @@ Config = TypeVar("Config")
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """The settings as plain values."""
+    """Convert settings to nested dictionaries of plain values."""
     return dataclasses.asdict(config)
 
 
 def from_dict(kind: type[Config], values: Mapping[str, Any], where: str = "config") -> Config:
-    """Settings from plain values, the inverse of `to_dict`.
+    """Make settings from plain values, the inverse of `to_dict`. Absent settings get their defaults.
+
+    Args:
+        kind: the dataclass of settings.
+        values: nested mappings of plain values.
+        where: name of the settings in error messages.
 
     Raises:
-        UserError: a key is unknown or a value has the wrong type; names the setting.
+        UserError: a setting is unknown or its value has the wrong type; the message names the setting.
     """
     hints = get_type_hints(kind)
     for name in values:
         _check_known(name, hints, where)
     arguments = {}
     for name, value in values.items():
-        room = _room(hints[name], value, f"{where}.{name}")
-        arguments[name] = (
-            from_dict(room, value, f"{where}.{name}")
-            if room
-            else _leaf(value, hints[name], f"{where}.{name}")
-        )
+        inside = f"{where}.{name}"
+        part = _part(hints[name], value, inside)
+        arguments[name] = from_dict(part, value, inside) if part else _leaf(value, hints[name], inside)
     return kind(**arguments)
 
 
 def changed(config: Config, values: Mapping[str, Any], where: str = "config") -> Config:
-    """The same settings but for these.
+    """Return settings with some values changed.
 
     A part (light, host, encoding) whose `kind` changes starts from the defaults of its new kind.
 
     Args:
         config: a dataclass of settings.
-        values: by name; a room is a mapping of its own, or its settings are named with dots. Dashes count as
-            underscores.
-        where: what the settings are called in a complaint.
+        values: new values by name. The settings of a part are a nested mapping, or have dotted names. Dashes
+            in names count as underscores.
+        where: name of the settings in error messages.
 
     Raises:
-        UserError: a key is unknown or a value has the wrong type; names the setting.
+        UserError: a setting is unknown or its value has the wrong type; the message names the setting.
 
     Example:
         >>> changed(NeilfConfig(), {"train.rays": 512, "light": {"kind": "distant"}}).train.rays
@@ -59,56 +61,57 @@ def changed(config: Config, values: Mapping[str, Any], where: str = "config") ->
     """
     hints = get_type_hints(type(config))
     arguments = {}
-    for name, value in _by_room(values, where).items():
+    for name, value in _by_part(values, where).items():
         _check_known(name, hints, where)
-        inside = f"{where}.{name}"
-        room = _room(hints[name], value, inside, now=getattr(config, name))
-        if room:
-            now = getattr(config, name)
-            value = changed(now if type(now) is room else room(), value, inside)
-        arguments[name] = value if room else _leaf(value, hints[name], inside)
+        inside, current = f"{where}.{name}", getattr(config, name)
+        part = _part(hints[name], value, inside, current)
+        if part:
+            arguments[name] = changed(current if type(current) is part else part(), value, inside)
+        else:
+            arguments[name] = _leaf(value, hints[name], inside)
     return dataclasses.replace(config, **arguments)
 
 
-def _by_room(values: Any, where: str) -> dict[str, Any]:
-    """Dotted names taken apart, and what belongs to one room put together."""
+def _by_part(values: Any, where: str) -> dict[str, Any]:
+    """Split dotted names, and merge the settings of each part into one mapping."""
     if not isinstance(values, Mapping):
-        raise UserError(f"{where}: {values!r} where settings belong", "give it as names and values")
-    rooms: dict[str, Any] = {}
+        raise UserError(f"{where}: {values!r} where settings belong", "give names and values")
+    parts: dict[str, Any] = {}
     for key, value in values.items():
         name, dot, rest = str(key).replace("-", "_").partition(".")
-        before = rooms.get(name, {} if dot or isinstance(value, Mapping) else None)
+        before = parts.get(name, {} if dot or isinstance(value, Mapping) else None)
         if dot:
             value = {rest: value}
         if isinstance(before, Mapping) and isinstance(value, Mapping):
             value = {**before, **value}
-        elif name in rooms:
+        elif name in parts:
             raise UserError(f"{where}.{name} is set twice", "set it once")
-        rooms[name] = value
-    return rooms
+        parts[name] = value
+    return parts
 
 
 def _check_known(name: str, hints: Mapping[str, Any], where: str) -> None:
     if name not in hints:
         near = get_close_matches(name, hints, n=1)
-        remedy = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(sorted(hints))}"
+        remedy = f"did you mean '{near[0]}'?" if near else f"its settings are {', '.join(sorted(hints))}"
         raise UserError(f"{where}: unknown setting '{name}'", remedy)
 
 
-def _room(hint: Any, value: Any, where: str, now: Any = None) -> type | None:
-    """The dataclass that a mapping of settings stands for: where there are several, that of its `kind`; none:
-    a value.
+def _part(hint: Any, value: Any, where: str, current: Any = None) -> type | None:
+    """The dataclass of a mapping of settings, or None if the hint is that of a single value.
+
+    Of several dataclasses it is the one of the mapping's `kind`, else that of the current settings.
     """
-    rooms = [kind for kind in (hint, *get_args(hint)) if dataclasses.is_dataclass(kind)]
-    if not rooms:
+    parts = [kind for kind in (hint, *get_args(hint)) if dataclasses.is_dataclass(kind)]
+    if not parts:
         return None
     if not isinstance(value, Mapping):
-        raise UserError(f"{where}: {value!r} where settings belong", "give it as names and values")
-    if len(rooms) == 1:
-        return rooms[0]
+        raise UserError(f"{where}: {value!r} where settings belong", "give names and values")
+    if len(parts) == 1:
+        return parts[0]
     if "kind" not in value:
-        return type(now) if now is not None else rooms[0]
-    kinds = {kind: room for room in rooms for kind in get_args(get_type_hints(room)["kind"])}
+        return type(current) if current is not None else parts[0]
+    kinds = {kind: part for part in parts for kind in get_args(get_type_hints(part)["kind"])}
     if not isinstance(value["kind"], str) or value["kind"] not in kinds:
         raise UserError(
             f"{where}.kind: '{value['kind']}' is not a choice", f"choose one of {', '.join(kinds)}"
@@ -124,7 +127,7 @@ def _leaf(value: Any, hint: Any, where: str) -> Any:
 
 
 def _check_items(values: list | tuple, hint: Any, where: str) -> list | tuple:
-    """That a list is of a tuple's length, and of its types."""
+    """Check that a list has the length and the types of the tuple in the hint."""
     wanted = next(
         (get_args(kind) for kind in (hint, *get_args(hint)) if getattr(kind, "__origin__", None) is tuple),
         None,
@@ -134,22 +137,22 @@ def _check_items(values: list | tuple, hint: Any, where: str) -> list | tuple:
     if len(wanted) == 2 and wanted[1] is Ellipsis:
         wanted = (wanted[0],) * len(values)
     if len(values) != len(wanted):
-        raise UserError(f"{where}: {len(values)} numbers where {len(wanted)} belong", "give as many")
+        raise UserError(f"{where}: {len(values)} numbers where {len(wanted)} belong", f"give {len(wanted)}")
     for value, kind in zip(values, wanted, strict=True):
         _check(value, kind, where)
     return values
 
 
 def _check(value: Any, hint: Any, where: str) -> None:
-    """That a plain value is one of the choices, or of one of the plain types, that a hint names."""
+    """Check that a plain value is one of the choices, or has one of the plain types, of a hint."""
     choices = get_args(hint)
     if choices and all(isinstance(choice, str) for choice in choices):
         if value not in choices:
             raise UserError(f"{where}: '{value}' is not a choice", f"choose one of {', '.join(choices)}")
         return
     plain = [kind for kind in choices or (hint,) if isinstance(kind, type)]
-    # Files have one kind of number, and bool is an int to Python but to nobody else.
+    # Files do not distinguish int from float. In Python bool is a subclass of int, which is not meant here.
     fits = any(isinstance(value, (int, float) if kind is float else kind) for kind in plain)
     if plain and (not fits or (isinstance(value, bool) and bool not in plain)):
-        names = " or ".join("nothing" if kind is type(None) else kind.__name__ for kind in plain)
-        raise UserError(f"{where}: {value!r} where {names} belongs", "correct the file, or train again")
+        names = " or ".join("null" if kind is type(None) else kind.__name__ for kind in plain)
+        raise UserError(f"{where}: {value!r} where {names} belongs", "correct the value")

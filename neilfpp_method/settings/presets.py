@@ -1,4 +1,7 @@
-"""The presets: the published settings (`docs/paper.md`) and one for a laptop, as differences."""
+"""The presets: the published settings (`docs/paper.md`), and settings for a laptop's CPU.
+
+Each preset is a mapping of the settings in which it differs from another one.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,13 @@ from neilfpp_method.settings.types import FrequencyConfig, MeshConfig, NeilfConf
 __all__ = ["EXPOSURE_RATE", "PRESETS", "fixed_geometry", "free_light", "preset"]
 
 EXPOSURE_RATE = 1e-3
-"""Learning rate of log gains of photographs where they are switched on: a percent takes ten steps."""
+"""Learning rate of the log gains of photographs, if they are trained: 1 % takes Adam about ten steps."""
 SINE_FREQUENCY = 30.0
-"""ω of the sine layers sin(ω (W x + b)) of B and L. In the published code ω is part of W and b, so that a
-step of Adam there is one of 1/ω here.
+"""ω of the sine layers sin(ω (W x + b)) of B and L. In the published code ω is part of W and b, so a step
+of Adam there corresponds to a step of 1/ω here.
 """
 
-# Beside the settings' own defaults.
+# Differences from the defaults of the settings.
 PAPER_MLP: Mapping[str, Any] = {
     "preset": "paper-mlp",
     "light.monochrome": True,
@@ -37,11 +40,11 @@ PAPER_MLP: Mapping[str, Any] = {
 
 
 def paper_mlp() -> NeilfConfig:
-    """The published MLP setting for display images: 96k steps, 24 h on a V100 (`docs/paper.md`)."""
+    """The published MLP setting for LDR images: 96k steps, 24 h on a V100 (`docs/paper.md`)."""
     return changed(NeilfConfig(), PAPER_MLP)
 
 
-# Beside paper-mlp: hash grids with small networks behind them, and the rates and the steps that suit them.
+# Differences from paper-mlp: hash grids with small networks, and learning rates and steps for them.
 PAPER_NGP: Mapping[str, Any] = {
     "preset": "paper-ngp",
     "encoding.kind": "hash",
@@ -72,11 +75,11 @@ PAPER_NGP: Mapping[str, Any] = {
 
 
 def paper_ngp() -> NeilfConfig:
-    """The published hash-grid setting for display images: 40k steps, 4 h on a V100; made for point clouds."""
+    """The published hash-grid setting for LDR images: 40k steps, 4 h on a V100. It expects a point cloud."""
     return changed(paper_mlp(), PAPER_NGP)
 
 
-# Beside paper-ngp.
+# Differences from paper-ngp.
 PAPER_NGP_HDR: Mapping[str, Any] = {
     "preset": "paper-ngp-hdr",
     "background.kind": "inverted_sphere",
@@ -93,11 +96,11 @@ PAPER_NGP_HDR: Mapping[str, Any] = {
 
 
 def paper_ngp_hdr() -> NeilfConfig:
-    """The published hash-grid setting for photographs of linear radiance with a background: 50k steps."""
+    """The published hash-grid setting for HDR photographs with a background: 50k steps."""
     return changed(paper_ngp(), PAPER_NGP_HDR)
 
 
-# Beside the settings' own defaults.
+# Differences from the defaults of the settings.
 FAST: Mapping[str, Any] = {
     "preset": "fast",
     "encoding.kind": "hash",
@@ -152,7 +155,7 @@ FAST: Mapping[str, Any] = {
     "loss.lambertian": 0.0,
     "loss.position_gradient": 0.0,
     "loss.normal_gradient": 0.1,
-    # The joint stage is short: geometry goes on at the rate that SDF init ended with.
+    # In the short joint stage geometry keeps the learning rate with which SDF init ended.
     "optimizer.geometry": 2e-2,
     "optimizer.radiance": 5e-3,
     "optimizer.brdf": 5e-3,
@@ -171,9 +174,10 @@ FAST: Mapping[str, Any] = {
 
 
 def fast() -> NeilfConfig:
-    """Minutes on the two cores of a laptop: the same method with small hash grids, few rays, and as much
-    light as most scenes need: an environment map, what the scene reflects, and lamps close by where the
-    images ask for them. `free_light` has the paper's light field for it.
+    """Settings for minutes on two CPU cores: small hash grids, few rays, and a simpler light.
+
+    The light is an environment map with traced inter-reflection, and lamps if the images show that they are
+    needed. `free_light` replaces it by the paper's light field.
     """
     return changed(NeilfConfig(), FAST)
 
@@ -197,7 +201,7 @@ def preset(name: str) -> NeilfConfig:
     return PRESETS[name]()
 
 
-# Beside fast. A network takes smaller steps than the texels of a map.
+# Differences from fast. A network needs a lower learning rate than the texels of a map.
 FREE_LIGHT: Mapping[str, Any] = {
     "light": {
         "kind": "free",
@@ -210,22 +214,23 @@ FREE_LIGHT: Mapping[str, Any] = {
 
 
 def free_light(config: NeilfConfig) -> NeilfConfig:
-    """`fast` with the paper's light: a field that is free at every point, tied to the scene by L_ref.
+    """Replace the light of `fast` by the paper's: a field that is free at every point, constrained by L_ref.
 
-    It asks nothing of the host but `render`.
+    It needs no optional method of the host.
     """
     return changed(config, FREE_LIGHT)
 
 
 def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
-    """A preset for geometry that is given as a mesh: R alone for a while, as the light is chosen by what
-    surfaces send each other, then one stage in which R, B and L move together.
+    """Adapt a preset to geometry that is given as a mesh.
 
-    R has no feature of G that knows the place, so it encodes positions as G would; 8×128 is the paper's
-    surface light field. A surface without thickness needs no distance to leave it, and what leaves it is
-    known well enough to learn from L_ref (METHOD §2, §4). Its normals are taken as they are, so R need not
-    help to find them. R is new as well, so there are twice as many steps with a material. Rays through a mesh
-    are cheap, so light is solved for more often.
+    - Stages: R is trained first for a few steps, because light between surfaces influences the choice of the
+      light; then R, B and L are trained together, in twice as many steps, because R is new as well.
+    - R gets no feature of G, so it encodes positions itself; 8×128 is the paper's surface light field.
+    - A mesh is not a soft layer: rays may start close to it, and R is accurate enough to be trained by L_ref
+      (METHOD §2, §4).
+    - The normals are given: they are not smoothed, and R need not support their recovery.
+    - Rays through a mesh are cheap, so the light is solved for more often.
     """
     train = config.train
     mesh = {
@@ -245,7 +250,7 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
     return as_published_on_a_mesh(given) if config.preset.startswith("paper-") else given
 
 
-# Beside what a mesh changes in a preset of the paper: light in colour, three stages at one rate, more rays.
+# Further differences of the paper's presets with a mesh: three stages with one learning rate, more rays.
 PAPER_MESH: Mapping[str, Any] = {
     "background.kind": "auto",
     "loss.smoothness": 5e-4,
@@ -270,7 +275,7 @@ PAPER_MESH: Mapping[str, Any] = {
 
 
 def as_published_on_a_mesh(config: NeilfConfig) -> NeilfConfig:
-    """What the published run on given geometry sets in its own way."""
+    """Apply the settings that the published run on given geometry changes, colored light among them."""
     published = dict(PAPER_MESH)
     if isinstance(config.encoding, FrequencyConfig):
         published |= {name: 2e-3 / SINE_FREQUENCY for name in ("optimizer.brdf", "optimizer.light")}

@@ -1,7 +1,8 @@
-"""Every setting, one dataclass per room; `settings.presets` has the sets of them.
+"""All settings as dataclasses, one per part of the method. `settings.presets` has named sets of values.
 
-Lengths are in scene units (the object lies in the unit sphere). A setting with `kind`, `mode` or a `bool` is
-a switch: an effect that is switched off asks no network and traces no ray.
+Lengths are in scene units (the object lies in the unit sphere). A setting named `kind` or `mode`, or of type
+`bool`, is a switch: an effect that is switched off evaluates no network and traces no ray. The docstrings of
+the settings are the texts of `neilfpp train --help-all`.
 """
 
 from __future__ import annotations
@@ -19,26 +20,26 @@ __all__ = ["NeilfConfig"]
 
 @dataclass(frozen=True)
 class FrequencyConfig:
-    """Positions by sines and cosines, six octaves: the paper's MLP setting; B then has sine units (SIREN)."""
+    """Frequency encoding of positions in six octaves (the paper's MLP setting); B then has sine layers."""
 
     kind: Literal["frequency"] = "frequency"
-    """frequency or hash: how G, R and B see positions."""
+    """Encoding of positions for G, R and B: frequency or hash."""
 
 
 @dataclass(frozen=True)
 class HashGridConfig:
-    """Positions by multiresolution hash grids: one each for G, B and, where encoded, R (Müller 2022)."""
+    """Multiresolution hash grids for positions, one each for G, B and, if encoded, R (Müller et al. 2022)."""
 
     kind: Literal["hash"] = "hash"
-    """frequency or hash: how G, R and B see positions."""
+    """Encoding of positions for G, R and B: frequency or hash."""
     levels: int = 16
-    """Number of grids, coarse to fine."""
+    """Number of levels of a hash grid, from coarse to fine."""
     log2_entries: int = 19
-    """Table size of one level, as a power of two."""
+    """Binary logarithm of the table size of one level, for B and R."""
     sdf_log2_entries: int = 19
-    """The same for G. Only the surface of a scene is seen, and a table without collisions costs no more."""
+    """Binary logarithm of the table size of one level, for G. A table without collisions costs no more."""
     max_resolution: int = 4096
-    """Cells along an edge of the scene's cube at the finest level; at the coarsest there are 16."""
+    """Cells along an edge of the scene's cube at the finest level; the coarsest level has 16."""
 
 
 EncodingConfig = Annotated[FrequencyConfig | HashGridConfig, tyro.conf.AvoidSubcommands]
@@ -46,116 +47,115 @@ EncodingConfig = Annotated[FrequencyConfig | HashGridConfig, tyro.conf.AvoidSubc
 
 @dataclass(frozen=True)
 class SdfConfig:
-    """G: position → signed distance and a feature for R (METHOD §5)."""
+    """Network of G: position → signed distance and a feature vector for R (METHOD §5)."""
 
     layers: int = 8
-    """Hidden layers."""
+    """Number of hidden layers."""
     width: int = 256
-    """Units of a hidden layer."""
+    """Units per hidden layer."""
     feature_width: int = 256
-    """Length of the feature handed to R."""
+    """Length of the feature vector that R gets."""
     start: Literal["sphere", "silhouettes"] = "sphere"
-    """silhouettes: before SDF init the field is fitted to the visual hull of the masks, where given."""
+    """Initial shape: a sphere, or the visual hull of the object masks (silhouettes) if there are masks."""
 
 
 @dataclass(frozen=True)
 class OutgoingRadianceConfig:
-    """R: position, direction, normal and feature of G → linear RGB (METHOD §5)."""
+    """Network of R: position, direction, normal and feature of G → linear RGB (METHOD §5)."""
 
     positions: Literal["raw", "encoded"] = "raw"
-    """raw: R has no encoding of its own, and reads that of G by the feature. encoded: it has one of the kind
-    that `encoding` says, as it always has where there is no feature.
+    """raw: R gets the plain position and sees detail through the feature of G. encoded: R has an encoding of
+    its own, of the kind that `encoding` names; a host without features (a mesh) always uses it.
     """
     direction: Literal["outgoing", "mirrored"] = "outgoing"
-    """Which direction is encoded: the outgoing one, as in the paper, or the one that it mirrors about the
-    normal. What a shiny surface sends changes evenly with the latter, so its normals are found (Verbin et al.
-    2022, "Ref-NeRF").
+    """Direction that is encoded for R: the outgoing direction (the paper), or its mirror direction about the
+    normal. The radiance of a shiny surface varies smoothly with the mirror direction, which makes its normals
+    easier to recover (Verbin et al. 2022, "Ref-NeRF").
     """
     layers: int = 4
-    """Hidden layers."""
+    """Number of hidden layers."""
     width: int = 256
-    """Units of a hidden layer."""
+    """Units per hidden layer."""
 
 
 @dataclass(frozen=True)
 class BrdfConfig:
-    """B: position → base colour, roughness, metallic (METHOD §5)."""
+    """Network of B: position → base color, roughness, metallic (METHOD §5)."""
 
     initial_base_color: float = 0.5
-    """Initial base colour. Images hardly tell its scale from the light's, so it stays near this."""
+    """Initial base color. Images hardly separate its scale from the light's, so the mean stays near this."""
     initial_metallic: float = 0.5
-    """Initial metallic. Most surfaces are no metals; light found under metals is too weak for others."""
+    """Initial metallic. A high value makes the first estimate of the light too dark for other surfaces."""
     metals: bool = True
-    """Whether there may be metal; off, metallic is 0 everywhere."""
+    """Whether surfaces may be metallic. If False, metallic is 0 everywhere."""
     varying_roughness: bool = True
-    """Whether roughness is a field; off, the whole scene has one, which is learned."""
+    """Whether roughness varies in space. If False, the scene has a single roughness, which is learned."""
     layers: int = 8
-    """Hidden layers."""
+    """Number of hidden layers."""
     width: int = 512
-    """Units of a hidden layer."""
+    """Units per hidden layer."""
 
 
 @dataclass(frozen=True)
 class LightFitConfig:
-    """How an environment map, and lamps before it, are solved for (`lighting`)."""
+    """The fit of environment map and lamps to stored surface points (`lighting`). Its weights are relative to
+    that of the data term, the relative error of the pixels.
+    """
 
     points: int = 1024
-    """Surface points that the light is fitted to; memory and time grow with points · texels."""
+    """Surface points that the light is fitted to. Memory and time grow with points times texels."""
     every: int = 100
-    """Steps between two fits."""
+    """Training steps between two fits."""
     steps: int = 100
-    """Steps of a fit."""
+    """Optimization steps of a fit."""
     smoothness: float = 0.03
-    """Weight of the total variation of log radiance, per texel, against the relative error."""
+    """Weight of the total variation of log radiance per texel."""
     whiteness: float = 0.05
-    """Weight of the tint of all light that reaches the points, against the relative error: images hardly tell
-    the tint of the light from that of the surfaces.
-    """
+    """Weight of the tint of all light, which images hardly separate from the tint of the surfaces."""
     evenness: float = 0.3
-    """Weight of the mean difference of log base colour between neighbouring points, against the relative
-    error. The base colour of every point is free while light is fitted; 0: it is what surfaces have learned,
-    up to a factor per channel.
+    """Weight of the mean difference of log base color between neighboring points; a fit also estimates the
+    base color of each point. With 0 it only estimates a factor per channel on the base color of B.
     """
 
 
 @dataclass(frozen=True)
 class MapLightConfig:
-    """L: an environment map, and perhaps lamps before it. It goes with inter-reflection hard or off."""
+    """L as an environment map, optionally with lamps. It requires inter-reflection "hard" or "off"."""
 
     kind: Literal["distant", "distant_near", "auto"] = "auto"
-    """free: its own light at every point (the paper). distant: an environment map. distant_near: a map, and
-    lamps close to the scene. auto: a map, and lamps where points that were kept back from the fit ask for
-    them.
+    """free: a light field that is free at every point (the paper). distant: an environment map. distant_near:
+    an environment map and lamps near the scene. auto: an environment map, and lamps if they lower the error
+    of points that are held back from the fit.
     """
     environment_height: int = 32
-    """Rows of the environment map; it has twice as many columns. 1: one colour from everywhere."""
+    """Rows of the environment map; it has twice as many columns. 1: the same radiance from all directions."""
     monochrome: bool = False
-    """One channel for all three colours; lamps keep theirs."""
+    """Whether the light has a single channel. Lamps are always colored."""
     map: str | None = None
-    """An environment map that is known, a linear EXR in the layout of docs/light.md; none: the map is
-    recovered. Lamps before it are sought where `kind` says so.
+    """File of a known environment map (linear EXR, layout in docs/light.md). If not given, the map is
+    recovered. Lamps are still recovered if `kind` allows them.
     """
     fit: LightFitConfig = field(default_factory=LightFitConfig)
-    """How the map is found."""
+    """How the map and the lamps are solved for."""
 
 
 @dataclass(frozen=True)
 class FreeLightConfig:
-    """L: the paper's field, its own light at each point (METHOD §5): sharp in direction, smooth in x."""
+    """L as in the paper: a network of position and direction, sharp in direction and smooth in position."""
 
     kind: Literal["free"] = "free"
-    """free: its own light at every point (the paper). distant: an environment map. distant_near: a map, and
-    lamps close to the scene. auto: a map, and lamps where points that were kept back from the fit ask for
-    them.
+    """free: a light field that is free at every point (the paper). distant: an environment map. distant_near:
+    an environment map and lamps near the scene. auto: an environment map, and lamps if they lower the error
+    of points that are held back from the fit.
     """
     activation: Literal["sine", "relu"] = "sine"
-    """Hidden units; sine is SIREN's, with ω = 30."""
+    """Activation of the hidden layers; sine is that of SIREN with ω = 30."""
     layers: int = 8
-    """Hidden layers; the position enters at the middle one."""
+    """Number of hidden layers; the position enters at the middle one."""
     width: int = 128
-    """Units of a hidden layer."""
+    """Units per hidden layer."""
     monochrome: bool = False
-    """One channel for all three colours; lamps keep theirs."""
+    """Whether the light has a single channel."""
 
 
 IncidentLightConfig = Annotated[FreeLightConfig | MapLightConfig, tyro.conf.AvoidSubcommands]
@@ -163,19 +163,20 @@ IncidentLightConfig = Annotated[FreeLightConfig | MapLightConfig, tyro.conf.Avoi
 
 @dataclass(frozen=True)
 class BackgroundConfig:
-    """What a ray sees beyond the scene."""
+    """Radiance that rays get from beyond the scene sphere."""
 
     kind: Literal["auto", "none", "constant", "inverted_sphere"] = "auto"
-    """none: R paints the scene sphere, which closes the scene. constant: one colour. inverted_sphere: a
-    NeRF++ field. auto: constant where one colour is all that the borders of the images show behind the scene,
-    else inverted_sphere.
+    """none: R on the scene sphere, which closes the scene. constant: one color. inverted_sphere: a NeRF++
+    field. auto: constant if the image borders show a single color behind the scene, else inverted_sphere.
     """
     color: tuple[float, float, float] | None = None
-    """Linear RGB of a constant background and initial inverted_sphere; none: from the image borders."""
+    """Linear RGB of a constant background, and initial color of inverted_sphere. If not given, it is taken
+    from the image borders.
+    """
     layers: int = 8
-    """Hidden layers of the NeRF++ field."""
+    """Number of hidden layers of the NeRF++ field."""
     width: int = 256
-    """Units of a hidden layer of the NeRF++ field."""
+    """Units per hidden layer of the NeRF++ field."""
     samples: int = 32
     """Samples per ray beyond the scene sphere."""
 
@@ -185,22 +186,22 @@ class BackgroundConfig:
 
 @dataclass(frozen=True)
 class VolSdfConfig:
-    """Geometry is found: a distance field that is rendered as a volume (`volume`)."""
+    """Geometry is recovered: a signed distance field, rendered as a volume (`volume`)."""
 
     kind: Literal["volsdf"] = "volsdf"
-    """volsdf or mesh: where geometry comes from."""
+    """Source of geometry: volsdf (recovered) or mesh (given)."""
     sdf: SdfConfig = field(default_factory=SdfConfig)
 
 
 @dataclass(frozen=True)
 class MeshConfig:
-    """Geometry is given: triangles as they are."""
+    """Geometry is given: a triangle mesh that is not changed."""
 
     kind: Literal["mesh"] = "mesh"
-    """volsdf or mesh: where geometry comes from."""
+    """Source of geometry: volsdf (recovered) or mesh (given)."""
     path: str | None = None
-    """The triangle mesh, in the world frame of the capture; none: the capture's inputs/model/mesh.ply.
-    Normals are interpolated between its vertices, edges kept.
+    """File of the triangle mesh, in the world frame of the capture. If not given, inputs/model/mesh.ply of
+    the capture. Normals are interpolated between vertices except across sharp edges.
     """
 
 
@@ -212,21 +213,21 @@ class VolumeConfig:
     """Volume rendering of the VolSDF host (METHOD §3)."""
 
     radius: float = 3.0
-    """Where the scene ends."""
+    """Radius of the scene sphere, at which rays end."""
     beta_init: float = 0.1
-    """Scale of the Laplace density at the start."""
+    """Initial scale β of the Laplace density."""
     skip_empty: bool = False
-    """Rays skip what a coarse grid of the SDF shows to be empty; pictures, too, on a grid of their own."""
+    """Whether rays skip parts that a coarse grid of the SDF shows to be empty, in training and evaluation."""
     initial_samples: int = 128
-    """SDF queries per ray of the first round; also those added in each refinement. Half as many for rays that
-    skip empty space: what is left of them is short.
+    """SDF queries per ray in the first round of the sampler and in each refinement round. Rays that skip
+    empty space use half as many, as the rest of them is short.
     """
     rounds: int = 5
-    """Most refinement rounds."""
+    """Maximum number of refinement rounds of the sampler."""
     samples: int = 98
-    """Samples per ray that are rendered: two thirds where it is stopped, the rest even, ends included."""
+    """Rendered samples per ray: two thirds by opacity, the rest spread over the whole ray with both ends."""
     normal_radius: float = 0.0
-    """Surfaces are shaded with the normal of this neighbourhood, edges kept; 0: that of the hit."""
+    """Radius within which normals are smoothed for shading, except across edges. 0: no smoothing."""
 
 
 # ---------------------------------------------------------------------------------------------------- shading
@@ -237,33 +238,36 @@ class ShadingConfig:
     """The rendering equation (METHOD §1)."""
 
     lobe: Literal["spherical_gaussian", "ggx"] = "spherical_gaussian"
-    """Distribution and masking of the specular lobe."""
+    """Microfacet distribution and masking function of the specular lobe."""
     specular: bool = True
-    """Off: a Lambertian surface; roughness and metallic are not asked for."""
+    """Whether surfaces reflect specularly. If False, they are Lambertian, without roughness and metallic."""
     sampler: Literal["fibonacci", "cosine", "lobe", "mis", "no_lobe"] = "fibonacci"
-    """Who draws the incident directions: the paper's lattice, a cosine, the specular lobe; mis: cosine, lobe
-    and (where it can be sampled) light by the balance heuristic; no_lobe: cosine and light.
+    """Sampling of incident directions. fibonacci: the paper's lattice. cosine: by cosine. lobe: by the
+    specular lobe. mis: cosine, lobe and (for an environment map) light, combined by the balance heuristic.
+    no_lobe: cosine and light.
     """
     train_samples: int = 128
-    """Incident directions per point in training."""
+    """Incident directions per surface point in training."""
     eval_samples: int = 256
-    """Incident directions per point in evaluation."""
+    """Incident directions per surface point in evaluation."""
     hit_share: float = 0.8
-    """Least concentration of a ray's blending weight at a surface point; other hits are not shaded."""
+    """A ray hits, and is shaded, if at least this share of its rendering weight lies close to one point."""
 
 
 @dataclass(frozen=True)
 class InterReflectionConfig:
-    """L_ref: what arrives from another surface is what that surface sends (METHOD §2)."""
+    """Light that surfaces of the scene send to each other (METHOD §2)."""
 
     mode: Literal["off", "soft", "hard"] = "soft"
-    """soft: the paper's loss. hard: directions that meet the scene bring R from there; others the light."""
+    """soft: the paper's loss L_ref. hard: incident directions that hit the scene bring R from there, and only
+    the others bring the light. off: none.
+    """
     rays_per_point: float = 1.0
-    """Traced directions per surface point and step, in expectation."""
+    """Expected number of traced rays per surface point and step, for L_ref."""
     radiance_gradient: float = 0.0
-    """Scale of the gradient that reaches R; 0 detaches it, 0.7 suits fixed geometry."""
+    """Scale of the gradient of L_ref into R. 0 detaches R; 0.7 suits fixed geometry."""
     offset: float = 0.02
-    """Least displacement off the surface; it grows with β and as 1/cos towards grazing."""
+    """Minimum distance from the surface at which rays start; it grows with β and as 1/cos θ."""
 
 
 # --------------------------------------------------------------------------------------------------- training
@@ -271,94 +275,108 @@ class InterReflectionConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the losses (METHOD §4) beside L_phys, which has 1; `schedule.py` says in which stage each
-    counts. 0 switches a loss off.
-    """
+    """Weights of the losses (METHOD §4), relative to L_phys, which has 1. 0 switches a loss off."""
 
     unit: Literal["activation", "median"] = "activation"
-    """What radiance is measured in. activation: L_vol in the range of R's output, all else absolute, as the
-    paper has it. median: all in the median of the images, so that the weights depend neither on the exposure
-    nor on what cameras store.
+    """Unit of radiance. activation (the paper): the range of R's output for L_vol, 1 for the other losses.
+    median: the median radiance of the images, so that the balance of the losses depends neither on the
+    exposure nor on the camera's response.
     """
     volume: float = 1.0
+    """Weight of L_vol, the error of the volume-rendered color."""
     eikonal: float = 0.1
+    """Weight of L_Eik: gradients of G have length 1."""
     hessian: float = 1e-3
+    """Weight of L_Hess (little curvature of G) at the start of SDF init."""
     hessian_growth: float = 1.0
-    """Weight of L_Hess at the end of SDF init over its start: shapes fold early; late ripples are noise."""
+    """Factor on the weight of L_Hess at the end of SDF init. A low weight first lets the shape form."""
     hessian_joint: float = 1e-4
+    """Weight of L_Hess in the joint stage."""
     surface: float = 1e-3
+    """Weight of L_surf (no unseen surfaces) in SDF init."""
     surface_joint: float = 1e-4
+    """Weight of L_surf in the joint stage."""
     point_cloud: float = 0.0
+    """Weight of L_pcd, the distance to an oriented point cloud, in SDF init."""
     inter_reflection: float = 0.1
+    """Weight of L_ref: L and R agree along rays between surfaces."""
     smoothness: float = 5e-4
+    """Weight of L_smth: roughness and metallic are smooth where the image is."""
     lambertian: float = 5e-4
+    """Weight of L_Lam: roughness 1 and metallic 0 without evidence to the contrary."""
     mask: float = 0.0
-    """Opacity against the object mask, where the capture has masks or shows exactly its background."""
+    """Weight of the loss of the opacity against the object mask, at pixels whose mask is known."""
     points: Literal["scene", "rays"] = "rays"
-    """Where L_Eik, L_Hess and L_surf look. scene: at points all over the scene, more of them about the
-    object, and L_Eik at one sample of each ray as well; L_surf is so wide then that it hardly has a slope
-    (published code). rays: at the samples of the rays, and L_Hess about their hits.
+    """Points of L_Eik, L_Hess and L_surf. scene: random points in the whole scene, more of them around the
+    object, and one sample per ray for L_Eik; L_surf is then so wide that its gradient is almost 0 (published
+    code). rays: the samples of the rays, and points around their hits for L_Hess.
     """
     position_gradient: float = 0.1
-    """Scale of the gradient from the material into the hit position, joint stage."""
+    """Factor on the gradient of L_phys into the hit position, in the joint stage."""
     normal_gradient: float = 1.0
-    """Scale of the gradient from the material into the hit normal, joint stage."""
+    """Factor on the gradient of L_phys into the hit normal, in the joint stage."""
 
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """Adam, one learning rate per field, which falls in the course of each stage."""
+    """Learning rates of Adam, one per field, decayed over each stage."""
 
     geometry: float = 1e-3
+    """Learning rate of G."""
     radiance: float = 1e-3
+    """Learning rate of R."""
     brdf: float = 1e-3
+    """Learning rate of B."""
     light: float = 1e-3
+    """Learning rate of L, if it is a network."""
     background: float = 1e-3
+    """Learning rate of the background field."""
     beta: float = 1e-3
+    """Learning rate of the density's scale β."""
     exposure: float = 0.0
-    """Of log gains of photographs, where evidence calls for them; 0: all are taken to be exposed alike."""
+    """Learning rate of the log gains of the photographs. 0: all photographs have the same exposure."""
     joint: float = 1.0
-    """Factor on all rates in the joint stage."""
+    """Factor on all learning rates in the joint stage."""
     final: tuple[float, float, float] = (0.1, 0.1, 0.1)
-    """Rate at the end of each of the three stages over its start."""
+    """Learning rate at the end of each of the three stages, relative to its start."""
     drops: tuple[int, int, int] = (0, 0, 0)
-    """In how many equal steps, evenly spaced, the rate falls in each stage; 0: exponentially all along."""
+    """Number of equal, evenly spaced drops of the learning rate in each stage. 0: exponential decay."""
     warm_up: int = 0
-    """Steps at the start of each stage in which the rate rises from a tenth."""
+    """Steps at the start of each stage in which the learning rate rises from a tenth."""
     background_from: float = 0.0
-    """Share of SDF init that is over when the field beyond the scene starts to move. Until then it is the
-    colour that it starts as: a field that is seen from everywhere can paint the scene as well.
+    """Share of SDF init after which the background field is trained. Before that it is a constant color: a
+    field that all views see could otherwise explain the object as well.
     """
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """The loop."""
+    """The training loop."""
 
     sdf_steps: int = 40_000
-    """Steps of the stage SDF init."""
+    """Steps of the first stage, SDF init."""
     material_steps: int = 20_000
-    """Steps of the stage material init."""
+    """Steps of the second stage, material init."""
     joint_steps: int = 20_000
-    """Steps of the joint stage; 0 is the paper's separate pipeline ("Sep.")."""
+    """Steps of the joint stage. 0 is the paper's separate pipeline ("Sep.")."""
     rays: int = 4096
     """Rays per step and process."""
     fresh: float = 1.0
-    """Share of a step's rays rendered while the surface stands still; other points are replayed."""
+    """Share of a step's rays that are rendered while geometry is fixed; stored points replace the others."""
     seed: int = 0
-    """Every random number of step k follows from seed and k alone."""
+    """Seed. The random numbers of step k depend only on the seed and k."""
     checkpoint_every: int = 500
     """Steps between checkpoints."""
     eval_chunk: int = 2048
-    """Rays rendered at once in evaluation; bounds the memory."""
+    """Rays per batch in evaluation; limits memory."""
 
 
 @dataclass(frozen=True)
 class NeilfConfig:
-    """Everything that decides a run, besides the capture."""
+    """All settings of a run. Together with the capture they determine its result."""
 
     preset: str = "custom"
-    """The preset that the settings started from; a label."""
+    """Name of the preset that the settings were made from; a label."""
     host: HostConfig = field(default_factory=VolSdfConfig)
     encoding: EncodingConfig = field(default_factory=FrequencyConfig)
     radiance: OutgoingRadianceConfig = field(default_factory=OutgoingRadianceConfig)
@@ -374,5 +392,5 @@ class NeilfConfig:
 
     @property
     def known_map(self) -> str | None:
-        """The environment map that is given; none: the light is recovered."""
+        """File of the given environment map; None if the light is recovered."""
         return self.light.map if isinstance(self.light, MapLightConfig) else None

@@ -1,4 +1,4 @@
-"""From a capture to a model: what the images decide, and the host that the settings ask for."""
+"""Build a model for a capture: the facts that are measured in its images, and the configured host."""
 
 from __future__ import annotations
 
@@ -28,25 +28,35 @@ from neilfpp_method.structures import OrientedPoints
 
 __all__ = ["build_model", "cloud_in_words", "exposures_of", "scene_facts", "show_known_light"]
 
-# The sigmoid of R reaches 1 for LDR input, as published. Where errors have a unit of their own it reaches
-# twice that: clipped pixels are lower bounds, and dark photographs show more than others before they clip.
-# Radiance has no unit: the paper's 3 for HDR is twenty times the median of a well exposed image. Where more
-# is bright R needs more room; the few brightest pixels (a lamp in view) do not decide for all.
 LDR_SCALE = 1.0
+"""Largest radiance that R can represent for LDR input, as published: the scale of its sigmoid."""
 LDR_ROOM = 2.0
+"""The same if losses are measured in units of the image. Clipped pixels are only lower bounds of radiance,
+and an underexposed photograph shows radiance above the clipping level of the others.
+"""
 HDR_MEDIANS = 20.0
+"""The same for HDR input, in medians of the images, because radiance has no absolute unit. The paper's value
+of 3 is about twenty times the median of a well exposed image.
+"""
 BRIGHT_QUANTILE = 0.999
-
-# Of the pixels of every view, one in so many asks whether a mesh is where the cameras look.
+"""R also reaches this quantile of the radiance of HDR images. The brightest pixels are excluded because a
+single lamp in view should not set the scale of R.
+"""
 SEEN_EVERY = 67
+"""One in this many pixels of every view is traced to check that the cameras see the outside of a mesh."""
 
 
 def scene_facts(
     capture: Capture, pixels: PixelDataset, config: NeilfConfig, log_gains: Tensor | None = None
 ) -> SceneFacts:
-    """What the training images decide before training; see `SceneFacts`.
+    """Measure in the training images what the model must know before training; see `SceneFacts`.
 
-    `log_gains` are those of the training views, (V, 3); none: all are exposed alike.
+    Args:
+        capture: the capture.
+        pixels: its training pixels.
+        config: the settings.
+        log_gains: logarithms of the gains of the training views, (V, 3); None if all views have the same
+            exposure.
     """
     response = "linear" if capture.hdr else "srgb"
     median = pixels.median_radiance()
@@ -70,8 +80,10 @@ def scene_facts(
 
 
 def exposures_of(capture: Capture, pixels: PixelDataset) -> Exposures | None:
-    """What the training photographs say of their exposures; none where no cloud shows them the same
-    places.
+    """Measure the relative exposures of the training photographs at the points of the capture's point cloud.
+
+    Returns:
+        The exposures; None if the capture has no point cloud.
     """
     if capture.point_cloud is None:
         return None
@@ -79,22 +91,22 @@ def exposures_of(capture: Capture, pixels: PixelDataset) -> Exposures | None:
 
 
 def build_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> NeilfModel:
-    """An untrained model for a capture.
+    """Build an untrained model for a capture.
 
     Raises:
-        UserError: the settings ask for a mesh that the capture does not have, or its point cloud is of no
-            use.
+        UserError: if the settings name a mesh that the capture does not have, or if no point of its point
+            cloud lies in the scene.
     """
     return NeilfModel(HOSTS[config.host.kind](capture, facts, config), config, facts)
 
 
 def show_known_light(model: NeilfModel) -> None:
-    """Read the environment map that is known into a new model, where the settings name one.
+    """Load the known environment map into a new model if the settings name one.
 
-    It is part of the checkpoints, so a run needs the file no more once it has one.
+    The map is part of the checkpoints, so the file is not needed again once a checkpoint is written.
 
     Raises:
-        UserError: the map cannot be used.
+        UserError: if the file is missing or is not a usable map.
     """
     if model.config.known_map is not None:
         model.light.show(read_environment(Path(model.config.known_map)))
@@ -124,27 +136,27 @@ HOSTS: Mapping[str, Callable[[Capture, SceneFacts, NeilfConfig], Host]] = {"vols
 
 
 def cloud_in_words(capture: Capture, config: NeilfConfig) -> str | None:
-    """What a point cloud that geometry could learn from comes to, for people; none where there is nothing to
-    say.
+    """One line for the console on whether a point cloud supervises geometry.
+
+    Returns None if the settings use no point cloud.
     """
     if config.host.kind != "volsdf" or config.loss.point_cloud == 0.0:
         return None
     if capture.point_cloud is None:
         return "point cloud: the capture has none with normals, so geometry is found from the images alone"
-    used = f"point cloud: geometry keeps to {capture.point_cloud.name}"
-    return f"{used}; --config.loss.point-cloud 0 leaves it out"
+    used = f"point cloud: {capture.point_cloud.name} supervises the geometry"
+    return f"{used}; --config.loss.point-cloud 0 switches this off"
 
 
 def _check_seen(host: MeshHost, capture: Capture, path: str) -> None:
-    """That the cameras see the outside of the mesh."""
+    """Raise a `UserError` unless the cameras see the outside of the mesh."""
     cameras = [capture.normalisation.camera(view.camera) for view in capture.train_views]
-    met = [host.cross(camera_rays(camera)[::SEEN_EVERY]).outside for camera in cameras]
-    outside = torch.cat(met)
+    outside = torch.cat([host.cross(camera_rays(camera)[::SEEN_EVERY]).outside for camera in cameras])
     if not len(outside):
         raise UserError(f"{path}: no camera sees this mesh", "give it in the world frame of the capture")
     if outside.float().mean() < 0.5:
         raise UserError(
-            f"{path}: the cameras see the inside of this mesh", "turn its faces: they are wound outwards"
+            f"{path}: the cameras see the inside of this mesh", "reverse the orientation of its faces"
         )
 
 
@@ -152,7 +164,7 @@ def _points(capture: Capture, config: NeilfConfig) -> OrientedPoints | None:
     if config.loss.point_cloud == 0.0 or capture.point_cloud is None:
         return None
     points = load_point_cloud(capture.point_cloud, capture.normalisation)
-    # What lies beyond the scene sphere is no business of G.
+    # G is defined within the scene sphere only.
     within = points[points.position.norm(dim=-1) < config.volume.radius]
     if not len(within):
         raise UserError(

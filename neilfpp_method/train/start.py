@@ -1,7 +1,8 @@
-"""What the distance field starts as: the sphere that it is made as, or the visual hull of the masks.
+"""The initial shape of the distance field: the sphere of its initialisation, or the visual hull of the masks.
 
-Training finds a surface faster, and more often the right one, from a body that has the object's outline in
-every view: hollows are carved from there, while a sphere has to grow legs.
+Training finds a surface faster, and more often the correct one, if it starts from a shape that has the
+object's outline in every view. Concavities are easily carved out of a visual hull, whereas thin parts do not
+easily grow out of a sphere.
 """
 
 from __future__ import annotations
@@ -23,31 +24,36 @@ from neilfpp_method.settings.types import NeilfConfig
 __all__ = ["GeometryStart", "fit_distance", "start_geometry"]
 
 HULL_VIEWS = 64
-"""Masks that are asked at most, evenly chosen."""
+"""Maximum number of masks that the visual hull is computed from, evenly spaced over the views."""
 STEPS = 300
-"""Steps of the fit."""
+"""Optimizer steps of the fit to the hull."""
 POINTS = 2048
-"""Points of a step."""
+"""Sample points per step of the fit."""
 NEAR_SHARE = 0.5
-"""Share of the points that lie about the surface."""
+"""Share of the sample points that are drawn near the surface of the hull."""
 NEAR_SURFACE = 0.1
-"""How far from the surface these lie, scene units, standard deviation."""
+"""Standard deviation of the offset of these points from the surface, per axis, in scene units."""
 RATE = 1e-2
-"""Adam's rate for the grids and networks of `fast`, falling to a tenth; sine networks take a tenth."""
+"""Learning rate of Adam for hash grids with their networks; it decays to a tenth. MLPs take a tenth of it."""
 DAMPING = 1e-3
-"""Adam's ε. An entry of a fine grid that one point alone asks for has a gradient far below this, and hardly
-moves. With the usual 1e-15 it leaps by the whole rate: normals at the surface were then 12.5° off those of
-the hull, in place of 6°, and second derivatives four times as large.
+"""Adam's ε. A fine grid entry that only one sample point reads has a gradient far below this value, so it
+hardly moves. With the usual 1e-15 the entry jumps by the full learning rate: normals at the surface then
+deviated by 12.5° from those of the hull instead of 6°, and second derivatives were four times as large.
 """
 POOL = 65_536
-"""Points of the cube among which those near the surface are sought."""
+"""Random points in the cube of the hull from which those near the surface are selected."""
 
 
 @dataclass(frozen=True)
 class GeometryStart:
-    """What the field starts as. `error` is the mean difference between field and hull at the hull's surface,
-    scene units; none: it starts as a sphere, for the `reason`. `warning`: masks are there, and no body comes
-    of them.
+    """The initial shape of the distance field.
+
+    Attributes:
+        views: number of masks that the hull was computed from.
+        error: mean absolute difference between the fitted field and the hull's distance at the hull's
+            surface, in scene units; None if the field starts as a sphere.
+        reason: why the field starts as a sphere.
+        warning: whether the capture has masks that give no usable hull.
     """
 
     views: int = 0
@@ -57,21 +63,23 @@ class GeometryStart:
 
     @property
     def text(self) -> str:
-        """For people, in a line."""
+        """One line for the console."""
         if self.error is None:
             return f"{'warning: ' * self.warning}geometry starts as a sphere: {self.reason}"
         return f"geometry starts as the visual hull of {self.views} masks, to {self.error:.3f} scene units"
 
 
 def start_geometry(model: NeilfModel, capture: Capture, config: NeilfConfig) -> GeometryStart | None:
-    """Give a new model the geometry that `config.host.sdf.start` names, and say which it is.
+    """Initialise the distance field of a new model as `config.host.sdf.start` requests.
 
-    None where there is nothing to start: geometry is given, or belongs to another trainer. Only views to
-    train on are asked. The outcome follows from `config.train.seed` and the masks alone, and no other random
-    number is moved by it.
+    Only training views are read. The result depends on nothing but `config.train.seed` and the masks, and
+    the global random state is left unchanged.
+
+    Returns:
+        The initial shape; None if the host has no distance field to initialise (a mesh or a borrowed host).
 
     Raises:
-        UserError: a mask cannot be read.
+        UserError: if a mask cannot be read.
     """
     if not isinstance(model.host, VolSdfHost):
         return None
@@ -90,22 +98,24 @@ def start_geometry(model: NeilfModel, capture: Capture, config: NeilfConfig) -> 
 def fit_distance(
     field: SdfField, target: DistanceCube, radius: float, seed: int, rate: float = RATE
 ) -> float:
-    """Fit a distance field to a sampled distance within `radius`; returns the mean error at its surface.
+    """Fit a distance field to a sampled signed distance within a ball about the origin.
 
-    The L1 error of the distance is minimised at points that are half spread over the ball and half about the
-    surface. Features of the field, which R reads, are not asked for and move as they like.
+    Adam minimises the L1 error of the distance. Half of the sample points are uniform in the ball, half lie
+    near the surface. The features of the field, which R reads, do not enter the loss and are unconstrained.
 
     Args:
-        field: moves in place, on its own device.
-        target: what it is brought to.
-        radius: of the ball, scene units.
-        seed: of the points.
-        rate: of Adam.
+        field: the distance field; it is changed in place, on its own device.
+        target: the sampled signed distance.
+        radius: radius of the ball, in scene units.
+        seed: seed of the sample points.
+        rate: initial learning rate of Adam.
+
+    Returns:
+        The mean absolute error at the surface of `target`, in scene units.
     """
     device = next(field.parameters()).device
-    points = torch.Generator().manual_seed(
-        seed
-    )  # its own: what training draws does not depend on how it started
+    # A generator of its own keeps the random numbers of training independent of the initial shape.
+    points = torch.Generator().manual_seed(seed)
     surface = _surface_points(target, points)
     optimizer = torch.optim.Adam(field.parameters(), lr=rate, eps=DAMPING, fused=True)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.1 ** (1 / STEPS))
@@ -125,25 +135,22 @@ def fit_distance(
 
 
 def _surface_points(target: DistanceCube, generator: torch.Generator) -> Float[Tensor, "P 3"]:
-    """Points of the cube within two cells of the surface."""
+    """Random points of the cube within two grid cells of the surface."""
     x = target.radius * (2 * torch.rand(POOL, 3, generator=generator) - 1)
-    nearest = target.at(x).abs()
-    # A body of a few cells has few points near it: the nearest hundredth of the pool serves then.
-    return x[
-        nearest
-        <= torch.maximum(
-            torch.tensor(4 * target.radius / len(target.distance)), nearest.kthvalue(POOL // 100)[0]
-        )
-    ]
+    distance = target.at(x).abs()
+    two_cells = torch.tensor(4 * target.radius / len(target.distance))
+    # If the hull is very small, few points lie that near: then the nearest hundredth of the points is taken.
+    return x[distance <= torch.maximum(two_cells, distance.kthvalue(POOL // 100)[0])]
 
 
 def _in_ball(count: int, radius: float, generator: torch.Generator) -> Float[Tensor, "N 3"]:
-    """Points spread evenly over a ball."""
+    """Points uniformly distributed in a ball about the origin."""
     direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     return radius * torch.rand(count, 1, generator=generator) ** (1 / 3) * direction
 
 
 def _in_scene(outline: Outline, capture: Capture) -> Outline:
+    """The same outline with its camera in the scene frame."""
     return replace(
         outline, view=replace(outline.view, camera=capture.normalisation.camera(outline.view.camera))
     )

@@ -78,7 +78,7 @@ def test_a_run_keeps_to_its_budget_though_steps_take_longer_than_the_trial_said(
     assert loaded.config.train.sdf_steps == last.steps["sdf_init"]
     assert loaded.config.train.joint_steps == last.steps["joint"]
     assert loaded.has_material
-    assert "budget 2m: steps planned: sdf init" in said
+    assert "budget 2m: planned steps: sdf init" in said
     assert f"budget: {plan.took:.1f} s of 120 s" in said
 
     # The trial found no time for evidence for metals, so there may be metals.

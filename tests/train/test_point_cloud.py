@@ -33,7 +33,7 @@ def test_the_cloud_is_in_the_loss_of_fast(capture):
     terms = model.losses(pixels.sample(8), Stage.SDF_INIT)
     # The sphere of the start is no sphere of 0.8: points lie off it.
     assert terms["point_cloud"].values.max() > 0.05
-    assert "geometry keeps to oriented_pcd.ply" in cloud_in_words(capture, config)
+    assert "oriented_pcd.ply supervises the geometry" in cloud_in_words(capture, config)
 
 
 def test_a_capture_without_a_cloud_goes_without_it(capture):
