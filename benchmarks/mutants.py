@@ -228,8 +228,8 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "swapped samples emit",
         "volume/compositing.py",
-        "widths.clamp_min(0.0)",
-        "widths",
+        "dim=-1).diff(dim=-1).clamp_min(0.0)",
+        "dim=-1).diff(dim=-1)",
         "volume/test_compositing.py",
     ),
     Mutant(
@@ -408,7 +408,7 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "steps that are not finite are taken",
         "train/loop.py",
-        "if all(math.isfinite(value) for value in (loss, *found.values())):",
+        "if all(math.isfinite(value) for value in (loss, *mean_norms)):",
         "if True:",
         "train/test_not_finite.py",
     ),
