@@ -162,5 +162,6 @@ CASES = {
 def test_the_surface_that_is_found_is_right(name):
     case = CASES[name]
     found = learn(SHAPES[case.shape], 400, **case.options)
+    print(found)  # pytest -rA shows it
     for measure in dataclasses.fields(Errors):
         assert getattr(found, measure.name) <= getattr(case.largest, measure.name), found
