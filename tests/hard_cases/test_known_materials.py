@@ -239,6 +239,7 @@ LONG = {
 
 def check(case: Case, folder: Path) -> None:
     found = learn(case.ball, folder, **case.options)
+    print(found)  # pytest -rA shows it
     for name, bound in case.bounds.items():
         assert getattr(found, name) <= bound, f"{name}: {found}"
 

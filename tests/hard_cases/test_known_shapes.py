@@ -151,7 +151,9 @@ CASES = {
     "a twentieth of the frame": Case("a twentieth of the frame", Errors(0.4, 8.0, 0.01, 0.01)),
     "two views": Case("two touching balls", Errors(0.3, 30.0, 0.09, 0.045), {"views": 2}),
     "noisy poses": Case("two touching balls", Errors(0.15, 12.5, 0.025, 0.018), {"pose_noise": 0.01}),
-    "every fifth normal flipped": Case("two touching balls", Errors(9, 99, 9, 9), {"flipped": 0.2}),
+    "every fifth normal flipped": Case(
+        "two touching balls", Errors(0.06, 7.0, 0.01, 0.008), {"flipped": 0.2}
+    ),
 }
 
 
@@ -160,5 +162,6 @@ CASES = {
 def test_the_surface_that_is_found_is_right(name):
     case = CASES[name]
     found = learn(SHAPES[case.shape], 400, **case.options)
+    print(found)  # pytest -rA shows it
     for measure in dataclasses.fields(Errors):
         assert getattr(found, measure.name) <= getattr(case.largest, measure.name), found

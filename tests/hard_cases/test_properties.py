@@ -354,7 +354,7 @@ def test_a_light_fit_is_a_light(pixel, firefly, count, seed):
     color[: min(count, 1)] = firefly
     places = LampPlaces(torch.tensor([[0.0, 0.0, 0.5]]), torch.zeros(1, 3))
     sky = EnvironmentLight(4, 1.0)
-    carried = from_texels(sky, seen, made_of.roughness, GGX, None).beside(
+    carried = from_texels(sky, seen, made_of.roughness, GGX, None).concatenate(
         from_lamps(places, 0.06, seen, made_of.roughness, GGX, None)
     )
     target = Target(seen.position, made_of, color)

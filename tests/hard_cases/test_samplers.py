@@ -15,26 +15,29 @@ from tests import oracles
 from tests.hard_cases.known_ball import sky
 from tests.shading.test_sampling import NORMALS, density, points
 
-POINTS, PER_POINT = 100_000, 10
+SAMPLES = 1_000_000
+PER_POINT = {"mis": 2}
+"""Directions per point, else one: those of a point share a turned lattice, and χ² wants independent ones."""
+# The even sampler has a density that jumps at the horizon, which must be an edge of the cells.
 CASES = [
-    ("fibonacci", "ggx"),
-    ("cosine", "ggx"),
-    *((kind, lobe) for kind in ("lobe", "mis") for lobe in LOBES),
+    ("fibonacci", "ggx", "frontal"),
+    *(("cosine", "ggx", view) for view in NORMALS),
+    *((kind, lobe, view) for kind in ("lobe", "mis") for lobe in LOBES for view in NORMALS),
 ]
-TESTS = len(CASES) * len(NORMALS) + 1
+TESTS = len(CASES) + 1
 """Tests of this module: all of them together fail by chance once in a hundred times."""
 ROUGHNESS = 0.35
 
 
 @pytest.mark.hard
-@pytest.mark.parametrize("view", NORMALS)
-@pytest.mark.parametrize(("kind", "lobe"), CASES)
+@pytest.mark.parametrize(("kind", "lobe", "view"), CASES)
 def test_a_million_directions(kind, lobe, view):
     torch.manual_seed(11)
-    many = points(NORMALS[view], (0.0, 0.0, 1.0), POINTS, ROUGHNESS)
+    count = PER_POINT.get(kind, 1)
+    many = points(NORMALS[view], (0.0, 0.0, 1.0), SAMPLES // count, ROUGHNESS)
     one = tuple(t[:1] for t in many)
     result = oracles.chi2_test(
-        lambda: sample_directions(kind, *many, PER_POINT, LOBES[lobe], True).wi.reshape(-1, 3).numpy(),
+        lambda: sample_directions(kind, *many, count, LOBES[lobe], True).wi.reshape(-1, 3).numpy(),
         lambda wi: density(kind, LOBES[lobe], torch.from_numpy(wi)[None], *one)[0].numpy(),
         tests=TESTS,
     )
@@ -50,7 +53,7 @@ def test_a_million_directions_of_a_map():
     middle = light.texel_directions(torch.zeros(1, 3))
     share = (light.pdf(middle.wi)[0] * middle.solid_angle).double().numpy()
     assert share.sum() == pytest.approx(1, abs=1e-4)
-    drawn = light.sample(torch.zeros(POINTS, 3), PER_POINT, stochastic=True).wi
+    drawn = light.sample(torch.zeros(SAMPLES, 3), 1, stochastic=True).wi
     counted = np.bincount(texels_of(drawn, 16, 32).reshape(-1).numpy(), minlength=512)
     expected = share / share.sum() * counted.sum()
     p_value = stats.chisquare(counted, expected).pvalue

@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 import torch
 
+from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.images import read_image, write_exr
+from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.point_cloud import read_oriented_ply, write_oriented_ply
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.loop import train
@@ -85,3 +87,29 @@ def test_other_units_show_the_same_scene(tmp_path, usual, radiance, length):
             torch.testing.assert_close(
                 shown(other.model), expected, rtol=1e-3, atol=1e-4 * float(expected.mean())
             )
+
+
+@pytest.mark.parametrize("length", [1e-4, 1e4])
+def test_a_scene_in_other_units_and_far_from_the_origin_has_the_same_rays(tmp_path, length):
+    """A world frame whose unit is 10⁴ times larger or smaller, and whose origin is 10⁴ radii away."""
+    away = 1e4 * np.array([0.6, 0.0, -0.8])
+    usual, other = make_capture(tmp_path / "usual"), make_capture(tmp_path / "other")
+    path = other / "inputs" / "sfm_scene.json"
+    scene = json.loads(path.read_text())
+    for track in scene["camera_track_map"]["images"].values():
+        w2c = np.reshape(track["camera"]["extrinsic"], (4, 4))
+        w2c[:3, 3] = length * (w2c[:3, 3] - w2c[:3, :3] @ away)
+        track["camera"]["extrinsic"] = w2c.tolist()
+    box = np.reshape(scene["bbox"]["transform"], (4, 4))
+    box[:3] *= length
+    box[:3, 3] += length * away
+    scene["bbox"]["transform"] = box.tolist()
+    path.write_text(json.dumps(scene))
+    one, two = (
+        PixelDataset(capture, capture.views).sample(2000)
+        for capture in map(load_capture, (usual, other))
+        if torch.manual_seed(0)
+    )
+    torch.testing.assert_close(two.origins, one.origins, rtol=0, atol=1e-6)
+    torch.testing.assert_close(two.directions, one.directions, rtol=0, atol=1e-6)
+    assert torch.equal(two.color, one.color)
