@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import nn
 
-from neilfpp_method.attach import attach_neilf, missing_capabilities, pixel_batch
+from neilfpp_method.attach import CallableHost, attach_neilf, missing_capabilities, pixel_batch
 from neilfpp_method.data.images import write_exr
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.volsdf import VolSdfHost
@@ -296,6 +296,25 @@ def test_a_bad_answer_names_the_host_the_output_and_the_remedy(answer, message):
     with pytest.raises(UserError, match=message) as caught:
         neilf.losses(pixels(), Stage.JOINT)
     assert "spoiled.<locals>.field" in caught.value.problem
+
+
+def test_a_function_may_return_a_dictionary():
+    ball = Ball()
+
+    def dictionary(origins, directions):
+        color, position, normal = ball(origins, directions)
+        return {"rgb": color, "depth": (position - origins).norm(dim=-1), "normal": normal}
+
+    rays = pixels().rays
+    expected, found = CallableHost(ball).render(rays), CallableHost(dictionary).render(rays)
+    hit = expected.is_hit(0.8)
+    assert hit.any()
+    torch.testing.assert_close(found.is_hit(0.8), hit)
+    torch.testing.assert_close(found.position[hit], expected.position[hit])
+    assert attach_neilf(dictionary, tiny_config()).losses(pixels(), Stage.MATERIAL_INIT).loss.isfinite()
+    incomplete = attach_neilf(spoiled(lambda c, p, n: {"rgb": c}), tiny_config())
+    with pytest.raises(UserError, match="its outputs have no tensor"):
+        incomplete.losses(pixels(), Stage.MATERIAL_INIT)
 
 
 def test_a_colour_may_be_cut_off_where_nothing_trains_it():

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -26,12 +27,11 @@ from torch import Tensor
 
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.base import ReadsOutputs
-from neilfpp_method.hosts.function import function_hits
 from neilfpp_method.hosts.outputs import check_tensors, host_name
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import RayBatch, SurfaceHits
 
-__all__ = ["Rendered", "as_hits", "in_precision", "no_hits"]
+__all__ = ["Rendered", "as_hits", "function_hits", "in_precision", "no_hits"]
 
 Rendered = SurfaceHits | Mapping[str, Tensor] | Sequence[Tensor]
 """Rendered outputs of a host, in any form that this module reads."""
@@ -59,6 +59,31 @@ def as_hits(host: object, rays: RayBatch, rendered: Rendered) -> SurfaceHits:
         hits = rendered
     check_tensors(name, rays, {f.name: getattr(hits, f.name, None) for f in fields(SurfaceHits)})
     return hits
+
+
+def function_hits(name: str, rays: RayBatch, answer: Any) -> SurfaceHits:
+    """Convert (color, position, normal), each (N, 3), to hits.
+
+    Args:
+        name: name of the function, for error messages.
+        rays: the rays that it was called with.
+        answer: what it returned.
+
+    Raises:
+        UserError: these are not three tensors of the right shape on the device of the rays.
+    """
+    if not isinstance(answer, tuple | list) or len(answer) != 3:
+        kind = f"{len(answer)} values" if isinstance(answer, tuple | list) else f"a {type(answer).__name__}"
+        raise UserError(
+            f"{name}: returns {kind}", "return color, position and normal, each (N, 3), or a dictionary"
+        )
+    check_tensors(name, rays, dict(zip(("color", "position", "normal"), answer, strict=True)))
+    color, position, normal = answer
+    # The comparison is False for NaN.
+    hit = normal.detach().square().sum(-1) > 0.25
+    position = torch.where(hit[:, None], position, rays.origins.to(position.dtype))
+    share = hit.to(color.dtype)
+    return SurfaceHits(color, position, torch.where(hit[:, None], normal, 0.0), share, share)
 
 
 def in_precision(hits: SurfaceHits, dtype: torch.dtype) -> SurfaceHits:
