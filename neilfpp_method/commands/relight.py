@@ -34,8 +34,11 @@ class Relight:
     ] = ()
     """Move a lamp that the run has found, or leave it out, and keep the others: 0=1,0.5,2 (the capture's
     world) or 1=off; numbers as in lamps.json; can be given several times."""
-    views: Literal["test", "train", "all", "turntable"] = "test"
-    """Views of the capture, or a circle about the scene, which also becomes turntable.mp4."""
+    views: Annotated[tuple[str, ...], tyro.conf.arg(metavar="test|train|all|turntable|VIEW [VIEW ...]")] = (
+        "test",
+    )
+    """Views of the capture, as a set or by name; or a circle about the scene, which also becomes
+    turntable.mp4."""
     frames: int = 96
     """Pictures of a turntable."""
     edits: Annotated[
@@ -91,6 +94,7 @@ COMMAND = Command(
     run,
     [
         "neilfpp relight runs/teapot --env studio.exr",
+        "neilfpp relight runs/teapot --env studio.exr --views 004 019 --spp 256",
         "neilfpp relight runs/teapot --env forest.hdr --env-layout common --rotate 90 --views turntable",
         "neilfpp relight runs/teapot --set roughness=0.2 --set metallic=1 --mask 004.png --seconds 20",
         "neilfpp relight runs/lantern --lamp 0=0.5,-1,1.2 --lamp 1=off",

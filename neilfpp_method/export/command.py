@@ -11,7 +11,7 @@ from neilfpp_method.export.asset.command import AssetOptions, Bar, Deviations, c
 from neilfpp_method.export.light import check_light, export_light, has_light
 from neilfpp_method.export.mesh import export_mesh, has_surface
 from neilfpp_method.train.device import pick_device
-from neilfpp_method.train.run import check_writable, load_run
+from neilfpp_method.train.run import check_folder, load_run
 
 __all__ = ["run_export"]
 
@@ -44,7 +44,7 @@ def run_export(
     """
     trained = load_run(run, pick_device(device), checkpoint)
     out = out or run / "export"
-    check_writable(out)
+    check_folder(out)
     has = {"mesh": has_surface(trained), "light": has_light(trained)}
     what = what or [name for name, there in has.items() if there] or ["mesh"]
     if "light" in what:

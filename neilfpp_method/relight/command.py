@@ -22,7 +22,7 @@ import torch
 
 from neilfpp_method.errors import UserError
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.relight.cameras import Shot, rays_through, turntable, view_shots
+from neilfpp_method.relight.cameras import Shot, chosen_views, rays_through, turntable, view_shots
 from neilfpp_method.relight.comparison import compare, find_truth, read_truth
 from neilfpp_method.relight.denoise import check_denoiser, denoised
 from neilfpp_method.relight.edits import edited, parse_edits, scene_box
@@ -37,12 +37,14 @@ from neilfpp_method.relight.recovered import check_material, surface_of_run
 from neilfpp_method.relight.sky import Sky, sky_of_run
 from neilfpp_method.relight.stencil import painted, read_stencils
 from neilfpp_method.train.device import pick_device
-from neilfpp_method.train.run import Run, check_writable, load_run, write_json
+from neilfpp_method.train.run import Run, check_folder, load_run, write_json
 
 __all__ = ["Request", "relight"]
 
 OWN = "own"
 """The name of the light that a run has found."""
+TURNTABLE = "turntable"
+"""The word for a circle of cameras in place of views."""
 SAMPLES = 64
 """Per pixel, where neither samples nor seconds are asked for."""
 FORMAT = 1
@@ -59,7 +61,7 @@ class Request:
     exposure: float
     lamps: str
     lamp_edits: tuple[str, ...]
-    views: str
+    views: tuple[str, ...]
     frames: int
     edits: tuple[str, ...]
     box: tuple[float, ...] | None
@@ -98,7 +100,7 @@ def relight(
     run = load_run(request.run, pick_device(request.device), request.checkpoint)
     check_material(run)
     out = request.out or request.run / "relit"
-    check_writable(out)
+    check_folder(out)
     shots = _shots(request, run)
     lights = _lights(request, run, say)
     lamps = _lamps(request, run)
@@ -116,7 +118,7 @@ def relight(
         scenes = {name: Scene(surface, materials, run.model.lobe, sky, lamps) for name, sky in lights.items()}
         _render(request, scenes, folders, missing, on_progress)
     for k, folder in enumerate(folders.values()):
-        if request.views == "turntable":
+        if TURNTABLE in request.views:
             write_movie(folder.path / "turntable.mp4", [folder.png(shot) for shot in shots])
         if truths:
             say(_measure(run, folder, shots, truths[k]))
@@ -156,8 +158,10 @@ def _check(request: Request) -> None:
             )
     if request.lamp_edits and request.lamps == "drop":
         raise UserError("--lamp moves what --lamps drop leaves out", "give one of them")
+    if TURNTABLE in request.views and len(request.views) > 1:
+        raise UserError("--views turntable is a circle, and no other views go with it", "give one of them")
     if request.truth:
-        if request.views == "turntable" or request.scale is not None or request.width is not None:
+        if TURNTABLE in request.views or request.scale is not None or request.width is not None:
             raise UserError(
                 "true images are of views in full size", "leave --views turntable, --scale and --width out"
             )
@@ -177,9 +181,9 @@ def _check(request: Request) -> None:
 
 def _shots(request: Request, run: Run) -> list[Shot]:
     capture = run.capture
-    if request.views == "turntable":
+    if TURNTABLE in request.views:
         return turntable(capture, request.frames, request.scale, request.width)
-    views = {"test": capture.test_views, "train": capture.train_views, "all": capture.views}[request.views]
+    views = chosen_views(capture, request.views)
     return view_shots(capture, views, 1.0 if request.truth else request.scale, request.width)
 
 
@@ -200,7 +204,8 @@ def _lights(request: Request, run: Run, say: Callable[[str], None]) -> dict[str,
     for name, path in zip(map_names(request.env), request.env, strict=True):
         read = read_map(path, request.env_layout, request.rotate, request.exposure)
         if read.negative:
-            say(f"{path}: {read.negative} texels are slightly negative, and count as 0")
+            texels = "texel is" if read.negative == 1 else "texels are"
+            say(f"{path}: {read.negative} {texels} slightly negative; replaced by 0")
         lights[name] = dataclasses.replace(read.sky, radiance=read.sky.radiance.to(device))
     return lights
 

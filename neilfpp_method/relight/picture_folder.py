@@ -52,8 +52,14 @@ class PictureFolder:
         made = read_json(record)
         for key, value in self._made_with(shot).items():
             if made.get(key) != value:
-                problem = f"{record}: was made with {key} {made.get(key)}, not {value}"
-                raise UserError(problem, "choose another --out, or render again with --force")
+                same = (
+                    "another map of this name"
+                    if key == "map_sha256"
+                    else f"{key} {made.get(key)}, not {value}"
+                )
+                raise UserError(
+                    f"{record}: was made with {same}", "choose another --out, or render again with --force"
+                )
         return all(self._file(shot, suffix).is_file() for suffix in (".exr", ".png"))
 
     def write(self, shot: Shot, picture: Picture, seconds: float) -> None:

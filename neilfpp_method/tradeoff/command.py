@@ -14,7 +14,7 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.tradeoff.files import write_tradeoff
 from neilfpp_method.tradeoff.frontier import FIGURES, Point, frontier
 from neilfpp_method.tradeoff.rows import Row, measured, rows_of, run_row
-from neilfpp_method.train.run import check_writable, read_description
+from neilfpp_method.train.run import check_folder, read_description
 
 __all__ = ["run_tradeoff"]
 
@@ -50,7 +50,7 @@ def run_tradeoff(
     """
     rows = rows_of(data, out, config, budgets, seeds, device)
     load_capture(data)  # what is wrong with it is told before anything is written
-    check_writable(out)
+    check_folder(out)
     for row in rows:
         _check_same(row)
     refused = ""

@@ -49,6 +49,7 @@ __all__ = [
     "CaptureSource",
     "Description",
     "Run",
+    "check_folder",
     "check_free",
     "check_writable",
     "create_run",
@@ -178,7 +179,7 @@ def check_free(path: Path) -> None:
     """
     if path.exists() and (not path.is_dir() or any(not _of_no_run(inner.name) for inner in path.iterdir())):
         raise UserError(f"{path}: exists already", "choose another --out, or continue it with --resume")
-    check_writable(path)
+    check_folder(path)
 
 
 def _of_no_run(name: str) -> bool:
@@ -187,15 +188,32 @@ def _of_no_run(name: str) -> bool:
 
 
 def check_writable(path: Path) -> None:
-    """That a file or a folder can be made, told before there is work to lose.
+    """Check that a file can be written, before there is work to lose. Its folder need not exist.
 
     Raises:
-        UserError: it cannot.
+        UserError: the path is a folder, or nothing can be written above it.
     """
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder", "name a file with --out")
+    _check_above(path, path)
+
+
+def check_folder(path: Path) -> None:
+    """Check that files can be written into a folder, before there is work to lose. It need not exist.
+
+    Raises:
+        UserError: the path is a file, or nothing can be written there.
+    """
+    if path.exists() and not path.is_dir():
+        raise UserError(f"{path}: is a file", "name a folder with --out")
+    _check_above(path / "file", path)
+
+
+def _check_above(path: Path, named: Path) -> None:
     above = next(folder for folder in path.absolute().parents if folder.exists())
     if not above.is_dir() or not os.access(above, os.W_OK):
         raise UserError(
-            f"{path}: cannot be written, for nothing can be made in {above}", "choose another --out"
+            f"{named}: cannot be written, for nothing can be made in {above}", "choose another --out"
         )
 
 
