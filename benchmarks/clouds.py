@@ -1,7 +1,7 @@
 """How far the point cloud and the cameras of a prepared capture are from the truth: the figures of
 docs/captures.md.
 
-    neilfpp prepare DATA/ring_capture/images --out CAPTURE --dense
+    neilfpp prepare DATA/ring_capture/images --out CAPTURE --cloud dense
     python -m benchmarks.clouds CAPTURE DATA/ring_capture/true_cameras.json \
         DATA/tabletop_env/inputs/model/mesh.ply
 

@@ -19,7 +19,7 @@ COMMAND = Command(
     run,
     [
         "neilfpp prepare photos/teapot --out captures/teapot",
-        "neilfpp prepare photos/teapot --out captures/teapot --dense --also nerfstudio neilf",
+        "neilfpp prepare photos/teapot --out captures/teapot --also nerfstudio neilf",
         "neilfpp prepare scans/colmap-project --out captures/teapot   (keeps the poses)",
     ],
 )

@@ -106,7 +106,8 @@ class Capture:
             [
                 f"{self.root.resolve().name} ({self.format}): {len(self.views)} views of {size}, "
                 f"{len(self.train_views)} to train on and {len(self.test_views)} to test on",
-                f"pixels: {'linear HDR' if self.hdr else 'display values (sRGB)'}; masks: {masks or 'none'}; "
+                f"pixels: {'linear HDR' if self.hdr else 'display values (sRGB)'}; "
+                f"mask files: {masks or 'none'}; "
                 f"point cloud: {self.point_cloud.name if self.point_cloud else 'none'}",
                 f"scene: centre ({x:.3g}, {y:.3g}, {z:.3g}), 1 scene unit = {self.normalisation.scale:.4g} "
                 "world units" + FOUND[self.scene_from],
@@ -234,7 +235,9 @@ def _test_views(
     else:
         every = TEST_EVERY if test_every is None else test_every
         if every < 0:
-            raise UserError(f"every {every}-th view cannot be held out", "give 2 or more, or 0 for none")
+            raise UserError(
+                f"every {every}-th view cannot be held out", "give 2 or more, or 0 to hold out no view"
+            )
         held_out = frozenset(view.name for view in views[every - 1 :: every]) if every else frozenset()
     if len(held_out) == len(views):
         raise UserError(f"{root}: all {len(views)} views are held out for testing", "leave some to train on")

@@ -64,6 +64,14 @@ class ImageFile:
     alpha: Float[np.ndarray, "H W"] | None
     hdr: bool
 
+    @property
+    def mask(self) -> Float[np.ndarray, "H W"]:
+        """The values of a mask file, in [0, 1]: its alpha channel if it has one, else its brightest channel.
+
+        Tools that cut out objects write the mask as the alpha channel of a white image or of the photograph.
+        """
+        return self.pixels.max(axis=-1) if self.alpha is None else self.alpha
+
 
 # --------------------------------------------------------------------------------------------- kinds of files
 

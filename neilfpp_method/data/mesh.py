@@ -41,7 +41,8 @@ def read_mesh(path: Path, normalisation: Normalisation) -> Mesh:
         if path.suffix.lower() == ".glb":
             _check_counts(path)
         mesh = trimesh.load_mesh(path, process=False)
-        vertices = torch.as_tensor(np.array(mesh.vertices), dtype=torch.float32)
+        # In double precision, because the world's origin may be far away, as in map coordinates.
+        vertices = torch.as_tensor(np.array(mesh.vertices), dtype=torch.float64)
         faces = torch.as_tensor(np.array(mesh.faces), dtype=torch.int64)
     except Exception as error:  # whatever trimesh meets in a damaged file
         raise UserError(f"{path}: not a mesh that can be read ({error})", "export it again as PLY") from error
@@ -56,7 +57,7 @@ def read_mesh(path: Path, normalisation: Normalisation) -> Mesh:
         raise UserError(
             f"{path}: no triangles, or triangles of vertices that are not there", "export it again"
         )
-    return Mesh(normalisation.to_scene(vertices), faces)
+    return Mesh(normalisation.to_scene(vertices).float(), faces)
 
 
 def _check_counts(path: Path) -> None:

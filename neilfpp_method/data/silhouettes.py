@@ -50,7 +50,7 @@ def read_outlines(views: Sequence[View], most: int = MAX_VIEWS, longest: int = M
     outlines = []
     for view in chosen:
         image = read_image(view.mask or view.image)
-        values = image.alpha if view.mask is None else image.pixels.max(axis=-1)
+        values = image.alpha if view.mask is None else image.mask
         if values is not None:
             outlines.append(_outline(view, values > 0.5, longest))
     return outlines if len(outlines) >= len(chosen) / 2 else []

@@ -94,7 +94,7 @@ def pixel_colors(view: View, image: ImageFile, hdr: bool) -> Float32[Tensor, "H 
 
 def read_mask(path: Path, view: View) -> Bool[np.ndarray, "H W"]:
     """Where a mask of the view, at the size of its files, is above one half."""
-    values = read_image(path).pixels.max(axis=-1)
+    values = read_image(path).mask
     if values.shape[::-1] != file_size(view):
         raise UserError(f"{path}: the mask has another size than {view.image}", "load the capture again")
     return values > 0.5

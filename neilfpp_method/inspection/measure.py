@@ -109,7 +109,7 @@ def _mask(view: View, kind: str, size: tuple[int, int]) -> Bool[np.ndarray, "H W
     path = getattr(view, kind)
     if path is None:
         return np.ones(size, bool)
-    values = read_image(path).pixels.max(axis=-1)
+    values = read_image(path).mask
     if values.shape != size:
         raise UserError(f"{path}: another size than {view.image}", "make the mask again")
     return values > 0.5

@@ -1,4 +1,4 @@
-"""Native calls that take minutes run beside the main thread, which shows progress and can stop them."""
+"""Run long native calls in a second thread, so that the main thread can show progress and handle Ctrl-C."""
 
 from __future__ import annotations
 
@@ -14,20 +14,26 @@ __all__ = ["in_background", "sigterm_as_ctrl_c", "silent"]
 
 Result = TypeVar("Result")
 INTERVAL = 0.2
+"""Seconds between two updates of the progress bar."""
 
 
 def in_background(
-    call: Callable[[pycolmap.CancellationToken], Result], look: Callable[[], None] = lambda: None
+    call: Callable[[pycolmap.CancellationToken], Result], update: Callable[[], None] = lambda: None
 ) -> Result:
-    """What `call` returns or raises; `look` is called several times a second meanwhile, and once at the end.
+    """Run `call` in a second thread and return its result, or raise its exception.
+
+    Args:
+        call: a native call that observes the cancellation token.
+        update: called every `INTERVAL` seconds in the main thread while `call` runs, and once at the end.
 
     Raises:
-        KeyboardInterrupt: a person asked to stop; the call has been told, and has ended.
+        KeyboardInterrupt: Ctrl-C was pressed. `call` has been cancelled and has ended.
     """
     token = pycolmap.CancellationToken()
     outcome: list[Result] = []
     failure: list[BaseException] = []
-    ended = threading.Event()  # Thread.join forgets its thread when Ctrl-C interrupts it (CPython 3.11)
+    # Not Thread.join: after an interruption by Ctrl-C it takes the thread for ended (CPython 3.11).
+    ended = threading.Event()
 
     def work() -> None:
         try:
@@ -40,8 +46,8 @@ def in_background(
     threading.Thread(target=work, daemon=True).start()
     try:
         while not ended.wait(INTERVAL):
-            look()
-        look()
+            update()
+        update()
     except BaseException:
         token.cancel()
         ended.wait()
@@ -53,10 +59,11 @@ def in_background(
 
 @contextmanager
 def sigterm_as_ctrl_c() -> Iterator[None]:
-    """SIGTERM, by which schedulers end a command, acts like a person's stop: a `KeyboardInterrupt`."""
+    """Raise `KeyboardInterrupt` on SIGTERM, the signal by which schedulers end a job, as on Ctrl-C."""
     try:
         before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    except ValueError:  # not the main thread: somebody else handles signals
+    except ValueError:
+        # Outside of the main thread Python allows no signal handlers.
         yield
         return
     try:
@@ -66,5 +73,5 @@ def sigterm_as_ctrl_c() -> Iterator[None]:
 
 
 def silent() -> None:
-    """COLMAP reports every image on the standard error; bars and a summary take its place."""
+    """Switch off COLMAP's log of every image on standard error; progress bars and a summary replace it."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL.value)

@@ -1,9 +1,9 @@
 """`neilfpp prepare`: from a folder of photographs to a capture.
 
-merged ──► copies ──► matches ──► model ──► views ──► cloud ──► capture       each a step in CAPTURE/work,
-done once
+    merged ──► copies ──► matches ──► model ──► views ──► dense ──► capture
 
-The capture's files are laid out at the end, `capture.json` last: a folder without it is unfinished.
+Each of these steps keeps its results in a folder of CAPTURE/work and is done once. The files of the capture
+are written at the end, `capture.json` last: a folder without it is unfinished.
 """
 
 from __future__ import annotations
@@ -39,15 +39,21 @@ __all__ = ["run_prepare"]
 
 
 def run_prepare(options: Prepare, console: Console) -> Path:
-    """Make a capture and return its folder. A finished one, of the same images and options, is kept.
+    """Make a capture from a folder of photographs and return the capture's folder.
+
+    If the folder already holds a finished capture of the same images and options, nothing is done.
+
+    Args:
+        options: the options of the command.
+        console: receives progress bars and the summary.
 
     Raises:
-        UserError: bad input, or images that do not make a scene.
-        Stopped: a person asked for it; names the command that continues.
+        UserError: the input is bad, or the images cannot be placed in one scene.
+        Stopped: the command was interrupted; the message names the command that continues.
     """
     _check_place(options)
     silent()
-    with _way_on(options):
+    with _stop_with_command(options):
         return _prepare(options, console)
 
 
@@ -66,7 +72,7 @@ def _prepare(options: Prepare, console: Console) -> Path:
             )
             summary = lay_out(source, options, open_bar)
         if summary is None:
-            console.print(f"{options.out}: finished already", highlight=False, soft_wrap=True)
+            console.print(f"{options.out}: already finished", highlight=False, soft_wrap=True)
             return options.out
         for line in summary.lines:
             console.print(line, highlight=False, soft_wrap=True)
@@ -82,35 +88,39 @@ def _check_place(options: Prepare) -> None:
     images, out = options.images.resolve(), options.out.resolve()
     if images.is_relative_to(out) or out.is_relative_to(images):
         raise UserError(
-            f"{options.out}: the images and the capture lie within one another", "choose another --out"
+            f"{options.out}: one of the folders of images and capture lies inside the other",
+            "choose another --out",
         )
     if out.exists() and not out.is_dir():
         raise UserError(f"{options.out}: not a folder", "choose another --out")
     if out.is_dir() and any(out.iterdir()) and not (out / WORK).is_dir():
-        raise UserError(f"{options.out}: not empty, and not made by this command", "choose another --out")
+        raise UserError(
+            f"{options.out}: not empty, and not written by neilfpp prepare", "choose another --out"
+        )
     if options.test_every is not None and (options.test_every < 0 or options.test_every == 1):
         raise UserError(
-            f"every {options.test_every}-th view cannot be held out", "give 2 or more, or 0 for none"
+            f"every {options.test_every}-th view cannot be held out",
+            "give 2 or more, or 0 to hold out no view",
         )
 
 
 @contextmanager
-def _way_on(options: Prepare) -> Iterator[None]:
-    """A stop names the command that continues."""
+def _stop_with_command(options: Prepare) -> Iterator[None]:
+    """Turn Ctrl-C into `Stopped`, with the command that continues."""
     try:
         with sigterm_as_ctrl_c():
             yield
     except KeyboardInterrupt:
-        given = [str(options.images), "--out", str(options.out)]
+        arguments = [str(options.images), "--out", str(options.out)]
         for field in fields(options)[2:]:
             value = getattr(options, field.name)
             name = field.name.replace("_", "-")
             if isinstance(value, bool) and value != field.default:
-                given.append(f"--{name}" if value else f"--no-{name}")
+                arguments.append(f"--{name}" if value else f"--no-{name}")
             elif value != field.default:
-                given += [f"--{name}", *map(str, value if isinstance(value, tuple) else [value])]
+                arguments += [f"--{name}", *map(str, value if isinstance(value, tuple) else [value])]
         raise Stopped(
-            "stopped; what is done is kept", f"continue with: neilfpp prepare {shlex.join(given)}"
+            "stopped; finished steps are kept", f"continue with: neilfpp prepare {shlex.join(arguments)}"
         ) from None
 
 
@@ -123,7 +133,7 @@ def _check_readable(problems: tuple[str, ...], options: Prepare) -> None:
 
 
 def _from_capture(capture: Capture, options: Prepare) -> Source:
-    """A capture keeps its poses; the points of a COLMAP model come with it."""
+    """The views of a capture with its own poses, and the points if it is a COLMAP model."""
     posed = posed_by_capture(capture)
     files = [path for view in posed.views for path in (view.image, view.mask, view.valid) if path]
     poses = [[view.name, view.camera.w2c.tolist(), view.camera.intrinsics.tolist()] for view in posed.views]
@@ -138,7 +148,7 @@ def _from_capture(capture: Capture, options: Prepare) -> Source:
 
 
 def _from_photos(photos: Photos, brackets: Brackets | None, options: Prepare, open_bar: Bars) -> Source:
-    """Structure from motion."""
+    """The photographs with poses from structure from motion, after the merging of exposure brackets."""
     work = options.out / WORK
     merged = merge_photos(photos, brackets, options.response, work / "merged", open_bar) if brackets else None
     photos = merged.photos if merged else photos

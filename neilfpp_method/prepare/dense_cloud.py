@@ -41,7 +41,7 @@ def dense_cloud(capture: Capture, folder: Path, open_bar: Bars) -> WorldPoints:
     centre = np.array(capture.normalisation.centre)
     sources = choose_sources(cameras, centre, STEREO_SOURCES)
     if not any(sources):
-        raise UserError(f"{capture.root}: no two views see the scene from nearby", "leave out --dense")
+        raise UserError(f"{capture.root}: no two views see the scene from nearby", "use --cloud sparse")
     bar = open_bar("depth of each view", len(views))
     depths = []
     for view, reference, others in zip(capture.views, views, sources, strict=True):
@@ -59,6 +59,6 @@ def dense_cloud(capture: Capture, folder: Path, open_bar: Bars) -> WorldPoints:
     if not len(points.position):
         raise UserError(
             f"{capture.root}: the depth maps of the views agree on no surface",
-            "leave out --dense: stereo needs texture",
+            "use --cloud sparse: stereo needs texture",
         )
     return without_outliers(points)

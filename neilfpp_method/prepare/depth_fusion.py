@@ -27,8 +27,7 @@ MIN_COSINE = 0.7
 """Smallest cosine between two normals that agree: an angle of 45°."""
 
 MIN_VIEWS = 2
-"""Number of other views that have to confirm a depth. Two wrong depths often agree by chance, three rarely
-do."""
+"""Number of other views that must confirm a depth. A wrong depth rarely agrees with two others by chance."""
 
 
 def fuse(

@@ -1,6 +1,7 @@
-"""The last steps: from posed views to the capture's folder.
+"""The last steps of `neilfpp prepare`: from posed views to the folder of the capture.
 
-The folder is laid out when all else is done, `capture.json` last: a folder without it is no capture yet.
+The files are copied into that folder when all steps are done, `capture.json` last, so that an unfinished
+folder is never mistaken for a capture.
 """
 
 from __future__ import annotations
@@ -30,15 +31,35 @@ from neilfpp_method.prepare.summary import Placement, Summary, write_summary
 
 __all__ = ["WORK", "Source", "lay_out"]
 
-WORK, CLOUD = "work", "points.ply"
-PARTS = ("images", "masks", "valid")
+WORK = "work"
+"""Folder inside the capture's folder in which the steps keep their results."""
+
+CLOUD = "points.ply"
+"""File of the oriented point cloud."""
+
+IMAGE_FOLDERS = ("images", "masks", "valid")
+"""Folders of a capture that this module writes, and empties first."""
+
 TEST_EVERY = 8
+"""Default split: every 8th view is a test view, as in mip-NeRF 360 and many papers after it."""
+
 WRITERS = {"nerfstudio": write_transforms, "neilf": write_sfm_scene}
+"""Writers of other layouts, by the value of `--also`."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """What a capture is made from: views with poses, the step that found them, and how, where known."""
+    """Posed views from which a capture is made, and where the poses come from.
+
+    Attributes:
+        posed: the views.
+        step: the step that found the poses.
+        points: sparse points of structure from motion; None if the poses came without points.
+        placed: how well each image fits the model; empty if the poses came with the images.
+        models: number of images of each model that structure from motion made, largest first.
+        cameras: the estimated cameras, as in `describe_cameras`.
+        remarks: notes for the summary.
+    """
 
     posed: Posed
     step: Step
@@ -50,45 +71,49 @@ class Source:
 
 
 def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
-    """Write the capture's folder and its summary; none where it exists for the same source and options.
+    """Write the folder of the capture with its summary.
+
+    Returns:
+        The summary; None if the folder already holds the capture of the same source and options.
 
     Raises:
-        UserError: an image cannot be read, or nothing tells where the scene is.
+        UserError: an image cannot be read, or the extent of the scene cannot be determined.
     """
     work, posed = options.out / WORK, source.posed
     step = begin(work / "views", source.step, undistort=options.undistort)
-    asked = {
-        "test_every": options.test_every,
-        "dense": options.dense,
-        "also": options.also,
-        "auto": options.auto,
-    }
-    last = begin(work / "capture", step, **asked)
+    last = begin(
+        work / "capture",
+        step,
+        test_every=options.test_every,
+        dense=options.dense,
+        also=options.also,
+        auto=options.auto,
+    )
     if last.result is not None and recognise(options.out):
         return None
-    known = (
-        source.points.position[reliable(source.points)]
-        if source.points is not None and len(source.points)
-        else None
-    )
     if step.result is None:
+        points = None
+        if source.points is not None and len(source.points):
+            points = source.points.position[reliable(source.points)]
         views = write_views(
             posed, step.folder, options.undistort, open_bar("writing images", len(posed.views)).advance
         )
-        box = (
-            SceneBox(posed.normalisation, posed.scene_from) if posed.normalisation else find_box(views, known)
-        )
+        if posed.normalisation:
+            box = SceneBox(posed.normalisation, posed.scene_from)
+        else:
+            box = find_box(views, points)
         files = CaptureFiles(step.folder, views, box.normalisation, scene_from=box.source)
         write_capture(step.folder, files, response="linear" if posed.linear else "srgb")
         step.complete({})
     prepared = load_capture(step.folder)
     bar = open_bar("inspecting", len(prepared.views))
     inspection = inspect_capture(prepared, lambda _: bar.advance())
-    spoilt = to_leave_out(inspection) if options.auto else {}
-    if spoilt:
-        prepared = replace(prepared, views=tuple(view for view in prepared.views if view.name not in spoilt))
+    rejected = to_leave_out(inspection) if options.auto else {}
+    if rejected:
+        kept = tuple(view for view in prepared.views if view.name not in rejected)
+        prepared = replace(prepared, views=kept)
         inspection = inspect_capture(prepared)
-        remarks = (*source.remarks, *(f"left out: {name}, {reason}" for name, reason in spoilt.items()))
+        remarks = (*source.remarks, *(f"left out: {name}, {reason}" for name, reason in rejected.items()))
         source = replace(source, remarks=remarks)
     cloud, kind = _cloud(source, prepared, options, step, open_bar)
     return _publish(source, prepared, cloud, kind, problems(inspection), options, last)
@@ -97,7 +122,7 @@ def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
 def _cloud(
     source: Source, prepared: Capture, options: Prepare, after: Step, open_bar: Bars
 ) -> tuple[WorldPoints, str]:
-    """The oriented points, and what they are."""
+    """The oriented points, and where they come from, in words."""
     if options.dense:
         step = begin(options.out / WORK / "dense", after, views=[view.name for view in prepared.views])
         path = step.folder / CLOUD
@@ -106,12 +131,11 @@ def _cloud(
             step.complete({})
         return read_oriented_ply(path), "dense: plane-sweep stereo"
     if source.posed.cloud is not None:
-        return without_outliers(read_oriented_ply(source.posed.cloud)), "those of the images' own capture"
+        return without_outliers(read_oriented_ply(source.posed.cloud)), "given with the capture"
     if source.points is not None:
         return oriented(source.points), "sparse: structure from motion"
-    return WorldPoints(
-        np.empty((0, 3)), np.empty((0, 3))
-    ), "none: poses came without points; --dense makes them"
+    empty = WorldPoints(np.empty((0, 3)), np.empty((0, 3)))
+    return empty, "none: the poses came without points; --dense computes a cloud"
 
 
 def _publish(
@@ -123,17 +147,17 @@ def _publish(
     options: Prepare,
     last: Step,
 ) -> Summary:
-    """Lay out the capture's folder; `capture.json` first goes, and comes back last."""
+    """Write the folder of the capture; `capture.json` is removed first and written last."""
     out = options.out
     (out / FILE).unlink(missing_ok=True)
-    for part in PARTS:
-        shutil.rmtree(out / part, ignore_errors=True)
+    for name in IMAGE_FOLDERS:
+        shutil.rmtree(out / name, ignore_errors=True)
     for path in (path for view in prepared.views for path in (view.image, view.mask, view.valid) if path):
         copy = out / path.relative_to(prepared.root)
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(path, copy)
     points = write_oriented_ply(out / CLOUD, cloud) if len(cloud.position) else None
-    views = tuple(_moved(view, prepared.root, out) for view in prepared.views)
+    views = tuple(_relocate(view, prepared.root, out) for view in prepared.views)
     test = _test_views(source.posed, views, options.test_every)
     box = prepared.normalisation
     summary = Summary(
@@ -158,13 +182,13 @@ def _publish(
     return summary
 
 
-def _moved(view: View, old: Path, new: Path) -> View:
-    moved = {
-        name: path and new / path.relative_to(old)
-        for name in ("image", "mask", "valid")
-        for path in [getattr(view, name)]
-    }
-    return replace(view, **moved)
+def _relocate(view: View, old: Path, new: Path) -> View:
+    """The view with its files in the folder `new` in place of `old`."""
+
+    def relocated(path: Path | None) -> Path | None:
+        return path and new / path.relative_to(old)
+
+    return replace(view, image=relocated(view.image), mask=relocated(view.mask), valid=relocated(view.valid))
 
 
 def _test_views(posed: Posed, views: tuple[View, ...], test_every: int | None) -> frozenset[str]:

@@ -1,4 +1,4 @@
-"""From matches to poses and points: COLMAP's incremental mapping."""
+"""Incremental structure from motion by COLMAP: from feature matches to poses and points."""
 
 from __future__ import annotations
 
@@ -15,57 +15,65 @@ from neilfpp_method.prepare.upright import turn_upright
 __all__ = ["MIN_SHARE", "map_scene", "refuse_partial"]
 
 MIN_SHARE = 0.6
+"""Smallest share of the images that the largest model must contain; with fewer, a side is usually missing."""
+
 SEED = 7
-SHOT_ADVICE = (
-    "take more photographs between those that are there, so that neighbours differ by 15° at most, "
-    "with texture in sight"
+"""Seed of COLMAP's random numbers (RANSAC), so that a repeated command gives the same poses."""
+
+SHOOTING_ADVICE = (
+    "take more photographs between the existing ones, at most 15° apart, with textured surfaces in view"
 )
+"""Remedy of errors about images that cannot be placed."""
 
 
 def map_scene(
     database: Path, copies: Path, work: Path, photos: Sequence[Photo], progress: Callable[[int, int], None]
 ) -> list[int]:
-    """Place the cameras and the points; the largest model is left, upright, in `work`/largest.
-
-    Returns how many images each of the models places, the largest first.
+    """Estimate poses and points; the largest model is written to `work`/largest, with +z up.
 
     Args:
-        database: with verified matches.
-        copies: the images' 8-bit copies; they colour the points.
-        work: where models go.
+        database: COLMAP's database with verified matches.
+        copies: folder of the 8-bit copies of the images, from which points get their colours.
+        work: folder of the models.
         photos: the images.
-        progress: called with the images placed, and all.
+        progress: called with the number of placed images and the number of all images.
+
+    Returns:
+        The number of images of each model, largest first. Images that share no matches end up in different
+        models.
 
     Raises:
         UserError: no two images could be placed.
-        KeyboardInterrupt: asked to stop.
+        KeyboardInterrupt: Ctrl-C was pressed.
     """
     models, count = work / "models", len(photos)
     shutil.rmtree(models, ignore_errors=True)
     models.mkdir(parents=True)
     placed = 0
 
-    def grow(images: int) -> None:
+    def add(images: int) -> None:
         nonlocal placed
         placed += images
 
     pycolmap.set_random_seed(SEED)
-    found = in_background(
+    mapped = in_background(
         lambda token: pycolmap.incremental_mapping(
             database,
             copies,
             models,
             _options(count),
-            initial_image_pair_callback=lambda: grow(2),
-            next_image_callback=lambda: grow(1),
+            initial_image_pair_callback=lambda: add(2),
+            next_image_callback=lambda: add(1),
             cancellation_token=token,
         ),
         lambda: progress(min(placed, count), count),
     )
-    if not found:
-        raise UserError(f"no two of the {count} images could be placed in space", SHOT_ADVICE)
-    ranked = sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
-    turn_upright(ranked[0], {f"{photo.name}.png": photo.held for photo in photos})
+    if not mapped:
+        raise UserError(
+            f"no two of the {count} images could be placed relative to each other", SHOOTING_ADVICE
+        )
+    ranked = sorted(mapped.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+    turn_upright(ranked[0], {f"{photo.name}.png": photo.orientation for photo in photos})
     largest = work / "largest"
     shutil.rmtree(largest, ignore_errors=True)
     largest.mkdir()
@@ -74,23 +82,23 @@ def map_scene(
 
 
 def refuse_partial(missing: Sequence[str], sizes: Sequence[int]) -> None:
-    """Refuse a largest model with less than `MIN_SHARE` of the images.
+    """Raise an error if the largest model contains less than `MIN_SHARE` of the images.
 
     Args:
-        missing: the images that it does not place.
-        sizes: how many images each of the models places, the largest first.
+        missing: names of the images that are not in the largest model.
+        sizes: number of images of each model, largest first.
 
     Raises:
-        UserError: says how many are placed, in how many pieces, and some that are not.
+        UserError: too few images; the message names the sizes of all models and three missing images.
     """
     placed, count = sizes[0], sizes[0] + len(missing)
     if placed >= MIN_SHARE * count:
         return
-    pieces = f", others in models of {', '.join(map(str, sizes[1:]))}" if len(sizes) > 1 else ""
-    named = ", ".join(missing[:3]) + (", …" if len(missing) > 3 else "")
+    others = f", others in models of {', '.join(map(str, sizes[1:]))}" if len(sizes) > 1 else ""
+    examples = ", ".join(missing[:3]) + (", …" if len(missing) > 3 else "")
     raise UserError(
-        f"only {placed} of {count} images could be placed in one model{pieces}; not placed: {named}",
-        f"{SHOT_ADVICE}, try --matching exhaustive, or go on with --allow-partial",
+        f"only {placed} of {count} images could be placed in one model{others}; not placed: {examples}",
+        f"{SHOOTING_ADVICE}, try --matching exhaustive, or accept the model with --allow-partial",
     )
 
 

@@ -1,8 +1,8 @@
-"""Features and matches: SIFT on the CPU, pairs compared and verified, all kept in COLMAP's database.
+"""Features and matches by COLMAP on the CPU: SIFT, matching of pairs, geometric verification.
 
-The database grows image by image and pair by pair, and COLMAP passes over what it holds, so an interrupted
-step goes on where it stopped. It is read by COLMAP's own SQLite only: beside a second copy of SQLite in the
-process, such as Python's, neither sees the other's locks, and the process dies.
+Results are kept in COLMAP's database. COLMAP skips images and pairs that are already in it, so an interrupted
+step continues where it stopped. The database is read through COLMAP's own SQLite only: two copies of SQLite
+in one process, such as COLMAP's and Python's, do not see each other's locks, and the process crashes.
 """
 
 from __future__ import annotations
@@ -23,19 +23,36 @@ from neilfpp_method.prepare.photos import Photo
 __all__ = ["Pairing", "choose_pairing", "extract_features", "feature_counts", "match_features"]
 
 Pairing = Literal["exhaustive", "sequential", "vocabulary"]
-EXHAUSTIVE_UP_TO = 200
-NEIGHBOURS = 20
-LOOK_ALIKES = 30
-WORDS = 4096
-WORD_SAMPLES = 200_000
-FOCAL_GUESS = 1.2
-"""Focal length in units of the longer side where nothing tells it: a field of view of 45°, to be refined."""
+"""Which pairs of images are matched: all, neighbours in the order of the names, or similar images."""
+
+MAX_EXHAUSTIVE = 200
+"""Largest number of images of which all pairs are matched (19 900 pairs); the time grows with its square."""
+
+SEQUENTIAL_OVERLAP = 20
+"""Number of following images that each image is matched with in sequential matching."""
+
+SIMILAR_IMAGES = 30
+"""Number of most similar images that each image is matched with in vocabulary matching."""
+
+MAX_WORDS = 4096
+"""Largest number of visual words of the vocabulary: far fewer than in vocabularies for any scene, because it
+is trained on a single scene."""
+
+FEATURES_PER_WORD = 8
+"""Smallest number of training features per visual word, for captures with few features."""
+
+TRAINING_FEATURES = 200_000
+"""Number of features, evenly drawn from all images, from which the vocabulary is trained."""
+
+DEFAULT_FOCAL = 1.2
+"""Initial focal length without EXIF, in units of the longer side of the image: a field of view of 45°. It is
+COLMAP's default as well, and is refined."""
 
 
 def choose_pairing(matching: str, count: int) -> Pairing:
-    """The pairing for a number of images."""
+    """Choose the pairing of `--matching`, by the number of images if it is "auto"."""
     if matching == "auto":
-        return "exhaustive" if count <= EXHAUSTIVE_UP_TO else "vocabulary"
+        return "exhaustive" if count <= MAX_EXHAUSTIVE else "vocabulary"
     return matching  # type: ignore[return-value]
 
 
@@ -47,26 +64,26 @@ def extract_features(
     model: str,
     progress: Callable[[int, int], None],
 ) -> None:
-    """Find the features of all copies, each image attached to the camera of its group.
+    """Extract the SIFT features of all copies and assign a camera to each image.
 
     Args:
-        database: COLMAP's database; made where there is none.
-        copies: the folder of the 8-bit copies, NAME.png.
+        database: COLMAP's database; created if it does not exist.
+        copies: folder of the 8-bit copies, NAME.png.
         photos: the photographs whose copies are used.
-        cameras: which photographs share a camera.
-        model: COLMAP's camera model.
-        progress: called with the images done, and all.
+        cameras: which photographs share a camera, as in `--cameras`.
+        model: name of COLMAP's camera model.
+        progress: called with the number of finished images and the number of all images.
 
     Raises:
-        UserError: photographs of different sizes are to share a camera.
-        KeyboardInterrupt: asked to stop.
+        UserError: photographs of different sizes would share a camera.
+        KeyboardInterrupt: Ctrl-C was pressed.
     """
     groups = _groups(copies, photos, cameras)
     with closing(pycolmap.Database.open(database)) as opened:
         known = sorted(opened.read_all_cameras(), key=lambda camera: camera.camera_id)
         ids = [camera.camera_id for camera in known]
         for members in list(groups.values())[len(ids) :]:
-            ids.append(opened.write_camera(_first_guess(copies, members[0], model)))
+            ids.append(opened.write_camera(_initial_camera(copies, members[0], model)))
 
     def extract(token: pycolmap.CancellationToken) -> None:
         for camera_id, members in zip(ids, groups.values(), strict=True):
@@ -91,49 +108,46 @@ def extract_features(
 def match_features(
     database: Path, pairing: Pairing, work: Path, progress: Callable[[int, int], None]
 ) -> None:
-    """Compare pairs of images and verify them by their epipolar geometry.
+    """Match the features of pairs of images and verify the matches by epipolar geometry.
 
     Args:
-        database: with the features of all images.
-        pairing: which pairs are compared.
-        work: where the vocabulary is kept.
-        progress: called with the pairs done, and about how many there are.
+        database: COLMAP's database with the features of all images.
+        pairing: which pairs are matched.
+        work: folder of the vocabulary.
+        progress: called with the number of finished pairs and the expected number of pairs.
 
     Raises:
-        UserError: there are too few features to compare.
-        KeyboardInterrupt: asked to stop.
+        UserError: fewer than two images have features.
+        KeyboardInterrupt: Ctrl-C was pressed.
     """
     counts = feature_counts(database)
     images = len(counts)
     if sum(count > 0 for count in counts.values()) < 2:
         raise UserError(
-            "no features in the images",
-            "structure from motion needs texture: put printed paper around the object, or check that images "
-            "are not black",
+            "fewer than two images have features",
+            "structure from motion needs texture: put printed paper around the object, and check that the "
+            "images are not black",
         )
     pairs = images * (images - 1) // 2
-    expected = min(
-        {"exhaustive": pairs, "sequential": images * NEIGHBOURS, "vocabulary": images * LOOK_ALIKES}[pairing],
-        pairs,
-    )
+    partners = {"exhaustive": images, "sequential": SEQUENTIAL_OVERLAP, "vocabulary": SIMILAR_IMAGES}[pairing]
+    expected = min(images * partners, pairs)
 
     def match(token: pycolmap.CancellationToken) -> None:
-        known = {"device": pycolmap.Device.cpu, "cancellation_token": token}
+        common = {"device": pycolmap.Device.cpu, "cancellation_token": token}
         if pairing == "exhaustive":
-            pycolmap.match_exhaustive(database, **known)
+            pycolmap.match_exhaustive(database, **common)
         elif pairing == "sequential":
-            pycolmap.match_sequential(database, pairing_options=_sequential(), **known)
+            pycolmap.match_sequential(database, pairing_options=_sequential(), **common)
         else:
-            pycolmap.match_vocabtree(
-                database, pairing_options=_vocabulary(database, work / "vocabulary.bin"), **known
-            )
+            options = _vocabulary(database, work / "vocabulary.bin")
+            pycolmap.match_vocabtree(database, pairing_options=options, **common)
 
     with closing(pycolmap.Database.open(database)) as watched:
         in_background(match, lambda: progress(min(watched.num_matched_image_pairs(), expected), expected))
 
 
 def feature_counts(database: Path) -> dict[str, int]:
-    """The number of features of each image, by the name of its view."""
+    """Return the number of features of each image, by the name of its view."""
     with closing(pycolmap.Database.open(database)) as opened:
         return _features(opened)
 
@@ -146,7 +160,7 @@ def _features(database: pycolmap.Database) -> dict[str, int]:
 
 
 def _groups(copies: Path, photos: Sequence[Photo], cameras: str) -> dict[Hashable, list[Photo]]:
-    """The photographs that share a camera, in an order that does not change between runs."""
+    """Group the photographs that share a camera. The order of the groups is the same in every run."""
     sizes = {photo.name: _size(copies, photo) for photo in photos}
     keys: dict[str, Callable[[Photo], Hashable]] = {
         "auto": lambda photo: (sizes[photo.name], photo.device),
@@ -160,8 +174,8 @@ def _groups(copies: Path, photos: Sequence[Photo], cameras: str) -> dict[Hashabl
         if group and sizes[photo.name] != sizes[group[0].name]:
             (w, h), (w0, h0) = sizes[photo.name], sizes[group[0].name]
             raise UserError(
-                f"{photo.path}: {w}×{h} pixels where {group[0].path.name}, of the same camera, has {w0}×{h0}",
-                "leave out --cameras, which tells cameras apart by size and EXIF",
+                f"{photo.path}: {w}×{h} pixels, but {group[0].path.name} of the same camera has {w0}×{h0}",
+                "leave out --cameras: then images of different size or EXIF have different cameras",
             )
         group.append(photo)
     return groups
@@ -172,9 +186,9 @@ def _size(copies: Path, photo: Photo) -> tuple[int, int]:
     return header.width, header.height
 
 
-def _first_guess(copies: Path, photo: Photo, model: str) -> pycolmap.Camera:
+def _initial_camera(copies: Path, photo: Photo, model: str) -> pycolmap.Camera:
     width, height = _size(copies, photo)
-    focal = (photo.focal or FOCAL_GUESS) * max(width, height)
+    focal = (photo.focal or DEFAULT_FOCAL) * max(width, height)
     camera = pycolmap.Camera.create_from_model_name(0, model, focal, width, height)
     camera.has_prior_focal_length = photo.focal is not None
     return camera
@@ -182,28 +196,29 @@ def _first_guess(copies: Path, photo: Photo, model: str) -> pycolmap.Camera:
 
 def _sequential() -> pycolmap.SequentialPairingOptions:
     options = pycolmap.SequentialPairingOptions()
-    options.overlap = NEIGHBOURS
+    options.overlap = SEQUENTIAL_OVERLAP
     return options
 
 
 def _vocabulary(database: Path, path: Path) -> pycolmap.VocabTreePairingOptions:
-    """Words learnt from the capture's own features: none have to be fetched."""
+    """Options with a vocabulary trained on the features of this capture, so that nothing is downloaded."""
     if not path.is_file():
         with closing(pycolmap.Database.open(database)) as opened:
             tables = [opened.read_descriptors(image.image_id) for image in opened.read_all_images()]
-        share = max(1, WORD_SAMPLES // len(tables))
+        per_image = max(1, TRAINING_FEATURES // len(tables))
         samples = tables[0]
-        samples.data = np.concatenate([_some(table.data, share) for table in tables])
+        samples.data = np.concatenate([_every_nth(table.data, per_image) for table in tables])
         options = pycolmap.VisualIndex.BuildOptions()
-        options.num_visual_words = min(WORDS, max(1, len(samples.data) // 8))
+        options.num_visual_words = min(MAX_WORDS, max(1, len(samples.data) // FEATURES_PER_WORD))
         index = pycolmap.VisualIndex.create(samples.data.shape[1], 64)
         index.build(options, samples.to_float())
         index.write(path)
     options = pycolmap.VocabTreePairingOptions()
-    options.num_images = LOOK_ALIKES
+    options.num_images = SIMILAR_IMAGES
     options.vocab_tree_path = path
     return options
 
 
-def _some(rows: np.ndarray, count: int) -> np.ndarray:
+def _every_nth(rows: np.ndarray, count: int) -> np.ndarray:
+    """At most `count` rows, evenly spaced."""
     return rows[:: max(1, -(-len(rows) // count))]

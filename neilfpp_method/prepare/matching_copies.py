@@ -1,7 +1,7 @@
-"""8-bit copies of the photographs, for finding features: COLMAP reads no EXR and no RAW.
+"""8-bit copies of the photographs for feature extraction, because COLMAP reads neither EXR nor RAW files.
 
-All linear images are shown at one exposure, so that a point looks alike wherever it is seen; differences in
-the camera's own exposure are divided out. Display values are copied as they are.
+All linear images are tone-mapped at one exposure, after division by the camera's exposure of each image, so
+that a point of the scene looks the same in all copies. Display values are copied unchanged.
 """
 
 from __future__ import annotations
@@ -20,17 +20,26 @@ from neilfpp_method.shading.color import tone_map
 
 __all__ = ["relative_exposures", "write_copies"]
 
-LOOKED_AT = 12
-BRIGHT, SHOWN_AT = 90.0, 0.7
+GAIN_PHOTOS = 12
+"""Number of photographs from which the common gain is computed; decoding all of them would take too long."""
+
+BRIGHT_PERCENTILE = 90.0
+"""Percentile of the lit pixels that is the bright level of an image; highlights are above it."""
+
+BRIGHT_VALUE = 0.7
+"""Linear value to which the common gain brings the bright level: a light grey with room for highlights."""
 
 
 def write_copies(photos: Photos, folder: Path, advance: Callable[[], None]) -> tuple[str, ...]:
-    """Write `folder/NAME.png` for photographs without one; returns what is wrong with unreadable ones.
+    """Write the copy `folder/NAME.png` of each photograph.
 
     Args:
         photos: the photographs.
-        folder: where the copies go; copies that are there are kept.
+        folder: folder of the copies; existing copies are kept.
         advance: called once per photograph.
+
+    Returns:
+        For each photograph that cannot be read, what is wrong with it.
     """
     exposures = relative_exposures(photos)
     gain = None
@@ -42,7 +51,7 @@ def write_copies(photos: Photos, folder: Path, advance: Callable[[], None]) -> t
                 pixels = read_photo(photo.path).pixels
                 if photos.linear:
                     gain = gain or _common_gain(photos)
-                    write_png(copy, _shown(pixels * np.float32(gain / exposures[photo.name])))
+                    write_png(copy, _tone_mapped(pixels * np.float32(gain / exposures[photo.name])))
                 else:
                     write_png(copy, _to_bytes(pixels))
             except UserError as error:
@@ -52,38 +61,37 @@ def write_copies(photos: Photos, folder: Path, advance: Callable[[], None]) -> t
 
 
 def relative_exposures(photos: Photos) -> dict[str, float]:
-    """Each photograph's exposure over their median, by name; all 1 unless EXIF has it for every one."""
+    """Return each photograph's exposure relative to the median, by name; all 1 if EXIF lacks any of them."""
     known = [photo.exposure for photo in photos.items if photo.exposure is not None]
     if not photos.linear or len(known) < len(photos.items):
         return {photo.name: 1.0 for photo in photos.items}
-    middle = float(np.median(known))
-    return {photo.name: (photo.exposure or middle) / middle for photo in photos.items}
+    median = float(np.median(known))
+    return {photo.name: (photo.exposure or median) / median for photo in photos.items}
 
 
 def _common_gain(photos: Photos) -> float:
-    """The factor that brings the bright end of what a dozen photographs show to a light grey."""
+    """The factor that brings the median bright level of a sample of photographs to `BRIGHT_VALUE`."""
     exposures = relative_exposures(photos)
-    step = -(-len(photos.items) // LOOKED_AT)
-    levels = {
-        photo.name: level for photo in photos.items[::step] if (level := _bright_level(photo)) is not None
-    }
-    return (
-        SHOWN_AT / float(np.median([level / exposures[name] for name, level in levels.items()]))
-        if levels
-        else 1.0
-    )
+    step = -(-len(photos.items) // GAIN_PHOTOS)
+    levels = [
+        level / exposures[photo.name]
+        for photo in photos.items[::step]
+        if (level := _bright_level(photo)) is not None
+    ]
+    return BRIGHT_VALUE / float(np.median(levels)) if levels else 1.0
 
 
 def _bright_level(photo: Photo) -> float | None:
     try:
         values = read_photo(photo.path).pixels[::4, ::4].mean(axis=2)
-    except UserError:  # told when its own turn comes
+    except UserError:
+        # `write_copies` reports this image.
         return None
     lit = values[values > 0]
-    return float(np.percentile(lit, BRIGHT)) if len(lit) else None
+    return float(np.percentile(lit, BRIGHT_PERCENTILE)) if len(lit) else None
 
 
-def _shown(radiance: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+def _tone_mapped(radiance: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
     return _to_bytes(tone_map(torch.from_numpy(radiance)).numpy())
 
 

@@ -1,4 +1,4 @@
-"""Exposure brackets among the photographs: each becomes one linear image, which replaces them."""
+"""Merging of exposure brackets: one linear image takes the place of the photographs of each bracket."""
 
 from __future__ import annotations
 
@@ -18,22 +18,35 @@ from neilfpp_method.prepare.steps import Step, begin, stamp
 
 __all__ = ["Merged", "brackets_among", "merge_photos"]
 
-IMAGES, VALID, MOVED = "images", "valid", "moved.json"
-SAME_STEP = 0.2
-"""In stops: what EXIF rounds an exposure to is off by less."""
-AS_THEY_ARE = "or take the photographs as they are: --brackets off"
+IMAGES, VALID = "images", "valid"
+"""Folders of the merged images and of their validity masks, inside the folder of the step."""
+
+SHIFTS = "moved.json"
+"""File with the shift of each bracket that is merged already, so that an interrupted step can continue."""
+
+STEP_TOLERANCE = 0.2
+"""Largest difference between exposure steps that count as equal, in stops; EXIF rounds by less than that."""
+
+BRACKETS_OFF = "or use the photographs as single images: --brackets off"
 
 
 def brackets_among(photos: Photos, wanted: Literal["auto", "off"]) -> Brackets | None:
-    """The brackets that the photographs are; none where they are single pictures.
+    """Find the exposure brackets among the photographs.
 
-    A list of brackets or of exposures beside the photographs says that they are brackets. Without one they
-    are where `find_brackets` puts every one of them into a bracket, there are enough poses, and all brackets
-    have the same steps: exposures that the camera chose for each picture do not. A bracket with a photograph
-    that cannot be read is left out.
+    If a list of brackets or of exposures lies beside the photographs, they are brackets. Without a list they
+    are brackets if `find_brackets` assigns every photograph to a bracket, if there are at least `MIN_PHOTOS`
+    brackets, and if all brackets have the same exposure steps; automatic exposures of single images differ
+    irregularly. A bracket with an unreadable photograph is left out.
+
+    Args:
+        photos: the photographs of the folder.
+        wanted: the option `--brackets`.
+
+    Returns:
+        The brackets by name; None if the photographs are single images.
 
     Raises:
-        UserError: there is a list, and the photographs are no brackets, or too few.
+        UserError: there is a list, but the photographs do not match it or make too few brackets.
     """
     if wanted == "off":
         return None
@@ -44,7 +57,7 @@ def brackets_among(photos: Photos, wanted: Literal["auto", "off"]) -> Brackets |
     except UserError as error:
         if listed is None:
             return None
-        raise UserError(error.problem, f"{error.remedy}, {AS_THEY_ARE}") from error
+        raise UserError(error.problem, f"{error.remedy}, {BRACKETS_OFF}") from error
     photographs = {photo.path for photo in photos.items}
     used = {path for bracket in found.values() for path in bracket if path not in photos.unreadable}
     found = {
@@ -53,26 +66,33 @@ def brackets_among(photos: Photos, wanted: Literal["auto", "off"]) -> Brackets |
         if not any(path in photos.unreadable for path in bracket)
     }
     if listed is not None:
-        if strange := sorted(used - photographs):
-            raise UserError(f"{listed}: {strange[0]} is no photograph that can be read", "correct the list")
+        if unknown := sorted(used - photographs):
+            raise UserError(f"{listed}: {unknown[0]} is not a readable photograph", "correct the list")
         if len(found) < MIN_PHOTOS:
             problem = f"{listed}: {len(found)} bracket{'s' * (len(found) != 1)}"
             raise UserError(
-                problem, f"give at least {MIN_PHOTOS}, better 30, from all around the object, {AS_THEY_ARE}"
+                problem, f"give at least {MIN_PHOTOS}, better 30, from all around the object, {BRACKETS_OFF}"
             )
         return found
     return found if used == photographs and len(found) >= MIN_PHOTOS and _same_steps(found) else None
 
 
 def _same_steps(brackets: Brackets) -> bool:
+    """Whether the exposures of all brackets differ by the same steps."""
     stops = [np.log2(sorted(bracket.values())) for bracket in brackets.values()]
     steps = [np.diff(values) for values in stops]
-    return all(len(s) == len(steps[0]) and np.abs(s - steps[0]).max() < SAME_STEP for s in steps)
+    return all(len(s) == len(steps[0]) and np.abs(s - steps[0]).max() < STEP_TOLERANCE for s in steps)
 
 
 @dataclass(frozen=True)
 class Merged:
-    """The merged images in the place of the photographs, the step that made them, and what it came to."""
+    """Merged images, in place of the photographs.
+
+    Attributes:
+        photos: the merged images.
+        step: the step that made them.
+        remark: a note for the summary: numbers of photographs and images, and shifts.
+    """
 
     photos: Photos
     step: Step
@@ -86,16 +106,16 @@ def merge_photos(
     folder: Path,
     open_bar: Bars,
 ) -> Merged:
-    """Merge brackets, as a step.
+    """Merge exposure brackets into linear images.
 
-    The camera and focal length of a merged image are those that EXIF names in its middle exposure.
+    A merged image has the camera and the focal length that EXIF gives for its middle exposure.
 
     Args:
-        photos: the photographs; those that are in no bracket are left out.
-        brackets: by `brackets_among`.
-        response: what the photographs' pixels are; auto: calibrated, or linear for camera RAW.
-        folder: the step's folder.
-        open_bar: for the progress.
+        photos: the photographs; those in no bracket are left out.
+        brackets: the result of `brackets_among`.
+        response: response curve of the photographs; "auto" calibrates it, or takes camera RAW as linear.
+        folder: folder of the step.
+        open_bar: opens a progress bar.
 
     Raises:
         UserError: as `merge_brackets`.
@@ -112,26 +132,26 @@ def merge_photos(
         middle = by_path[sorted(bracket, key=lambda path, of=bracket: of[path])[len(bracket) // 2]]
         files = {"path": folder / IMAGES / f"{name}.exr", "valid": folder / VALID / f"{name}.png"}
         items.append(replace(middle, name=name, folder=".", exposure=None, **files))
-    remark = f"{len(used)} photographs in {len(brackets)} exposure brackets became {len(items)} linear images"
+    remark = f"{len(used)} photographs in {len(brackets)} exposure brackets were merged into "
+    remark += f"{len(items)} linear images"
     if unused := len(photos.items) - len(set(used)):
-        remark += f"; {unused} in no bracket left out"
-    if by_hand := [shift for shift in step.result["moved"].values() if shift]:
-        remark += f"; taken by hand: those of {len(by_hand)} were moved onto one another, "
-        remark += f"by up to {max(by_hand):.1f} pixels"
+        remark += f"; {unused} photographs in no bracket were left out"
+    if shifts := [shift for shift in step.result["moved"].values() if shift]:
+        remark += f"; those of {len(shifts)} brackets were aligned, by up to {max(shifts):.1f} pixels"
     return Merged(replace(photos, root=folder, items=tuple(items), linear=True), step, remark)
 
 
 def _merge(
     brackets: Brackets, folder: Path, response: Literal["auto", "linear", "srgb"], bar: Bar
 ) -> dict[str, float]:
-    """Merge the remaining brackets; returns each pose's largest shift in pixels, earlier ones included."""
-    known = folder / MOVED
-    moved = dict(Entry.load(known).entries()) if known.is_file() else {}
+    """Merge the brackets that are not merged yet; return the largest shift of every bracket, in pixels."""
+    path = folder / SHIFTS
+    moved = dict(Entry.load(path).entries()) if path.is_file() else {}
 
     def done(name: str, shift: float | None) -> None:
         if shift is not None:
             moved[name] = shift
-            write_json(known, moved)
+            write_json(path, moved)
         bar.advance()
 
     merge_brackets(brackets, folder / IMAGES, folder / VALID, response, done)

@@ -1,4 +1,4 @@
-"""What `neilfpp prepare` can be asked for."""
+"""Options of the command `neilfpp prepare`."""
 
 from __future__ import annotations
 
@@ -16,34 +16,35 @@ class Prepare:
     """Make a capture from a folder of photographs: poses, scene box and oriented points."""
 
     images: tyro.conf.Positional[Path]
-    """The folder of photographs; sub-folders count. A capture with poses keeps them."""
+    """Folder of photographs, with its sub-folders. If it is a capture with poses, the poses are kept."""
     out: Path
-    """The capture's folder. Finished steps are kept in its folder work, so a stopped command continues."""
+    """Folder of the capture. Finished steps are kept in its sub-folder work, so a stopped command
+    continues."""
     matching: Literal["auto", "exhaustive", "sequential", "vocabulary"] = "auto"
-    """Which pairs are compared: all, neighbours in the order of the names, or look-alikes; auto: all up to
-    200 images, look-alikes beyond.
+    """Pairs of images to match: all, neighbours in the order of the names, or similar images; auto: all pairs
+    of up to 200 images, similar images of more.
     """
     cameras: Literal["auto", "shared", "folder", "image"] = "auto"
-    """Which images share focal length and distortion: all, those of a folder, or none; auto: those of one
-    size, camera and focal length in EXIF.
+    """Images that share focal length and distortion: all, those of a folder, or none; auto: those of the same
+    size, camera and focal length (EXIF).
     """
     camera_model: Literal[
         "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"
     ] = "SIMPLE_RADIAL"
-    """COLMAP's model of the lens that is estimated."""
+    """COLMAP camera model whose parameters are estimated."""
     response: Literal["auto", "linear", "srgb"] = "auto"
-    """Pixels are linear radiance (HDR) or sRGB (LDR); auto: floating-point and RAW files are linear."""
+    """Pixel values are linear radiance (HDR) or sRGB (LDR); auto: floating-point and RAW files are linear."""
     brackets: Literal["auto", "off"] = "auto"
-    """Merge exposure brackets into linear images first; auto: where the folder is one of brackets."""
+    """Merging of exposure brackets into linear images; auto: if all photographs belong to brackets."""
     undistort: bool = False
-    """Resample images to pinhole cameras; otherwise pixels stay as they are and cameras keep their lens."""
+    """Resample images to pinhole cameras; otherwise images are unchanged and cameras keep their lens."""
     dense: bool = False
-    """Compute a dense oriented cloud by plane-sweep stereo; otherwise the sparse points are used."""
+    """Compute a dense oriented point cloud by plane-sweep stereo; otherwise the sparse points are used."""
     test_every: int | None = None
-    """Hold out every k-th view for testing, 0 none; by default the poses' own split, or every 8th."""
+    """Hold out every k-th view for testing, 0: none; default: the split of the capture, or every 8th view."""
     auto: bool = False
-    """Leave out the views that `neilfpp inspect` rejects: black or blurred ones, and duplicates."""
+    """Leave out the views that `neilfpp inspect` rejects: black views, blurred views and duplicates."""
     allow_partial: bool = False
-    """Leave out images that cannot be read or placed, however many."""
+    """Leave out images that cannot be read or placed, whatever their number."""
     also: tuple[Literal["nerfstudio", "neilf"], ...] = ()
-    """Other formats to write into the folders CAPTURE/nerfstudio and CAPTURE/neilf."""
+    """Other formats to write as well, into the folders CAPTURE/nerfstudio and CAPTURE/neilf."""

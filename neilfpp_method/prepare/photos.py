@@ -1,4 +1,4 @@
-"""The photographs of a folder: files, names, and what their headers and EXIF entries say."""
+"""Find the photographs of a folder and read their headers, EXIF entries and pixels."""
 
 from __future__ import annotations
 
@@ -22,18 +22,30 @@ from neilfpp_method.errors import UserError
 __all__ = ["MIN_PHOTOS", "Photo", "Photos", "Picture", "check_names", "read_photo", "survey", "unreadable"]
 
 MIN_PHOTOS = 3
+"""Smallest number of photographs with which structure from motion is attempted."""
+
 EXIF_FOLDER, MAKE, MODEL, ORIENTATION, FOCAL, FOCAL_35MM = 0x8769, 0x010F, 0x0110, 0x0112, 0x920A, 0xA405
+"""EXIF tags: the sub-directory of exposure data, manufacturer, model, orientation, focal length in
+millimetres, and the equivalent focal length on 35 mm film."""
+
 FILM_WIDTH = 36.0
+"""Longer side of a frame of 35 mm film, in millimetres."""
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A photograph that is to become a view.
+    """The file of a photograph and what its header says.
 
-    `exposure` is the light that the picture took in, relative to the others, where EXIF says it. `device`
-    names camera and focal length as far as EXIF does, `focal` is the focal length in units of the image's
-    longer side. `held` is EXIF's orientation: pixels stay as the sensor has them, but it tells which way is
-    up. `valid` is a validity mask, where there is one.
+    Attributes:
+        name: name of the view that the photograph becomes.
+        path: the file.
+        folder: folder of the file, relative to the folder of all photographs.
+        exposure: exposure by EXIF (see `photo_exposure`), if pixels are linear; None if it is unknown.
+        device: manufacturer, model and focal length by EXIF, in one text; empty if unknown.
+        focal: focal length by EXIF, in units of the longer side of the image; None if unknown.
+        orientation: EXIF orientation, 1 to 8. Pixels are not rotated by it; it is used to find the up
+            direction.
+        valid: validity mask; None if all pixels are valid.
     """
 
     name: str
@@ -42,13 +54,20 @@ class Photo:
     exposure: float | None
     device: str
     focal: float | None
-    held: int = 1
+    orientation: int = 1
     valid: Path | None = None
 
 
 @dataclass(frozen=True)
 class Photos:
-    """A folder's photographs in path order, all of one kind. `unreadable`: what is wrong with others."""
+    """The photographs of a folder.
+
+    Attributes:
+        root: the folder.
+        items: the photographs, in the order of their paths.
+        linear: whether pixels are linear radiance; the same for all photographs.
+        unreadable: for each file that cannot be read, what is wrong with it.
+    """
 
     root: Path
     items: tuple[Photo, ...]
@@ -58,10 +77,12 @@ class Photos:
 
 @dataclass(frozen=True)
 class Picture:
-    """The pixels of a photograph: linear radiance, or display values in [0, 1].
+    """The decoded pixels of a photograph.
 
-    `valid` is false where a pixel means nothing: saturated in a RAW file, or not a finite number ≥ 0 (these
-    are 0). `alpha` in [0, 1] is the object's mask where the file has one.
+    Attributes:
+        pixels: linear radiance, or display values in [0, 1]. Invalid numbers are replaced by 0.
+        valid: false at pixels that are saturated in a RAW file, negative, or not finite.
+        alpha: alpha channel in [0, 1], the mask of the object; None if the file has none.
     """
 
     pixels: Float32[np.ndarray, "H W 3"]
@@ -70,45 +91,45 @@ class Picture:
 
 
 def survey(root: Path, response: Literal["auto", "linear", "srgb"]) -> Photos:
-    """Find the photographs under a folder and read their headers; hidden and other files are skipped.
+    """Find the photographs in a folder and its sub-folders and read their headers.
+
+    Hidden files and files that are not images are skipped.
 
     Args:
         root: the folder.
-        response: what the pixels are; auto: floating-point and RAW files are linear.
+        response: meaning of pixel values; "auto": floating-point and RAW files are linear.
 
     Raises:
-        UserError: no such folder, too few images, two of the same name, or two kinds.
+        UserError: the folder does not exist, has too few images, has images of the same name, or has both
+            linear images and images with display values.
     """
     if not root.is_dir():
         raise UserError(f"{root}: no such folder", "give a folder of photographs")
     paths = sorted(path for path in root.rglob("*") if _is_photo(path, root))
-    kinds: dict[Path, bool] = {}
+    is_linear: dict[Path, bool] = {}
     problems: dict[Path, str] = {}
     for path in paths:
         try:
-            kinds[path] = path.suffix.lower() in RAW_SUFFIXES or image_header(path).hdr
+            is_linear[path] = path.suffix.lower() in RAW_SUFFIXES or image_header(path).hdr
         except UserError as error:
             problems[path] = error.problem
-    if len(kinds) < MIN_PHOTOS:
-        count = f"{len(kinds) or 'no'} image{'s' * (len(kinds) != 1)}"
-        also = (
-            f", and {len(problems)} that cannot be read ({next(iter(problems.values()))})" if problems else ""
-        )
-        raise UserError(
-            f"{root}: {count}{also}", f"give at least {MIN_PHOTOS}, better 30, from all around the object"
-        )
-    if response == "auto" and len(set(kinds.values())) > 1:
-        hdr, ldr = (next(path for path, kind in kinds.items() if kind is wanted) for wanted in (True, False))
+    if len(is_linear) < MIN_PHOTOS:
+        message = f"{root}: {len(is_linear) or 'no'} image{'s' * (len(is_linear) != 1)}"
+        if problems:
+            message += f", and {len(problems)} that cannot be read ({next(iter(problems.values()))})"
+        raise UserError(message, f"give at least {MIN_PHOTOS}, better 30, from all around the object")
+    if response == "auto" and len(set(is_linear.values())) > 1:
+        hdr, ldr = (next(path for path in is_linear if is_linear[path] is kind) for kind in (True, False))
         raise UserError(f"{hdr} is linear and {ldr} is not", "keep images of one kind, or give --response")
-    linear = next(iter(kinds.values())) if response == "auto" else response == "linear"
-    names = view_names([path.relative_to(root).as_posix() for path in kinds])
-    check_names(names, tuple(kinds))
-    items = tuple(_photo(root, name, path, linear) for name, path in zip(names, kinds, strict=True))
+    linear = next(iter(is_linear.values())) if response == "auto" else response == "linear"
+    names = view_names([path.relative_to(root).as_posix() for path in is_linear])
+    check_names(names, tuple(is_linear))
+    items = tuple(_photo(root, name, path, linear) for name, path in zip(names, is_linear, strict=True))
     return Photos(root, items, linear, problems)
 
 
 def unreadable(problems: Sequence[str]) -> UserError:
-    """One error for all images that cannot be read."""
+    """Return one error for all images that cannot be read."""
     more = f" (and {len(problems) - 1} more such images)" if len(problems) > 1 else ""
     return UserError(
         f"{problems[0]}{more}", "export the image again or remove it, or leave it out with --allow-partial"
@@ -136,18 +157,22 @@ def _is_photo(path: Path, root: Path) -> bool:
 
 
 def check_names(names: Sequence[str], paths: Sequence[Path]) -> None:
-    """Refuse names of views that two of the files would share, or that cannot name a file everywhere.
+    """Check that the names of views are unique and valid file names on all operating systems.
+
+    Args:
+        names: names of the views.
+        paths: their files, for the message.
 
     Raises:
-        UserError: names the files.
+        UserError: two files have the same name, or a name is not a valid file name.
     """
-    often = Counter(names)
+    counts = Counter(names)
     for name, path in zip(names, paths, strict=True):
-        if often[name] > 1:
+        if counts[name] > 1:
             twins = " and ".join(str(other) for n, other in zip(names, paths, strict=True) if n == name)
             raise UserError(f"{twins} would both be named '{name}'", "keep or rename one of them")
         if not plain_name(name):
-            raise UserError(f"{path}: '{name}' cannot name a file everywhere", "rename the image")
+            raise UserError(f"{path}: '{name}' is not a valid file name on all systems", "rename the image")
 
 
 def _photo(root: Path, name: str, path: Path, linear: bool) -> Photo:
@@ -163,21 +188,23 @@ def _photo(root: Path, name: str, path: Path, linear: bool) -> Photo:
         exposure=photo_exposure(path) if linear else None,
         device=device,
         focal=focal_35mm and focal_35mm / FILM_WIDTH,
-        held=int(_number(entries.get(ORIENTATION)) or 1),
+        orientation=int(_number(entries.get(ORIENTATION)) or 1),
     )
 
 
 def _exif(path: Path) -> tuple[dict, dict]:
-    """The entries of a file, and those about the exposure; empty where Pillow finds none."""
+    """The EXIF entries of a file and those of its exposure sub-directory; empty if Pillow finds none."""
     try:
         with Image.open(path) as image:
             exif = image.getexif()
             return dict(exif), dict(exif.get_ifd(EXIF_FOLDER))
-    except Exception:  # formats that Pillow does not know, and EXIF blocks that are damaged
+    except Exception:
+        # Pillow raises many types of exceptions for unknown formats and for damaged EXIF blocks.
         return {}, {}
 
 
 def _number(entry: object) -> float | None:
+    """A positive, finite number; None if the entry is something else."""
     try:
         number = float(entry)  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError):

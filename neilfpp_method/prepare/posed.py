@@ -1,4 +1,4 @@
-"""Photographs with poses, found here or given: what every later step works on."""
+"""Photographs with poses, from structure from motion or from an existing capture."""
 
 from __future__ import annotations
 
@@ -23,7 +23,16 @@ __all__ = ["Posed", "posed_by_capture", "posed_by_model", "write_views"]
 
 @dataclass(frozen=True)
 class Posed:
-    """Views with files where they came from; `normalisation` and its origin, and `cloud` where known."""
+    """Views whose files are still in their original place.
+
+    Attributes:
+        views: the views, in the world frame.
+        linear: whether pixels are linear radiance.
+        normalisation: the scene's sphere, if the capture states it.
+        cloud: oriented point cloud of the capture, if it has one.
+        test: names of the test views, if the capture states them.
+        scene_from: where `normalisation` comes from.
+    """
 
     views: tuple[View, ...]
     linear: bool
@@ -34,7 +43,7 @@ class Posed:
 
 
 def posed_by_model(photos: Photos, model: pycolmap.Reconstruction) -> Posed:
-    """The photographs that a model places, in their order."""
+    """Return the photographs that a model of structure from motion places, in the order of `photos`."""
     poses = {model.image(i).name.removesuffix(".png"): model.image(i) for i in model.reg_image_ids()}
     exposures = relative_exposures(photos)
     views = []
@@ -49,34 +58,37 @@ def posed_by_model(photos: Photos, model: pycolmap.Reconstruction) -> Posed:
 
 
 def posed_by_capture(capture: Capture) -> Posed:
-    """The views of a capture that has poses."""
+    """Return the views of a capture, with its scene box unless that was guessed from the cameras."""
     known = capture.normalisation if capture.scene_from != "cameras" else None
     return Posed(capture.views, capture.hdr, known, capture.point_cloud, capture.test, capture.scene_from)
 
 
-def write_views(posed: Posed, folder: Path, straight: bool, advance: Callable[[], None]) -> tuple[View, ...]:
-    """Write `folder`/images, masks and valid; returns the views that they make.
+def write_views(posed: Posed, folder: Path, undistort: bool, advance: Callable[[], None]) -> tuple[View, ...]:
+    """Copy the files of all views to `folder`/images, `folder`/masks and `folder`/valid.
 
-    RAW files, and images with pixels that mean nothing, become EXR with a validity mask.
+    RAW files and images with invalid pixels are converted to EXR with a validity mask.
 
     Args:
-        posed: where the views come from.
-        folder: where they go.
-        straight: undo lenses.
+        posed: the views.
+        folder: the target folder.
+        undistort: whether to resample images to pinhole cameras.
         advance: called once per view.
+
+    Returns:
+        The views with the copied files.
 
     Raises:
         UserError: an image cannot be read.
     """
     written = []
     for view in posed.views:
-        written.append(copy_view(_usable(view, folder / "developed"), folder, posed.linear, straight))
+        written.append(copy_view(_usable(view, folder / "developed"), folder, posed.linear, undistort))
         advance()
     return tuple(written)
 
 
 def _usable(view: View, developed: Path) -> View:
-    """The view itself, or one whose image can be read anywhere and has no pixel that is not a number."""
+    """The view, converted to EXR with a validity mask if its image is RAW or has invalid pixels."""
     picture = read_photo(view.image)
     if picture.valid.all() and view.image.suffix.lower() not in RAW_SUFFIXES:
         return view
@@ -87,6 +99,6 @@ def _usable(view: View, developed: Path) -> View:
         write_exr(image, {"RGBA": np.concatenate([picture.pixels, picture.alpha[..., None]], axis=-1)})
     usable = picture.valid
     if view.valid is not None:
-        usable = usable & (read_image(view.valid).pixels.min(axis=-1) > 0.5)
+        usable = usable & (read_image(view.valid).mask > 0.5)
     write_png(valid, np.where(usable, 255, 0).astype(np.uint8))
     return replace(view, image=image, valid=valid)

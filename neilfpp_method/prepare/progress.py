@@ -1,4 +1,4 @@
-"""What a person sees while a capture is prepared: a bar for each step."""
+"""Progress bars of `neilfpp prepare`, one for each step."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ __all__ = ["Bar", "Bars", "bars"]
 
 
 class Bar:
-    """The bar of one step: `to` sets it, `advance` moves it by one."""
+    """The progress bar of one step."""
 
     def __init__(self, progress: Progress, title: str, total: int) -> None:
         self._progress = progress
         self._task = progress.add_task(title, total=total)
 
     def to(self, done: int, total: int) -> None:
-        """`done` of `total` are behind it."""
+        """Set the bar to `done` of `total`."""
         self._progress.update(self._task, completed=done, total=total)
 
     def advance(self) -> None:
-        """One further."""
+        """Move the bar by one."""
         self._progress.advance(self._task)
 
 
 Bars = Callable[[str, int], Bar]
-"""Opens the bar of a step, with its title and length."""
+"""A function that opens the bar of a step, given its title and its total."""
 
 
 @contextmanager
 def bars(console: Console) -> Iterator[Bars]:
-    """Bars one below another."""
+    """Show progress bars, one below the other, until the context ends."""
     columns = (TextColumn("{task.description:20}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as progress:
         yield lambda title, total: Bar(progress, title, total)

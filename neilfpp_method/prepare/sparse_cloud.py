@@ -1,4 +1,4 @@
-"""Points of structure from motion as an oriented cloud: outliers removed, normals towards cameras."""
+"""An oriented point cloud from the points of structure from motion, without outliers."""
 
 from __future__ import annotations
 
@@ -14,16 +14,34 @@ from neilfpp_method.data.point_cloud import WorldPoints
 __all__ = ["SparsePoints", "estimate_normals", "oriented", "reliable", "sparse_points", "without_outliers"]
 
 NEIGHBOURS = 12
+"""Number of nearest neighbours from which normals and outliers are computed."""
+
 MAX_ERROR = 2.0
+"""Largest mean reprojection error of a reliable point, in pixels."""
+
 MIN_TRACK = 3
-FAR = 3.0
-FLAT = 0.1
+"""Smallest number of images that must observe a reliable point: the position by two images alone is not
+checked by any other observation."""
+
+MAX_DEVIATIONS = 3.0
+"""Largest deviation of a point's log mean neighbour distance from the median, in standard deviations."""
+
+MAD_TO_SIGMA = 1.4826
+"""Ratio of the standard deviation to the median absolute deviation of a normal distribution."""
+
+MAX_FLATNESS = 0.1
+"""Largest ratio of the smallest to the middle eigenvalue of the neighbours' covariance in a flat place."""
 
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """Points with what is known of each: its reprojection error in pixels, in how many images it is, and the
-    unit mean of the directions to the cameras that see it.
+    """Points of structure from motion, in the world frame.
+
+    Attributes:
+        position: positions.
+        error: mean reprojection error of each point, in pixels.
+        track: number of images that observe each point.
+        towards: unit mean of the directions from each point to the cameras that observe it; 0 if none does.
     """
 
     position: Float64[np.ndarray, "P 3"]
@@ -39,7 +57,7 @@ class SparsePoints:
 
 
 def sparse_points(model: pycolmap.Reconstruction) -> SparsePoints:
-    """All points of a model. Those that no image sees, as models of known points have, look nowhere."""
+    """Return all points of a COLMAP model."""
     centres = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
     points = list(model.points3D.values())
     position = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
@@ -57,16 +75,16 @@ def sparse_points(model: pycolmap.Reconstruction) -> SparsePoints:
 
 
 def reliable(points: SparsePoints) -> Bool[np.ndarray, " P"]:
-    """Which points to trust: seen in at least 3 images, with errors of at most 2 pixels, not alone."""
+    """Return which points have 3 observations or more, errors of at most 2 pixels, and are not isolated."""
     good = (
         (points.error <= MAX_ERROR) & (points.track >= MIN_TRACK) & np.isfinite(points.position).all(axis=1)
     )
-    good[good] = _in_company(points.position[good])
+    good[good] = _not_isolated(points.position[good])
     return good
 
 
 def oriented(points: SparsePoints) -> WorldPoints:
-    """The reliable points whose surroundings are flat enough to tell a normal, with it."""
+    """Return the reliable points whose neighbours lie close to a plane, with the normal of that plane."""
     points = points[reliable(points)]
     if len(points) <= NEIGHBOURS:
         return WorldPoints(np.empty((0, 3)), np.empty((0, 3)))
@@ -75,37 +93,44 @@ def oriented(points: SparsePoints) -> WorldPoints:
 
 
 def without_outliers(points: WorldPoints) -> WorldPoints:
-    """The points of a cloud, such as one of multi-view stereo, that are not alone."""
-    good = _in_company(points.position)
+    """Return the points of a cloud that are not isolated, for example those of multi-view stereo."""
+    good = _not_isolated(points.position)
     return WorldPoints(points.position[good], points.normal[good])
 
 
 def estimate_normals(
     position: Float64[np.ndarray, "P 3"], towards: Float64[np.ndarray, "P 3"]
 ) -> tuple[Float64[np.ndarray, "P 3"], Bool[np.ndarray, " P"]]:
-    """Unit normals on the side of `towards`, and where the neighbours are flat enough to mean one.
+    """Estimate normals by principal component analysis of the nearest neighbours.
 
-    The normal is the direction in which the nearest neighbours spread least; the surroundings are flat where
-    that spread, a variance, is at most a tenth of the next larger one.
+    The normal is the direction of the smallest variance of the neighbours.
+
+    Args:
+        position: at least `NEIGHBOURS` + 1 points.
+        towards: for each point a direction; its normal has a non-negative dot product with it.
+
+    Returns:
+        Unit normals, and for each point whether its neighbours are flat: whether their smallest variance is
+        at most a tenth of the next larger one.
     """
     neighbours = cKDTree(position).query(position, k=NEIGHBOURS + 1)[1]
     spread = position[neighbours] - position[neighbours].mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("pki,pkj->pij", spread, spread))
     normal = vectors[:, :, 0]
     normal = normal * np.where((normal * towards).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
-    return normal, values[:, 0] <= FLAT * values[:, 1]
+    return normal, values[:, 0] <= MAX_FLATNESS * values[:, 1]
 
 
-def _in_company(position: Float64[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
-    """Which points have a mean neighbour distance within 3 deviations of its logarithm over all points.
+def _not_isolated(position: Float64[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
+    """Which points have a mean neighbour distance that is not unusually large.
 
-    The median and the median deviation tell what is common, so that outliers have no say in it.
+    The logarithm of the distance is compared with its median over all points, in standard deviations
+    estimated from the median absolute deviation, which outliers do not influence.
     """
     if len(position) <= NEIGHBOURS:
         return np.ones(len(position), dtype=bool)
-    distance = np.log(
-        np.maximum(cKDTree(position).query(position, k=NEIGHBOURS + 1)[0][:, 1:].mean(axis=1), 1e-12)
-    )
-    middle = np.median(distance)
-    deviation = 1.4826 * np.median(np.abs(distance - middle))
-    return distance <= middle + FAR * max(deviation, 1e-3)
+    distances = cKDTree(position).query(position, k=NEIGHBOURS + 1)[0][:, 1:]
+    log_distance = np.log(np.maximum(distances.mean(axis=1), 1e-12))
+    median = np.median(log_distance)
+    deviation = MAD_TO_SIGMA * np.median(np.abs(log_distance - median))
+    return log_distance <= median + MAX_DEVIATIONS * max(deviation, 1e-3)

@@ -1,7 +1,8 @@
-"""Steps that are done once: each has a folder, and a marker of its inputs and its completion.
+"""Steps of a long command that are done once and can be interrupted.
 
-A marker is written in one step when the work is done. A step whose inputs have changed since starts from an
-empty folder, one that was interrupted goes on with what its folder holds.
+Each step has a folder with a marker file, which holds a hash of the step's inputs and, when the step is
+complete, its result. A step whose inputs have changed starts again with an empty folder; an interrupted step
+continues with the files in its folder. Markers are replaced atomically.
 """
 
 from __future__ import annotations
@@ -20,46 +21,54 @@ from neilfpp_method.data.images import replacing
 __all__ = ["Step", "begin", "stamp"]
 
 MARKER = "step.json"
+"""Name of the marker file."""
+
 VERSION = 2
-"""Of what the steps leave in their folders; what another version left is done again."""
+"""Version of the files that steps write. A step that another version has written is done again."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """A step of the work. `result` is what it left when complete; none: it is to be done or continued."""
+    """A step of the work.
+
+    Attributes:
+        folder: folder of its files.
+        inputs: hash of its inputs and of those of all steps before it.
+        result: JSON result of the complete step; None if it must be done or continued.
+    """
 
     folder: Path
     inputs: str
     result: dict[str, Any] | None
 
     def complete(self, result: dict[str, Any]) -> dict[str, Any]:
-        """Mark the step as done; returns the result."""
+        """Mark the step as complete and return the result."""
         _mark(self.folder, self.inputs, result)
         return result
 
 
 def begin(folder: Path, after: Step | None = None, **inputs: Any) -> Step:
-    """Enter a step: done, begun, or to do.
+    """Enter a step and report whether it is complete already.
 
     Args:
-        folder: the step's own folder; emptied where it was made of other inputs.
-        after: the step before, whose inputs are inputs of this one, too.
-        inputs: all else that the step's outcome follows from, as JSON.
+        folder: folder of the step; it is emptied if it was written for other inputs.
+        after: the previous step, whose inputs are inputs of this one as well.
+        inputs: all other values on which the result depends, as JSON values.
     """
-    made_of = hashlib.sha256(
+    digest = hashlib.sha256(
         json.dumps([VERSION, after and after.inputs, inputs], sort_keys=True).encode()
     ).hexdigest()
     marker = _marker(folder)
-    if marker.get("inputs") != made_of:
+    if marker.get("inputs") != digest:
         if folder.exists():
             shutil.rmtree(folder)
-        _mark(folder, made_of, None)
-        return Step(folder, made_of, None)
-    return Step(folder, made_of, marker.get("result"))
+        _mark(folder, digest, None)
+        return Step(folder, digest, None)
+    return Step(folder, digest, marker.get("result"))
 
 
 def stamp(paths: Iterable[Path], root: Path) -> list[list[Any]]:
-    """What tells whether files are still the same: names, sizes, and times of their last change."""
+    """Return names, sizes and modification times of files, by which changed files are detected."""
     stats = ((os.path.relpath(path, root), path.stat()) for path in paths)
     return [[name, stat.st_size, stat.st_mtime_ns] for name, stat in stats]
 

@@ -1,4 +1,4 @@
-"""What preparing came to: figures for each image and for the whole, as JSON and as lines for people."""
+"""The summary of `neilfpp prepare`: figures of each image and of the capture, for the console and as JSON."""
 
 from __future__ import annotations
 
@@ -18,13 +18,21 @@ from neilfpp_method.data.views import SceneSource
 __all__ = ["Placement", "Summary", "describe_cameras", "placements", "remarks_on", "write_summary"]
 
 MIN_FEATURES = 100
+"""Number of features below which an image is named in the remarks; a sharp image has thousands."""
+
 MAX_ERROR = 1.5
+"""Mean reprojection error, in pixels, above which an image is named in the remarks; most are below 1."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """An image in the model: how many features it has, how many of them became points, and how far off in
-    pixels, in the mean, these are; none where the image is not placed.
+    """How well an image fits the model of structure from motion.
+
+    Attributes:
+        name: name of the image.
+        features: number of its features.
+        points: number of features with a 3D point; None if the image is not placed.
+        error: mean reprojection error of these points, in pixels; None if the image is not placed.
     """
 
     name: str
@@ -35,8 +43,19 @@ class Placement:
 
 @dataclass(frozen=True)
 class Summary:
-    """The outcome. `placements` is empty and `models` too where poses came with the images. `remarks` are
-    what a person should know, `problems` what `neilfpp inspect` says spoils or prevents a result.
+    """The figures of a finished capture.
+
+    Attributes:
+        placements: how well each image fits the model; empty if the poses came with the images.
+        models: number of images of each model; empty if the poses came with the images.
+        cameras: the estimated cameras, as in `describe_cameras`.
+        views: number of views.
+        points: number of points of the oriented cloud.
+        cloud: origin of the cloud, in words.
+        radius: radius of the scene's sphere, world units.
+        scene_from: origin of the scene's sphere.
+        remarks: notes for the user.
+        problems: findings of `neilfpp inspect` that spoil or prevent a result.
     """
 
     placements: tuple[Placement, ...]
@@ -52,13 +71,13 @@ class Summary:
 
     @property
     def error(self) -> float | None:
-        """The mean reprojection error of the images that are placed, pixels."""
+        """Mean reprojection error of the placed images, in pixels; None if there is none."""
         errors = [p.error for p in self.placements if p.error is not None]
         return float(np.mean(errors)) if errors else None
 
     @property
     def lines(self) -> list[str]:
-        """For people."""
+        """The summary as lines for the console."""
         lines = []
         if self.placements:
             lines.append(
@@ -66,7 +85,7 @@ class Summary:
                 "pixels"
             )
         else:
-            lines.append(f"{self.views} views, with the poses that they came with")
+            lines.append(f"{self.views} views, with the poses of the given capture")
         lines += [
             f"camera {camera['model']}: {camera['images']} images, {_parameters(camera)}"
             for camera in self.cameras
@@ -77,20 +96,20 @@ class Summary:
 
 
 def placements(features: Mapping[str, int], model: pycolmap.Reconstruction) -> tuple[Placement, ...]:
-    """Every image that has been looked at, in the order of the names."""
-    found = {}
+    """Return how well each image fits the model, in the order of the names."""
+    placed = {}
     for i in model.reg_image_ids():
         image = model.image(i)
         points = [model.point3D(p.point3D_id) for p in image.points2D if p.has_point3D()]
         error = float(np.mean([point.error for point in points])) if points else 0.0
-        found[image.name.removesuffix(".png")] = (len(points), error)
+        placed[image.name.removesuffix(".png")] = (len(points), error)
     return tuple(
-        Placement(name, count, *found.get(name, (None, None))) for name, count in sorted(features.items())
+        Placement(name, count, *placed.get(name, (None, None))) for name, count in sorted(features.items())
     )
 
 
 def describe_cameras(model: pycolmap.Reconstruction) -> tuple[dict[str, Any], ...]:
-    """The cameras of a model, as estimated, and whether EXIF had told their focal lengths."""
+    """Return the estimated cameras of a model, and whether EXIF gave their focal lengths."""
     ids = [model.image(i).camera_id for i in model.reg_image_ids()]
     return tuple(
         {
@@ -114,21 +133,21 @@ def write_summary(path: Path, summary: Summary) -> None:
 def remarks_on(
     placed: Sequence[Placement], models: Sequence[int], cameras: Sequence[Mapping[str, Any]]
 ) -> list[str]:
-    """What a person should know about a model that is good enough."""
+    """Return notes about an accepted model that the user should know."""
     remarks = []
     if missing := [p.name for p in placed if p.points is None]:
-        remarks.append(f"not placed, and left out: {', '.join(missing)}")
+        remarks.append(f"left out because they could not be placed: {', '.join(missing)}")
     if len(models) > 1:
         remarks.append(
-            f"the images fell into {len(models)} models of {', '.join(map(str, models))} images; the first "
-            "is used"
+            f"the images are in {len(models)} separate models of {', '.join(map(str, models))} images; the "
+            "first is used"
         )
     if poor := [p.name for p in placed if p.features < MIN_FEATURES]:
         remarks.append(f"fewer than {MIN_FEATURES} features in {', '.join(poor)}")
     if off := [p.name for p in placed if (p.error or 0.0) > MAX_ERROR]:
         remarks.append(f"reprojection error above {MAX_ERROR} pixels in {', '.join(off)}")
     if not all(camera["focal_from_exif"] for camera in cameras):
-        remarks.append("EXIF does not tell the focal length; it is estimated from the images")
+        remarks.append("the focal length is not in EXIF; it is estimated from the images")
     return remarks
 
 

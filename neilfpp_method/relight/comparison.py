@@ -88,7 +88,7 @@ def read_truth(capture: Capture, view: View, path: Path) -> TrueImage:
     elif depth is not None:
         mask, source = (depth > 0).view(image.shape[:2]).numpy(), "true depth"
     elif view.mask is not None:
-        mask, source = read_image(view.mask).pixels[..., 0] > 0.5, "capture masks"
+        mask, source = read_image(view.mask).mask > 0.5, "capture masks"
     else:
         mask, source = None, "rendered opacity"
     photograph = read_image(view.image).pixels

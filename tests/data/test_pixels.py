@@ -355,3 +355,15 @@ def test_exact_pixels_are_those_of_the_files(tmp_path: Path) -> None:
     assert not np.array_equal(kept[0], kept[1]), "a training keeps fewer bits"
     with pytest.raises(ValueError, match="in memory"):
         PixelDataset(capture, capture.views, folder=tmp_path / "pixels", exact=True)
+
+
+def test_a_mask_file_with_an_alpha_channel_is_its_alpha(tmp_path: Path) -> None:
+    """As tools that cut out objects write them: white, or the photograph, with the mask as alpha."""
+    capture = load_capture(make_capture(tmp_path, masks=True))
+    plain = PixelDataset(capture, capture.views).store.bits.copy()
+    for i, view in enumerate(capture.views):
+        mask = cv2.imread(str(view.mask), cv2.IMREAD_GRAYSCALE)
+        color = np.full((*mask.shape, 3), 255 if i % 2 else 10, np.uint8)
+        write_png(view.mask, np.dstack([color, mask]))
+    again = PixelDataset(load_capture(tmp_path), capture.views).store.bits
+    assert np.array_equal(plain, again)

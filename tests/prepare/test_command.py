@@ -39,7 +39,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def prepared(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("captures") / "corner"
-    assert prepare(photos, out, "--dense", "--also", "nerfstudio", "neilf") == 0
+    assert prepare(photos, out, "--cloud", "dense", "--also", "nerfstudio", "neilf") == 0
     return out
 
 
@@ -119,8 +119,8 @@ def test_the_folder_has_a_split_a_summary_and_other_formats(prepared):
 
 def test_what_is_finished_is_left_as_it_is(photos, prepared, capsys):
     before = {path: path.stat().st_mtime_ns for path in prepared.rglob("*")}
-    assert prepare(photos, prepared, "--dense", "--also", "nerfstudio", "neilf") == 0
-    assert "finished already" in capsys.readouterr().out
+    assert prepare(photos, prepared, "--cloud", "dense", "--also", "nerfstudio", "neilf") == 0
+    assert "already finished" in capsys.readouterr().out
     assert {path: path.stat().st_mtime_ns for path in prepared.rglob("*")} == before
 
 
@@ -298,7 +298,7 @@ def test_too_few_images(own, tmp_path, capfd, kept, says):
 def test_no_features(tmp_path, capfd):
     for i in range(4):
         write_exr(tmp_path / "photos" / f"{i}.exr", {"RGB": np.full((120, 160, 3), 0.5, np.float32)})
-    refused(capfd, tmp_path / "photos", tmp_path / "out", says="no features")
+    refused(capfd, tmp_path / "photos", tmp_path / "out", says="have features")
 
 
 def test_images_of_unlike_things(tmp_path, capfd):
@@ -323,7 +323,7 @@ def test_less_than_sixty_per_cent_placed(own, tmp_path, capfd):
     assert "--allow-partial" in line
     assert prepare(own, tmp_path / "out", "--allow-partial") == 0
     assert len(load_capture(tmp_path / "out").views) == 6
-    assert "not placed, and left out: other0" in capfd.readouterr().out
+    assert "left out because they could not be placed: other0" in capfd.readouterr().out
 
 
 def test_two_sizes_that_are_to_share_a_camera(own, tmp_path, capfd):
@@ -366,8 +366,8 @@ def test_an_output_folder_that_is_somebody_elses(photos, tmp_path, capfd):
 
 
 def test_images_and_capture_within_one_another(own, tmp_path, capfd):
-    refused(capfd, own, own / "out", says="within one another")
-    refused(capfd, own, tmp_path, says="within one another")
+    refused(capfd, own, own / "out", says="inside the other")
+    refused(capfd, own, tmp_path, says="inside the other")
 
 
 # ----------------------------------------------------------------------------------------- a rendered capture

@@ -65,7 +65,7 @@ def test_brackets_become_a_linear_capture(tmp_path: Path, capsys) -> None:
         for k, time in enumerate(TIMES):
             write(tmp_path / "photos" / f"{i:03}_{k}.png", radiance(i), time)
     assert main(["prepare", str(tmp_path / "photos"), "--out", str(tmp_path / "out")]) == 0
-    assert "24 photographs in 8 exposure brackets became 8 linear images" in capsys.readouterr().out
+    assert "24 photographs in 8 exposure brackets were merged into 8 linear images" in capsys.readouterr().out
     capture = load_capture(tmp_path / "out")
     assert capture.hdr
     assert [view.name for view in capture.views] == [f"{i:03}" for i in range(POSES)]
@@ -87,7 +87,7 @@ def test_brackets_become_a_linear_capture(tmp_path: Path, capsys) -> None:
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["remarks"][0].startswith("24 photographs")
     assert main(["prepare", str(tmp_path / "photos"), "--out", str(tmp_path / "out")]) == 0
-    assert "finished already" in capsys.readouterr().out
+    assert "already finished" in capsys.readouterr().out
 
 
 def test_brackets_taken_by_hand_say_so_also_after_a_stop(tmp_path: Path, monkeypatch) -> None:
@@ -108,7 +108,7 @@ def test_brackets_taken_by_hand_say_so_also_after_a_stop(tmp_path: Path, monkeyp
         with pytest.raises(KeyboardInterrupt):
             merged(photos, tmp_path / "merged")
     done = merged(photos, tmp_path / "merged")
-    assert "taken by hand: those of 2 were moved onto one another, by up to 3." in done.remark
+    assert "those of 2 brackets were aligned, by up to 3." in done.remark
     assert merged(photos, tmp_path / "merged").remark == done.remark
     assert [photo.name for photo in done.photos.items] == ["0", "1", "2"]
 
@@ -206,7 +206,7 @@ def test_a_damaged_photograph_costs_its_own_bracket_alone(tmp_path: Path, name: 
     photos = survey(root, "auto")
     brackets = brackets_among(photos, "auto")
     assert {path for bracket in brackets.values() for path in bracket} == set(paths) - spoilt
-    assert "2 in no bracket left out" in merged(photos, tmp_path / "merged").remark
+    assert "2 photographs in no bracket were left out" in merged(photos, tmp_path / "merged").remark
 
 
 def test_a_list_says_what_is_used(tmp_path: Path) -> None:
@@ -215,7 +215,7 @@ def test_a_list_says_what_is_used(tmp_path: Path) -> None:
     (root / "brackets.json").write_text(json.dumps(listed))
     photos = survey(root, "auto")
     assert list(brackets_among(photos, "auto")) == ["pose0", "pose1", "pose2"]
-    assert "3 in no bracket left out" in merged(photos, tmp_path / "merged").remark
+    assert "3 photographs in no bracket were left out" in merged(photos, tmp_path / "merged").remark
 
 
 @pytest.mark.parametrize(
@@ -225,9 +225,9 @@ def test_a_list_says_what_is_used(tmp_path: Path) -> None:
         ({"brackets.json": '{"a": ["0_0.png", "x.png"]}'}, r"there is no .*x\.png; .*--brackets off"),
         (
             {"brackets.json": '{"a": ["0_0.png", "notes.txt"]}', "exposures.txt": "0_0.png 1\nnotes.txt 2"},
-            "is no photograph",
+            "is not a readable photograph",
         ),
-        ({"brackets.json": '{"a:b": ["0_0.png", "0_1.png"]}'}, "cannot name a file everywhere"),
+        ({"brackets.json": '{"a:b": ["0_0.png", "0_1.png"]}'}, "is not a valid file name on all systems"),
         ({"exposures.txt": "0_0.png 1/60"}, r"0_1\.png: no exposure time; .*--brackets off"),
     ],
 )

@@ -52,7 +52,7 @@ def test_exif_tells_how_a_camera_was_held(tmp_path):
         if orientation:
             exif[0x0112] = orientation
         Image.new("RGB", (40, 30)).save(tmp_path / f"{i}.jpg", exif=exif)
-    assert [photo.held for photo in survey(tmp_path, "auto").items] == [1, 6, 8, 99]
+    assert [photo.orientation for photo in survey(tmp_path, "auto").items] == [1, 6, 8, 99]
 
 
 def test_unreadable_files_are_listed(tmp_path):

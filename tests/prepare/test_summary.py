@@ -10,7 +10,7 @@ from neilfpp_method.data.views import Camera, Normalisation, View
 from neilfpp_method.errors import UserError
 from neilfpp_method.prepare.mapping import refuse_partial
 from neilfpp_method.prepare.matching import choose_pairing
-from neilfpp_method.prepare.pictures import BAD, TEST, TRAIN, draw_fit, draw_scene
+from neilfpp_method.prepare.pictures import MISSING, TEST, TRAIN, draw_fit, draw_scene
 from neilfpp_method.prepare.summary import Placement, Summary, remarks_on
 from tests.prepare.textured_corner import pose
 
@@ -21,7 +21,7 @@ CAMERA = {"model": "PINHOLE", "images": 2, "parameters": {"fx": 500.0}, "focal_f
 def test_remarks_name_the_images():
     missing, models, poor, off, exif = remarks_on(PLACED, (2, 1), [CAMERA])
     assert missing.endswith(": c")
-    assert "2 models of 2, 1 images" in models
+    assert "2 separate models of 2, 1 images" in models
     assert poor.endswith(" in b")
     assert off.endswith(" in b")
     assert "EXIF" in exif
@@ -70,9 +70,9 @@ def test_the_pictures_show_cameras_points_and_failures(tmp_path):
     assert has(scene, TRAIN)
     assert has(scene, TEST)
     assert has(scene, (128, 128, 255))
-    assert not has(scene, BAD)
+    assert not has(scene, MISSING)
     assert draw_scene(views, (), WorldPoints(up[:0], up[:0]), box).shape == scene.shape
     fit = draw_fit(PLACED, scene.shape[1])
     assert fit.shape[1] == scene.shape[1]
-    assert has(fit, BAD)
-    assert not has(draw_fit(PLACED[:2], 800), BAD)
+    assert has(fit, MISSING)
+    assert not has(draw_fit(PLACED[:2], 800), MISSING)

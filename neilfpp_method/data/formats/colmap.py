@@ -18,7 +18,7 @@ from jaxtyping import Float64
 
 from neilfpp_method.data.colmap_library import pycolmap
 from neilfpp_method.data.formats.colmap_sizes import check_sizes
-from neilfpp_method.data.formats.places import stored, stored_image, view_names
+from neilfpp_method.data.formats.places import check_masks, stored, stored_image, view_names
 from neilfpp_method.data.lens import PANORAMAS, lens_of
 from neilfpp_method.data.point_cloud import read_positions
 from neilfpp_method.data.scene_box import find_box
@@ -69,6 +69,7 @@ def read(root: Path) -> CaptureFiles:
         w2c = np.concatenate([image.cam_from_world().matrix(), [[0.0, 0.0, 0.0, 1.0]]])
         camera = camera_of(image.camera, w2c, f"{folder}: {listed}")
         views.append(View(name, index, camera, file, _mask(root, listed)))
+    check_masks(root / "masks", views)
     known = (root / OBJECT).is_file()
     points = (
         read_positions(inside(root, root / OBJECT))

@@ -106,7 +106,7 @@ def _copy_mask(
         return None
     if camera is straight and mask.suffix.lower() == ".png":
         return copy_file(mask, target)
-    white = (read_image(mask).pixels.max(axis=-1, keepdims=True) > 0.5).astype(np.float32)
+    white = (read_image(mask).mask[..., None] > 0.5).astype(np.float32)
     moved = white if camera is straight else resample(white, camera, straight)
     write_png(target, np.where(moved > least, 255, 0).astype(np.uint8))
     return target

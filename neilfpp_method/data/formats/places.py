@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from neilfpp_method.data.images import IMAGE_SUFFIXES
-from neilfpp_method.data.views import inside
+from neilfpp_method.data.views import View, inside
 from neilfpp_method.errors import UserError
 
-__all__ = ["stored", "stored_image", "view_names"]
+__all__ = ["check_masks", "stored", "stored_image", "view_names"]
 
 
 def stored(root: Path, path: Path) -> Path | None:
@@ -35,6 +35,22 @@ def stored_image(root: Path, path: Path, where: str) -> Path:
     if image is None:
         raise UserError(f"{where}: there is no {path}", "put the image there, or correct the path")
     return image
+
+
+def check_masks(folder: Path, views: Sequence[View]) -> None:
+    """Check that a folder of masks holds the mask of at least one view.
+
+    Raises:
+        UserError: it holds images, but none is named after a view, so that all of them would be ignored.
+    """
+    if any(view.mask for view in views) or not folder.is_dir():
+        return
+    images = sorted(path.name for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+    if images:
+        raise UserError(
+            f"{folder}: no mask is named after an image; the first is {images[0]}",
+            f"name the mask of {views[0].image.name} {views[0].image.stem}.png, or remove the folder",
+        )
 
 
 def view_names(listed: Sequence[str]) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neilfpp_method.data.formats.places import stored, stored_image
+from neilfpp_method.data.formats.places import check_masks, stored, stored_image
 from neilfpp_method.data.images import IMAGE_SUFFIXES
 from neilfpp_method.data.json_entry import Entry
 from neilfpp_method.data.point_cloud import read_oriented_ply
@@ -65,6 +65,7 @@ def read(root: Path) -> CaptureFiles:
     listed = {key: files[key].text() for key in files.entries()}
     inputs = _inputs_folder(root, path, listed[valid[0]])
     views = tuple(_view(root, inputs, int(key), tracks[key], files[key]) for key in valid)
+    check_masks(inputs / "masks", views)
     _refuse_strays(views, {Path(name).stem for name in listed.values()}, path)
     cloud = inputs / POINT_CLOUD
     point_cloud = inside(root, cloud) if cloud.is_file() else None

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.lens import LENSES, PINHOLES
 from neilfpp_method.data.views import project
+from neilfpp_method.errors import UserError
 from tests.data.formats.scenes import (
     FOCAL,
     HEIGHT,
@@ -138,6 +139,14 @@ def test_the_dense_cloud_and_masks_are_found(tmp_path: Path) -> None:
     capture = load_capture(tmp_path)
     assert capture.point_cloud == tmp_path / "fused.ply"
     assert [view.mask.name for view in capture.views][2:4] == ["002.png", "003.png.png"]
+
+
+def test_masks_of_other_names_are_an_error(tmp_path: Path) -> None:
+    write(material(tmp_path), reconstruction(colmap_camera("PINHOLE")))
+    for mask in sorted((tmp_path / "masks").iterdir()):
+        mask.rename(mask.with_name(f"mask_{mask.name}"))
+    with pytest.raises(UserError, match=r"no mask is named after an image.* mask_000\.png; .* 000\.png"):
+        load_capture(tmp_path)
 
 
 def test_images_of_one_name_in_two_folders(tmp_path: Path) -> None:
