@@ -16,6 +16,8 @@ __all__ = ["quality_curve", "work_bars"]
 WIDTH, HEIGHT = 640.0, 260.0
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 96.0, 14.0, 40.0
 BAR, GAP = 22.0, 14.0
+LABEL_HEIGHT = 14.0
+"""Vertical distance of labels that would overlap."""
 TICKS = 5
 COLORS = (
     "#4477aa",
@@ -56,12 +58,16 @@ def quality_curve(looks: Sequence[Look]) -> Html | None:
         height = place(0.0, y)[1]
         grid.append(_line(LEFT, height, WIDTH - RIGHT, height))
         grid.append(_text(LEFT - 6, height + 4, f"{y:g}", "end"))
-    lines = []
+    lines, labels = [], []
     for name, points, color in (("R", radiance, COLORS[0]), ("PBR", physical, COLORS[3])):
         if points:
             shown = [place(*point) for point in points]
             lines.append(_curve(shown, color))
-            lines.append(_text(shown[-1][0] + 8, shown[-1][1] + 4, f"{name} {points[-1][1]:.1f} dB", "start"))
+            labels.append((shown[-1], f"{name} {points[-1][1]:.1f} dB"))
+    previous = -math.inf
+    for (x, y), text in sorted(labels, key=lambda label: label[0][1]):
+        previous = max(y + 4, previous + LABEL_HEIGHT)
+        lines.append(_text(x + 8, previous, text, "start"))
     caption = _text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 4, "seconds of the run", "middle")
     return _svg(HEIGHT, "PSNR of held-back pixels over seconds", *grid, *lines, caption)
 

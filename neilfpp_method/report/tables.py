@@ -9,7 +9,7 @@ from neilfpp_method.evaluate.glossary import explain
 from neilfpp_method.health.cases import Finding, verdict_of
 from neilfpp_method.report.curves import quality_curve, work_bars
 from neilfpp_method.report.files import Changed
-from neilfpp_method.report.markup import Html, cell, element, joined, table
+from neilfpp_method.report.markup import Html, cell, element, joined, table, with_code
 from neilfpp_method.train.quality import Look
 
 __all__ = [
@@ -82,14 +82,15 @@ def figures_section(metrics: Mapping[str, float], said: str) -> Html:
         return element("p", said)
     beside = {name: (f"{name}_frame", f"baseline_{name}") for name in metrics}
     companions = {companion for pair in beside.values() for companion in pair}
+    titles = ("whole frame", "without a method")
+    filled = [k for k in range(len(titles)) if any(pair[k] in metrics for pair in beside.values())]
     rows = []
     for name in metrics:
         if name in companions:
             continue
         entry = explain(name)
-        value, frame, baseline = (
-            entry.format(metrics[key]) if key in metrics else "–" for key in (name, *beside[name])
-        )
+        keys = (name, *(beside[name][k] for k in filled))
+        value, *others = (entry.format(metrics[key]) if key in metrics else "–" for key in keys)
         arrow = {"higher": "↑", "lower": "↓"}.get(entry.better)
         beside_value = (" ", element("span", arrow, title=f"{entry.better} is better")) if arrow else ()
         rows.append(
@@ -102,13 +103,12 @@ def figures_section(metrics: Mapping[str, float], said: str) -> Html:
                     *beside_value,
                     class_="number",
                 ),
-                element("td", frame, class_="number"),
-                element("td", baseline, class_="number"),
+                *(element("td", other, class_="number") for other in others),
                 element("td", entry.meaning),
             )
         )
-    names = ("figure", "this run", "whole frame", "without a method", "what it says")
-    return joined(element("p", said, class_="pale"), table(names, *rows))
+    names = ("figure", "this run", *(titles[k] for k in filled), "what it says")
+    return joined(element("p", with_code(said), class_="pale"), table(names, *rows))
 
 
 def time_section(
