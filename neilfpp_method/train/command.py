@@ -69,6 +69,7 @@ from neilfpp_method.train.run import (
     Description,
     check_free,
     create_run,
+    default_folder,
     load_checkpoint,
     read_description,
 )
@@ -148,8 +149,7 @@ def run_training(
         check_asked(asked, config)
         _check(Plan.begin(asked, config).config)
         source = CaptureSource(str(data.resolve()), test_every, response, format)
-        out = out or Path("runs") / f"{data.resolve().name}-{config.preset}"
-        check_free(out)
+        check_free(out := out or default_folder(data, config))
     capture = source.load_again(out) if resume else source.load()
     if not resume:
         planned = None

@@ -53,6 +53,7 @@ __all__ = [
     "check_free",
     "check_writable",
     "create_run",
+    "default_folder",
     "load_checkpoint",
     "load_run",
     "load_weights",
@@ -170,6 +171,11 @@ def run_folder(path: Path) -> Path:
     return folder
 
 
+def default_folder(data: Path, config: NeilfConfig) -> Path:
+    """The folder of a new run without --out: runs/CAPTURE-PRESET."""
+    return Path("runs") / f"{data.resolve().name}-{config.preset}"
+
+
 def check_free(path: Path) -> None:
     """That a new run may take this folder.
 
@@ -188,22 +194,14 @@ def _of_no_run(name: str) -> bool:
 
 
 def check_writable(path: Path) -> None:
-    """Check that a file can be written, before there is work to lose. Its folder need not exist.
-
-    Raises:
-        UserError: the path is a folder, or nothing can be written above it.
-    """
+    """Raise a UserError if a file cannot be written here. Its folder need not exist."""
     if path.is_dir():
         raise UserError(f"{path}: is a folder", "name a file with --out")
     _check_above(path, path)
 
 
 def check_folder(path: Path) -> None:
-    """Check that files can be written into a folder, before there is work to lose. It need not exist.
-
-    Raises:
-        UserError: the path is a file, or nothing can be written there.
-    """
+    """Raise a UserError if files cannot be written into this folder. It need not exist."""
     if path.exists() and not path.is_dir():
         raise UserError(f"{path}: is a file", "name a folder with --out")
     _check_above(path / "file", path)

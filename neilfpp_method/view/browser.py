@@ -36,6 +36,8 @@ __all__ = ["Page", "open_page"]
 OWN = "the run's own"
 PHOTOGRAPH = 320
 """Longest side of the photograph beside a camera that was jumped to, pixels."""
+MAP_SCALE = 3
+"""Pixels of the page for each pixel of the map of incident light, along an edge."""
 STOPS = 8.0
 BRAND = (43, 108, 130)
 CAMERA, HELD_OUT, PICKED = (70, 110, 130), (200, 130, 60), (220, 60, 60)
@@ -277,7 +279,9 @@ class _Session:
         with self.page.turn:
             radiance = light_at(self.subject, self.light, point)
         normal = point.normal.cpu().numpy()
-        self.map.image = light_picture(radiance, normal)
+        self.map.image = np.kron(
+            light_picture(radiance, normal), np.ones((MAP_SCALE, MAP_SCALE, 1), np.uint8)
+        )
         material = point.material
         colour = ", ".join(f"{value:.2f}" for value in material.base_color[0].tolist())
         roughness, metallic = material.roughness.item(), material.metallic.item()
