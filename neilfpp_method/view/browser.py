@@ -279,9 +279,8 @@ class _Session:
         with self.page.turn:
             radiance = light_at(self.subject, self.light, point)
         normal = point.normal.cpu().numpy()
-        self.map.image = np.kron(
-            light_picture(radiance, normal), np.ones((MAP_SCALE, MAP_SCALE, 1), np.uint8)
-        )
+        picture = light_picture(radiance, normal)
+        self.map.image = picture.repeat(MAP_SCALE, axis=0).repeat(MAP_SCALE, axis=1)
         material = point.material
         colour = ", ".join(f"{value:.2f}" for value in material.base_color[0].tolist())
         roughness, metallic = material.roughness.item(), material.metallic.item()
