@@ -33,7 +33,7 @@ from neilfpp_method.evaluate import metrics
 from neilfpp_method.export.asset.command import AssetOptions, check_asset, export_asset
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.relight.cameras import resized
-from neilfpp_method.relight.film import Budget, Picture, take_picture
+from neilfpp_method.relight.film import Budget, Picture, render_picture
 from neilfpp_method.relight.lamplight import lamps_of_run
 from neilfpp_method.relight.path_tracer import Scene
 from neilfpp_method.relight.recovered import surface_of_run
@@ -112,7 +112,7 @@ def own_picture(run: Run, name: str, options: Options) -> Picture:
     surface, sky = surface_of_run(run, options.resolution), sky_of_run(run.model.light)
     scene = Scene(surface, run.model.materials, run.model.lobe, sky, lamps_of_run(run.model.lamps))
     camera = resized(run.capture.normalisation.camera(view.camera), options.percent / 100)
-    return take_picture(scene, camera, Budget(options.samples), BOUNCES)
+    return render_picture(scene, camera, Budget(options.samples), BOUNCES)
 
 
 def compare(options: Options, folder: Path, console: Console) -> None:

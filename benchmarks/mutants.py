@@ -232,6 +232,13 @@ MUTANTS: Sequence[Mutant] = (
         "widths",
         "volume/test_compositing.py",
     ),
+    Mutant(
+        "a distance of many β is NaN in half precision",
+        "volume/density.py",
+        "scaled.clamp_max(0.0)\n    return",
+        "scaled - torch.relu(scaled)\n    return",
+        "hard_cases/test_properties.py",
+    ),
     # Losses.
     Mutant(
         "mask loss: object and background swapped",
@@ -339,6 +346,13 @@ MUTANTS: Sequence[Mutant] = (
         "data/views.py",
         "< 1e-3 and np.linalg.det(rotation) > 0",
         "< 1e-3",
+        "hard_cases/test_captures.py",
+    ),
+    Mutant(
+        "cameras whose rays do not fit into float32 are taken",
+        "data/views.py",
+        "if min(camera.fx, camera.fy) < MIN_FOCAL or",
+        "if False and",
         "hard_cases/test_captures.py",
     ),
     Mutant(

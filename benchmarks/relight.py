@@ -30,7 +30,7 @@ from benchmarks.measure import hardware
 from benchmarks.mitsuba_scene import Part, load_mitsuba, render
 from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
-from neilfpp_method.relight.film import Budget, take_picture
+from neilfpp_method.relight.film import Budget, render_picture
 from neilfpp_method.relight.path_tracer import Scene
 from neilfpp_method.relight.sky import Sky
 from neilfpp_method.relight.surface import Surface
@@ -123,7 +123,7 @@ def agreement(variant: str, width: int, spp: int, reference_spp: int, bounces: i
     parts, radiance, camera = corner_parts(), sunny_map(), corner_camera(width)
     begun = time.perf_counter()
     scene = scene_of(parts, Sky(radiance, rows_at_poles=True, start=0.0))
-    ours = take_picture(scene, camera, Budget(spp), bounces).radiance.numpy()
+    ours = render_picture(scene, camera, Budget(spp), bounces).radiance.numpy()
     seconds = time.perf_counter() - begun
     with tempfile.TemporaryDirectory() as folder:
         begun = time.perf_counter()

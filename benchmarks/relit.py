@@ -33,10 +33,10 @@ from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.mesh import MeshHost
-from neilfpp_method.relight.comparison import Compared, compare, find_truth, read_truth
+from neilfpp_method.relight.comparison import Comparison, compare, find_truth, read_truth
 from neilfpp_method.relight.denoise import check_denoiser, denoised
 from neilfpp_method.relight.edits import Materials
-from neilfpp_method.relight.film import Budget, take_picture
+from neilfpp_method.relight.film import Budget, render_picture
 from neilfpp_method.relight.maps import read_map
 from neilfpp_method.relight.path_tracer import Scene
 from neilfpp_method.relight.recovered import check_material, surface_of_run
@@ -160,7 +160,7 @@ def measure(options: Options, say: Callable[[str], None]) -> list[Row]:
     for name, scene in scenes(options, capture):
         pictures = []
         for camera in cameras:
-            picture = take_picture(scene, camera, Budget(options.spp), BOUNCES)
+            picture = render_picture(scene, camera, Budget(options.spp), BOUNCES)
             pictures.append(denoised(picture) if options.denoise else picture)
         found = compare(
             [picture.radiance.numpy() for picture in pictures],
@@ -175,7 +175,7 @@ def measure(options: Options, say: Callable[[str], None]) -> list[Row]:
     return rows
 
 
-def figures(found: Compared, title: str) -> dict[str, float]:
+def figures(found: Comparison, title: str) -> dict[str, float]:
     """Those of the table, under the names of the relit pictures."""
     renamed = {
         key.replace(title, "relight", 1): value for key, value in found.figures.items() if title in key

@@ -22,10 +22,11 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.presets import PRESETS, preset
 from neilfpp_method.settings.types import NeilfConfig
+from neilfpp_method.structures import PixelBatch
 from neilfpp_method.train.build import build_model, scene_facts
 from neilfpp_method.train.optimizer import make_optimizer, seed_step
 
-__all__ = ["measurements", "step_of"]
+__all__ = ["measurements", "model_of", "pixels_of", "step_of"]
 
 RAYS = 64
 EVALUATED = 256  # rays
@@ -58,6 +59,12 @@ def model_of(name: str) -> NeilfModel:
     return build_model(pixels.capture, scene_facts(pixels.capture, pixels, config), config).to(device())
 
 
+def pixels_of(rays: int) -> PixelBatch:
+    """So many pixels, always the same, that steps may be compared."""
+    seed_step(0, 0)
+    return _pixels().sample(rays)
+
+
 def step_of(model: NeilfModel, stage: Stage, rays: int = RAYS) -> Callable[[], None]:
     """A training step, as the loop takes it; always on the same pixels, that steps may be compared."""
     config = model.config
@@ -65,8 +72,7 @@ def step_of(model: NeilfModel, stage: Stage, rays: int = RAYS) -> Callable[[], N
     optimizer = make_optimizer(model, config.optimizer)
     for group in optimizer.param_groups:
         group["lr"] = 0.0  # the surface stays where it is, step by step
-    seed_step(0, 0)
-    batch = _pixels().sample(rays)
+    batch = pixels_of(rays)
 
     def step() -> None:
         seed_step(0, 1)

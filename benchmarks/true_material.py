@@ -22,7 +22,7 @@ from torch import Tensor
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.errors import UserError
-from neilfpp_method.evaluate.protocols import light_metrics
+from neilfpp_method.evaluate.scene_metrics import light_metrics
 from neilfpp_method.evaluate.views import known_test_views, render_test_views
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.light import LightModel

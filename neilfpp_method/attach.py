@@ -343,7 +343,7 @@ def pixel_batch(origins: Tensor, directions: Tensor, color: Tensor, mask: Tensor
     Args:
         origins: ray origins (N, 3), scene frame.
         directions: unit ray directions (N, 3).
-        color: pixel values (N, 3), linear or sRGB as `attach_neilf` was told.
+        color: pixel values (N, 3), linear or sRGB as declared to `attach_neilf`.
         mask: 1 on the object and 0 off it (N,). None: all pixels may show the object.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The command line: `neilfpp COMMAND …`; `commands` has the commands."""
+"""The entry point of the command line, `neilfpp COMMAND …`; the commands are defined in `commands`."""
 
 from __future__ import annotations
 
@@ -24,14 +24,19 @@ __all__ = ["main"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command and return the exit status: 0 done, 2 bad input, 130 stopped by Ctrl-C, 143 by SIGTERM, 1
-    anything else.
+    """Run a command.
+
+    Args:
+        arguments: the words of the command line; None for those of the process.
+
+    Returns:
+        The exit status: 0 for success, 2 for bad input, 130 after Ctrl-C, 143 after SIGTERM, 1 otherwise.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview())
         return 0
-    # Beside the first process of a parallel run the others keep silent, and leave the status to it.
+    # In a parallel training only the first process prints errors and sets the exit status.
     first = os.environ.get("LOCAL_RANK", "0") == "0"
     errors = Console(stderr=True, quiet=not first)
     with ended_by_signal() as asked:
@@ -41,7 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             text = str(end) if isinstance(end, Stopped) else f"error: {end}"
             errors.print(text, highlight=False, soft_wrap=True, markup=False)
             return end.status if first else 0
-        except SystemExit:  # tyro has shown a command's help
+        except SystemExit:
+            # tyro has printed the help of a command.
             return 0
         except BaseException as error:
             if not asked.number and not isinstance(error, KeyboardInterrupt):
@@ -63,18 +69,20 @@ def _run(name: str, arguments: Sequence[str]) -> None:
         raise UserError(f"unknown command '{name}'", remedy)
     command = COMMANDS[name]
     try:
-        options = _meant(_parse(name, command, arguments))
-        with sigterm_waits():  # the threads that this library starts do not take it, either
+        options = _resolve_run_folder(_parse(name, command, arguments))
+        # Threads that numpy starts inherit the blocked SIGTERM, so only the main thread receives it.
+        with sigterm_waits():
             import numpy  # noqa: F401
         command.run(options)
-    except OSError as error:  # what nobody nearer to it has explained
+    except OSError as error:
+        # Errors of files that are not handled where they occur.
         where = f"{error.filename}: " if error.filename else ""
-        remedy = "see that it is there, can be read or written, and has room"
+        remedy = "check that it exists, that it is readable and writable, and that the disk is not full"
         raise UserError(f"{where}{error.strerror or error}", remedy) from error
 
 
-def _meant(options: Any) -> Any:
-    """The options of a command, with the folder of a run in place of nerfstudio's file of it."""
+def _resolve_run_folder(options: Any) -> Any:
+    """Replace the path of nerfstudio's `config.yml` by the run folder next to it."""
     if isinstance(getattr(options, "run", None), Path) and options.run.suffix == ".yml":
         from neilfpp_method.train.run import run_folder
 
@@ -83,23 +91,29 @@ def _meant(options: Any) -> Any:
 
 
 def _parse(name: str, command: Command, arguments: Sequence[str]) -> Any:
-    description = f"{command.summary}\n\nExamples:\n" + "\n".join(
-        f"  {example}" for example in command.examples
-    )
-    known: dict[str, Any] = {"prog": f"neilfpp {name}", "description": description}
+    """Parse the options of a command, or print its help.
+
+    Raises:
+        UserError: if the options are wrong.
+        SystemExit: after help has been printed.
+    """
+    examples = "\n".join(f"  {example}" for example in command.examples)
+    description = f"{command.summary}\n\nExamples:\n{examples}"
+    keywords: dict[str, Any] = {"prog": f"neilfpp {name}", "description": description}
     if command.usual is not None:
-        known["description"] += f"\n\nEvery setting: neilfpp {name} --help-all"
+        keywords["description"] += f"\n\nEvery setting: neilfpp {name} --help-all"
         if {"-h", "--help"} & set(arguments):
-            tyro.cli(command.usual, args=["--help"], **known)
+            tyro.cli(command.usual, args=["--help"], **keywords)
         arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
     if command.default is not None:
-        known["default"] = command.default(arguments)
+        keywords["default"] = command.default(arguments)
     complaint = io.StringIO()
     try:
         with redirect_stderr(complaint):
-            return tyro.cli(command.options, args=arguments, **known)
+            return tyro.cli(command.options, args=arguments, **keywords)
     except SystemExit as end:
-        if not complaint.getvalue():  # --help
+        # Without a complaint, tyro has printed the help.
+        if not complaint.getvalue():
             raise
         what, meant = mistake(complaint.getvalue(), arguments)
         see = f"see neilfpp {name} --help"
@@ -107,6 +121,7 @@ def _parse(name: str, command: Command, arguments: Sequence[str]) -> Any:
 
 
 def _overview() -> str:
+    """The help of `neilfpp` without a command."""
     lines = [
         "neilfpp: geometry, material and light from posed images",
         "",

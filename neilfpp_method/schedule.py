@@ -99,6 +99,7 @@ STAGES: StageTable = {
         weights={
             "volume": "volume",
             "mask": "mask",
+            "free_space": "mask",
             "eikonal": "eikonal",
             "hessian": "hessian",
             "surface": "surface",
@@ -112,6 +113,7 @@ STAGES: StageTable = {
         weights={
             "volume": "volume",
             "mask": "mask",
+            "free_space": "mask",
             "eikonal": "eikonal",
             "hessian": "hessian_joint",
             "surface": "surface_joint",

@@ -185,7 +185,7 @@ def test_modules_are_short(source):
         ("inspection.picture", "evaluate.pictures", True),
         ("train.loop", "attach", True),
         ("export.mesh", "evaluate.metrics", True),
-        ("evaluate.protocols", "export.mesh", False),
+        ("evaluate.scene_metrics", "export.mesh", False),
         ("relight.command", "evaluate.metrics", False),
         ("export.mesh", "relight.surface", True),
         ("settings.presets", "settings.facts", True),

@@ -170,7 +170,7 @@ def test_a_host_of_images_learns_a_material_from_what_is_handed_in():
     torch.manual_seed(0)
     view, host = camera(), Splats()
     neilf = attach_neilf(host, hard_config(), median_radiance=0.3)
-    with pytest.raises(UserError, match="Splats draws whole images, not rays; hand in what it has drawn"):
+    with pytest.raises(UserError, match="Splats draws whole images, not rays; pass its hits"):
         neilf.losses(pixels(camera_rays(view)), 0)
     rays, hits = camera_rays(view), host.render_image(view)
     batch = pixel_batch(rays.origins, rays.directions, hits.color)

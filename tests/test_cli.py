@@ -20,7 +20,7 @@ import trimesh
 from neilfpp_method.cli import COMMANDS, main
 from neilfpp_method.commands.evaluate import Eval
 from neilfpp_method.data.images import read_image, write_exr, write_png
-from neilfpp_method.evaluate import protocols
+from neilfpp_method.evaluate import scene_metrics
 from neilfpp_method.evaluate.published import PROTOCOLS
 from neilfpp_method.settings.presets import PRESETS
 from tests.data.make_capture import CENTRE, RADIUS, make_capture
@@ -80,8 +80,8 @@ def test_train_says_what_it_does_and_leaves_a_run(trained):
 
 
 def test_eval_writes_flat_finite_figures(trained, tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(protocols, "SURFACE_POINTS", 1000)
-    monkeypatch.setattr(protocols, "MESH_RESOLUTION", 32)
+    monkeypatch.setattr(scene_metrics, "SURFACE_POINTS", 1000)
+    monkeypatch.setattr(scene_metrics, "MESH_RESOLUTION", 32)
     assert main(["eval", str(trained), "--device", "cpu"]) == 0
     said = capfd.readouterr()
     assert said.err == ""
@@ -305,7 +305,7 @@ def refused(capfd, arguments: list[object], *words: object, leaves: Path) -> Non
         (["train", "--test-every", "often"], ("--test-every", "'often'")),
         (["train"], ("--data",)),
         (["train", "--resume"], ("--resume needs the run's folder", "--out")),
-        (["eval"], ("The run's folder", "neilfpp eval --help")),
+        (["eval"], ("The run folder", "neilfpp eval --help")),
         (["eval", "a", "b"], ("b", "neilfpp eval --help")),
         (["export", "a", "--checkpoint", "first"], ("--checkpoint", "sdf_init")),
         (["render", "a", "--views", "best"], ("--views", "test")),
@@ -492,7 +492,7 @@ def test_a_place_that_cannot_be_written(tmp_path, capfd, capture, trained, name)
     (tmp_path / "file").write_text("")
     out = tmp_path / "file" / "out"
     options = ["--data", capture, "--preset", "tiny"] if name == "train" else [trained]
-    complaint = f"cannot be written, for nothing can be made in {tmp_path / 'file'}"
+    complaint = f"cannot be written, because {tmp_path / 'file'} is not a writable folder"
     refused(capfd, [name, *options, "--out", out, "--device", "cpu"], out, complaint, leaves=tmp_path)
 
 
@@ -512,7 +512,7 @@ def test_a_file_where_a_folder_is_wanted_and_the_reverse(tmp_path, capfd, traine
     ("options", "words"),
     [
         (["export", "--what", "mesh", "light"], ("no light yet at step 4",)),
-        (["render", "--what", "light"], ("no light to show at step 4",)),
+        (["render", "--what", "light"], ("the run has no light yet at step 4",)),
         (["render", "--confidence"], ("no material at step 4",)),
     ],
 )

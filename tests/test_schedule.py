@@ -123,7 +123,6 @@ def test_settings_of_another_version_are_refused_by_name():
 
 
 def test_an_unknown_preset_is_named():
-    with pytest.raises(
-        UserError, match=r"unknown preset 'turbo'; choose one of fast, paper-mlp, paper-ngp, paper-ngp-hdr"
-    ):
+    names = "fast, balanced, best, paper-mlp, paper-ngp, paper-ngp-hdr"
+    with pytest.raises(UserError, match=f"unknown preset 'turbo'; choose one of {names}"):
         preset("turbo")

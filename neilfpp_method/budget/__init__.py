@@ -1,1 +1,1 @@
-"""A training that is planned for a time: numbers in, plan out. Nothing here measures, waits or writes."""
+"""Plan a training for a time budget. These are pure functions: they measure nothing and write nothing."""

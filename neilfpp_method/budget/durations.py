@@ -1,4 +1,4 @@
-"""Times as people write them."""
+"""Parse and format durations such as `10m`."""
 
 from __future__ import annotations
 
@@ -9,29 +9,31 @@ from neilfpp_method.errors import UserError
 __all__ = ["in_words", "read_duration"]
 
 UNITS = {"h": 3600.0, "m": 60.0, "s": 1.0}
+"""Seconds per unit."""
 MAX_HOURS = 24 * 30
+"""Longest duration that is accepted, in hours: a month."""
 
 
 def read_duration(text: str) -> float:
-    """Seconds.
+    """Parse a duration into seconds.
 
     Raises:
-        UserError: it is no time, or none that a training can take.
+        UserError: if the text is no duration, or if it is 0 or longer than `MAX_HOURS`.
 
     >>> read_duration("90s"), read_duration("10m"), read_duration("1h30m")
     (90.0, 600.0, 5400.0)
     """
     parts = re.fullmatch(r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s)?", text.strip())
     if parts is None or not any(parts.groups()):
-        raise UserError(f"'{text}' is no time", "write it as 90s, 10m, 1h or 1h30m")
+        raise UserError(f"'{text}' is not a duration", "write it as 90s, 10m, 1h or 1h30m")
     seconds = sum(float(n or 0) * unit for n, unit in zip(parts.groups(), UNITS.values(), strict=True))
     if not 0 < seconds <= MAX_HOURS * 3600:
-        raise UserError(f"'{text}' is no time for a training", f"give more than 0 and at most {MAX_HOURS}h")
+        raise UserError(f"'{text}' is out of range", f"give more than 0 and at most {MAX_HOURS}h")
     return seconds
 
 
 def in_words(seconds: float) -> str:
-    """A time that `read_duration` reads, to the second; without seconds from an hour on.
+    """Format a duration as `read_duration` parses it, rounded to seconds, or to minutes from an hour on.
 
     >>> in_words(59.6), in_words(600), in_words(754), in_words(5400)
     ('1m', '10m', '12m34s', '1h30m')

@@ -1,12 +1,13 @@
-"""How many steps of each stage fit into a time: from what a trial measured, and again by the clock of the
-run.
+"""Compute how many steps of each stage fit into a time budget.
 
-A stage costs its steps, each with its share of the fits of the light, and what happens once at its start and
-at its end. The stages keep the proportions that the settings have; one factor, the `share`, makes them fit:
+The time of a stage consists of its steps, each with its part of the fits of the light, and of work that is
+done once at its start and its end. The stages keep the proportions of the settings. A common factor on their
+steps, the `share`, follows from
 
     share · Σ steps · (step + fit) = budget − spent − Σ once − reserve
 
-While the run goes on the same sum is solved for what is left, with the rates that the clock has shown.
+The first plan uses the costs that a trial measured. During the run the equation is solved again for the
+remaining steps, with the times measured so far.
 """
 
 from __future__ import annotations
@@ -28,28 +29,29 @@ __all__ = [
 ]
 
 MIN_SHARE = 0.1
-"""Of the steps of the settings; with fewer there is nothing to look at: in `fast` the distance field has then
-had 200 steps, and the light a single fit.
+"""Smallest useful share of the steps of the settings. With this share, `fast` trains the distance field for
+200 steps and fits the light once; fewer give no recognisable result.
 """
 MAX_SHARE = 8.0
-"""Of the steps of the settings; whether more bring anything was never tried."""
+"""Largest share of the steps of the settings. More steps were never tried."""
 TRUSTED_STEPS = 40
-"""So many steps of a stage the measurement of the trial counts for, beside those that the run has taken."""
+"""Weight of the trial's measurement in the mean time of a step, in steps of the run."""
 SPARE = 1.15
-"""Factor from the time that is needed to the smallest budget that is named: a trial errs."""
+"""Safety factor of the smallest budget that an error message names, because a trial is not exact."""
 
 
 @dataclass(frozen=True)
 class StageCost:
-    """What a stage costs, seconds.
+    """The costs of a stage, in seconds.
 
     Attributes:
-        steps: of the settings; the proportion of the stages.
-        step: of one step.
-        fit: of the fits of the light, to a step, without the first fit of the run.
-        start: once, before its first step: evidence for effects.
-        first_fit: once, in its first steps: the first fit of the light takes longer than those after it.
-        end: once, at its end: pictures, looks, a checkpoint.
+        steps: number of steps in the settings, which defines the proportions of the stages.
+        step: time of a step.
+        fit: time of the fits of the light per step, without the first fit of the run.
+        start: time of the work before its first step: evidence for effects.
+        first_fit: time of the first fit of the light in the run, which takes longer than later ones; 0 in
+            other stages.
+        end: time of the work at its end: preview, measurements, checkpoint.
     """
 
     steps: int
@@ -61,14 +63,17 @@ class StageCost:
 
     @property
     def once(self) -> float:
-        """What does not depend on the number of steps."""
+        """Time that does not depend on the number of steps."""
         return self.start + self.first_fit + self.end
 
 
 @dataclass(frozen=True)
 class Costs:
-    """What a training costs: its stages in order, those without steps left out, and what comes after them
-    (the report), seconds.
+    """The costs of a training, in seconds.
+
+    Attributes:
+        stages: costs of the stages in order; stages without steps are left out.
+        reserve: time of the report after training.
     """
 
     stages: Mapping[str, StageCost]
@@ -76,25 +81,25 @@ class Costs:
 
     @property
     def once(self) -> float:
-        """All that does not depend on the number of steps."""
+        """Time that does not depend on the number of steps."""
         return self.reserve + sum(cost.once for cost in self.stages.values())
 
     @property
     def all_steps(self) -> float:
-        """All steps of the settings."""
+        """Time of all steps of the settings."""
         return sum(cost.steps * (cost.step + cost.fit) for cost in self.stages.values())
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a run stands.
+    """The state of a run.
 
     Attributes:
-        stage: the one that it is in.
-        step: how many steps of that are over.
-        seconds: of the run so far.
-        stepping: of them, those of the steps of this stage, without fits of the light.
-        fitting: of them, those of fits of the light in this stage.
+        stage: the current stage.
+        step: number of steps of this stage trained so far.
+        seconds: time of the run so far.
+        stepping: time of the steps of this stage so far, without fits of the light.
+        fitting: time of the fits of the light in this stage so far.
     """
 
     stage: str
@@ -105,13 +110,14 @@ class Progress:
 
 
 def share_for(costs: Costs, budget: float, spent: float) -> float:
-    """The factor on the steps of the settings that fills the budget, at most `MAX_SHARE`; below `MIN_SHARE`
-    the budget is too small.
+    """The factor on the steps of the settings that uses up the budget, at most `MAX_SHARE`.
+
+    If it is below `MIN_SHARE`, the budget is too small.
 
     Args:
-        costs: of the training.
-        budget: seconds of all.
-        spent: seconds that are gone.
+        costs: the costs of the training.
+        budget: the budget, in seconds.
+        spent: time that has passed, in seconds.
 
     >>> share_for(Costs({"joint": StageCost(steps=100, step=0.5, end=10.0)}, reserve=5.0), 50.0, 10.0)
     0.5
@@ -120,31 +126,32 @@ def share_for(costs: Costs, budget: float, spent: float) -> float:
 
 
 def steps_for(costs: Costs, share: float) -> dict[str, int]:
-    """Steps of each stage, one at least."""
+    """Steps of each stage for a share, at least one."""
     return {stage: max(1, round(share * cost.steps)) for stage, cost in costs.stages.items()}
 
 
 def smallest_budget(costs: Costs, spent: float) -> float:
-    """The smallest budget that makes sense, seconds: rounded up to 5 s, from 3 minutes on to half a
-    minute.
-    """
+    """The smallest useful budget in seconds, rounded up to 5 s, or to 30 s from 3 minutes on."""
     needed = SPARE * (spent + costs.once + MIN_SHARE * costs.all_steps)
     unit = 5.0 if needed <= 180.0 else 30.0
     return unit * math.ceil(needed / unit)
 
 
 def revised_steps(costs: Costs, planned: Mapping[str, int], at: Progress, budget: float) -> dict[str, int]:
-    """The steps of each stage that keep a run to its budget, by what the clock has shown.
+    """Plan the remaining steps of a run again from measured times.
 
-    Stages that are over stay as they were. In the current stage the rate is the mean over its steps so far
-    and `TRUSTED_STEPS` of the trial's. Later stages are taken to be slower or faster than the trial by the
-    same factor. Where no time is left, the current stage ends now, and later ones have a step each.
+    Finished stages are left unchanged. In the current stage, the time of a step is the mean over its steps so
+    far and `TRUSTED_STEPS` of the trial. Later stages are assumed to deviate from the trial by the same
+    factor. If no time is left, the current stage ends at once and each later stage gets one step.
 
     Args:
-        costs: as the trial measured them.
-        planned: steps of each stage so far.
-        at: where the run stands.
-        budget: seconds of all.
+        costs: the costs that the trial measured.
+        planned: steps of each stage in the current plan.
+        at: the state of the run.
+        budget: the budget, in seconds.
+
+    Returns:
+        The steps of each stage in the new plan.
     """
     order = list(costs.stages)
     later = order[order.index(at.stage) + 1 :]

@@ -1,8 +1,8 @@
-"""How large a step is: rays, directions, points of the light's fits, networks, as factors on the settings.
+"""Sizes of a training step: factors on the numbers of rays, directions and fit points, and on network widths.
 
-A size is taken for the steps that it leaves. With few steps for a time, smaller ones allow more of them; with
-many, larger ones learn more from each. The factors and the thresholds are a rule of thumb: on which scenes a
-smaller step pays was not measured.
+If a budget permits few steps of the usual size, smaller ones permit more of them; if it permits many, larger
+steps learn more from each. The factors and thresholds are rules of thumb: it was not measured on which scenes
+a smaller step is better.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ __all__ = ["Size", "next_size", "sized"]
 
 Size = Literal["small", "usual", "large"]
 
-FEW, MANY = 0.25, 2.0
-"""Share of the steps of the settings below which a smaller size, and above which a larger one, is tried."""
+FEW = 0.25
+"""Share of the steps of the settings below which the small size is tried."""
+MANY = 2.0
+"""Share of the steps of the settings above which the large size is tried."""
 
 FACTORS: Mapping[Size, Mapping[str, float]] = {
     "small": {
@@ -40,8 +42,9 @@ FACTORS: Mapping[Size, Mapping[str, float]] = {
 
 
 def sized(config: NeilfConfig, size: Size) -> NeilfConfig:
-    """The settings with steps of this size; what they do not have, as fits of a light that is free, is left
-    out.
+    """The settings with steps of this size.
+
+    Factors on settings that do not exist, such as those of fits with the free light field, are ignored.
 
     >>> sized(NeilfConfig(), "small").train.rays
     2048
@@ -56,8 +59,9 @@ def sized(config: NeilfConfig, size: Size) -> NeilfConfig:
 
 
 def next_size(share: float) -> Size:
-    """The size to try when steps of the usual size come to this share of those of the settings; a larger one
-    is kept if `share_for` of it is 1 at least.
+    """The size to try if the budget permits this share of the steps of the settings at the usual size.
+
+    The large size should be used only if `share_for` is at least 1 for it.
 
     >>> [next_size(share) for share in (0.1, 0.25, 1.0, 2.5)]
     ['small', 'usual', 'usual', 'large']
@@ -66,4 +70,5 @@ def next_size(share: float) -> Size:
 
 
 def _value(config: NeilfConfig, name: str) -> int:
+    """The value of a setting with a dotted name."""
     return reduce(getattr, name.split("."), config)

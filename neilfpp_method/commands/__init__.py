@@ -1,6 +1,6 @@
-"""The commands of `neilfpp`, a module each: its options, what runs it, and examples for its help.
+"""The commands of `neilfpp`: a module for each, with its options, its implementation and examples.
 
-What a command needs to run is imported when it runs, so that help and a mistyped option cost no second.
+Heavy libraries are imported when a command runs, so that help and errors in the options appear at once.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a command is, and the options that several of them have."""
+"""The structure of a command, and helpers that several commands share."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from rich.console import Console
 __all__ = ["Checkpoint", "Command", "Device", "duration", "progress_bar", "terminal"]
 
 SOON = 10.0
-"""Seconds; what takes no longer needs no word."""
+"""Estimated time above which a progress bar announces it, in seconds."""
 MEASURED = 2.0
 """Seconds of progress from which the time of the whole work is estimated."""
 
 Device = Annotated[str, tyro.conf.arg(metavar="cpu|cuda|cuda:N|auto")]
+"""Type of an option that names a device."""
 Checkpoint = Literal["last", "sdf_init", "material_init", "joint"]
 
 
@@ -27,13 +28,13 @@ class Command:
     """A command of the command line.
 
     Attributes:
-        options: a dataclass; its docstring is the command's summary, those of its fields are the help.
-        run: does it.
+        options: a dataclass; its docstring is the summary of the command, those of its fields are the help.
+        run: executes the command with its options.
         examples: command lines for the help.
-        default: the options that a command line starts from, where some of its words decide what others
-            default to; none: the defaults of the dataclass.
-        usual: the dataclass that `--help` shows, where `options` has too many to read; `--help-all` then
-            shows all.
+        default: computes default options from the words of the command line, for a command where some
+            options determine the defaults of others; None for the defaults of the dataclass.
+        usual: a dataclass with fewer options for `--help`, if `options` has very many; `--help-all` then
+            shows all of them.
     """
 
     options: type
@@ -44,11 +45,12 @@ class Command:
 
     @property
     def summary(self) -> str:
+        """The summary for the help."""
         return (self.options.__doc__ or "").strip()
 
 
 def terminal() -> Console:
-    """Where a command speaks; what it says is shown as it is, brackets in a path included."""
+    """The console of a command. Text is printed literally, so that brackets in a path are not markup."""
     return Console(markup=False, highlight=False)
 
 
@@ -109,7 +111,7 @@ class _Pace:
 
 
 def duration(seconds: float) -> str:
-    """A time for people: two digits are enough.
+    """A time rounded to about two digits.
 
     >>> duration(42.4), duration(200), duration(9000)
     ('42 s', '3 min', '2.5 h')

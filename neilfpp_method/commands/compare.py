@@ -14,18 +14,18 @@ __all__ = ["COMMAND"]
 
 @dataclass
 class Compare:
-    """Set runs side by side: what differs in their settings, figures, seconds, and the same views of all."""
+    """Compare runs of one capture: differing settings, metrics, times, and renderings of the same views."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    """The folders of two runs or more, of one capture; the first is what the others are compared with."""
+    """Two or more run folders; the others are compared with the first."""
     out: Path = Path("comparison")
-    """Where compare.json, compare.csv and compare.png go."""
+    """Folder for compare.json, compare.csv and compare.png."""
     views: int = 2
-    """How many views are rendered for the picture; 0: none, a table alone."""
+    """Number of views to render for the picture; 0 for tables only."""
     size: int = 320
-    """Pixels of the longest side of a rendered view, and no more than every run was trained at."""
+    """Longest side of a rendered view in pixels, at most the size that every run was trained at."""
     device: Device = "auto"
-    """Where to render."""
+    """Device to render on."""
 
 
 def run(options: Compare) -> None:
@@ -61,6 +61,6 @@ COMMAND = Command(
     [
         "neilfpp compare runs/fast runs/paper",
         "neilfpp compare runs/lamps runs/no-lamps --views 4 --out lamps-or-not",
-        "neilfpp compare runs/a runs/b runs/c --views 0   (the table alone, at once)",
+        "neilfpp compare runs/a runs/b runs/c --views 0   (tables only, without rendering)",
     ],
 )

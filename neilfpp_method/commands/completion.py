@@ -15,10 +15,10 @@ __all__ = ["COMMAND"]
 
 @dataclass
 class Completion:
-    """Print the script by which a shell completes commands and options."""
+    """Print the completion script of a shell, for the commands and their options."""
 
     shell: tyro.conf.Positional[Literal["bash", "zsh"]]
-    """Which shell. The script goes where the shell looks for one; README.md has a line for each."""
+    """The shell. README.md says where to store the script."""
 
 
 def run(options: Completion) -> None:

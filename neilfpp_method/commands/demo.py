@@ -12,16 +12,16 @@ __all__ = ["COMMAND"]
 
 @dataclass
 class Demo:
-    """Train on the scene in the package and write a report to look at."""
+    """Train on the example scene of the package and write a report."""
 
     out: Path = Path("demo-run")
-    """Where the run and its report go."""
+    """Folder for the run and its report."""
     resume: bool = False
     """Continue a demo that was stopped."""
     short: bool = False
-    """A twentieth of the steps: shows that everything runs, not what it can do."""
+    """Train a twentieth of the steps: a test of the installation, without useful results."""
     device: Device = "auto"
-    """Where to compute."""
+    """Device to compute on."""
 
 
 def run(options: Demo) -> None:

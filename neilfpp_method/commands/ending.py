@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: a command that is asked to end does so without a trace of its inside."""
+"""Handle Ctrl-C and SIGTERM, so that a command ends without a traceback."""
 
 from __future__ import annotations
 
@@ -10,34 +10,37 @@ __all__ = ["Asked", "ended_by_signal"]
 
 
 class Asked:
-    """Which signal has asked the process to end; none: 0."""
+    """The signal that has asked the process to end; `number` is 0 if there was none."""
 
     def __init__(self) -> None:
         self.number = 0
 
     @property
     def status(self) -> int:
-        """The exit status that shells give a process that the signal ended: 130 or 143."""
+        """The exit status that shells report for a process ended by this signal: 130 or 143."""
         return 128 + self.number
 
 
 @contextmanager
 def ended_by_signal() -> Iterator[Asked]:
-    """Ctrl-C and SIGTERM raise `KeyboardInterrupt` in the block, so that files that are half written are
-    removed, and are noted: an extension that is being loaded turns the exception into one of its own.
+    """Raise `KeyboardInterrupt` in the context on Ctrl-C and SIGTERM, so that temporary files are removed.
+
+    The signal is also recorded in the yielded object, because an extension module that is being loaded may
+    turn the exception into one of its own.
     """
     asked = Asked()
 
-    def ask(number: int, _frame: object) -> None:
+    def handle(number: int, _frame: object) -> None:
         asked.number = number
         raise KeyboardInterrupt
 
-    before = {}
-    with suppress(ValueError):  # not the main thread: somebody else handles signals
+    previous = {}
+    # Signal handlers can only be set in the main thread.
+    with suppress(ValueError):
         for number in (signal.SIGINT, signal.SIGTERM):
-            before[number] = signal.signal(number, ask)
+            previous[number] = signal.signal(number, handle)
     try:
         yield asked
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)

@@ -15,10 +15,10 @@ __all__ = ["COMMAND"]
 
 @dataclass
 class Eval:
-    """Measure a run on its test views; writes RUN/metrics.json, with --protocol RUN/eval/NAME.json."""
+    """Evaluate a run on its test views; writes RUN/metrics.json or, with --protocol, RUN/eval/NAME.json."""
 
     run: tyro.conf.Positional[Path]
-    """The run's folder."""
+    """The run folder."""
     protocol: Literal[
         "neilfpp",
         "neilf-synthetic",
@@ -28,20 +28,20 @@ class Eval:
         "dtu",
         "shiny-normals",
     ] = "neilfpp"
-    """How to measure. neilfpp: this project's own figures. The others as the official code of that benchmark
-    does, at the size of the files (docs/protocols.md)."""
+    """Evaluation protocol. neilfpp: the metrics of this project. Others: as in the official code of that
+    benchmark, at the size of the image files (docs/protocols.md)."""
     checkpoint: Checkpoint = "last"
-    """Which weights."""
+    """Checkpoint to evaluate."""
     out: Path | None = None
-    """Where the figures go; none: RUN/metrics.json, or RUN/eval/NAME.json of a published protocol."""
+    """Output file; default: RUN/metrics.json, or RUN/eval/NAME.json for a published protocol."""
     scale: float | None = None
-    """Size of the views over that of their files; 1: every pixel. None: 131 thousand pixels a view, about
-    420×310, and no more than the run was trained at.
+    """Size of the views relative to their files; 1 for full size. Default: 131 thousand pixels per view,
+    about 420×310, and at most the size of the training images.
     """
     width: int | None = None
-    """Width of the views in pixels, in place of --scale."""
+    """Width of the views in pixels, instead of --scale."""
     device: Device = "auto"
-    """Where to compute."""
+    """Device to compute on."""
 
 
 def run(options: Eval) -> None:
@@ -54,11 +54,12 @@ def run(options: Eval) -> None:
 def _published(options: Eval) -> None:
     from neilfpp_method.evaluate.published import PROTOCOLS
     from neilfpp_method.evaluate.published.protocol import write_figures
-    from neilfpp_method.evaluate.size import at_size, size_in_words
+    from neilfpp_method.evaluate.size import at_size, describe_size
     from neilfpp_method.evaluate.views import render_test_views
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.device import pick_device
-    from neilfpp_method.train.run import check_writable, load_run
+    from neilfpp_method.train.output import check_writable
+    from neilfpp_method.train.run import load_run
 
     protocol = PROTOCOLS[options.protocol]
     scale, width = options.scale, options.width
@@ -69,14 +70,14 @@ def _published(options: Eval) -> None:
     check_writable(out)
     protocol.check(run)
     console = terminal()
-    if protocol.side is None and (size := size_in_words(run)):
+    if protocol.side is None and (size := describe_size(run)):
         console.print(f"{size}; published figures are at the size of the files", soft_wrap=True)
     with computing_fast(), progress_bar("evaluating") as advance:
         figures = protocol.measure(run, render_test_views(run, advance) if protocol.needs_views else ())
         advance(1.0)
     write_figures(out, protocol, run, figures)
     console.print(
-        f"protocol {protocol.name}, as {protocol.source}; left out: {protocol.left_out}", soft_wrap=True
+        f"protocol {protocol.name}, as {protocol.source}; not computed: {protocol.left_out}", soft_wrap=True
     )
     for name, value in figures.items():
         console.print(f"{name:36} {value:8.3f}")
@@ -85,10 +86,11 @@ def _published(options: Eval) -> None:
 
 def _own(options: Eval) -> None:
     from neilfpp_method.evaluate.protocols import evaluate, write_metrics
-    from neilfpp_method.evaluate.size import at_size, size_in_words
+    from neilfpp_method.evaluate.size import at_size, describe_size
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.device import pick_device
-    from neilfpp_method.train.run import check_writable, load_run
+    from neilfpp_method.train.output import check_writable
+    from neilfpp_method.train.run import load_run
 
     run = at_size(
         load_run(options.run, pick_device(options.device), options.checkpoint), options.scale, options.width
@@ -96,7 +98,7 @@ def _own(options: Eval) -> None:
     out = options.out or options.run / "metrics.json"
     check_writable(out)
     console = terminal()
-    if size := size_in_words(run):
+    if size := describe_size(run):
         console.print(size, soft_wrap=True)
     with computing_fast(), progress_bar("evaluating") as advance:
         metrics = evaluate(run, advance)

@@ -15,32 +15,32 @@ __all__ = ["COMMAND"]
 
 @dataclass
 class Export:
-    """Write a run's surface, its light, or a textured asset for other programs, in the capture's frame."""
+    """Export the surface, the light, or a textured asset for other programs, in the capture's frame."""
 
     run: tyro.conf.Positional[Path]
-    """The run's folder."""
+    """The run folder."""
     what: tuple[Literal["mesh", "light", "asset"], ...] = ()
     """mesh: the surface (PLY). light: environment map (EXR), lamps (JSON), probes (EXR). asset: textures,
-    GLB, USD, light, and scripts for Blender and Mitsuba (docs/assets.md). None named: mesh and light, as far
-    as the run has them."""
+    GLB, USD, light, and scripts for Blender and Mitsuba (docs/assets.md). Default: mesh and light, if the run
+    has them."""
     out: Path | None = None
-    """The folder; none: RUN/export."""
+    """Output folder; default: RUN/export."""
     resolution: int = 256
-    """Cells of the mesh along an edge of the scene's cube."""
+    """Cells of the marching-cubes grid along an edge of the scene's cube."""
     probes: int | None = None
-    """Light probes, spread over the surface; none: 16 for a light that is free at every point, else 0."""
+    """Number of light probes on the surface; default: 16 for the free light field, otherwise 0."""
     texture_size: int = 2048
-    """Texels along an edge of the asset's textures."""
+    """Width and height of the asset's textures, in texels."""
     faces: int = 30_000
-    """Most triangles of the asset."""
+    """Maximum number of triangles of the asset."""
     error: float = 0.001
-    """Largest error of the asset's simplified triangles, scene units; a normal map keeps finer relief."""
+    """Maximum error of the simplified surface, in scene units; a normal map represents finer relief."""
     confidence: bool = False
     """Add a texture of the expected error of base colour, roughness and metallic; takes twice as long."""
     checkpoint: Checkpoint = "last"
-    """Which weights."""
+    """Checkpoint to export."""
     device: Device = "auto"
-    """Where to compute."""
+    """Device to compute on."""
 
 
 def run(options: Export) -> None:

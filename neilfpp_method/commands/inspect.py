@@ -15,18 +15,18 @@ __all__ = ["COMMAND"]
 
 @dataclass
 class Inspect:
-    """Say what is in a capture and what is wrong with it."""
+    """Describe a capture and list the problems in it."""
 
     data: tyro.conf.Positional[Path]
-    """The capture's folder."""
+    """The folder of the capture."""
     out: Path | None = None
-    """Where inspect.json and inspect.png go; none: they are not written."""
+    """Folder for inspect.json and inspect.png; default: they are not written."""
     format: str | None = None
-    """The capture's format; none: told from what is in the folder."""
+    """Format of the capture; default: recognised from the files."""
     response: Literal["auto", "linear", "srgb"] = "auto"
-    """What the pixels are: linear radiance (HDR) or sRGB (LDR); auto: told from the files."""
+    """What the pixels hold: linear radiance (HDR) or sRGB (LDR); auto: as the files say."""
     strict: bool = False
-    """End with status 1 where there is a problem."""
+    """Exit with status 1 if there is a problem."""
 
 
 def run(options: Inspect) -> None:

@@ -1,4 +1,4 @@
-"""A command line that cannot be read: what is wrong with it, in one line, and what was probably meant."""
+"""Turn tyro's description of a faulty command line into one line, with a suggestion."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from itertools import pairwise
 __all__ = ["closest", "mistake"]
 
 TYRO_SUGGESTS = "Perhaps you meant"
+"""Heading of the options that tyro suggests."""
 TYRO_UNKNOWN = "Unrecognized options:"
+"""Beginning of tyro's message about unknown options."""
 
 
 def closest(word: str, known: Iterable[str]) -> str | None:
-    """The known word that is most like a mistyped one; none: nothing is like it.
+    """The known word that is most similar to a mistyped one; None if none is similar.
 
     >>> closest("tran", ["train", "render"])
     'train'
@@ -22,15 +24,17 @@ def closest(word: str, known: Iterable[str]) -> str | None:
 
 
 def mistake(complaint: str, arguments: Sequence[str]) -> tuple[str, str | None]:
-    """What tyro's boxed complaint says first, and the option that was probably meant.
+    """Extract the message from tyro's error output, and the option that was probably meant.
 
     Args:
-        complaint: the box as tyro prints it; its paragraphs are separated by rules.
+        complaint: the box that tyro prints; its paragraphs are separated by rules.
         arguments: the words of the command line.
+
+    Returns:
+        The message, and the suggested option; the latter is None if there is none.
     """
-    lines = [
-        line.strip("│ ") for line in complaint.splitlines() if line.startswith("│")
-    ] or complaint.splitlines()
+    boxed = [line.strip("│ ") for line in complaint.splitlines() if line.startswith("│")]
+    lines = boxed or complaint.splitlines()
     paragraphs: list[list[str]] = [[]]
     for line in lines:
         if line.strip("─ "):
@@ -42,7 +46,7 @@ def mistake(complaint: str, arguments: Sequence[str]) -> tuple[str, str | None]:
 
 
 def _suggested(what: str, paragraphs: Sequence[Sequence[str]]) -> str | None:
-    """The option that is most like the first unknown word, of those that tyro suggests under a heading."""
+    """The one of tyro's suggestions that is most similar to the first unknown word."""
     unknown = what.removeprefix(TYRO_UNKNOWN).replace(",", " ").split()
     for heading, *suggestions in filter(None, paragraphs):
         if heading.startswith(TYRO_SUGGESTS):
@@ -52,9 +56,7 @@ def _suggested(what: str, paragraphs: Sequence[Sequence[str]]) -> str | None:
 
 
 def _flag_with_a_value(what: str, arguments: Sequence[str]) -> str | None:
-    """How to write `--a.flag False`, of which tyro says that it does not know the word False:
-    `--a.no-flag`.
-    """
+    """The correct form `--a.no-flag` of `--a.flag False`, which tyro reports as an unknown word."""
     if not what.startswith(TYRO_UNKNOWN):
         return None
     unknown = what.removeprefix(TYRO_UNKNOWN).replace(",", " ").split()

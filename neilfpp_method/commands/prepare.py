@@ -1,4 +1,4 @@
-"""`neilfpp prepare`; its options lie with what they decide."""
+"""`neilfpp prepare`; its options are defined in `prepare.options`."""
 
 from __future__ import annotations
 

@@ -16,46 +16,48 @@ __all__ = ["COMMAND"]
 
 @dataclass
 class Render:
-    """Write every map of a run's views as PNG and EXR, and a picture of the incident light at four points."""
+    """Render all maps of the views of a run as PNG and EXR, and the incident light at four points."""
 
     run: tyro.conf.Positional[Path]
-    """The run's folder."""
+    """The run folder."""
     out: Path | None = None
-    """Where the pictures go; none: RUN/renders."""
+    """Output folder; default: RUN/renders."""
     what: tuple[Literal["maps", "light"], ...] = ("maps", "light")
-    """maps: a folder each, and an EXR a view. light: incident_light.png, beside the truth where known."""
+    """maps: a folder of PNG files per map, and an EXR file per view. light: incident_light.png, next to the
+    truth if it is known."""
     views: Literal["test", "train", "all"] = "test"
-    """Which views."""
+    """Views to render."""
     checkpoint: Checkpoint = "last"
-    """Which weights."""
+    """Checkpoint to render."""
     overwrite: bool = False
-    """Render again what is there already."""
+    """Render pictures again that exist already."""
     confidence: bool = False
     """Add maps of the expected error of the material (base_color_std, …); takes about twice as long."""
     scale: float | None = None
-    """Size of the views over that of their files; 1: every pixel. None: 131 thousand pixels a view, about
-    420×310, and no more than the run was trained at.
+    """Size of the views relative to their files; 1 for full size. Default: 131 thousand pixels per view,
+    about 420×310, and at most the size of the training images.
     """
     width: int | None = None
-    """Width of the views in pixels, in place of --scale."""
+    """Width of the views in pixels, instead of --scale."""
     device: Device = "auto"
-    """Where to compute."""
+    """Device to compute on."""
 
 
 def run(options: Render) -> None:
     from neilfpp_method.evaluate.render_views import render_run
     from neilfpp_method.evaluate.sheet import write_light_picture
-    from neilfpp_method.evaluate.size import at_size, size_in_words
+    from neilfpp_method.evaluate.size import at_size, describe_size
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.device import pick_device
-    from neilfpp_method.train.run import check_folder, load_run
+    from neilfpp_method.train.output import check_folder
+    from neilfpp_method.train.run import load_run
 
     run = at_size(
         load_run(options.run, pick_device(options.device), options.checkpoint), options.scale, options.width
     )
     out = options.out or options.run / "renders"
     check_folder(out)
-    if size := size_in_words(run):
+    if size := describe_size(run):
         terminal().print(size, soft_wrap=True)
     if "maps" in options.what:
         with computing_fast(), progress_bar("rendering") as advance:
@@ -65,9 +67,7 @@ def run(options: Render) -> None:
         and not write_light_picture(run, out / "incident_light.png")
         and options.what == ("light",)
     ):
-        raise UserError(
-            f"{options.run}: there is no light to show at step {run.step}", "train the next stage"
-        )
+        raise UserError(f"{options.run}: the run has no light yet at step {run.step}", "train the next stage")
     terminal().print(f"written to {out}", soft_wrap=True)
 
 

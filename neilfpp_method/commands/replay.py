@@ -14,12 +14,12 @@ __all__ = ["COMMAND"]
 
 @dataclass
 class Replay:
-    """Run a step that training skipped again, and name its first operation that is not finite."""
+    """Repeat a step that training skipped, and name its first operation whose result is not finite."""
 
     run: tyro.conf.Positional[Path]
-    """The run's folder."""
+    """The run folder."""
     step: tyro.conf.Positional[int]
-    """The step that was skipped, as the warning named it; a run keeps the first four."""
+    """Number of the skipped step, from the warning of the training; a run stores the first four."""
 
 
 def run(options: Replay) -> None:

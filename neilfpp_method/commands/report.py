@@ -12,42 +12,42 @@ from neilfpp_method.commands.command import Command, Device, progress_bar, termi
 __all__ = ["COMMAND", "after_training"]
 
 TELLING = 0.1
-"""Share of the work done before the total time is estimated: loading and compiling come first."""
+"""Share of the work after which the total time is estimated. Before, loading and compiling dominate."""
 
 
 @dataclass
 class Report:
-    """Write a page that shows a run: its views beside the truth, its surface in 3-D, light, figures."""
+    """Write an HTML page on a run: views next to the truth, the surface in 3-D, light, metrics."""
 
     run: tyro.conf.Positional[Path]
-    """The run's folder."""
+    """The run folder."""
     out: Path | None = None
-    """The page; none: RUN/report.html."""
+    """Output file; default: RUN/report.html."""
     views: int = 2
-    """How many views are rendered for it."""
+    """Number of views to render."""
     size: int = 320
-    """Pixels of the longest side of its pictures."""
+    """Longest side of a picture in pixels."""
     confidence: bool = False
-    """Add how far off base colour, roughness and metallic may be; takes about twice as long."""
+    """Add the expected error of base colour, roughness and metallic; takes about twice as long."""
     device: Device = "auto"
-    """Where to render."""
+    """Device to render on."""
 
 
 def run(options: Report) -> None:
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.report.write import REPORT, ReportOptions, write_report
     from neilfpp_method.train.device import pick_device
-    from neilfpp_method.train.run import check_writable
+    from neilfpp_method.train.output import check_writable
 
-    chosen = ReportOptions(options.views, options.size, options.confidence)
-    chosen.check()
+    contents = ReportOptions(options.views, options.size, options.confidence)
+    contents.check()
     out = options.out or options.run / REPORT
     check_writable(out)
     with computing_fast(), progress_bar("report") as advance:
         write_report(
             options.run,
             out,
-            chosen,
+            contents,
             str(pick_device(options.device)),
             lambda share: advance(share) if share >= TELLING else None,
         )
@@ -55,14 +55,16 @@ def run(options: Report) -> None:
 
 
 def after_training(path: Path, device: str) -> None:
-    """The page of a run that has just ended; a page that cannot be made takes nothing from the run."""
+    """Write the report of a finished training. If that fails, print a warning; the run itself is complete."""
     from neilfpp_method.errors import UserError
 
     try:
         run(Report(path, device=device))
     except UserError as error:
         terminal().print(
-            f"no report: {error}; neilfpp report {path} tries again", style="yellow", soft_wrap=True
+            f"no report written: {error}; try again with: neilfpp report {path}",
+            style="yellow",
+            soft_wrap=True,
         )
 
 

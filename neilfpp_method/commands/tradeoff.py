@@ -14,26 +14,26 @@ __all__ = ["COMMAND"]
 
 @dataclass
 class Tradeoff:
-    """Show what accuracy costs in time: train for several budgets, measure, write the frontier."""
+    """Measure accuracy against training time: train with several time budgets and plot the frontier."""
 
     data: Path
-    """The capture's folder."""
+    """The folder of the capture."""
     budgets: str = "1m,3m,10m"
-    """How long the runs may take, as 90s, 10m or 1h, with commas between them."""
+    """Time budgets of the runs, such as 90s, 10m or 1h, separated by commas."""
     out: Path | None = None
-    """The folder of the runs and of tradeoff.csv, .json and .svg; none: runs/CAPTURE-PRESET-tradeoff. What is
-    done there is not done again, and a run that was stopped goes on.
+    """Folder for the runs and for tradeoff.csv, .json and .svg; default: runs/CAPTURE-PRESET-tradeoff.
+    Finished runs in it are used again, and stopped ones are continued.
     """
     seeds: int = 1
-    """Runs of each budget, which differ in their random numbers; from two on the figure has error bars."""
-    preset: Literal["fast", "paper-mlp", "paper-ngp", "paper-ngp-hdr"] = "fast"
-    """The settings of all runs."""
+    """Number of runs per budget with different seeds; with two or more the figure has error bars."""
+    preset: Literal["fast", "balanced", "best", "paper-mlp", "paper-ngp", "paper-ngp-hdr"] = "fast"
+    """Preset of all runs."""
     host: Literal["volsdf", "mesh"] = "volsdf"
-    """Where geometry comes from, as of neilfpp train; mesh: the capture's inputs/model/mesh.ply."""
+    """Source of geometry, as in neilfpp train; mesh: the capture's inputs/model/mesh.ply."""
     report: bool = False
-    """Write the page of each run, within its budget."""
+    """Write the report of each run, within its budget."""
     device: Device = "auto"
-    """Where to compute."""
+    """Device to compute on."""
 
 
 def run(options: Tradeoff) -> None:

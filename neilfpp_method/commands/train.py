@@ -22,8 +22,9 @@ from neilfpp_method.settings.types import MapLightConfig, MeshConfig, NeilfConfi
 __all__ = ["COMMAND"]
 
 DEFAULT_PRESET = "fast"
+"""Preset if neither --preset nor a settings file names one."""
 ROOMS_WITH_KINDS = ("light", "encoding")
-"""Rooms whose other settings depend on their `kind`; that of the host is --host."""
+"""Groups of settings whose members depend on their `kind`. The kind of the host is the option --host."""
 
 
 @dataclass
@@ -31,47 +32,47 @@ class Train:
     """Recover geometry, material and light from posed images."""
 
     data: Path | None = None
-    """The capture's folder. Not needed with --resume."""
+    """The folder of the capture. Not needed with --resume."""
     out: Path | None = None
-    """The run's folder; none: runs/CAPTURE-PRESET."""
+    """The run folder; default: runs/CAPTURE-PRESET."""
     preset: str | None = None
-    """fast (minutes on a laptop's CPU), paper-mlp, paper-ngp or paper-ngp-hdr (the published settings); none:
-    fast.
+    """fast (minutes on a laptop's CPU), balanced or best (more steps, more rays and finer grids:
+    docs/budget.md), or paper-mlp, paper-ngp, paper-ngp-hdr (the published settings); default: fast.
     """
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
-    """Settings from a .yaml or .json file, such as a run folder's config.json; options here override it."""
+    """Settings from a .yaml or .json file, such as a run folder's config.json; other options override it."""
     host: Literal["volsdf", "mesh"] = "volsdf"
-    """Where geometry comes from: volsdf recovers it; mesh is given, and material and light are recovered."""
+    """Source of geometry: recovered from the images (volsdf), or a given mesh."""
     mesh: Path | None = None
-    """The mesh of --host mesh, in the capture's world frame; none: the capture's inputs/model/mesh.ply."""
+    """Mesh for --host mesh, in the capture's world frame; default: the capture's inputs/model/mesh.ply."""
     light: Path | None = None
-    """An environment map that is known (linear EXR, see docs/light.md), in the radiance of the images; none:
-    recovered.
-    """
+    """A known environment map (linear EXR, docs/light.md); default: recovered."""
     resume: bool = False
-    """Continue the run in --out from its last checkpoint, exactly as if it had never stopped."""
+    """Continue the run in --out from its last checkpoint, with the same result as without a stop."""
     format: str | None = None
-    """The capture's format (see docs/captures.md); none: told from what is in the folder."""
+    """Format of the capture (see docs/captures.md); default: recognised from the files."""
     test_every: int | None = None
-    """Hold out every k-th view for testing; none: the capture's split.json, or every 8th."""
+    """Hold out every k-th view for testing; default: split.json, or every 8th."""
     response: Literal["auto", "linear", "srgb"] = "auto"
-    """What the pixels are: linear radiance (HDR) or sRGB (LDR); auto: told from the files."""
+    """What the pixels hold: linear radiance (HDR) or sRGB (LDR); auto: as the files say."""
     scale: float | None = None
-    """Image size over that of the files; 1: full size; none: as large as the training's rays can use."""
+    """Image size relative to the files; default: as large as the training can use."""
     effects: str | None = None
-    """auto, all, none, as-set, or as auto,-lamps."""
+    """Effects to simulate: auto, all, none, as-set, or a list such as auto,-lamps (docs/effects.md)."""
     budget: str | None = None
-    """How long all of it may take, as 90s, 10m or 1h: steps are planned for that (docs/budget.md). None: as
-    many steps as the settings say.
+    """Time for the whole command, such as 90s, 10m or 1h; the steps are planned for it (docs/budget.md).
+    Default: no limit.
     """
     view: bool = False
     """Serve the viewer in the browser while the run trains (docs/viewer.md); needs the extra `view`."""
     strict: bool = False
-    """End with exit status 1 where the result is of no use (docs/health.md)."""
+    """Exit with status 1 if the result is unusable (docs/health.md)."""
     device: Device = "auto"
-    """Where to train; auto takes a GPU where there is one."""
+    """Device to train on; auto selects a GPU if there is one."""
     devices: int = 1
-    """Processes that share the work, one per GPU (or CPU process)."""
+    """Number of processes on this machine, each on its own GPU, or all on the CPU."""
+    nodes: int = 1
+    """Number of machines, each with --devices processes that torchrun starts (docs/performance.md)."""
 
 
 @dataclass
@@ -79,9 +80,9 @@ class TrainWithSettings(Train):
     """Recover geometry, material and light from posed images."""
 
     config: NeilfConfig = field(default_factory=NeilfConfig)
-    """Any setting of the preset."""
+    """Individual settings, which override those of the preset."""
     view_port: int = 8080
-    """The port of --view."""
+    """Port of --view."""
     report: bool = True
     """Write RUN/report.html at the end (docs/report.md)."""
 
@@ -114,6 +115,7 @@ def run(options: TrainWithSettings) -> None:
             scale=options.scale,
             device=options.device,
             devices=options.devices,
+            nodes=options.nodes,
             strict=options.strict,
             effects=asked,
             budget=budget,
@@ -123,22 +125,22 @@ def run(options: TrainWithSettings) -> None:
 
 
 def _viewer(options: TrainWithSettings, config: NeilfConfig) -> AbstractContextManager[object]:
-    """The viewer beside the training, if it is asked for; only the first of several processes has one."""
-    from neilfpp_method.train.run import default_folder
+    """The viewer beside the training, if requested; only the first of several processes starts one."""
+    from neilfpp_method.train.output import default_folder
     from neilfpp_method.view.beside import viewer_beside
 
     if not options.view or os.environ.get("LOCAL_RANK", "0") != "0":
         return nullcontext()
     out = options.out or (options.data and default_folder(options.data, config))
     if out is None:
-        return nullcontext()  # `run_training` says what is missing.
+        return nullcontext()  # `run_training` names the missing option.
     return viewer_beside(
         out, options.view_port, options.device, lambda text: terminal().print(text, soft_wrap=True)
     )
 
 
 def _with_files(options: TrainWithSettings) -> NeilfConfig:
-    """The settings, with the files that have an option of their own."""
+    """The settings with the files of --mesh and --light."""
     config = options.config
     if options.mesh is not None:
         if not isinstance(config.host, MeshConfig):
@@ -150,15 +152,17 @@ def _with_files(options: TrainWithSettings) -> NeilfConfig:
         if not isinstance(config.light, MapLightConfig):
             raise UserError(
                 f"{options.light}: a light that is free at every point takes no map",
-                "add --config.light.kind distant, or auto to look for lamps before the map as well",
+                "add --config.light.kind distant, or auto to look for near lamps as well",
             )
         config = changed(config, {"light.map": str(options.light.resolve())})
     return config
 
 
 def _starting_point(arguments: Sequence[str]) -> TrainWithSettings:
-    """What decides which other settings there are, and what they default to, is read first: the file, the
-    preset, the host, and the kinds of light and of encoding.
+    """Default options for a command line.
+
+    The settings file, the preset, the host, and the kinds of light and encoding are read before all other
+    options, because they determine which settings exist and what their defaults are.
     """
     file = _option(arguments, "--config")
     stored = dict(read_settings(Path(file))) if file is not None else {}
@@ -168,17 +172,17 @@ def _starting_point(arguments: Sequence[str]) -> TrainWithSettings:
     config = changed(config, stored, where)
     if host is not None and host != config.host.kind:
         raise UserError(
-            f"{where}: its host is {config.host.kind}, and --host {host} is given", "leave one of them out"
+            f"{where}: its host is {config.host.kind}, but --host is {host}", "leave one of them out"
         )
     kinds = {room: _option(arguments, f"--config.{room}.kind") for room in ROOMS_WITH_KINDS}
-    chosen = {f"{room}.kind": kind for room, kind in kinds.items() if kind is not None}
+    changes = {f"{room}.kind": kind for room, kind in kinds.items() if kind is not None}
     if kinds["light"] == "free" and config.light.kind != "free":
         config = free_light(config)
-    return TrainWithSettings(config=changed(config, chosen, "--config"))
+    return TrainWithSettings(config=changed(config, changes, "--config"))
 
 
 def _base(name: str | None, host: str | None, stored: Mapping[str, Any], where: str) -> NeilfConfig:
-    """The preset that a file changes: the one that is named, else the file's own, else the usual one."""
+    """The preset to which a settings file is applied: that of --preset, of the file, or the default."""
     label = stored.get("preset", DEFAULT_PRESET) if name is None else name
     kind = stored.get("host", {})
     mesh = (
@@ -187,11 +191,9 @@ def _base(name: str | None, host: str | None, stored: Mapping[str, Any], where: 
         or stored.get("host.kind") == "mesh"
     )
     if not isinstance(label, str):
-        raise UserError(
-            f"{where}.preset: {label!r} where a name belongs", f"choose one of {', '.join(PRESETS)}"
-        )
+        raise UserError(f"{where}.preset: {label!r} is not a name", f"choose one of {', '.join(PRESETS)}")
     label = label.removesuffix("-mesh") if name is None else label
-    # What no preset made has the label of the settings' own defaults.
+    # Settings that no preset made carry the label of the default settings.
     config = NeilfConfig() if name is None and label == NeilfConfig().preset else preset(label)
     config = fixed_geometry(config) if mesh else config
     light = stored.get("light", {})
@@ -200,7 +202,7 @@ def _base(name: str | None, host: str | None, stored: Mapping[str, Any], where: 
 
 
 def _option(arguments: Sequence[str], name: str) -> str | None:
-    """The value of an option, the last where it is given more than once."""
+    """The value of an option in a command line; the last one if it occurs several times."""
     value = None
     for i, argument in enumerate(arguments):
         if argument == name and i + 1 < len(arguments):
@@ -218,10 +220,10 @@ COMMAND = Command(
         "neilfpp train --data captures/teapot --preset paper-ngp --out runs/teapot",
         "neilfpp train --data captures/teapot --config settings.yaml",
         "neilfpp train --data captures/teapot --host mesh --mesh scans/teapot.ply",
-        "neilfpp train --data captures/teapot --budget 10m   (steps are planned for the time)",
+        "neilfpp train --data captures/teapot --budget 10m   (as many steps as fit in ten minutes)",
         "neilfpp train --data captures/teapot --view   (in the browser while it trains)",
         "neilfpp train --out runs/teapot --resume",
-        "neilfpp train --data captures/teapot --effects auto,-lamps   (evidence decides, but no lamps)",
+        "neilfpp train --data captures/teapot --effects auto,-lamps   (without lamps)",
     ],
     _starting_point,
     usual=Train,

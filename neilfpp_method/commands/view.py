@@ -15,26 +15,26 @@ __all__ = ["COMMAND"]
 
 @dataclass
 class View:
-    """Look at a run in the browser: its layers, its light, other light."""
+    """Show a run in the browser: its maps, its light, and its scene under other light."""
 
     run: tyro.conf.Positional[Path]
-    """The run's folder."""
+    """The run folder."""
     env: tuple[Path, ...] = ()
-    """Environment maps to choose from beside the run's own light (EXR, HDR, PNG, JPEG), or folders."""
+    """Environment maps (EXR, HDR, PNG, JPEG), or folders of them, to offer in addition to the run's light."""
     env_layout: Literal["ours", "common"] = "ours"
     """ours: as `neilfpp export` writes maps. common: as Blender reads them."""
     follow: bool = False
-    """Wait for a run that trains, and show every new checkpoint."""
+    """Follow a run in training, and show every new checkpoint."""
     host: str = "127.0.0.1"
-    """Address to listen on. 127.0.0.1: this machine alone; 0.0.0.0: everybody who can reach it."""
+    """Address to listen on. 127.0.0.1: only this machine; 0.0.0.0: all machines that can reach this one."""
     port: int = 8080
-    """The port that is listened on."""
+    """Port to listen on."""
     resolution: int = 256
-    """Cells along an edge of the scene, where the surface is taken from a distance field."""
+    """Cells along an edge of the scene's cube, if the surface comes from a distance field."""
     checkpoint: Checkpoint = "last"
-    """Which weights."""
+    """Checkpoint to show."""
     device: Device = "auto"
-    """Where to compute."""
+    """Device to compute on."""
 
 
 def run(options: View) -> None:

@@ -1,5 +1,5 @@
-"""Runs side by side (docs/compare.md).
+"""Compare runs in a table and an image (docs/compare.md).
 
-`contenders` reads what lies in their folders, `common` finds the views that all of them can show, `figures`
-and `parts` make the table, `terminal` shows it, `sheet` makes the picture, and `write` does it all.
+`contenders` reads the folders of the runs, `common` selects the views that all runs can render, `figures` and
+`parts` build the table, `terminal` prints it, `sheet` draws the image, and `write` is the entry point.
 """

@@ -1,4 +1,4 @@
-"""The runs of a comparison, as their folders describe them."""
+"""Read the runs of a comparison from their folders."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from neilfpp_method.train.run import CaptureSource, load_checkpoint, read_descri
 __all__ = ["Contender", "labels_of", "read_contenders"]
 
 MAX_RUNS = 16
-"""A table of more columns is for no screen, and a sheet of more pictures for no page."""
+"""Largest number of runs. A table or image with more columns would not fit on a screen."""
 
 
 @dataclass(frozen=True)
@@ -22,12 +22,12 @@ class Contender:
     """A run of the comparison.
 
     Attributes:
-        label: what tells it from the others, in few letters.
-        path: its folder, as it was given.
-        files: what lies there.
-        source: how its capture is read.
-        capture: the capture, its views at the size that the run was trained at.
-        step: how many steps its last checkpoint has seen; 0: it has none.
+        label: a short name that is unique among the runs.
+        path: the run's folder, as given by the user.
+        files: contents of the files there.
+        source: how the run's capture is read.
+        capture: the capture, with views of the size that the run was trained at.
+        step: training step of the last checkpoint; 0 if there is none.
     """
 
     label: str
@@ -39,37 +39,38 @@ class Contender:
 
     @property
     def has_model(self) -> bool:
-        """Whether there is something to render."""
+        """Whether the run has a checkpoint, so that it can be rendered."""
         return self.step > 0
 
 
 def read_contenders(paths: Sequence[Path]) -> list[Contender]:
-    """The runs, in the order in which they were given.
+    """Read the runs, in the order given.
 
     Raises:
-        UserError: fewer than two runs or too many, one is given twice, a folder is no run, or a run's capture
-            has moved.
+        UserError: there are fewer than two runs or more than `MAX_RUNS`, one is given twice, a folder is not
+            a run, or a run's capture was moved.
     """
     if not 2 <= len(paths) <= MAX_RUNS:
-        raise UserError(f"{len(paths)} runs to compare", f"give the folders of 2 to {MAX_RUNS} runs")
+        raise UserError(f"runs to compare: {len(paths)}", f"give the folders of 2 to {MAX_RUNS} runs")
     resolved = [path.resolve() for path in paths]
     for i, path in enumerate(resolved):
         if path in resolved[:i]:
             raise UserError(f"{paths[i]}: given twice", "give every run once")
-    described = [(path, read_files(path), read_description(path).source) for path in paths]
+    # All folders are read before any capture is loaded, so that a folder that is not a run fails early.
+    contents = [(path, read_files(path), read_description(path).source) for path in paths]
     return [
-        Contender(label, path, files, source, source.load_again(path), _step(path))
-        for label, (path, files, source) in zip(labels_of(resolved), described, strict=True)
+        Contender(label, path, files, source, source.load_again(path), _last_step(path))
+        for label, (path, files, source) in zip(labels_of(resolved), contents, strict=True)
     ]
 
 
-def _step(path: Path) -> int:
+def _last_step(path: Path) -> int:
     last = path / "checkpoints" / "last.pt"
     return int(load_checkpoint(last)["step"]) if last.is_file() else 0
 
 
 def labels_of(paths: Sequence[Path]) -> list[str]:
-    """The end of each path, as many folders of it as it takes to tell all apart.
+    """Shorten paths to their last folders, as many as needed to make them unique.
 
     >>> labels_of([Path("/a/teapot/fast"), Path("/a/lamp/fast")])
     ['teapot/fast', 'lamp/fast']

@@ -1,4 +1,4 @@
-"""Figures of several runs under one protocol, and whether they can be compared."""
+"""Collect the figures of several runs under one protocol, and decide which can be compared."""
 
 from __future__ import annotations
 
@@ -13,14 +13,18 @@ from neilfpp_method.report.measured import OWN, Measured
 __all__ = ["SHOWN", "figure_rows", "figures_parts"]
 
 SHOWN = "shown"
-"""The name of the figures that are of the views in the picture."""
+"""Name of the part with figures of the rendered views; the names of other parts are protocols."""
 
 
 def figures_parts(runs: Sequence[Contender], other_capture: frozenset[int]) -> list[Part]:
-    """A part for each protocol that some run was measured with.
+    """Build one part of the table for each protocol that at least one run was measured with.
 
-    The first run that was measured sets the views and the size; the figures of a run that was measured on
-    others, and of a run of another capture, stand apart, with a note that says what makes them equal.
+    The first run that was measured is the reference for views, size and masks. A run that was measured
+    differently, or is of another capture, is marked as not comparable, and a note says how to change that.
+
+    Args:
+        runs: the runs.
+        other_capture: indices of runs of another capture.
     """
     return [
         _part(protocol, runs, other_capture)
@@ -30,20 +34,20 @@ def figures_parts(runs: Sequence[Contender], other_capture: frozenset[int]) -> l
 
 
 def figure_rows(figures: Sequence[Mapping[str, float]]) -> tuple[Row, ...]:
-    """A row for each figure that some run has."""
+    """Build one row for each figure that at least one run has."""
     rows = []
     for name in dict.fromkeys(name for column in figures for name in column):
         entry = explain(name)
         values = tuple(column.get(name) for column in figures)
-        shown = tuple("–" if value is None else entry.format(value) for value in values)
-        rows.append(Row(name, entry.title, values, shown, entry.better))
+        texts = tuple("–" if value is None else entry.format(value) for value in values)
+        rows.append(Row(name, entry.title, values, texts, entry.better))
     return tuple(rows)
 
 
 def _part(protocol: str, runs: Sequence[Contender], other_capture: frozenset[int]) -> Part:
     measured = [run.files.measured.get(protocol) for run in runs]
-    at = next(i for i, figures in enumerate(measured) if figures is not None)
-    basis = measured[at]
+    first = next(i for i, figures in enumerate(measured) if figures is not None)
+    basis = measured[first]
     apart, notes = set(other_capture), []
     for i, (run, figures) in enumerate(zip(runs, measured, strict=True)):
         if figures is None:
@@ -53,7 +57,7 @@ def _part(protocol: str, runs: Sequence[Contender], other_capture: frozenset[int
             notes.append(
                 f"{run.label}: its figures are older than its checkpoint: {_command(run, protocol, basis)}"
             )
-        difference = _difference(runs[at], basis, run, figures) if i != at else ""
+        difference = _difference(runs[first], basis, run, figures) if i != first else ""
         if difference:
             apart.add(i)
             notes.append(difference)
@@ -63,14 +67,12 @@ def _part(protocol: str, runs: Sequence[Contender], other_capture: frozenset[int
 
 
 def _difference(first: Contender, basis: Measured, run: Contender, figures: Measured) -> str:
-    """Why the figures of a run do not compare with those of the first, and what makes them equal; empty:
-    they do.
-    """
+    """Why the figures of a run cannot be compared with those of the first; empty if they can."""
     protocol = basis.protocol
     for contender, known in ((first, basis), (run, figures)):
         if not known.extent:
             return (
-                f"{contender.label}: an earlier version measured it, and its views and size are not known: "
+                f"{contender.label} was measured by an earlier version, its views and size are not known: "
                 f"{_command(contender, protocol)}"
             )
     if figures.views != basis.views:
@@ -83,16 +85,17 @@ def _difference(first: Contender, basis: Measured, run: Contender, figures: Meas
             f"{run.label} was measured on {figures.extent}, {first.label} on {basis.extent}: "
             f"{_command(run, protocol, basis)}"
         )
-    if figures.said.get("mask_source") != basis.said.get("mask_source"):
+    if figures.description.get("mask_source") != basis.description.get("mask_source"):
         return (
-            f"{run.label} counts pixels by {figures.said.get('mask_source')}, {first.label} by "
-            f"{basis.said.get('mask_source')}: give both captures the same masks, and measure again"
+            f"the masks of {run.label} come from {figures.description.get('mask_source')}, those of "
+            f"{first.label} from {basis.description.get('mask_source')}: give both captures the same masks, "
+            "and measure again"
         )
     return ""
 
 
 def _command(run: Contender, protocol: str, basis: Measured | None = None) -> str:
-    """What measures a run, at the size of another where that is known."""
+    """The command that measures a run, at the size of `basis` if it is known."""
     option = "" if protocol == OWN else f" --protocol {protocol}"
     width = f" --width {basis.size[0]}" if basis is not None and basis.size else ""
     return f"neilfpp eval {run.path}{option}{width}"

@@ -1,4 +1,4 @@
-"""The parts of the table: what the runs are, where their settings differ, and seconds."""
+"""Parts of the table of a comparison: the runs, the settings that differ, and the times."""
 
 from __future__ import annotations
 
@@ -20,26 +20,34 @@ Value = float | str | None
 
 @dataclass(frozen=True)
 class Row:
-    """A line of the table: a value for each run, none where there is none; `shown` are the same in words."""
+    """A row of the table.
+
+    Attributes:
+        key: name in files.
+        title: name for display.
+        values: one value per run; None if the run has none.
+        texts: the values formatted for display.
+        better: whether higher or lower values are better.
+    """
 
     key: str
     title: str
     values: tuple[Value, ...]
-    shown: tuple[str, ...]
+    texts: tuple[str, ...]
     better: Literal["higher", "lower", "neither"] = "neither"
 
 
 @dataclass(frozen=True)
 class Part:
-    """Lines of the table that belong together.
+    """Rows of the table under one heading.
 
     Attributes:
         kind: "runs", "settings", "seconds" or "figures".
-        name: which figures, by their protocol; empty for other kinds.
-        title: for people.
-        rows: the lines.
-        apart: the runs, by number, whose values are not to be compared with the others'.
-        notes: why, and what makes them equal.
+        name: the protocol of figures; empty for other kinds.
+        title: heading for display.
+        rows: the rows.
+        apart: indices of the runs whose values cannot be compared with the others.
+        notes: the reasons, and what would make the values comparable.
     """
 
     kind: Literal["runs", "settings", "seconds", "figures"]
@@ -51,7 +59,7 @@ class Part:
 
 
 def runs_part(runs: Sequence[Contender]) -> Part:
-    """What the runs are."""
+    """Build the part that identifies the runs: folder, capture, preset, geometry, steps and health."""
     lines = {
         "folder": ("Folder", [str(run.path) for run in runs]),
         "capture": ("Capture", [run.capture.root.resolve().name for run in runs]),
@@ -62,43 +70,42 @@ def runs_part(runs: Sequence[Contender]) -> Part:
     }
     notes = [f"{run.label}: {note}" for run in runs for note in run.files.notes]
     notes += [
-        f"{run.label} was stopped before its first checkpoint and has nothing to show; it goes on with: "
+        f"{run.label} was stopped before its first checkpoint and cannot be rendered; to continue it: "
         f"neilfpp train --out {run.path} --resume"
         for run in runs
         if not run.has_model
     ]
-    rows = tuple(_words(key, title, values) for key, (title, values) in lines.items())
+    rows = tuple(_text_row(key, title, values) for key, (title, values) in lines.items())
     return Part("runs", "", "Runs", rows, notes=tuple(notes))
 
 
 def settings_part(runs: Sequence[Contender]) -> Part:
-    """The settings, the reading of the capture and the decided effects that are not the same in all runs."""
+    """Build the part with settings, options of reading the capture, and effects that differ between runs."""
     columns = [_settings(run) for run in runs]
     names = list(dict.fromkeys(name for column in columns for name in column))
     differing = [name for name in names if len({str(column.get(name)) for column in columns}) > 1]
-    rows = tuple(_words(name, name, [column.get(name) for column in columns]) for name in differing)
+    rows = tuple(_text_row(name, name, [column.get(name) for column in columns]) for name in differing)
     return Part("settings", "", "Settings that differ", rows)
 
 
 def seconds_part(runs: Sequence[Contender]) -> Part:
-    """Seconds of each stage, of each kind of work, and together; notes where machines differ."""
+    """Build the part with seconds by stage, by kind of work, and in total; a note says if machines differ."""
     stages = [_stages(run) for run in runs]
     kinds = [_kinds(run) for run in runs]
     rows = [
-        _seconds(stage, STAGE_TITLES.get(stage, stage), [column.get(stage) for column in stages])
+        _seconds_row(stage, STAGE_TITLES.get(stage, stage), [column.get(stage) for column in stages])
         for stage in dict.fromkeys(stage for column in stages for stage in column)
     ]
-    together = [sum(column.values()) if column else None for column in stages]
-    rows.append(_seconds("together", "Together", together))
-    rows += [
-        _seconds(f"work.{kind}", f"of which {kind.replace('_', ' ')}", [column.get(kind) for column in kinds])
-        for kind in dict.fromkeys(kind for column in kinds for kind in column)
-    ]
+    totals = [sum(column.values()) if column else None for column in stages]
+    rows.append(_seconds_row("together", "Total", totals))
+    for kind in dict.fromkeys(kind for column in kinds for kind in column):
+        title = f"of which {kind.replace('_', ' ')}"
+        rows.append(_seconds_row(f"work.{kind}", title, [column.get(kind) for column in kinds]))
     machines = {_machine(run): run.label for run in reversed(runs)}
     notes = []
     if len(machines) > 1:
         notes.append(
-            "machines differ, so seconds tell little: "
+            "the runs used different machines, so their times cannot be compared: "
             + "; ".join(f"{label} on {machine}" for machine, label in reversed(machines.items()))
         )
     return Part("seconds", "", "Seconds", tuple(rows), notes=tuple(notes))
@@ -121,11 +128,11 @@ def _stages(run: Contender) -> dict[str, float]:
 
 
 def _kinds(run: Contender) -> dict[str, float]:
-    found: dict[str, float] = {}
+    totals: dict[str, float] = {}
     for parts in run.files.work.values():
         for kind, seconds in parts.items():
-            found[kind] = found.get(kind, 0.0) + seconds
-    return found
+            totals[kind] = totals.get(kind, 0.0) + seconds
+    return totals
 
 
 def _machine(run: Contender) -> str:
@@ -135,11 +142,11 @@ def _machine(run: Contender) -> str:
     return f"{' and '.join(devices)}, {machine.get('threads')} threads" if machine else "an unknown machine"
 
 
-def _words(key: str, title: str, values: Sequence[Any]) -> Row:
+def _text_row(key: str, title: str, values: Sequence[Any]) -> Row:
     texts = tuple(None if value is None else str(value) for value in values)
     return Row(key, title, texts, tuple("–" if text is None else text for text in texts))
 
 
-def _seconds(key: str, title: str, values: Sequence[float | None]) -> Row:
-    shown = tuple("–" if value is None else f"{value:.1f}" for value in values)
-    return Row(key, title, tuple(values), shown, better="lower")
+def _seconds_row(key: str, title: str, values: Sequence[float | None]) -> Row:
+    texts = tuple("–" if value is None else f"{value:.1f}" for value in values)
+    return Row(key, title, tuple(values), texts, better="lower")

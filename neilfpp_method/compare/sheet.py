@@ -1,4 +1,4 @@
-"""The picture of a comparison: a section a view, a column for the truth and each run, a row for each map."""
+"""The image of a comparison: one section per view, columns for the truth and each run, one row per map."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from neilfpp_method.report.views import title_of
 
 __all__ = ["Column", "comparison_sheet", "shortened"]
 
-LETTERS_OF_A_LABEL = 27
-"""As many fit above a picture of a sheet."""
+MAX_LABEL = 27
+"""Number of characters that fit above an image of a sheet."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """What a run shows of the views: its label, and its maps, each with a comparison for every view."""
+    """The maps of one run; each has a comparison for every view."""
 
     label: str
     maps: tuple[ComparedMap, ...]
@@ -29,12 +29,12 @@ class Column:
 def comparison_sheet(
     title: str, views: Sequence[str], columns: Sequence[Column]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The sheet. A map that a run does not have leaves its cell empty, as does a truth that is not known.
+    """Draw the sheet. A cell is empty if the run does not have the map, or its truth is not known.
 
     Args:
-        title: of the sheet.
-        views: names, in the order of every map's comparisons.
-        columns: the runs, from left to right; the truth of a map is that of the first run that has one.
+        title: title of the sheet.
+        views: names of the views, in the order of the comparisons of every map.
+        columns: the runs from left to right. The truth of a map is taken from the first run that has it.
     """
     titles = list(dict.fromkeys(title_of(m) for column in columns for m in column.maps))
     by_title = [{title_of(m): m for m in column.maps} for column in columns]
@@ -43,24 +43,25 @@ def comparison_sheet(
     for i, view in enumerate(views):
         rows = tuple(_row(name, [maps.get(name) for maps in by_title], i) for name in titles)
         sections.append(Section((Group(f"View {view}", headings),), rows))
-    many = f"{len(views)} views" if len(views) != 1 else "one view"
-    return contact_sheet(title, f"{many} of {len(columns)} runs", sections)
+    number = f"{len(views)} views" if len(views) != 1 else "one view"
+    return contact_sheet(title, f"{number} of {len(columns)} runs", sections)
 
 
 def shortened(label: str) -> str:
-    """The label where it fits above a picture, else its two ends."""
-    if len(label) <= LETTERS_OF_A_LABEL:
+    """Shorten a label to `MAX_LABEL` characters by removing its middle."""
+    if len(label) <= MAX_LABEL:
         return label
-    end = LETTERS_OF_A_LABEL // 2
-    return f"{label[: LETTERS_OF_A_LABEL - end - 1]}…{label[-end:]}"
+    end = MAX_LABEL // 2
+    return f"{label[: MAX_LABEL - end - 1]}…{label[-end:]}"
 
 
 def _row(title: str, maps: Sequence[ComparedMap | None], view: int) -> Row:
     comparisons = [None if m is None else m.comparisons[view] for m in maps]
     truth = next((c.truth for c in comparisons if c is not None and c.truth is not None), None)
     note = next(m.note for m in maps if m is not None)
-    if note.startswith("scaled"):  # by other factors in every run
+    # The factors in the note are those of one run, and every run has its own.
+    if note.startswith("scaled"):
         note = "scaled per channel\nto fit the truth"
-    words = title.split(", ", 1)
-    # What follows a comma in a title is said by the note as well.
-    return Row(words[0], (truth, *(None if c is None else c.estimate for c in comparisons)), note)
+    # The note repeats what follows a comma in the title.
+    short_title = title.split(", ", 1)[0]
+    return Row(short_title, (truth, *(None if c is None else c.estimate for c in comparisons)), note)

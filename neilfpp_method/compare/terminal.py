@@ -1,4 +1,4 @@
-"""The table of a comparison in a terminal."""
+"""The table of a comparison for the terminal."""
 
 from __future__ import annotations
 
@@ -13,23 +13,25 @@ from neilfpp_method.compare.write import Comparison
 __all__ = ["tables_of"]
 
 ARROWS = {"higher": " ↑", "lower": " ↓", "neither": ""}
+"""Suffix of a row's title that tells which way is better."""
 MARK = " *"
-"""Behind a figure that is not to be compared with the others."""
+"""Suffix of a figure that cannot be compared with the others."""
 TITLE_WIDTH = 32
+"""Width of the titles of rows, characters."""
 WIDEST = 28
-"""Letters of a column; longer texts go on in the next line."""
+"""Largest width of a column, characters; longer texts are wrapped."""
 
 
-def tables_of(found: Comparison) -> Iterator[tuple[str, Table, tuple[str, ...]]]:
-    """Title, table and notes of each part; the best of the figures that can be compared are bold."""
-    texts = [[*found.labels], *(row.shown for part in found.parts for row in part.rows)]
+def tables_of(comparison: Comparison) -> Iterator[tuple[str, Table, tuple[str, ...]]]:
+    """Yield title, table and notes of each part. The best value among comparable figures is bold."""
+    texts = [[*comparison.labels], *(row.texts for part in comparison.parts for row in part.rows)]
     widths = [min(max(map(len, column)) + len(MARK), WIDEST) for column in zip(*texts, strict=True)]
-    for part in found.parts:
+    for part in comparison.parts:
         if not part.rows and not part.notes:
             continue
         table = Table(box=None, pad_edge=False, header_style="bold")
         table.add_column("", width=TITLE_WIDTH, overflow="fold")
-        for label, width in zip(found.labels, widths, strict=True):
+        for label, width in zip(comparison.labels, widths, strict=True):
             table.add_column(Text(label), justify="right", width=width, overflow="fold")
         for row in part.rows:
             table.add_row(Text(row.title + ARROWS[row.better]), *_cells(part, row))
@@ -38,13 +40,13 @@ def tables_of(found: Comparison) -> Iterator[tuple[str, Table, tuple[str, ...]]]
 
 def _cells(part: Part, row: Row) -> Iterator[Text]:
     best = _best(part, row)
-    for i, text in enumerate(row.shown):
+    for i, text in enumerate(row.texts):
         mark = MARK if i in part.apart and row.values[i] is not None else ""
         yield Text(text + mark, style="bold" if i in best else "")
 
 
 def _best(part: Part, row: Row) -> set[int]:
-    """The runs with the best value, of those that can be compared; none where there is nothing to compare."""
+    """Indices of the comparable runs with the best value; empty if fewer than two values differ."""
     values = {
         i: value
         for i, value in enumerate(row.values)

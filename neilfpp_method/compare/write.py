@@ -1,8 +1,10 @@
-"""`neilfpp compare`: runs side by side, as a table and a picture.
+"""`neilfpp compare`: compare runs in a table and an image.
 
-<out>/compare.json    what the table holds, with its notes
-<out>/compare.csv     the same, a line for each row
-<out>/compare.png     the same views of all runs beside the truth
+Files:
+
+    <out>/compare.json    the table with its notes
+    <out>/compare.csv     the table, one line per row
+    <out>/compare.png     the same views of all runs beside the truth
 """
 
 from __future__ import annotations
@@ -21,18 +23,24 @@ from neilfpp_method.compare.parts import Part, runs_part, seconds_part, settings
 from neilfpp_method.compare.sheet import Column, comparison_sheet
 from neilfpp_method.data.images import replacing, write_png
 from neilfpp_method.errors import UserError
-from neilfpp_method.report.views import Looked, look_at_views
-from neilfpp_method.train.run import check_writable, load_run, write_json
+from neilfpp_method.report.views import ComparedViews, compare_views
+from neilfpp_method.train.output import check_writable
+from neilfpp_method.train.run import load_run, write_json
 
 __all__ = ["FILES", "Comparison", "compare_runs"]
 
 FILES = ("compare.json", "compare.csv", "compare.png")
 FORMAT = 1
+"""Version of the format of compare.json."""
+MAX_VIEWS = 64
+"""Largest number of views in the image."""
+MIN_SIZE, MAX_SIZE = 16, 2048
+"""Smallest and largest longest side of a rendered view, pixels."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A table and what is to be known of it: a label for each run, parts, notes, and the files."""
+    """The result of a comparison: a label per run, the parts of the table, notes, and the files written."""
 
     labels: tuple[str, ...]
     parts: tuple[Part, ...]
@@ -48,62 +56,62 @@ def compare_runs(
     device: str,
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> Comparison:
-    """Compare runs, and write table and picture.
+    """Compare runs, and write the table and the image.
 
     Args:
-        paths: the runs' folders; the first is what the others are compared with.
+        paths: folders of the runs. The first run is the reference.
         out: the folder to write.
-        views: how many views the picture shows; 0: no picture, and nothing is rendered.
-        size: pixels of the longest side of a rendered view.
-        device: where to render.
-        on_progress: told the share that is done.
+        views: number of views in the image; if 0, nothing is rendered and no image is written.
+        size: longest side of a rendered view, pixels.
+        device: device on which views are rendered.
+        on_progress: called with the fraction of the work that is done.
 
     Raises:
-        UserError: something that is no run, an option out of range, or a place that cannot be written;
-            nothing is written then.
+        UserError: a folder is not a run, an option is out of range, or the output cannot be written. In these
+            cases nothing is written.
     """
-    if not 0 <= views <= 64:
-        raise UserError(f"a picture of {views} views", "give 0 to 64 with --views")
-    if not 16 <= size <= 2048:
-        raise UserError(f"pictures of {size} pixels", "give 16 to 2048 with --size")
+    if not 0 <= views <= MAX_VIEWS:
+        raise UserError(f"cannot show {views} views in one image", f"give 0 to {MAX_VIEWS} with --views")
+    if not MIN_SIZE <= size <= MAX_SIZE:
+        raise UserError(f"cannot render views of {size} pixels", f"give {MIN_SIZE} to {MAX_SIZE} with --size")
     check_writable(out / FILES[0])
     runs = read_contenders(paths)
     common = common_views(runs, views, size)
-    looked = _look(runs, common, device, on_progress) if common.names else {}
+    rendered = _render(runs, common, device, on_progress) if common.names else {}
     parts = [runs_part(runs), settings_part(runs), *figures_parts(runs, common.apart)]
-    if looked:
-        parts.append(_shown_part(runs, common, looked))
+    if rendered:
+        parts.append(_rendered_part(runs, common, rendered))
     parts.append(seconds_part(runs))
-    found = Comparison(tuple(run.label for run in runs), tuple(parts), common.notes, ())
-    return replace(found, files=_write(found, out, common, runs, looked))
+    comparison = Comparison(tuple(run.label for run in runs), tuple(parts), common.notes, ())
+    return replace(comparison, files=_write(comparison, out, common, runs, rendered))
 
 
-def _look(
+def _render(
     runs: Sequence[Contender], common: Common, device: str, on_progress: Callable[[float], None]
-) -> dict[int, Looked]:
-    """What each run shows of the common views, by its number; one model at a time is in memory."""
-    shown = [i for i, run in enumerate(runs) if run.has_model]
-    found = {}
-    for k, i in enumerate(shown):
+) -> dict[int, ComparedViews]:
+    """Render the common views of each run that has a model, by index; one model is in memory at a time."""
+    with_model = [i for i, run in enumerate(runs) if run.has_model]
+    rendered = {}
+    for k, i in enumerate(with_model):
         run = load_run(runs[i].path, device)
         run = replace(run, capture=capture_to_show(run.capture, common))
-        found[i] = look_at_views(run, False, lambda share, k=k: on_progress((k + share) / len(shown)))
-    return found
+        rendered[i] = compare_views(run, False, lambda share, k=k: on_progress((k + share) / len(with_model)))
+    return rendered
 
 
-def _shown_part(runs: Sequence[Contender], common: Common, looked: Mapping[int, Looked]) -> Part:
-    """Figures of the views in the picture: the same views at the same size for all runs."""
-    rows = figure_rows([looked[i].figures if i in looked else {} for i in range(len(runs))])
-    sources = {look.mask_source for look in looked.values()}
+def _rendered_part(runs: Sequence[Contender], common: Common, rendered: Mapping[int, ComparedViews]) -> Part:
+    """Figures of the views in the image: the same views at the same size for all runs."""
+    rows = figure_rows([rendered[i].figures if i in rendered else {} for i in range(len(runs))])
+    sources = {views.mask_source for views in rendered.values()}
     notes = []
     if len(sources) > 1 or "rendered opacity" in sources:
         notes.append(
-            "the capture does not say which pixels show the object, so each run counts those that it renders "
-            "as opaque; masks in the capture make that equal"
+            "the capture has no masks, so each run counts the pixels that it renders as opaque; masks in the "
+            "capture would make all runs count the same pixels"
         )
-    seen = "" if common.held_out else ", learned from"
-    many = f"{len(common.names)} views" if len(common.names) != 1 else "one view"
-    title = f"The picture's {many}, sides up to {common.longest} pixels{seen}"
+    trained = "" if common.held_out else ", used in training"
+    number = f"{len(common.names)} views" if len(common.names) != 1 else "one view"
+    title = f"The image's {number}, longest side {common.longest} pixels{trained}"
     return Part("figures", SHOWN, title, rows, notes=tuple(notes))
 
 
@@ -111,61 +119,66 @@ def _shown_part(runs: Sequence[Contender], common: Common, looked: Mapping[int, 
 
 
 def _write(
-    found: Comparison, out: Path, common: Common, runs: Sequence[Contender], looked: Mapping[int, Looked]
+    comparison: Comparison,
+    out: Path,
+    common: Common,
+    runs: Sequence[Contender],
+    rendered: Mapping[int, ComparedViews],
 ) -> tuple[Path, ...]:
-    files = [out / name for name in FILES]
-    if looked:
-        columns = [Column(runs[i].label, look.maps) for i, look in looked.items()]
+    json_file, csv_file, image_file = (out / name for name in FILES)
+    if rendered:
+        columns = [Column(runs[i].label, views.maps) for i, views in rendered.items()]
         title = f"{runs[0].capture.root.resolve().name}: {len(runs)} runs"
-        write_png(files[2], comparison_sheet(title, common.names, columns))
+        write_png(image_file, comparison_sheet(title, common.names, columns))
     else:
-        files[2].unlink(missing_ok=True)  # of an earlier comparison, which the table would not belong to
-    write_json(files[0], _plain(found, common))
-    with replacing(files[1]) as temporary:
-        temporary.write_text(_csv(found), encoding="utf-8")
-    return tuple(files if looked else files[:2])
+        # The image of an earlier comparison would not match the new table.
+        image_file.unlink(missing_ok=True)
+    write_json(json_file, _plain(comparison, common))
+    with replacing(csv_file) as temporary:
+        temporary.write_text(_csv(comparison), encoding="utf-8")
+    return (json_file, csv_file, image_file) if rendered else (json_file, csv_file)
 
 
-def _plain(found: Comparison, common: Common) -> dict[str, Any]:
-    """The table as plain values; numbers as they are, without rounding."""
+def _plain(comparison: Comparison, common: Common) -> dict[str, Any]:
+    """The table as plain values for JSON; numbers are not rounded."""
     parts = [
         {
             "kind": part.kind,
             "name": part.name,
             "title": part.title,
             "notes": list(part.notes),
-            "apart": [found.labels[i] for i in sorted(part.apart)],
+            "apart": [comparison.labels[i] for i in sorted(part.apart)],
             "rows": {
                 row.key: {
                     "title": row.title,
                     "better": row.better,
-                    "values": dict(zip(found.labels, row.values, strict=True)),
+                    "values": dict(zip(comparison.labels, row.values, strict=True)),
                 }
                 for row in part.rows
             },
         }
-        for part in found.parts
+        for part in comparison.parts
     ]
     return {
         "format": FORMAT,
-        "runs": list(found.labels),
+        "runs": list(comparison.labels),
         "views": list(common.names),
-        "notes": list(found.notes),
+        "notes": list(comparison.notes),
         "parts": parts,
     }
 
 
-def _csv(found: Comparison) -> str:
-    """A line for each row: kind, which protocol, key, and a value for each run.
+def _csv(comparison: Comparison) -> str:
+    """The table as CSV: one line per row with kind, protocol, key, and a value for each run.
 
-    The line `comparable` of figures says whether they may be compared with the first run's.
+    In a part of figures, the line `comparable` says whether they can be compared with the first run's.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["kind", "name", "key", *found.labels])
-    for part in found.parts:
+    writer.writerow(["kind", "name", "key", *comparison.labels])
+    for part in comparison.parts:
         if part.kind == "figures":
-            apart = ["no" if i in part.apart else "yes" for i in range(len(found.labels))]
+            apart = ["no" if i in part.apart else "yes" for i in range(len(comparison.labels))]
             writer.writerow([part.kind, part.name, "comparable", *apart])
         for row in part.rows:
             values = ["" if value is None else value for value in row.values]

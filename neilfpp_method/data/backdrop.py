@@ -1,8 +1,9 @@
-"""Whether a colour that most of the borders share is all that lies behind the scene.
+"""Test whether the colour that most image borders share is the background behind the scene.
 
-The ground under a sky, or a table that runs out of the picture, leaves half of the border to one colour as
-well. What tells them apart is the other views: a thing in the scene has a place that all views see covered, a
-sky has none (the visual hull of all that is not of the colour; Laurentini 1994).
+If the images show the ground under a sky, or a table that extends beyond the images, half of the border has
+one colour as well. The views together distinguish these cases: everything that is not background must lie
+inside the scene at a place that all views see covered, that is, in the visual hull (Laurentini 1994) of all
+pixels that do not have the background colour.
 """
 
 from __future__ import annotations
@@ -21,29 +22,29 @@ from neilfpp_method.structures import RayBatch
 __all__ = ["MAX_RAYS", "leaves_room"]
 
 MAX_RAYS = 1000
-"""Rays that are tested."""
+"""Largest number of rays that are tested."""
 PLACES = 65
-"""Points on each ray, evenly within the sphere around the scene box."""
+"""Number of test points on each ray, evenly spaced inside the sphere around the scene box."""
 RADIUS = math.sqrt(3.0)
-"""Of that sphere, scene units: it passes through the corners of the box."""
+"""Radius of that sphere, scene units: it passes through the corners of the box."""
 ROOM = 0.9
-"""Share of the rays that must have a point which nothing contradicts."""
+"""Share of the rays that must have a test point inside the visual hull."""
 
 
 def leaves_room(outlines: Sequence[Outline], rays: RayBatch, normalisation: Normalisation) -> bool:
-    """Whether what rays see that is not of the backdrop's colour can lie within the scene.
+    """Return whether the pixels that do not have the background colour can lie within the scene.
 
     Args:
-        outlines: what is not of that colour in each view; cameras in the world frame.
-        rays: through pixels that are not, scene frame.
-        normalisation: between the two.
+        outlines: for each view, the pixels without that colour; cameras in the world frame.
+        rays: rays through such pixels, in the scene frame.
+        normalisation: the transformation between the two frames.
     """
     held = agreement(outlines, _places(rays, normalisation)).reshape(len(rays), PLACES)
     return bool((held >= AGREEMENT).any(axis=1).mean() >= ROOM)
 
 
 def _places(rays: RayBatch, normalisation: Normalisation) -> Float64[np.ndarray, "P 3"]:
-    """Of a ray that passes the sphere by, the place nearest to it."""
+    """Test points on each ray, world frame; the closest point of a ray that misses the sphere."""
     origins, directions = rays.origins.double().cpu(), rays.directions.double().cpu()
     nearest = -(origins * directions).sum(-1, keepdim=True)
     missed = origins.square().sum(-1, keepdim=True) - nearest.square()

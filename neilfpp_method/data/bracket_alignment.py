@@ -1,10 +1,10 @@
-"""Hand-held brackets: the photographs of a pose are aligned with its middle exposure before merging.
+"""Alignment of hand-held exposure brackets with their middle exposure, before they are merged.
 
-Neighbours in exposure are compared, as these share most levels of light that neither clips, and the motions
-are chained. No response is needed: the levels of one image are first mapped to those of the other by their
-histograms (Grossberg and Nayar, 2003), which a motion of the camera hardly changes. OpenCV's median threshold
-bitmaps find the shift, least squares from coarse to fine (Baker and Matthews, 2004) the rest: a homography,
-which is what a turn of the camera does to a picture.
+Images of neighbouring exposures are registered, because they have the most unclipped pixels in common, and
+the motions are chained. The camera's response is not needed: the values of one image are first mapped to
+those of the other by histogram matching (Grossberg and Nayar, 2003), which a small motion hardly changes.
+Median threshold bitmaps (OpenCV) give the initial shift. Inverse compositional least squares from coarse to
+fine (Baker and Matthews, 2004) give a homography, the motion of an image when the camera rotates.
 """
 
 from __future__ import annotations
@@ -21,28 +21,30 @@ from neilfpp_method.data.brackets import MAX_VALUE, MIN_VALUE, Bracket
 __all__ = ["Aligned", "align"]
 
 SIDES = (128, 256, 512, 1024)
-"""Longer sides, pixels, of the reduced images that are aligned, coarse to fine."""
+"""Longer sides of the reduced images that are registered, in pixels, from coarse to fine."""
 ROUNDS = 20
 """Largest number of Gauss–Newton steps per size."""
 CONVERGED = 0.01
-"""Motion of a step, pixels of the reduced image, below which the search ends."""
+"""Motion of a Gauss–Newton step, in pixels of the reduced image, below which the iteration ends."""
 MIN_SHIFT = 0.25
-"""Pixels: an image whose corners move less is used as it is, without resampling."""
+"""Smallest corner motion, in pixels, for which an image is resampled; resampling blurs."""
 MAX_RESIDUAL = 0.8
-"""A motion is accepted if it leaves at most this share of the difference."""
+"""Largest ratio of the image difference after a motion to that before it with which a motion is accepted."""
 MAX_SHIFT = 0.15
-"""Share of the longer side that no hand moves between two exposures."""
+"""Largest accepted corner motion, as a share of the longer side; a larger one is taken for a failure."""
 MIN_OVERLAP = 0.02
-"""Least share of the pixels that both images must show unclipped."""
+"""Smallest share of pixels that must be unclipped in both images."""
 SHIFT_BITS = 5
-"""Power of two that bounds the shift of the coarse alignment, pixels."""
+"""Base-2 logarithm of the largest shift of the coarse alignment, in pixels of the reduced image."""
 
 
 @dataclass(frozen=True)
 class Aligned:
-    """An aligned bracket, and the largest motion that was undone, in pixels; 0 for a bracket on a tripod.
+    """An aligned bracket.
 
-    What an image does not show after its motion, and what it had clipped, is 1 there: no evidence.
+    Attributes:
+        bracket: the images; pixels that an image does not show after its motion, or had clipped, are 1.
+        moved: largest corner motion that was corrected, in pixels; 0 if no image was resampled.
     """
 
     bracket: Bracket
@@ -50,9 +52,9 @@ class Aligned:
 
 
 def align(bracket: Bracket) -> Aligned:
-    """Bring all images of a bracket onto the middle exposure.
+    """Align all images of a bracket with the middle exposure.
 
-    An image in which nothing tells how it moved goes the way of its neighbour in exposure.
+    An image that cannot be registered gets the motion of its neighbour in exposure.
     """
     order = [int(i) for i in np.argsort(bracket.exposures)]
     middle = len(order) // 2
@@ -77,7 +79,7 @@ def align(bracket: Bracket) -> Aligned:
 def _motion(
     fixed: Float32[np.ndarray, "H W 3"], moving: Float32[np.ndarray, "H W 3"]
 ) -> Float64[np.ndarray, "3 3"]:
-    """The homography from pixels of `fixed` to those of `moving`; the identity where none fits better."""
+    """The homography from pixels of `fixed` to pixels of `moving`; the identity if none fits better."""
     size = fixed.shape[:2]
     still = np.eye(3)
     pair = _pair(fixed, moving, SIDES[1])
@@ -97,8 +99,14 @@ def _motion(
 
 @dataclass(frozen=True)
 class _Pair:
-    """Two exposures in grey, reduced, the levels of the second mapped to those of the first; where they are
-    neither dark nor clipped; and the map from reduced to full pixels. Motions are said in full pixels.
+    """Two exposures, reduced and in grey, with the values of the second mapped to those of the first.
+
+    Attributes:
+        fixed: the first image.
+        moving: the second image.
+        fixed_seen: pixels of the first image that are neither dark nor clipped.
+        moving_seen: pixels of the second image that are neither dark nor clipped.
+        scale: the map from reduced to full pixels. Motions are given in full pixels.
     """
 
     fixed: Float32[np.ndarray, "h w"]
@@ -110,7 +118,7 @@ class _Pair:
     def warped(
         self, motion: Float64[np.ndarray, "3 3"]
     ) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-        """The second image after a motion, and where both are seen."""
+        """The second image after a motion, and the pixels that are usable in both images."""
         reduced = np.linalg.inv(self.scale) @ motion @ self.scale
         size, flags = self.fixed.shape[::-1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         seen = cv2.warpPerspective(self.moving_seen.astype(np.float32), reduced, size, flags=flags) > 0.99
@@ -127,13 +135,13 @@ def _pair(fixed: Float32[np.ndarray, "H W 3"], moving: Float32[np.ndarray, "H W 
     steps = np.linspace(0, 1, 256)
     matched = np.interp(second, np.quantile(second, steps), np.quantile(first, steps)).astype(np.float32)
     across, down = width / size[0], height / size[1]
-    # Pixels are counted from the centre of the first.
+    # The centre of the first pixel is (0, 0), as in OpenCV.
     scale = np.array([[across, 0, (across - 1) / 2], [0, down, (down - 1) / 2], [0, 0, 1]])
     return _Pair(first, matched, *seen, scale)
 
 
 def _first_shift(pair: _Pair) -> Float64[np.ndarray, "3 3"]:
-    """The shift under which both images are brighter than their medians in the same places."""
+    """The initial shift, by median threshold bitmaps."""
     levels = [np.rint(255 * image).astype(np.uint8) for image in (pair.fixed, pair.moving)]
     x, y = cv2.createAlignMTB(max_bits=SHIFT_BITS).calculateShift(*levels)
     motion = np.eye(3)
@@ -142,7 +150,7 @@ def _first_shift(pair: _Pair) -> Float64[np.ndarray, "3 3"]:
 
 
 def _refined(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
-    """The motion, from one that is nearly right, under which the images differ least but for gain and offset.
+    """The homography that minimises the difference of the images up to gain and offset, from an initial one.
 
     Inverse compositional Gauss–Newton: the derivatives are those of the fixed image, computed once.
     """
@@ -162,9 +170,8 @@ def _refined(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> Float64[np.ndar
             break
         off, known = (warped - pair.fixed)[seen], slopes[:, seen]
         typical = 1.5 * np.median(np.abs(off - np.median(off))) + 1e-4
-        weighted = known / np.maximum(
-            np.abs(off - np.median(off)) / typical, 1.0
-        )  # Huber: what moves on its own counts little
+        # Huber weights, because objects that move independently of the camera are outliers.
+        weighted = known / np.maximum(np.abs(off - np.median(off)) / typical, 1.0)
         step = np.linalg.lstsq(weighted @ known.T, weighted @ off, rcond=1e-9)[0]
         small = np.eye(3) + np.append(step[:8], 0).reshape(3, 3)
         change = centred @ np.linalg.inv(small) @ np.linalg.inv(centred)
@@ -176,7 +183,7 @@ def _refined(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> Float64[np.ndar
 
 
 def _difference(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> float:
-    """How unlike the images are after a motion: 1 − their correlation where both are seen."""
+    """The difference of the images after a motion: 1 − their correlation over the usable pixels."""
     warped, seen = pair.warped(motion)
     if seen.mean() < MIN_OVERLAP:
         return 1.0
@@ -185,7 +192,7 @@ def _difference(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> float:
 
 
 def _corner_shift(motion: Float64[np.ndarray, "3 3"], size: tuple[int, int]) -> float:
-    """How far the corner that moves most does, in pixels."""
+    """The largest motion of an image corner, in pixels."""
     height, width = size
     corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], np.float64)
     return float(np.linalg.norm(cv2.perspectiveTransform(corners[None], motion)[0] - corners, axis=1).max())
@@ -194,7 +201,7 @@ def _corner_shift(motion: Float64[np.ndarray, "3 3"], size: tuple[int, int]) -> 
 def _moved(
     image: Float32[np.ndarray, "H W 3"], motion: Float64[np.ndarray, "3 3"]
 ) -> Float32[np.ndarray, "H W 3"]:
-    """The image warped to the middle exposure, and 1 where a clipped or missing pixel contributes."""
+    """The image warped to the middle exposure; 1 where a clipped or missing pixel contributes."""
     size, flags = image.shape[1::-1], cv2.WARP_INVERSE_MAP
     moved = cv2.warpPerspective(
         image, motion, size, flags=cv2.INTER_CUBIC | flags, borderMode=cv2.BORDER_REPLICATE

@@ -1,4 +1,4 @@
-"""Folders of exposure brackets: which images belong together, and all of them merged into linear EXR."""
+"""Find the exposure brackets of a folder and merge each of them into a linear EXR image."""
 
 from __future__ import annotations
 
@@ -24,31 +24,37 @@ from neilfpp_method.errors import UserError
 __all__ = ["GROUPS", "Brackets", "find_brackets", "merge_brackets"]
 
 Brackets = Mapping[str, Mapping[Path, float]]
-"""By the name of the pose, its images with their exposures."""
+"""For each pose, by name, its images with their exposures."""
 
 GROUPS = "brackets.json"
+"""File that lists the images of each pose."""
+
 NUMBERED = re.compile(r"[_-]\d+$")
+"""Number at the end of a name, NAME_0 or NAME-0."""
+
 CALIBRATED = 6
-"""Largest number of brackets that a response is calibrated from."""
+"""Largest number of brackets from which a response is calibrated."""
 CALIBRATION_SIDE = 1024
-"""Longest side, pixels, of the images that a response is calibrated from."""
+"""Longest side of the images for the calibration of a response, in pixels; bounds the memory."""
 
 
 def find_brackets(folder: Path, exposures: Path | None = None, unreadable: Collection[Path] = ()) -> Brackets:
-    """The brackets of a folder.
+    """Find the brackets of a folder.
 
-    Images belong together when `brackets.json` says so ({"pose": ["a.jpg", "b.jpg"]}); when they lie in one
-    sub-folder; when their names are NAME_0, NAME_1, …; or when, in the order of their names, the same
-    exposures return again and again.
+    Images belong to one bracket if `brackets.json` lists them together ({"pose": ["a.jpg", "b.jpg"]}), if
+    they lie in one sub-folder, if their names are NAME_0, NAME_1, …, or if, in the order of the names, the
+    exposures repeat with a fixed period.
 
     Args:
-        folder: where the images are.
-        exposures: a file of exposures, as `exposures_of` reads it; none: beside the images, or from EXIF.
-        unreadable: images that are known to be damaged. They keep their places in the brackets, with the
-            exposure NaN, so that the brackets they spoil can be told from the others.
+        folder: the folder of the images.
+        exposures: a file of exposures, as `exposures_of` reads it; if None, the file beside the images, or
+            EXIF.
+        unreadable: images that are known to be damaged. They stay in their brackets, with the exposure NaN,
+            so that the caller can identify the brackets that they spoil.
 
     Raises:
-        UserError: no brackets, an image without an exposure, or two images of a bracket with the same one.
+        UserError: there are no brackets, an image has no exposure, or two images of a bracket have the same
+            one.
     """
     listed = _listed_groups(folder, unreadable)
     images = [image for group in listed.values() for image in group]
@@ -70,7 +76,7 @@ def find_brackets(folder: Path, exposures: Path | None = None, unreadable: Colle
 
 
 def _listed_groups(folder: Path, unreadable: Collection[Path]) -> Mapping[str, Sequence[Path]]:
-    """Groups as files and folders name them; of images that only differ in a number, one group."""
+    """Groups by `brackets.json`, by names that differ only in a number, or by sub-folders."""
     path = folder / GROUPS
     if path.is_file():
         try:
@@ -108,7 +114,7 @@ def _images(folder: Path) -> list[Path]:
 def _returning_groups(
     images: Sequence[Path], exposures: Mapping[Path, float]
 ) -> Mapping[str, Sequence[Path]]:
-    """Runs of the shortest period of the exposures; the whole sequence where there is none."""
+    """Groups by the shortest period with which the exposures repeat; one group if they do not repeat."""
     period = next(
         n
         for n in range(1, len(images) + 1)
@@ -133,20 +139,20 @@ def merge_brackets(
     response: Literal["auto", "linear", "srgb"] = "auto",
     on_merged: Callable[[str, float | None], None] = lambda name, moved: None,
 ) -> None:
-    """For every pose, write linear float `images/NAME.exr` and `valid/NAME.png`, white: radiance is known.
+    """Merge each bracket into a linear image `images/NAME.exr` and a validity mask `valid/NAME.png`.
 
-    All are on one radiance scale, in which 1 is about the white of the middle exposure; photographs taken by
-    hand are brought onto the middle one. A pose whose two files are there is passed over, so that a call that
-    was interrupted goes on.
+    All images have the same radiance scale, in which 1 is about the white of the middle exposure. Hand-held
+    photographs are aligned with the middle one. A pose whose two files exist already is skipped, so that an
+    interrupted call can be repeated.
 
     Args:
-        brackets: the photographs, as `find_brackets` tells them.
-        images: where the merged images go.
-        valid: where the validity masks go.
-        response: what the pixels are; auto: linear for camera RAW, else calibrated from the brackets
-            themselves.
-        on_merged: called once a pose's files are there, with its name and by how many pixels, at most, its
-            photographs had to be moved; none where the pose was passed over.
+        brackets: the result of `find_brackets`.
+        images: folder of the merged images.
+        valid: folder of the validity masks, which are white where radiance is known.
+        response: response curve of the pixels; "auto": linear for camera RAW, else calibrated from the
+            brackets.
+        on_merged: called when the files of a pose exist, with its name and the largest motion of its
+            photographs in pixels, which is None if the pose was skipped.
 
     Raises:
         UserError: an image cannot be read; the images of a pose differ in size; or the response cannot be
@@ -181,13 +187,13 @@ def _response(brackets: Brackets, response: str) -> Response:
 
 
 def _thin(bracket: Bracket) -> Bracket:
-    """A subset of the pixels, enough to calibrate from: all photographs at once would fill the memory."""
+    """A subset of the pixels for the calibration: all photographs together may not fit into memory."""
     step = -(-max(bracket.pixels[0].shape[:2]) // CALIBRATION_SIDE)
     return Bracket(tuple(pixels[::step, ::step].copy() for pixels in bracket.pixels), bracket.exposures)
 
 
 def _read(bracket: Mapping[Path, float], unit: float) -> Aligned:
-    """The pixels of a bracket, on one another, and its exposures in a unit."""
+    """Read and align the images of a bracket, with exposures relative to `unit`."""
     frames = {path: _frame(path) for path in bracket}
     first = next(iter(frames))
     for path, frame in frames.items():

@@ -1,8 +1,8 @@
-"""Exposure brackets, photographs of one pose at several exposures, merged into linear radiance.
+"""Merge exposure brackets, photographs of one pose at several exposures, into linear radiance.
 
 The camera's response is known (linear, sRGB) or calibrated by OpenCV's implementation of Debevec and Malik
-(SIGGRAPH 1997). The merge is our own: OpenCV's takes 8 bits a pixel alone, and does not say what is clipped
-at every exposure.
+(SIGGRAPH 1997). OpenCV's merge is not used, because it takes 8-bit images only and does not report which
+pixels are clipped at every exposure.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from neilfpp_method.shading.color import srgb_to_linear
 __all__ = ["Bracket", "Merged", "Response", "calibrate", "linear_response", "merge", "srgb_response"]
 
 Response = Callable[[Float32[np.ndarray, "H W 3"]], Float32[np.ndarray, "H W 3"]]
-"""From pixels in [0, 1] to the light that they took in, up to one factor."""
+"""Function from pixel values in [0, 1] to exposure (radiance times time), up to a constant factor."""
 
 MIN_VALUE, MAX_VALUE = 4 / 255, 250 / 255
-"""Encoded values that are used; outside them a pixel is too dark or clipped."""
+"""Range of encoded values that are used; outside it a pixel is too dark or clipped."""
 SAMPLES_SIDE = 16
-"""Pixels per side of the grid that the response is calibrated from."""
+"""Side of the square of sampled pixels from which the response is calibrated."""
 SMOOTHNESS = 30.0
-"""Weight of the response's smoothness; OpenCV's default, 10, follows errors of hand-held photographs."""
+"""Weight of the smoothness of the response; OpenCV's default of 10 overfits errors of hand-held brackets."""
 NOISE = 3
-"""Levels of 255 by which a longer exposure may be darker than a shorter one."""
+"""Largest amount, in 8-bit levels, by which noise may make a longer exposure darker than a shorter one."""
 
 
 @dataclass(frozen=True)
 class Bracket:
-    """Pixels of one pose, in [0, 1], and the exposure of each image."""
+    """Images of one pose, with values in [0, 1], and the exposure of each image."""
 
     pixels: tuple[Float32[np.ndarray, "H W 3"], ...]
     exposures: tuple[float, ...]
@@ -43,7 +43,7 @@ class Bracket:
 
 @dataclass(frozen=True)
 class Merged:
-    """Linear radiance, and where it is known: a pixel clipped at every exposure holds only a lower bound."""
+    """Linear radiance, and where it is valid: a pixel that is clipped at every exposure is a lower bound."""
 
     radiance: Float32[np.ndarray, "H W 3"]
     valid: Bool[np.ndarray, "H W"]
@@ -53,21 +53,21 @@ class Merged:
 
 
 def linear_response(pixels: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
-    """Pixels that are proportional to light."""
+    """Response of pixels that are proportional to radiance."""
     return pixels
 
 
 def srgb_response(pixels: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
-    """Pixels that an sRGB curve has encoded."""
+    """Response of pixels that are encoded with the sRGB curve."""
     return srgb_to_linear(torch.from_numpy(pixels)).numpy()
 
 
 def calibrate(brackets: Sequence[Bracket]) -> Response:
-    """The response of the camera that took brackets, all at the same exposures, with 8 bits a pixel.
+    """Calibrate the response of a camera from 8-bit brackets that all have the same exposures.
 
-    Debevec and Malik's linear system for 256 pixels, whose sums over the exposures are evenly spaced: so all
-    levels of light count alike, whatever fills most of the picture. Pixels that a longer exposure shows
-    darker are left out, unless most are: there something moved, or an image that was aligned shows nothing.
+    The linear system of Debevec and Malik is solved for 256 pixels, whose sums over the exposures are evenly
+    spaced, so that all brightness levels have the same weight. Pixels that are darker in a longer exposure
+    are left out unless they are the majority: something moved there, or an aligned image has no data.
 
     Raises:
         UserError: the images do not determine a response that increases.
@@ -90,7 +90,7 @@ def calibrate(brackets: Sequence[Bracket]) -> Response:
     inner = curve[round(255 * MIN_VALUE) : round(255 * MAX_VALUE) : 16]
     if not np.isfinite(curve).all() or (np.diff(inner, axis=0) <= 0).any():
         raise UserError(
-            "the camera's response cannot be told from these brackets: it would not increase",
+            "the camera's response cannot be calibrated from these brackets: it would not increase",
             "use three or more exposures a stop or two apart, or give the response (linear or srgb)",
         )
     level = np.linspace(0.0, 1.0, 256)
@@ -106,12 +106,14 @@ def calibrate(brackets: Sequence[Bracket]) -> Response:
 
 
 def merge(bracket: Bracket, response: Response) -> Merged:
-    """Radiance E = Σ w f(z)/t / Σ w over the exposures t, per channel, in the unit of f per unit of t.
+    """Compute radiance E = Σ w f(z)/t / Σ w over the exposures t, per channel, in the unit of f per unit of
+    t.
 
-    w = t · max(min(z − z₀, z₁ − z), 0): photon noise makes the variance of f(z)/t proportional to 1/t, and
-    values fade out towards both ends of the range. A channel that is dark at every exposure takes its value
-    from the longest, whose error is small as an amount of light; one that is clipped at every exposure takes
-    the shortest's, and the pixel is invalid. 1, a clipped value, also stands for what an image does not show.
+    The weight is w = t · max(min(z − z₀, z₁ − z), 0), because photon noise makes the variance of f(z)/t
+    proportional to 1/t, and values near both ends of the range are unreliable. A channel that is dark at
+    every exposure takes the value of the longest exposure, whose absolute error is small. A channel that is
+    clipped at every exposure takes the value of the shortest one, and the pixel is invalid. The value 1,
+    which is clipped, also marks pixels that an image does not show.
     """
     first, *_ = order = np.argsort(bracket.exposures)
     total = np.zeros_like(bracket.pixels[0])

@@ -1,6 +1,7 @@
-"""A capture: posed images of a scene, found by one of several readers, checked, normalised and split.
+"""A capture: posed images of a scene, read from one of several layouts, checked, normalised and split.
 
-All that the headers tell is checked here, before a run starts; pixels are checked when they are loaded.
+Everything that the headers contain is checked here, before a run starts; pixels are checked when they are
+loaded.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ from neilfpp_method.errors import UserError
 __all__ = ["FOUND", "READERS", "Camera", "Capture", "Normalisation", "Reader", "View", "load_capture"]
 
 TEST_EVERY = 8
-# How a line about the scene box ends.
+"""Default split: every 8th view is a test view, as in mip-NeRF 360 and many papers after it."""
+
 FOUND: Mapping[SceneSource, str] = {
     "box": ", as the capture says",
     "points": ", told by the points",
@@ -40,18 +42,19 @@ FOUND: Mapping[SceneSource, str] = {
     "masks": ", told by the masks",
     "cameras": ", guessed from the cameras alone: add masks, points or a scene box where it is wrong",
 }
+"""Where the scene box comes from, as the end of a line about it."""
 
 
 class Reader(Protocol):
-    """A module that reads one layout; `LAYOUT` says in a few words what it looks for."""
+    """A module that reads one layout; `LAYOUT` describes the layout in a few words."""
 
     LAYOUT: str
 
     def recognise(self, root: Path) -> bool:
-        """Whether the folder has this layout; cheap."""
+        """Return whether the folder has this layout, without reading large files."""
 
     def read(self, root: Path) -> CaptureFiles:
-        """The capture's files; a `UserError` where they contradict the layout."""
+        """Read the files of the capture; raises a `UserError` if they contradict the layout."""
 
 
 READERS: Mapping[str, Reader] = {
@@ -63,16 +66,23 @@ READERS: Mapping[str, Reader] = {
     "colmap": colmap,
     "nero": nero,
 }
-"""In the order in which they are asked."""
+"""The readers by the name of the layout; the first that recognises a folder reads it."""
 
 
 @dataclass(frozen=True)
 class Capture:
-    """A checked capture. Cameras are in the world frame; `normalisation` leads to the scene frame.
+    """A checked capture.
 
-    `hdr`: pixels are linear radiance; otherwise they are display values (sRGB). `test` names the views that
-    are held out. `inputs` is the folder of masks, depth maps and other companions of the images. `scene_from`
-    is what told the normalisation.
+    Attributes:
+        root: folder of the capture.
+        format: name of its layout in `READERS`.
+        inputs: folder of masks, depth maps and other companions of the images.
+        views: all views, with cameras in the world frame.
+        normalisation: the transformation from the world frame to the scene frame.
+        hdr: whether pixels are linear radiance; otherwise they are display values (sRGB).
+        test: names of the test views.
+        point_cloud: oriented point cloud; None if there is none.
+        scene_from: where the normalisation comes from.
     """
 
     root: Path
@@ -87,17 +97,17 @@ class Capture:
 
     @property
     def train_views(self) -> tuple[View, ...]:
-        """The views to learn from, in order."""
+        """The training views, in order."""
         return tuple(view for view in self.views if view.name not in self.test)
 
     @property
     def test_views(self) -> tuple[View, ...]:
-        """The views held out, in order."""
+        """The test views, in order."""
         return tuple(view for view in self.views if view.name in self.test)
 
     @property
     def summary(self) -> str:
-        """The capture in three lines, for people."""
+        """The capture in three lines for the console."""
         sizes = sorted({(view.camera.width, view.camera.height) for view in self.views})
         size = f"{sizes[0][0]}×{sizes[0][1]}" if len(sizes) == 1 else f"{len(sizes)} sizes"
         masks = sum(view.mask is not None for view in self.views)
@@ -126,15 +136,15 @@ def load_capture(
 
     Args:
         root: the capture's folder.
-        format: a name in `READERS`; none: the first reader that recognises the folder.
-        test_every: hold out every k-th view, from the k-th on; 0 holds out none. Overrides `split.json`.
-        test: hold out these views, by name or by number; overrides both. Without any of the three the
-            capture's own split counts, and without one every 8th view is held out.
-        response: whether pixels are linear radiance or display values; auto: as the capture says, and where
+        format: a name in `READERS`; if None, the first reader that recognises the folder.
+        test_every: hold out every k-th view, from the k-th on; 0 holds out no view. Overrides `split.json`.
+        test: hold out these views, by name or by number; overrides `test_every` and `split.json`. Without any
+            of the three, the split of the capture is used, and if it has none, every 8th view is held out.
+        response: whether pixels are linear radiance or display values; "auto": as the capture states, and if
             it does not, floating-point files are linear.
 
     Raises:
-        UserError: the capture cannot be used; names the file and the remedy.
+        UserError: the capture cannot be used; the message names the file and the remedy.
     """
     root = Path(root)
     if not root.is_dir():
@@ -173,7 +183,7 @@ def _recognise(root: Path) -> str:
 
 
 def _photographs(root: Path) -> int:
-    """How many photographs lie in a folder and in its own folders, as `neilfpp prepare` takes them."""
+    """Number of photographs in a folder and its direct sub-folders."""
     files = [*root.glob("*"), *root.glob("*/*")]
     return sum(
         file.suffix.lower() in (*IMAGE_SUFFIXES, *RAW_SUFFIXES)
@@ -183,7 +193,7 @@ def _photographs(root: Path) -> int:
 
 
 def _check_views(views: tuple[View, ...]) -> bool:
-    """Names, cameras, sizes and kinds of all views; whether the files are HDR."""
+    """Check names, cameras, image sizes and pixel types of all views; return whether the files are HDR."""
     names: dict[str, View] = {}
     hdr: dict[bool, View] = {}
     for view in views:
@@ -245,7 +255,7 @@ def _test_views(
 
 
 def _named(views: tuple[View, ...], wanted: Collection[str | int], where: str) -> frozenset[str]:
-    """The names of views that are given by name or by number."""
+    """Names of views that are given by name or by number."""
     names = {**{view.index: view.name for view in views}, **{view.name: view.name for view in views}}
     for key in wanted:
         if key not in names:

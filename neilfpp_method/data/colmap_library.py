@@ -1,13 +1,13 @@
-"""pycolmap, for every module that needs it: `from neilfpp_method.data.colmap_library import pycolmap`.
+"""The import of pycolmap for all modules: `from neilfpp_method.data.colmap_library import pycolmap`.
 
-Loaded before OpenCV, it brings its own zlib into the process first, and OpenCV's PNG writer then aborts with
-"free(): invalid pointer". OpenCV is therefore loaded before it, here and nowhere else.
+If pycolmap is loaded before OpenCV, its own zlib is used by OpenCV's PNG writer, which then aborts with
+"free(): invalid pointer". OpenCV is therefore imported first, here.
 
-It also has SIGTERM print a stack trace, as if the program had failed. What SIGTERM did before comes back,
-and a SIGTERM that arrives while it is loaded waits until then.
+pycolmap installs a handler that prints a stack trace on SIGTERM. The previous handler is restored, and a
+SIGTERM that arrives during the import is delivered afterwards.
 
-Its interface changes with its versions, so others than those that this project is made for are refused when
-they are loaded, and not somewhere in the middle of the work.
+The interface of pycolmap changes between versions, so unsupported versions are refused at the import and not
+in the middle of a command.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ with sigterm_waits():
 __all__ = ["pycolmap"]
 
 MIN_VERSION, END_VERSION = (4, 2), (5, 0)
-"""Versions of pycolmap that are supported: from the first, before the second."""
+"""Supported versions of pycolmap: from the first, and before the second."""
 
 if not MIN_VERSION <= tuple(int(part) for part in pycolmap.__version__.split(".")[:2]) < END_VERSION:
     raise UserError(
-        f"pycolmap {pycolmap.__version__} is installed, of another interface",
+        f"pycolmap {pycolmap.__version__} is installed and has another interface",
         "pip install 'pycolmap>=4.2,<5'",
     )

@@ -1,12 +1,11 @@
-"""Which pixels a step learns from: with masks, most of them on the object or near its outline.
+"""Random choice of the pixels of a training step: with masks, most of them on the object or near its outline.
 
-What a pixel far off the object shows is known after a few steps, so a step that draws uniformly from pictures
-of one object under a sky spends most of its rays on nothing. Where the object is known, `NEAR_SHARE` of a
-step's pixels are drawn from those on it or near its outline, and the rest from all others; within each of the
-two every pixel is as likely as any other. Where nothing is known of the object, all valid pixels are alike.
+The background far from the object is learned in a few steps, so uniform sampling would spend most rays on it.
+If the object is known, `NEAR_SHARE` of the pixels of a step are drawn from those on the object or near its
+outline, and the rest from all other pixels, both uniformly. Otherwise all valid pixels are equally likely.
 
-The loss stays a plain mean over the pixels that are drawn: it is weighted towards the object on purpose, and
-no importance weights take that back.
+The loss is the plain mean over the drawn pixels. It is weighted towards the object on purpose; there are no
+importance weights to compensate for it.
 """
 
 from __future__ import annotations
@@ -22,27 +21,27 @@ __all__ = ["BLOCK", "KNOWN", "MASK", "NEAR", "VALID", "PixelDraws", "PixelSet", 
 VALID, MASK, KNOWN, NEAR = 1, 2, 4, 8
 """Bits of a pixel: valid; on the object; whether that is known; on the object or near its outline."""
 NEAR_SHARE = 0.85
-"""Share of a step's pixels that are on the object or near its outline, where masks tell it."""
+"""Share of the pixels of a step that are on the object or near its outline, if the object is known."""
 NEAR_DISTANCE = 0.08
-"""How far from the object a pixel is near it: this share of the longer side of the image."""
+"""Largest distance of a near pixel from the object, as a share of the longer side of the image."""
 SMALL_SIDE = 256
-"""Longest side, pixels, at which nearness is decided."""
+"""Longest side of the reduced mask in which near pixels are computed, in pixels."""
 BLOCK = 1024
-"""Pixels of a block, whose chosen pixels are counted; pixel planes are padded to whole blocks."""
+"""Number of pixels of a block, the unit of the counts of `PixelSet`; arrays are padded to whole blocks."""
 COUNTED = 2**14
-"""Blocks that are counted together."""
+"""Number of blocks that are counted at once; bounds the memory."""
 
 
 class PixelSet:
-    """The numbers of the pixels with certain bits among P, drawn uniformly and independently.
+    """The indices of the pixels with certain bits, for uniform and independent draws.
 
-    The k-th such pixel is looked up: its block by the running count, then its place in the block. That takes
-    a byte a pixel, wherever that byte is, and 8 bytes a block in memory.
+    The k-th such pixel is found by its block, from cumulative counts, and then within the block. This takes 8
+    bytes of memory per block beside the array of bits, which may be a memory-mapped file.
 
     Args:
-        bits: of all pixels; a whole number of blocks, 0 in what is padded.
-        of: the bits that are looked at.
-        are: what they are.
+        bits: the bits of all pixels; a whole number of blocks, 0 in the padding.
+        of: mask of the bits that are compared.
+        are: required value of these bits.
     """
 
     def __init__(self, bits: UInt8[np.ndarray, " P"], of: int, are: int) -> None:
@@ -55,11 +54,11 @@ class PixelSet:
         return (self._bits[blocks] & self._of) == self._are
 
     def draw(self, count: int) -> Int[Tensor, " count"]:
-        """`count` numbers, by torch's global generator on the CPU."""
+        """Draw `count` indices with torch's global generator on the CPU."""
         return self.find(torch.randint(self.count, (count,)))
 
     def find(self, kth: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
-        """The number of the k-th pixel of the set, k from 0 to `count` − 1."""
+        """Return the index of the k-th pixel of the set, k from 0 to `count` − 1."""
         wanted = kth.numpy()
         block = np.searchsorted(self._before, wanted, side="right") - 1
         running = self._chosen(block).cumsum(axis=1, dtype=np.int32)
@@ -68,10 +67,10 @@ class PixelSet:
 
 
 class PixelDraws:
-    """Draws of a step's pixels.
+    """The distribution from which the pixels of a step are drawn.
 
     Args:
-        bits: of all pixels, as for `PixelSet`. Where a pixel has `NEAR`, the object is known.
+        bits: the bits of all pixels, as for `PixelSet`. If any pixel has `NEAR`, the object is known.
         total: number of pixels without the padding.
     """
 
@@ -80,39 +79,41 @@ class PixelDraws:
         self._left_out = torch.zeros(0, dtype=torch.long)
         near = PixelSet(bits, VALID | NEAR, VALID | NEAR)
         self._all = self.valid.count == total
-        # Nearly everything may be near the object already, and none of it the rest.
+        # If nearly all pixels are near the object, the draws are uniform.
         self._parts = None
         if 0 < near.count < NEAR_SHARE * self.valid.count:
             self._parts = (near, PixelSet(bits, VALID | NEAR, VALID))
 
     def leave_out(self, numbers: Int[Tensor, " N"]) -> None:
-        """Draw these pixels no more; they must be few among those near the object and among the rest."""
+        """Exclude pixels from all later draws; they must be few, near the object and elsewhere."""
         self._left_out = numbers
 
     def draw(self, count: int) -> Int[Tensor, " count"]:
-        """`count` indices of valid pixels, with repetition, from torch's global CPU generator; unordered."""
+        """Draw `count` indices of valid pixels, with repetition and in random order."""
         if self._parts is None:
             return self._of(self.valid, count)
         near, rest = self._parts
         first = round(NEAR_SHARE * count)
         drawn = torch.cat([self._of(near, first), self._of(rest, count - first)])
-        # A step may use the first pixels alone.
+        # Shuffled, because a step may use the first pixels only.
         return drawn[torch.randperm(count)]
 
     def _of(self, pixels: PixelSet, count: int) -> Int[Tensor, " count"]:
-        """Numbers from one set. Those that are left out are drawn again: all others stay equally likely."""
+        """Draw from one set; excluded pixels are drawn again, so that all others stay equally likely."""
         drawn = self._any_of(pixels, count)
         while len(again := torch.nonzero(torch.isin(drawn, self._left_out))[:, 0]):
             drawn[again] = self._any_of(pixels, len(again))
         return drawn
 
     def _any_of(self, pixels: PixelSet, count: int) -> Int[Tensor, " count"]:
-        everything = self._all and pixels is self.valid  # needs no look-up
+        # If all pixels are valid, the k-th valid pixel is pixel k.
+        everything = self._all and pixels is self.valid
         return torch.randint(pixels.count, (count,)) if everything else pixels.draw(count)
 
 
 def near_object(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Pixels on the object or within `NEAR_DISTANCE` of it, to a pixel of a picture of `SMALL_SIDE`.
+    """Return the pixels on the object or within `NEAR_DISTANCE` of it, computed at `SMALL_SIDE` pixels a
+    side.
 
     >>> mask = np.zeros((100, 100), bool)
     >>> mask[50, 50] = True

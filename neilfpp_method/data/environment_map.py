@@ -1,4 +1,4 @@
-"""Environment maps in: a file whose radiance is known, in latitude and longitude (docs/light.md)."""
+"""Read environment maps of known radiance, in latitude and longitude (docs/light.md)."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from neilfpp_method.errors import UserError
 __all__ = ["check_environment", "read_environment"]
 
 MIN_ROWS, MIN_COLUMNS = 4, 8
-"""Smallest map, texels."""
+"""Smallest size of a map, in texels."""
 MAX_ROWS, MAX_COLUMNS = 2048, 4096
-"""Largest map, texels: bounds the memory."""
+"""Largest size of a map, in texels; bounds the memory."""
 
 
 def check_environment(path: Path) -> None:
-    """That a file says of itself that it can be an environment map; its pixels are not read.
+    """Check that the header of a file is that of an environment map, without reading its pixels.
 
     Raises:
-        UserError: no such file, no EXR, or a size from below 4×8 or above 2048×4096 (rows×columns).
+        UserError: the file does not exist, is no EXR file, or is smaller than 4×8 or larger than 2048×4096
+            texels.
     """
     if path.suffix.lower() != ".exr":
         raise UserError(f"{path}: an environment map is linear radiance in an EXR file", "convert it to EXR")
@@ -37,7 +38,7 @@ def check_environment(path: Path) -> None:
 
 
 def read_environment(path: Path) -> Float[Tensor, "3 H W"]:
-    """Linear radiance of a lat-long map, rows from +z down; one channel counts for all three.
+    """Read the linear radiance of a lat-long map, with rows from +z downwards; a single channel is repeated.
 
     Raises:
         UserError: as `check_environment`, or the pixels cannot be read, are NaN, infinite or negative, or all

@@ -1,8 +1,8 @@
-"""OpenEXR: which part and which channels of a file are the picture, and where its pixels lie in the frame.
+"""OpenEXR files: choose the part and the channels that are the image, and place its pixels in the frame.
 
-Renderers store many things in one file. The picture is R, G, B wherever it is in the file; else that of the
-one layer that has these, or of Blender's "Combined" among several; else X, Y, Z; else a single channel. The
-alpha of its layer goes with it.
+Renderers store many layers in one file. The image is the first of these that exists: R, G, B in any part; R,
+G, B of the only layer that has them, or of Blender's layer "Combined" if there are several; X, Y, Z; a single
+channel. The alpha channel of the same layer belongs to it.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ VECTOR = ("X", "Y", "Z")
 SINGLE = (("Y",), ("Z",))
 COMBINED = "Combined"
 CHROMA = "RY"
-"""Beside a luminance: its chroma at half the resolution."""
+"""Chroma channel of luminance/chroma images, stored at half the resolution. They are not supported."""
 
 
 @dataclass(frozen=True)
 class Window:
-    """Where pixels lie, in OpenEXR's inclusive integer coordinates."""
+    """A rectangle of pixels; `box` in `of` has OpenEXR's inclusive integer coordinates."""
 
     left: int
     top: int
@@ -46,17 +46,17 @@ class Window:
 
 @dataclass(frozen=True)
 class ExrHeader:
-    """The frame, of which the camera speaks, and what is stored of it in each of the file's parts."""
+    """The display window, to which the camera refers, and the data window of each part of the file."""
 
     frame: Window
     stored: tuple[Window, ...]
 
 
 def exr_header(path: Path) -> ExrHeader:
-    """The header of a file, no pixels.
+    """Read the header of a file.
 
     Raises:
-        UserError: nothing in it is a picture.
+        UserError: no part has channels of an image.
     """
     parts = OpenEXR.File(str(path), header_only=True).parts
     picture = _picture(path, [[channel.name for channel in part.header["channels"]] for part in parts])
@@ -65,15 +65,14 @@ def exr_header(path: Path) -> ExrHeader:
 
 
 def exr_samples(path: Path) -> Float32[np.ndarray, "H W C"]:
-    """The picture in its frame, alpha last; 0 where the file has no pixels.
+    """Read the pixels of the display window, alpha last; 0 outside of the data window.
 
     Raises:
-        UserError: nothing in the file is a picture.
-        ValueError: it is damaged.
+        UserError: no part has channels of an image.
+        ValueError: the file is damaged.
     """
-    with redirect_stdout(
-        io.StringIO()
-    ):  # where a file is damaged, OpenEXR says so there, and goes on without the part
+    # OpenEXR reports a damaged part on standard output and continues without it.
+    with redirect_stdout(io.StringIO()):
         parts = OpenEXR.File(str(path), separate_channels=True).parts
     if not parts:
         raise ValueError("damaged, or cut off")
@@ -86,7 +85,7 @@ def exr_samples(path: Path) -> Float32[np.ndarray, "H W C"]:
     data, frame = Window.of(header["dataWindow"]), Window.of(header["displayWindow"])
     if data == frame:
         return stored
-    # A cropped render stores a part of its frame, an overscanned one more than it.
+    # A cropped render stores a part of its frame, a render with overscan more than its frame.
     samples = np.zeros((frame.height, frame.width, len(picture.channels)), np.float32)
     x, y = data.left - frame.left, data.top - frame.top
     seen = stored[max(-y, 0) : max(frame.height - y, 0), max(-x, 0) : max(frame.width - x, 0)]
@@ -96,7 +95,7 @@ def exr_samples(path: Path) -> Float32[np.ndarray, "H W C"]:
 
 @dataclass(frozen=True)
 class Picture:
-    """The number of a part, and the channels in it that are the picture, with its alpha."""
+    """The index of a part, and the names of its channels that are the image, with alpha last."""
 
     part: int
     channels: tuple[str, ...]
@@ -121,6 +120,6 @@ def _picture(path: Path, parts: Sequence[Sequence[str] | Mapping[str, object]]) 
 
 
 def _layers(names: Sequence[str] | Mapping[str, object]) -> list[str]:
-    """The layers that have colours."""
+    """The layers with R, G, B."""
     prefixes = sorted({name.rpartition(".")[0] for name in names} - {""})
     return [prefix for prefix in prefixes if {f"{prefix}.{color}" for color in COLORS} <= set(names)]

@@ -1,7 +1,7 @@
-"""The place that most cameras look at: where their optical axes come nearest to one another.
+"""The point that most cameras look at: the point closest to their optical axes.
 
-People who photograph a thing aim at it, and walk about it. So the axes tell where it is even where points do
-not: structure from motion finds points on walls and trees as well.
+A photographer walks around the object and aims at it, so the axes locate it even if the points do not:
+structure from motion finds points on walls and trees as well.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from neilfpp_method.data.views import View
 __all__ = ["Axes", "Focus", "axes_of", "find_focus", "meeting_point"]
 
 ITERATIONS = 50
-"""Rounds of reweighted least squares; it converges in about twenty."""
+"""Iterations of reweighted least squares, which converges in about twenty."""
 MIN_DISTANCE = 1e-3
-"""Share of the median distance below which an axis passes through the centre: it bounds the weights."""
+"""Smallest distance of an axis, as a share of the median camera distance; it bounds the weights."""
 CENTRAL_SHARE = 0.5
-"""Central part of a picture, along both sides, that counts as what its camera looks at."""
+"""Central part of the image, along both sides, in which a point counts as looked at."""
 MIN_SHARE = 2 / 3
-"""Share of the cameras that must look at the place."""
+"""Smallest share of the cameras that must look at the point."""
 MIN_SPREAD_DEG = 10.0
 """Least root mean square angle of the axes from their common plane or line. Cameras are aimed to a few
 degrees, so the intersection of axes closer to parallel is random.
@@ -39,13 +39,13 @@ class Axes:
 
     @property
     def across(self) -> Float64[np.ndarray, "V 3 3"]:
-        """I − a aᵀ for each: what it leaves of a vector is the part that is perpendicular to the axis."""
+        """I − a aᵀ for each axis a: the projection onto the plane perpendicular to it."""
         return np.eye(3) - self.ahead[:, :, None] * self.ahead[:, None, :]
 
 
 @dataclass(frozen=True)
 class Focus:
-    """A place, in the world frame, which cameras look at it, and the median distance from which these do."""
+    """A point in the world frame, the cameras that look at it, and their median distance from it."""
 
     centre: Float64[np.ndarray, " 3"]
     looking: Bool[np.ndarray, " V"]
@@ -53,17 +53,20 @@ class Focus:
 
 
 def axes_of(views: Sequence[View]) -> Axes:
-    """The optical axes of views."""
+    """Return the optical axes of views."""
     poses = np.stack([view.camera.c2w for view in views])
     return Axes(poses[:, :, 3], poses[:, :, 2])
 
 
 def find_focus(views: Sequence[View]) -> Focus | None:
-    """The place that most cameras look at, or none.
+    """Find the point that most cameras look at.
 
-    The sum of the distances to all axes is least there, and not that of their squares: a few cameras that
-    look elsewhere do not move it. None where fewer than two thirds of the cameras have it in the middle of
-    their picture, or where their axes are so nearly parallel that it could be at any depth.
+    The point minimises the sum of its distances to all axes. Squared distances are not used, because a few
+    cameras that look elsewhere would shift the minimum.
+
+    Returns:
+        The point; None if fewer than two thirds of the cameras have it in the central part of their image, or
+        if their axes are so close to parallel that its depth is undetermined.
 
     Example:
         >>> focus = find_focus(capture.views)
@@ -88,7 +91,7 @@ def find_focus(views: Sequence[View]) -> Focus | None:
 
 
 def meeting_point(axes: Axes, weights: Float64[np.ndarray, " V"]) -> Float64[np.ndarray, " 3"] | None:
-    """The point with the least weighted sum of squared distances to the axes; none where all are parallel."""
+    """Return the weighted least-squares point of the axes; None if all axes are parallel."""
     system = np.einsum("v,vij->ij", weights / weights.sum(), axes.across)
     if np.linalg.eigvalsh(system)[0] < 1e-4:
         return None
@@ -96,7 +99,7 @@ def meeting_point(axes: Axes, weights: Float64[np.ndarray, " V"]) -> Float64[np.
 
 
 def _looks_at(view: View, place: Float64[np.ndarray, " 3"]) -> bool:
-    """Whether a place lies in the middle of a view's picture; a lens bends nothing there."""
+    """Whether a point lies in the central part of a view, where lens distortion is negligible."""
     camera = view.camera
     x, y, depth = camera.w2c[:3, :3] @ place + camera.w2c[:3, 3]
     if depth <= 0:

@@ -1,6 +1,6 @@
-"""Pixels of training views that no step learns from, by which a training is judged while it runs.
+"""Held-back pixels: pixels of training views that no step learns from, to measure quality during training.
 
-They are small patches on the object, spread over the views. The test views of a capture stay untouched.
+They are small patches on the object, spread over the views. Test views are not used for that.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from neilfpp_method.structures import PixelBatch
 __all__ = ["PATCHES", "SIDE", "hold_back"]
 
 PATCHES, SIDE = 16, 4
-"""How many patches, and the pixels along the side of one."""
+"""Number of patches, and their side in pixels."""
 MAX_SHARE = 1 / 32
-"""Of the pixels of the object that are held back at most: small captures have fewer patches, or none."""
+"""Largest share of the object's pixels that is held back: small captures have fewer patches, or none."""
 TRIES = 64
-"""Places that are tried for a patch: others may leave no room, or lie on a border."""
+"""Random positions that are tried per patch: some overlap other patches, or cross the image border."""
 
 
 def hold_back(pixels: PixelDataset, seed: int, patches: int = PATCHES) -> PixelBatch:

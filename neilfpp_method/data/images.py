@@ -1,8 +1,8 @@
-"""Image files in and out: EXR, TIFF, PNG, JPEG, Radiance HDR → float arrays; EXR and PNG ← arrays.
+"""Read EXR, TIFF, PNG, JPEG and Radiance HDR files into float arrays, and write EXR and PNG files.
 
-Files come from strangers: a header is read and its size checked before any pixel is allocated, and a file
-that no decoder understands becomes a `UserError` that names it. Pixels stay in the orientation they are
-stored in; an EXIF rotation would part them from their camera.
+Files are not trusted: a header is read and its size checked before any pixel is allocated, and a file that
+cannot be decoded raises a `UserError` that names it. Pixels keep the orientation in which they are stored.
+EXIF orientation is not applied, because cameras are calibrated for the stored pixels.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ __all__ = [
 ]
 
 MAX_SIDE = 65_536
-"""Longest side of an image, pixels."""
+"""Longest side of an image, in pixels."""
 MAX_PIXELS = 2**30
-"""Largest image: bounds the memory."""
+"""Largest number of pixels of an image; bounds the memory."""
 RADIANCE_HEADER = 4096
-"""Longest header of a Radiance HDR file that is read, bytes."""
+"""Largest size of the header of a Radiance HDR file, in bytes."""
 
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What a file says about itself. `hdr` means floating-point samples, taken as linear radiance."""
+    """Size of an image, and whether its samples are floating point (`hdr`), which are linear radiance."""
 
     width: int
     height: int
@@ -55,9 +55,11 @@ class ImageHeader:
 class ImageFile:
     """A decoded image, rows from top to bottom, contiguous.
 
-    `pixels` is RGB or one channel: as stored where `hdr`, else scaled to [0, 1] and still display values, as
-    no curve is applied. `alpha` in [0, 1] is none where the file has no alpha channel, or one that is opaque
-    everywhere: programs write that without meaning that the object fills the picture.
+    Attributes:
+        pixels: RGB or one channel; as stored if `hdr`, otherwise display values scaled to [0, 1].
+        alpha: alpha channel in [0, 1]; None if the file has none, or one that is opaque everywhere, which
+            many programs write although the object does not fill the image.
+        hdr: whether the samples are floating point.
     """
 
     pixels: Float[np.ndarray, "H W C"]
@@ -78,7 +80,8 @@ class ImageFile:
 
 def _exr_header(path: Path) -> ImageHeader:
     header = exr_header(path)
-    for stored in header.stored:  # OpenEXR decodes all parts of a file
+    # All parts are checked, because OpenEXR decodes all of them.
+    for stored in header.stored:
         _check_size(path, stored.width, stored.height)
     return ImageHeader(header.frame.width, header.frame.height, hdr=True)
 
@@ -95,7 +98,7 @@ def _tiff_header(path: Path) -> ImageHeader:
 
 
 def _radiance_lines(path: Path) -> list[bytes]:
-    """The lines of the header, and after an empty one that of the size."""
+    """The lines of the header, an empty line, and the line with the size."""
     with path.open("rb") as file:
         lines = file.read(RADIANCE_HEADER).split(b"\n")
     return lines[: lines.index(b"") + 2]
@@ -112,7 +115,7 @@ def _radiance_header(path: Path) -> ImageHeader:
 
 
 def _radiance_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
-    """Radiance: stored values include every exposure of the header, and OpenCV does not undo that."""
+    """Radiance: stored values are multiplied by every EXPOSURE of the header, which OpenCV does not undo."""
     exposures = [
         float(line.split(b"=")[1]) for line in _radiance_lines(path) if line.startswith(b"EXPOSURE=")
     ]
@@ -123,7 +126,8 @@ def _radiance_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
 
 
 def _opencv_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
-    samples = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # also: no EXIF rotation
+    # IMREAD_UNCHANGED also ignores the EXIF orientation.
+    samples = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if samples is None:
         raise ValueError("damaged, or of a kind that OpenCV does not know")
     if samples.ndim == 2:
@@ -135,16 +139,16 @@ def _tiff_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
     with tifffile.TiffFile(path) as file:
         page = file.pages[0]
         if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and page.samplesperpixel > 1:
-            return np.moveaxis(
-                page.asarray(), 0, -1
-            )  # OpenCV would take the planes for pixels, and says nothing
+            # OpenCV would silently read the planes as pixels.
+            return np.moveaxis(page.asarray(), 0, -1)
         if page.dtype == np.float16:
-            return np.atleast_3d(page.asarray())  # which OpenCV does not know
+            # OpenCV does not support half precision in TIFF.
+            return np.atleast_3d(page.asarray())
     return _opencv_samples(path)
 
 
 def _jpeg_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
-    # Not OpenCV: it fills what a cut-off file lacks with grey, and says nothing.
+    # Not OpenCV, which silently fills the missing part of a truncated file with grey.
     with Image.open(path) as image:
         return np.atleast_3d(np.asarray(image if image.mode == "L" else image.convert("RGB")))
 
@@ -154,7 +158,7 @@ def _jpeg_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
 
 @dataclass(frozen=True)
 class Format:
-    """How one kind of file is read: its header alone, and its samples (H, W, C) in RGB order, alpha last."""
+    """Functions that read the header and the samples of a file format: (H, W, C), RGB, alpha last."""
 
     header: Callable[[Path], ImageHeader]
     samples: Callable[[Path], np.ndarray]
@@ -176,10 +180,11 @@ FULL_SCALE = {"uint8": 255.0, "uint16": 65_535.0, "float16": 1.0, "float32": 1.0
 
 
 def image_header(path: Path) -> ImageHeader:
-    """Size and kind of an image, from its first bytes.
+    """Read the size and the sample type of an image, without its pixels.
 
     Raises:
-        UserError: no such file, an unknown or unreadable format, or a size beyond 65536 a side or 2³⁰ pixels.
+        UserError: the file does not exist, cannot be read, or has more than 65536 pixels a side or 2³⁰
+            pixels.
     """
     with _naming(path):
         header = _format(path).header(path)
@@ -220,7 +225,8 @@ def _naming(path: Path) -> Iterator[None]:
         raise
     except FileNotFoundError:
         raise UserError(f"{path}: no such image", "check the path") from None
-    except Exception as error:  # four decoders, each with exceptions of its own
+    except Exception as error:
+        # Each of the four decoders has its own exception types.
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise UserError(
             f"{path}: cannot be read ({reason[0]})", "export the image again, as EXR or PNG"
@@ -229,7 +235,7 @@ def _naming(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _decoders_silent() -> Iterator[None]:
-    """What the native decoders print on their own goes nowhere; the `UserError` says it in one line."""
+    """Discard what native decoders print to standard error; the `UserError` reports it in one line."""
     kept = os.dup(2)
     with open(os.devnull, "wb") as nowhere:
         os.dup2(nowhere.fileno(), 2)
@@ -261,12 +267,13 @@ def _check_size(path: Path, width: int, height: int) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path`: renamed to it when the block ends, removed when the block fails.
+    """Provide a temporary path that is renamed to `path` at the end of the block, or removed if the block
+    fails.
 
-    A reader, or a run that is killed, never meets half a file. Folders that are missing are made.
+    Readers never see a partial file, even if the process is killed. Missing folders are created.
 
     Raises:
-        UserError: the system does not let it be written; what was there before is kept.
+        UserError: the operating system refuses to write the file; an existing file is kept.
     """
     temporary = path.parent / f".{path.stem}.{os.getpid()}{path.suffix}"
     try:
@@ -294,12 +301,13 @@ def write_exr(path: Path, channels: Mapping[str, Shaped[np.ndarray, "H W ..."]])
     with replacing(path) as temporary:
         try:
             OpenEXR.File(header, arrays).write(str(temporary))
-        except RuntimeError as error:  # a full disk, as OpenEXR tells it
+        except RuntimeError as error:
+            # OpenEXR reports a full disk as a RuntimeError.
             raise OSError(" ".join(str(error).split()).rstrip(".")) from error
 
 
 def write_png(path: Path, samples: Shaped[np.ndarray, "H W ..."]) -> None:
-    """Write 8- or 16-bit samples as they are: (H, W), (H, W, 1), RGB or RGBA.
+    """Write 8- or 16-bit samples without conversion: (H, W), (H, W, 1), RGB or RGBA.
 
     Raises:
         ValueError: the samples are of another type.

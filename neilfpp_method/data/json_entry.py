@@ -1,4 +1,4 @@
-"""JSON in and out: values that know their place, so that errors can name it, and atomic writing."""
+"""Read JSON files with errors that name the entry, and write them atomically."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Entry", "write_json"]
 
 
 class Entry:
-    """A value in a JSON file, and where it stands."""
+    """A value in a JSON file, and its place (`where`) for error messages."""
 
     def __init__(self, value: Any, where: str) -> None:
         self.value = value
@@ -25,26 +25,25 @@ class Entry:
 
     @staticmethod
     def load(path: Path) -> Entry:
-        """The root of a file."""
+        """Read a file and return its root value."""
         try:
-            return Entry(
-                json.loads(path.read_text("utf-8-sig")), str(path)
-            )  # Windows puts a byte order mark first
+            # Programs on Windows write a byte order mark at the beginning.
+            return Entry(json.loads(path.read_text("utf-8-sig")), str(path))
         except (ValueError, OSError, RecursionError) as error:
             raise UserError(f"{path}: not valid JSON ({error})", "export the cameras again") from error
 
     def name(self, key: str) -> str:
-        """The place of an entry below this one."""
+        """Return the place of an entry of this object."""
         return f"{self.where}: {key}" if ": " not in self.where else f"{self.where}.{key}"
 
     def entries(self) -> Mapping[str, Any]:
-        """The entries of an object."""
+        """Return the entries of a JSON object."""
         if not isinstance(self.value, dict):
             raise UserError(f"{self.where}: not a JSON object", "export the cameras again")
         return self.value
 
     def items(self) -> list[Entry]:
-        """The elements of a list."""
+        """Return the elements of a JSON list."""
         if not isinstance(self.value, list):
             raise UserError(f"{self.where}: not a JSON list", "export the cameras again")
         return [Entry(value, self.name(str(i))) for i, value in enumerate(self.value)]
@@ -55,24 +54,24 @@ class Entry:
         return Entry(self.value[key], self.name(key))
 
     def get(self, key: str) -> Entry | None:
-        """An entry that may be missing or null."""
+        """Return an entry; None if it is missing or null."""
         return None if self.entries().get(key) is None else self[key]
 
     def text(self) -> str:
-        """A file name; Windows's separators become the usual ones."""
+        """Return a file name, with forward slashes."""
         name = self.value.replace("\\", "/") if isinstance(self.value, str) else ""
         if not Path(name).name:
             raise UserError(f"{self.where}: not a file name", "give a path relative to the capture")
         return name
 
     def word(self, *choices: str) -> str:
-        """One of the words; any, where none are given."""
+        """Return a string that is one of `choices`; any string if there are no choices."""
         if not isinstance(self.value, str) or (choices and self.value not in choices):
             raise UserError(f"{self.where}: not {' or '.join(choices) or 'a word'}", "correct the entry")
         return self.value
 
     def numbers(self, *shapes: tuple[int, ...]) -> Float64[np.ndarray, " *shape"]:
-        """An array of finite numbers, of one of the shapes; without shapes, a list of any length."""
+        """Return an array of finite numbers of one of the shapes; without shapes, of any length."""
         try:
             numbers = np.asarray(self.value, dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
@@ -87,11 +86,11 @@ class Entry:
         return numbers
 
     def number(self) -> float:
-        """One finite number."""
+        """Return a finite number."""
         return float(self.numbers(()))
 
     def size(self) -> int:
-        """A positive whole number; files write sizes as floats, too."""
+        """Return a positive integer, which a file may also contain as a float."""
         number = self.number()
         if number < 1 or number != int(number):
             raise UserError(f"{self.where}: not a positive whole number", "give width and height in pixels")
@@ -99,6 +98,6 @@ class Entry:
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """Write an object atomically; numbers that are not finite do not exist in JSON: a `ValueError`."""
+    """Write an object atomically; numbers that are not finite raise a `ValueError`, as JSON has none."""
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n", "utf-8")

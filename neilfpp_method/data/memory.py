@@ -1,4 +1,4 @@
-"""How much memory is free, and a warning before a process takes more and is killed without a word."""
+"""Free memory, and an error before a process allocates more and is killed without a message."""
 
 from __future__ import annotations
 
@@ -10,30 +10,33 @@ from neilfpp_method.errors import UserError
 __all__ = ["available_memory", "check_memory"]
 
 UNLIMITED = 2**60
-"""Bytes above which the limit of a version 1 control group means no limit."""
+"""Limit of a version 1 control group, in bytes, above which it means that there is no limit."""
 
 
 def available_memory(proc: Path = Path("/proc"), groups: Path = Path("/sys/fs/cgroup")) -> int | None:
-    """Bytes that this process may still take: the least of what the system has left, what its control group
-    leaves it (both versions, with the groups above), and what its limit of address space does; none where
-    nothing of that is known.
+    """Return the number of bytes that this process may still allocate.
 
-    Pages of files that the system would give up for it count as free.
+    This is the minimum over the free memory of the system, the limits of its control group (both versions,
+    and all groups above it), and its limit of address space. Cached file pages that the system can evict
+    count as free.
+
+    Returns:
+        Bytes; None if none of these is known.
     """
     known = [_system(proc), _group(proc, groups), _group_1(groups), _address_space(proc)]
     return min((free for free in known if free is not None), default=None)
 
 
 def check_memory(needed: int, what: str, remedy: str, free: int | None = None) -> None:
-    """That there is memory for something; nothing is said where it is not known how much there is.
+    """Check that there is enough memory; passes if the free memory is unknown.
 
     Args:
-        needed: bytes.
-        what: needs them, for the message: "the pixels of 40 views".
-        free: bytes that there are; none: `available_memory`.
+        needed: number of bytes.
+        what: what needs them, in the plural, for the message: "the pixels of 40 views".
+        free: number of free bytes; if None, `available_memory`.
 
     Raises:
-        UserError: there is not enough.
+        UserError: there is not enough memory.
     """
     free = available_memory() if free is None else free
     if free is not None and needed > free:
@@ -48,7 +51,7 @@ def _system(proc: Path) -> int | None:
 
 
 def _group(proc: Path, groups: Path) -> int | None:
-    """Of control groups, version 2; each group is bound by those above it."""
+    """Free bytes by control groups, version 2; the limits of all groups above apply as well."""
     path = next(
         (line[3:].strip("/") for line in _lines(proc / "self" / "cgroup") if line.startswith("0::")), ""
     )
@@ -62,7 +65,7 @@ def _group(proc: Path, groups: Path) -> int | None:
 
 
 def _group_1(groups: Path) -> int | None:
-    """Of control groups, version 1, as a container sees its own."""
+    """Free bytes by control groups, version 1, as a container sees its own group."""
     folder = groups / "memory"
     limit, used = _number(folder / "memory.limit_in_bytes"), _number(folder / "memory.usage_in_bytes")
     if limit is None or used is None or limit > UNLIMITED:
@@ -77,13 +80,13 @@ def _address_space(proc: Path) -> int | None:
 
 
 def _number(path: Path) -> int | None:
-    """The number that a file holds; none where it says "max", or is not there."""
+    """The number in a file; None if the file contains "max" or does not exist."""
     text = "".join(_lines(path)[:1]).strip()
     return int(text) if text.isdigit() else None
 
 
 def _entry(path: Path, name: str, unit: int) -> int | None:
-    """What a line "NAME NUMBER" of a file says, times the unit."""
+    """The number in the line "NAME NUMBER" of a file, times the unit."""
     found = [line.split()[1] for line in _lines(path) if line.split()[:1] == [name]]
     return int(found[0]) * unit if found else None
 

@@ -21,17 +21,17 @@ __all__ = ["Mesh", "read_mesh"]
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles in the scene frame."""
+    """A triangle mesh in the scene frame."""
 
     vertices: Float[Tensor, "V 3"]
     faces: Int[Tensor, "F 3"]
 
 
 def read_mesh(path: Path, normalisation: Normalisation) -> Mesh:
-    """A mesh from a file in the world frame; vertices stay as they are, the ones at the same place too.
+    """Read a mesh in the world frame and transform it to the scene frame. Equal vertices are not merged.
 
     Raises:
-        UserError: no such file, or it holds no triangles that can be used.
+        UserError: the file does not exist, or has no valid triangles.
     """
     if not path.is_file():
         raise UserError(
@@ -44,7 +44,8 @@ def read_mesh(path: Path, normalisation: Normalisation) -> Mesh:
         # In double precision, because the world's origin may be far away, as in map coordinates.
         vertices = torch.as_tensor(np.array(mesh.vertices), dtype=torch.float64)
         faces = torch.as_tensor(np.array(mesh.faces), dtype=torch.int64)
-    except Exception as error:  # whatever trimesh meets in a damaged file
+    except Exception as error:
+        # trimesh raises many types of exceptions for damaged files.
         raise UserError(f"{path}: not a mesh that can be read ({error})", "export it again as PLY") from error
     flat = vertices.shape != (len(vertices), 3) or faces.shape != (len(faces), 3)
     if (
@@ -61,10 +62,10 @@ def read_mesh(path: Path, normalisation: Normalisation) -> Mesh:
 
 
 def _check_counts(path: Path) -> None:
-    """That a binary glTF is as long as it says: trimesh makes room for what is announced before it looks.
+    """Check the lengths in a binary glTF file, because trimesh allocates memory for them before reading.
 
     Raises:
-        ValueError: it is not.
+        ValueError: the file is shorter than its lengths say.
     """
     size = path.stat().st_size
     with path.open("rb") as file:

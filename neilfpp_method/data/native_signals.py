@@ -1,4 +1,4 @@
-"""SIGTERM while a native library is loaded."""
+"""Delay SIGTERM while a native library is loaded."""
 
 from __future__ import annotations
 
@@ -11,18 +11,20 @@ __all__ = ["sigterm_waits"]
 
 @contextmanager
 def sigterm_waits() -> Iterator[None]:
-    """A SIGTERM that arrives in the block is delivered at its end, to the handler of before the block: native
-    libraries put their own in its place when they are loaded.
+    """Block SIGTERM and restore its handler at the end of the block, when a pending signal is delivered.
 
-    Threads that the block starts do not take SIGTERM for the main thread, either.
+    Some native libraries install a handler of their own when they are loaded. Threads that are started in the
+    block inherit the blocked signal, so that they do not receive it in place of the main thread.
     """
-    can_wait = hasattr(signal, "pthread_sigmask")  # not on Windows
+    # Windows has no signal masks.
+    can_wait = hasattr(signal, "pthread_sigmask")
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM}) if can_wait else set()
     handler = signal.getsignal(signal.SIGTERM)
     try:
         yield
     finally:
-        with suppress(ValueError, TypeError):  # not the main thread, or a handler that is not Python's
+        # Fails outside of the main thread, and if the previous handler is not a Python function.
+        with suppress(ValueError, TypeError):
             signal.signal(signal.SIGTERM, handler)
         if can_wait:
             signal.pthread_sigmask(signal.SIG_SETMASK, blocked)

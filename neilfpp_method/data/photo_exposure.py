@@ -1,4 +1,4 @@
-"""How much light a photograph took in: from its EXIF entries, or from a file that a person wrote."""
+"""Exposures of photographs, from EXIF or from a file that the user wrote."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ WRITE_A_LIST = f"write {LISTS[1]} beside the images: a line 'NAME SECONDS' for e
 
 
 def exposures_of(folder: Path, images: Sequence[Path], table: Path | None = None) -> Mapping[Path, float]:
-    """The exposure of each image; only quotients of exposures mean anything.
+    """Return the exposure of each image. Only ratios of exposures are meaningful.
 
     Args:
-        folder: where a file `exposures.json` or `exposures.txt` is looked for.
+        folder: folder in which a file `exposures.json` or `exposures.txt` may lie.
         images: the files, under `folder`.
-        table: such a file elsewhere. With a file EXIF is not asked.
+        table: such a file in another place. If there is a file, EXIF is not read.
 
     Raises:
         UserError: the file is malformed, or an image has no exposure.
@@ -49,20 +49,16 @@ def exposures_of(folder: Path, images: Sequence[Path], table: Path | None = None
 
 
 def photo_exposure(path: Path) -> float | None:
-    """Exposure time in seconds times ISO/100 over the squared f-number, from EXIF; none without a time.
+    """Return time · ISO/100 / f-number² from EXIF, time in seconds; None if EXIF has no exposure time.
 
-    An entry that is missing counts as 1: it is the same in all pictures of a lens or a camera that does not
-    say it. An ISO of 0 or an f-number of 0, which adapted lenses write, is such an entry.
+    A missing factor counts as 1, because it is constant for a lens or a camera that does not record it. An
+    ISO of 0 or an f-number of 0, which adapted lenses write, counts as missing.
     """
     try:
         with Image.open(path) as image:
             exif = image.getexif().get_ifd(EXIF_FOLDER)
-    except (
-        OSError,
-        ValueError,
-        SyntaxError,
-        Image.DecompressionBombError,
-    ):  # what Pillow does not open says nothing
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        # Pillow cannot open the file.
         return None
     time, aperture, sensitivity = (_positive(exif.get(tag)) for tag in (TIME, APERTURE, SENSITIVITY))
     if time is None:
@@ -79,7 +75,7 @@ def _positive(entry: object) -> float | None:
 
 
 def read_exposures(path: Path) -> Mapping[str, float]:
-    """Seconds by image name: a JSON object, or lines `NAME SECONDS` (also `1/60`); `#` starts a comment.
+    """Read seconds by image name: a JSON object, or lines `NAME SECONDS` (also `1/60`) with `#` comments.
 
     Raises:
         UserError: the file is malformed, or an exposure is not a positive number.

@@ -1,9 +1,9 @@
-"""How colours are kept: in as few bits as hold what the files say.
+"""Encodings of stored colours, with as few bits as the files need.
 
-8-bit images keep their bytes, so they come back to the bit. 16-bit images, and display values that were
-averaged, take 16 bits. Radiance is kept in half precision (11 bits of mantissa), with a power of two for each
-view that brings its brightest pixel near the top of the range; where a view's range is wider than that of
-half, all views are kept in single precision.
+8-bit images are stored as bytes, without loss. 16-bit images, and display values that were averaged, take 16
+bits. Radiance is stored in half precision (11 bits of mantissa), multiplied by a power of two for each view
+that brings its brightest pixel near the top of the range. If the range of a view is wider than that of half
+precision, all views are stored in single precision.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from jaxtyping import Float, Float32, Shaped
 __all__ = ["BYTES", "ENCODINGS", "Encoded", "Encoding", "encodings_for"]
 
 MAX_VALUE = 32_768.0
-"""Largest encoded value of a view in half precision, which ends at 65 504."""
+"""Largest encoded value of a view in half precision, whose largest number is 65 504."""
 MIN_MEDIAN = 2.0**-4
-"""Least median of a view in half precision: a thousandth of it still has 11 bits (they end at 2⁻¹⁴)."""
+"""Smallest encoded median of a view in half precision: a thousandth of it is a normal number (above 2⁻¹⁴)."""
 MEDIAN_SAMPLES = 2**20
-"""Values of a view that its median is taken of."""
+"""Number of values of a view from which its median is computed."""
 
 
 @dataclass(frozen=True)
 class Encoded:
-    """Codes of a view; a colour is `decode` of its code, divided by `scale`."""
+    """Codes of a view, and its factor `scale`, by which decoded values are divided."""
 
     codes: Shaped[np.ndarray, "H W 3"]
     scale: float
@@ -35,12 +35,12 @@ class Encoded:
 
 @dataclass(frozen=True)
 class Encoding:
-    """One way to keep colours.
+    """An encoding of colours.
 
     Attributes:
-        name: as the store's description has it.
-        dtype: of a channel.
-        encode: codes of colours that are finite and not negative; none where too much of them would be lost.
+        name: its name in `store.json`.
+        dtype: type of a channel.
+        encode: function from finite, non-negative colours to codes; returns None if the loss were too large.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Encoding:
     def decode(
         self, codes: Shaped[np.ndarray, "*shape 3"], scale: float | Float[np.ndarray, "*shape"]
     ) -> Float32[np.ndarray, "*shape 3"]:
-        """Colours from codes; `scale` is that of the codes' views."""
+        """Return the colours of codes; `scale` is the factor of the view of each code."""
         if np.issubdtype(self.dtype, np.integer):
             return codes.astype(np.float32) / np.float32(np.iinfo(self.dtype).max)
         return codes.astype(np.float32) / np.asarray(scale, np.float32)[..., None]
@@ -62,7 +62,7 @@ def _levels(bits: int) -> Encoding:
 
     def encode(color: Float32[np.ndarray, "H W 3"]) -> Encoded | None:
         codes = np.rint(color * full)
-        # Of 8 bits, bytes alone will do; 16 bits stand for whatever display value lies next to them.
+        # 8 bits must be exact; 16 bits may round to the nearest level.
         lost = 1e-6 if bits == 8 else 0.51 / full
         if codes.max(initial=0) > full or np.abs(codes / full - color).max(initial=0) > lost:
             return None
@@ -88,7 +88,7 @@ ENCODINGS = {encoding.name: encoding for encoding in (BYTES, WORDS, HALF, FLOAT)
 
 
 def encodings_for(hdr: bool, exact: bool = False) -> tuple[Encoding, ...]:
-    """The encodings of a capture, from the smallest to one that holds everything; `exact`: that one alone."""
+    """Return the encodings to try for a capture, smallest first; `exact`: single precision only."""
     if exact:
         return (FLOAT,)
     return (HALF, FLOAT) if hdr else (BYTES, WORDS, FLOAT)

@@ -1,12 +1,12 @@
 """The pixels of many views, view after view, row by row: in memory, or in memory-mapped files.
 
-    color.npy    (P, 3) codes of `pixel_encoding`: 3 bytes a pixel for 8-bit images, else 6
+    color.npy    (P, 3) codes of `pixel_encoding`: 3 bytes per pixel for 8-bit images, else 6 or 12
     bits.npy     (P,) one byte: valid, mask, mask known, near the object (`drawing`); padded to whole blocks
-    store.json   what they were made from, written last: a folder without it holds no store
+    store.json   the inputs of the store, written last: a folder without it holds no store
 
-Views are read one at a time, so building takes the memory of one view, whatever their number. A store is used
-again when it was made from the very same files (name, size, time of the last change), cameras and factors;
-else it is made anew.
+Views are read one at a time, so building a store takes the memory of one view. A store is used again if it
+was built from the same files (name, size, modification time), cameras and factors; otherwise it is built
+again.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ __all__ = ["PixelStore", "border", "expect_draws", "load_pixels", "store_bytes"]
 
 FORMAT, VERSION = "neilfpp-pixels", 1
 BORDER_SHARE = 0.5
-"""Share of the border pixels of one colour from which that colour is the background."""
+"""Smallest share of border pixels of one colour with which that colour is the background."""
 REPAIR = "repair the images, or mark the pixels in a validity mask"
 MAX_MAPPED = 2**29
-"""Bytes of the files that draws may leave mapped; a page with one drawn pixel maps 16 pages."""
+"""Largest number of bytes that draws may leave mapped; reading one pixel maps 16 pages."""
 BYTES_OF_A_DRAW = 2 * 16 * 4096
-"""Bytes that reading one pixel maps: 16 pages of each of two files."""
+"""Number of bytes that reading one pixel maps: 16 pages of 4096 bytes in each of two files."""
 MIN_FREE_BYTES = 2**28
-"""Bytes that a disk should keep free."""
+"""Number of bytes that should remain free on the disk."""
 
 
 @dataclass
 class PixelStore:
-    """P pixels of some views. Numbers count them view after view, row by row.
+    """The P pixels of some views, indexed view after view, row by row.
 
     Attributes:
-        views: in order.
-        encoding: of `codes`.
-        scales: of each view's codes.
-        codes: (P, 3).
-        bits: of each pixel, and zeros up to a whole number of blocks.
+        views: the views, in order.
+        encoding: encoding of `codes`.
+        scales: factor of the codes of each view.
+        codes: colour codes, (P, 3).
+        bits: bits of each pixel (`drawing`), padded with zeros to a whole number of blocks.
     """
 
     views: tuple[View, ...]
@@ -74,31 +74,31 @@ class PixelStore:
         return int(self.starts[-1])
 
     def rows(self, i: int) -> slice:
-        """The numbers of the pixels of view `i`."""
+        """Return the indices of the pixels of view `i`."""
         return slice(int(self.starts[i]), int(self.starts[i + 1]))
 
     def colors(
         self, numbers: Int[np.ndarray, "*N"], view: Int[np.ndarray, "*N"]
     ) -> Float32[np.ndarray, "*N 3"]:
-        """Colours of single pixels of views; kept in a folder, only the pages that hold them are read."""
+        """Return colours of single pixels; of a store on disk, only the pages that contain them are read."""
         self._drawn += numbers.size
         if self._drawn * BYTES_OF_A_DRAW > MAX_MAPPED:
             self.release()
         return self.encoding.decode(self.codes[numbers], self.scales[view])
 
     def view_colors(self, i: int) -> Float32[np.ndarray, "N 3"]:
-        """The colours of a view."""
+        """Return the colours of a view."""
         return self.encoding.decode(np.asarray(self.codes[self.rows(i)]), self.scales[i])
 
     def release(self) -> None:
-        """Give pages of the files that are mapped back; what is read next is mapped again."""
+        """Unmap the pages of the files; later reads map them again."""
         self._drawn = 0
         for array in (self.codes, self.bits):
             _advise(array, "MADV_DONTNEED")
 
 
 def store_bytes(views: Sequence[View], hdr: bool) -> int:
-    """About how many bytes the pixels of views take in a store."""
+    """Estimate the number of bytes of a store of the given views."""
     pixels = sum(view.camera.width * view.camera.height for view in views)
     narrow = not hdr and all(view.file_size is None for view in views)
     return pixels * (4 if narrow else 7)

@@ -1,4 +1,4 @@
-"""All pixels of a capture's views, drawn at random or view by view, with their rays in the scene frame."""
+"""The pixels of the views of a capture, at random or view by view, with their rays in the scene frame."""
 
 from __future__ import annotations
 
@@ -25,31 +25,40 @@ from neilfpp_method.structures import PixelBatch
 __all__ = ["PixelDataset"]
 
 BORDER_TOLERANCE = 0.02
+"""Largest deviation of a background pixel from the background colour, relative to the brighter of that colour
+and the median of the object."""
+
 BORDER_SHARE = 0.5
+"""Smallest share of the border pixels that must have the background colour."""
+
 DARK = 1e-3
+"""Luminance below which a pixel counts as black, relative to the mean of the object."""
+
 MIDDLE_GREY = 0.18
+"""Linear value to which the median of the object is brought for image gradients: photographic middle grey."""
+
 NEIGHBOURS = np.array([(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1)])
-"""Rows and columns of the nine values about a pixel."""
+"""Offsets (row, column) of the 3 × 3 neighbourhood of a pixel."""
 MAX_COUNTED = 2**20
-"""Pixels of the object, evenly over all views, from which statistics are computed."""
+"""Largest number of object pixels, evenly drawn from all views, from which statistics are computed."""
 
 
 class PixelDataset:
     """P pixels of the chosen views, view after view, row by row. `PixelBatch.view` indexes `views`.
 
-    Colours, masks and validity are kept in a `PixelStore`, 4 to 13 bytes a pixel, in a folder or in memory;
-    rays and image gradients are computed when asked for. Colours of a linear capture are radiance on the
-    scale that its views share: the exposure and the white balance of each view are divided out. A pixel is
-    valid unless its view's validity mask is black there, or its view's lens shows nothing there.
+    Colours, masks and validity are stored in a `PixelStore`, with 4 to 13 bytes per pixel, in a folder or in
+    memory; rays and image gradients are computed on demand. Colours of a linear capture are radiance on the
+    scale that all views share: exposure and white balance of each view are divided out. A pixel is invalid if
+    the validity mask of its view is black there, or if no ray passes the lens there.
 
     Args:
-        capture: where the views come from.
+        capture: the capture.
         views: the views to load, for example `capture.train_views`.
-        device: where batches go. Pixels are drawn, and read, on the CPU.
-        on_view: called with the name of each view once it is read.
-        folder: where the pixels are kept, and found again by the next who asks; none: in memory.
-        exact: keep colours in single precision, as the files have them, to compare with; needs `folder` to be
-            none.
+        device: device of the batches. Pixels are drawn and read on the CPU.
+        on_view: called with the name of each view when it has been read.
+        folder: folder in which the pixels are stored and from which they are read the next time; None: in
+            memory.
+        exact: store colours in single precision, without loss; requires that `folder` is None.
 
     Raises:
         UserError: an image cannot be read, has changed its size, or holds NaN, infinite or negative pixels
@@ -83,7 +92,7 @@ class PixelDataset:
         return self._rays.shown(i).cpu().numpy()
 
     def on(self, device: torch.device | str) -> PixelDataset:
-        """The same pixels, with batches on another device."""
+        """Return the same pixels, with batches on another device."""
         other = copy.copy(self)
         other.device = torch.device(device)
         cameras = [self.capture.normalisation.camera(view.camera) for view in self.views]
@@ -94,9 +103,10 @@ class PixelDataset:
         return len(self.store)
 
     def sample(self, count: int, gradients: bool = True) -> PixelBatch:
-        """`count` valid pixels from torch's global generator, most on or near the object (`data.drawing`).
+        """Draw `count` valid pixels with torch's global generator, most on or near the object
+        (`data.drawing`).
 
-        Image gradients take nine reads a pixel; without `gradients` they are 0.
+        Image gradients take nine reads per pixel; without `gradients` they are 0.
         """
         numbers = self.draw(count).numpy()
         views = self._views_of(numbers)
@@ -104,21 +114,21 @@ class PixelDataset:
         return self._batch(numbers, views, colors, self._gradients_at(numbers, views) if gradients else None)
 
     def draw(self, count: int) -> Int[Tensor, " count"]:
-        """The numbers of the pixels that `sample` would return, from 0 to P − 1."""
+        """Draw the indices of the pixels that `sample` would return, from 0 to P − 1."""
         return self._draws.draw(count)
 
     def leave_out(self, numbers: Int[Tensor, " N"]) -> None:
-        """Draw these pixels no more; see `data.held_back`."""
+        """Exclude pixels from all later draws; see `data.held_back`."""
         self._draws.leave_out(numbers)
 
     def numbered(self, numbers: Int[Tensor, " N"]) -> PixelBatch:
-        """Pixels by their numbers, in that order; without image gradients."""
+        """Return pixels by index, in the given order, without image gradients."""
         chosen = numbers.cpu().numpy()
         views = self._views_of(chosen)
         return self._batch(chosen, views, self.store.colors(chosen, views), None)
 
     def view(self, i: int, gradients: bool = True) -> PixelBatch:
-        """All pixels of `views[i]`, row by row, invalid ones included. Image gradients as in `sample`."""
+        """Return all pixels of `views[i]`, row by row, also invalid ones. Image gradients as in `sample`."""
         rows, camera = self.store.rows(i), self.views[i].camera
         numbers, colors = np.arange(rows.start, rows.stop), self.store.view_colors(i)
         shape = camera.height, camera.width
@@ -126,17 +136,17 @@ class PixelDataset:
         return self._batch(numbers, np.full(len(numbers), i), colors, gradient)
 
     def at(self, i: int, rows: Int[Tensor, " N"]) -> PixelBatch:
-        """Some pixels of `views[i]`, by their number in the view, row by row; without image gradients."""
+        """Return pixels of `views[i]` by their index in the view, without image gradients."""
         numbers = self.store.rows(i).start + rows.cpu().numpy()
         views = np.full(len(numbers), i)
         return self._batch(numbers, views, self.store.colors(numbers, views), None)
 
     def valid(self, i: int) -> Bool[Tensor, " N"]:
-        """Which pixels of `views[i]` count: all but those that its validity mask, or its lens, leaves out."""
+        """Return which pixels of `views[i]` are valid."""
         return self._bit(self.store.bits[self.store.rows(i)], VALID)
 
     def near(self, i: int) -> Bool[Tensor, " N"]:
-        """Which pixels of `views[i]` are on or near the object; none where nothing is known of it."""
+        """Return which pixels of `views[i]` are on or near the object; all false if the object is unknown."""
         return self._bit(self.store.bits[self.store.rows(i)], NEAR)
 
     def _views_of(self, numbers: Int[np.ndarray, " N"]) -> Int[np.ndarray, " N"]:
@@ -171,19 +181,19 @@ class PixelDataset:
 
     @cached_property
     def _exposure(self) -> float:
-        """Brings the median of the object to middle grey, where pixels are linear."""
+        """Factor that brings the median of the object to middle grey; 1 if pixels are display values."""
         lit = self._lit() if self.capture.hdr else ()
         return MIDDLE_GREY / float(lit.median()) if len(lit) else 1.0
 
     def _seen(self, colors: Float32[np.ndarray, "*shape 3"]) -> Float32[Tensor, "*shape"]:
-        """Luminance of the images as they look: linear ones with the median of the object at middle grey."""
+        """Display luminance; linear images are exposed so that the median of the object is middle grey."""
         color = torch.from_numpy(colors)
         return luminance(tone_map(self._exposure * color) if self.capture.hdr else color)
 
     def _gradients_at(
         self, numbers: Int[np.ndarray, " N"], views: Int[np.ndarray, " N"]
     ) -> Float32[Tensor, " N"]:
-        """How much the images change per pixel as they look, at single pixels; see `_gradient`."""
+        """Image gradients at single pixels; see `_scharr`."""
         size = np.array([(view.camera.width, view.camera.height) for view in self.views])[views]
         at = numbers - self.store.starts[views]
         column, row, last = at % size[:, 0], at // size[:, 0], size - 1
@@ -196,9 +206,9 @@ class PixelDataset:
     # --------------------------------------------------------------------------------------------- statistics
 
     def median_radiance(self) -> float:
-        """The median luminance, linear, of the object: of valid pixels within the mask that are not black.
+        """Return the median linear luminance of the valid object pixels that are not black.
 
-        Of more than `MAX_COUNTED` pixels so many are counted, evenly over the views.
+        At most `MAX_COUNTED` pixels are read, evenly drawn from all views.
 
         Raises:
             UserError: there is no such pixel.
@@ -211,17 +221,17 @@ class PixelDataset:
         return float(lit.median())
 
     def radiance_quantile(self, share: float) -> float:
-        """The linear value that `share` of the values of valid object pixels and channels stay below."""
+        """Return the `share`-quantile of the linear values of all channels of valid object pixels."""
         values = self._of_the_object().flatten()
         return float(values.kthvalue(max(1, round(share * len(values)))).values)
 
     def _lit(self) -> Float[Tensor, " L"]:
-        """The luminance, linear, of the pixels of the object that are not black."""
+        """Linear luminance of the object pixels that are not black."""
         seen = luminance(self._of_the_object())
         return seen[seen > DARK * seen.mean()]
 
     def _of_the_object(self) -> Float[Tensor, "S 3"]:
-        """The linear colours of valid pixels within the mask: all, or every so many-th."""
+        """Linear colours of valid object pixels, evenly spaced if there are more than `MAX_COUNTED`."""
         step = -(-len(self) // MAX_COUNTED)
         colors = []
         for i in range(len(self.views)):
@@ -233,11 +243,13 @@ class PixelDataset:
         return self._linear(np.concatenate(colors))
 
     def border_color(self) -> Float[Tensor, " 3"] | None:
-        """The linear RGB that most pixels on the borders of the images share, or none.
+        """Return the linear RGB of the background, or None if the borders of the images have no common
+        colour.
 
-        The border's median colour counts when half of the border shares it: differs from it by at most 2 % of
-        the brighter of that colour and the object's median radiance. The rest must find room within the scene
-        (`backdrop`): the colour of the ground is not that of the sky above.
+        The background colour is the median of the border, if at least half of the border pixels differ from
+        it by at most 2 % of the brighter of that colour and the object's median radiance, and if the other
+        border pixels can lie within the scene (`backdrop`), which fails if that colour is the ground and the
+        others are the sky.
         """
         numbers, views = border(self.store)
         color = self.border_median()
@@ -254,12 +266,12 @@ class PixelDataset:
         return color if self._within_the_scene(numbers[others], views[others], unlike) else None
 
     def border_median(self) -> Float[Tensor, " 3"]:
-        """The median linear RGB of the borders of the images; black where no pixel there is valid."""
+        """Return the median linear RGB of the image borders; black if no pixel there is valid."""
         colors = self._linear(self.border_colors())
         return colors.median(dim=0).values if len(colors) else colors.new_zeros(3)
 
     def border_colors(self) -> Float32[np.ndarray, "B 3"]:
-        """The colours of the valid pixels on the borders of the images."""
+        """Return the colours of the valid pixels on the image borders."""
         return self.store.colors(*border(self.store))
 
     def _within_the_scene(
@@ -268,7 +280,7 @@ class PixelDataset:
         views: Int[np.ndarray, " N"],
         other: Callable[[Float32[np.ndarray, "V 3"]], Bool[Tensor, " V"]],
     ) -> bool:
-        """Whether what these pixels show can lie in the scene, judged by which pixels are `other`."""
+        """Whether the content of these pixels can lie in the scene; `other` selects the other colours."""
         if not len(numbers):
             return True
         step = -(-len(numbers) // MAX_RAYS)
@@ -287,7 +299,7 @@ class PixelDataset:
 
 
 def _gradient(values: Float32[Tensor, "H W"]) -> Float32[Tensor, "H W"]:
-    """`_scharr` of a whole image; the borders are continued."""
+    """`_scharr` of a whole image, with replicated borders."""
     padded = torch.nn.functional.pad(values[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
     height, width = values.shape
     return _scharr(
@@ -296,11 +308,11 @@ def _gradient(values: Float32[Tensor, "H W"]) -> Float32[Tensor, "H W"]:
 
 
 def _scharr(about: Sequence[Float32[Tensor, "*shape"]]) -> Float32[Tensor, "*shape"]:
-    """The length of the Scharr gradient from the nine values about each pixel, in the order of `NEIGHBOURS`.
+    """The length of the Scharr gradient from the nine values around each pixel, in the order of `NEIGHBOURS`.
 
-    Without its factor of 1/32: a ramp of 0.01 a pixel has 0.32.
-
-    L_smth weighs by its exponential (published code); with the factor no edge of a picture would count.
+    The usual factor of 1/32 is left out, so a ramp of 0.01 per pixel has the value 0.32. The weight of L_smth
+    is the exponential of this value, as in the published code; with the factor, no edge of an image would
+    have an effect.
     """
     right = 3 * (about[2] - about[0]) + 10 * (about[5] - about[3]) + 3 * (about[8] - about[6])
     down = 3 * (about[6] - about[0]) + 10 * (about[7] - about[1]) + 3 * (about[8] - about[2])

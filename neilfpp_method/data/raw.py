@@ -1,7 +1,7 @@
-"""Camera RAW developed into linear radiance by LibRaw; needs the extra `raw`.
+"""Develop camera RAW files into linear radiance by LibRaw; needs the extra `raw`.
 
-Nothing is decided by the single picture: no automatic brightness, no maximum told from the data, one white
-balance for all pictures of a camera. Two pictures of a scene then differ by their exposures alone.
+No parameter depends on the individual image: brightness and white level are fixed, and all images of a camera
+model have the same white balance. Two images of a scene then differ only by their exposures.
 """
 
 from __future__ import annotations
@@ -20,16 +20,18 @@ __all__ = ["RAW_SUFFIXES", "Developed", "develop"]
 
 RAW_SUFFIXES = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 INTERPOLATION_REACH = 5
-"""Side of the square of sensor pixels that demosaicing reads around each pixel."""
+"""Side of the square of sensor pixels around each pixel that demosaicing reads, in pixels."""
 
 
 @dataclass(frozen=True)
 class Developed:
     """A developed RAW file, in the orientation of the sensor.
 
-    `pixels` are linear, with the primaries of sRGB; 1 is the level at which the sensor saturates. `valid` is
-    false where it has. `white_balance` is what the camera would have multiplied red, green and blue of the
-    sensor by, relative to green; what was used instead is the daylight balance of the camera model.
+    Attributes:
+        pixels: linear radiance with the primaries of sRGB; 1 is the saturation level of the sensor.
+        valid: false at saturated pixels.
+        white_balance: the camera's own factors of red, green and blue, relative to green. They are not
+            applied; the daylight balance of the camera model is used.
     """
 
     pixels: Float32[np.ndarray, "H W 3"]
@@ -60,7 +62,8 @@ def develop(path: Path) -> Developed:
             red, green, blue = (float(factor) for factor in raw.camera_whitebalance[:3])
     except UserError:
         raise
-    except Exception as error:  # LibRaw's own exceptions do not share a base with rawpy's
+    except Exception as error:
+        # The exceptions of LibRaw and of rawpy have no common base class.
         raise UserError(
             f"{path}: cannot be developed ({error})", "convert it to DNG, or to linear EXR"
         ) from error

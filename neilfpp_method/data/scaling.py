@@ -1,7 +1,7 @@
-"""Views at another size than that of their files: cameras to match, and pixels averaged over their area.
+"""Scale views to another size than that of their files: cameras, and pixels averaged over their area.
 
-A pixel of a smaller image is the mean, over its area, of the linear radiance of the pixels that it covers
-(display values are made linear, averaged, and encoded again). An image point (u, v) of the file is then at (u
+A pixel of a smaller image is the mean over its area of the linear radiance of the pixels that it covers
+(display values are linearised, averaged, and encoded again). An image point (u, v) of the file is then at (u
 · w/W, v · h/H), as pixel centres are at +0.5: focal lengths and principal points are multiplied by the same
 factors, and a lens keeps its coefficients, which apply to the plane at unit distance.
 """
@@ -35,22 +35,21 @@ __all__ = [
 ]
 
 PIXELS_OF_A_VIEW = 2**17
-"""Pixels of a view that suffice to look at and to measure it, unless more are asked for: 420 × 310."""
+"""Default number of pixels of a view for rendering and measuring: about 420 × 310."""
 PIXELS_OF_A_RAY = 4
-"""Training pixels per ray of the whole training. With more, most are never drawn; a smaller image holds their
-means, with less noise.
-"""
+"""Number of training pixels per ray of the whole training. Of a larger number most would never be drawn; a
+smaller image has their means, with less noise."""
 SAME = 0.98
-"""Scales from here to 1 count as 1: so small a reduction is not worth resampling."""
+"""Smallest scale that is rounded to 1, because so small a reduction is not worth resampling."""
 
 
 def file_size(view: View) -> tuple[int, int]:
-    """Width and height of the view's files, pixels."""
+    """Return width and height of the files of a view, in pixels."""
     return view.file_size or (view.camera.width, view.camera.height)
 
 
 def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
-    """The camera with the same field of view and another number of pixels.
+    """Return the camera with the same field of view and another number of pixels.
 
     >>> camera = Camera(500.0, 500.0, 200.0, 150.0, 400, 300, np.eye(4))
     >>> half = scaled_camera(camera, 200, 150)
@@ -70,7 +69,7 @@ def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
 
 
 def scaled_view(view: View, scale: float) -> View:
-    """The view at `scale` times the size of its files.
+    """Return the view at `scale` times the size of its files.
 
     Raises:
         UserError: the scale is not above 0 and at most 1.
@@ -89,7 +88,7 @@ def scaled_view(view: View, scale: float) -> View:
 
 
 def at_scale(capture: Capture, scale: float) -> Capture:
-    """The capture with all views at `scale` times the size of their files."""
+    """Return the capture with all views at `scale` times the size of their files."""
     return replace(capture, views=tuple(scaled_view(view, scale) for view in capture.views))
 
 
@@ -97,23 +96,23 @@ def at_scale(capture: Capture, scale: float) -> Capture:
 
 
 def scale_for_rays(views: Sequence[View], rays: int) -> float:
-    """The largest scale at which a training of so many rays can use the pixels of the views.
+    """Return the largest scale at which a training with this number of rays uses most pixels of the views.
 
-    That is `PIXELS_OF_A_RAY` pixels to a ray, and `PIXELS_OF_A_VIEW` pixels of a view at least, so that many
-    views do not make for tiny ones.
+    It leaves `PIXELS_OF_A_RAY` pixels per ray, and at least `PIXELS_OF_A_VIEW` pixels per view, so that
+    captures of many views do not get tiny images.
     """
     return scale_for_pixels(views, max(PIXELS_OF_A_RAY * rays, PIXELS_OF_A_VIEW * len(views)))
 
 
 def scale_for_pixels(views: Sequence[View], pixels: int) -> float:
-    """The largest scale at which the views have at most so many pixels together."""
+    """Return the largest scale at which all views together have at most `pixels` pixels."""
     total = sum(math.prod(file_size(view)) for view in views)
     scale = math.sqrt(pixels / max(total, 1))
     return 1.0 if scale >= SAME else round(scale, 4)
 
 
 def scale_for_width(views: Sequence[View], width: int) -> float:
-    """The scale at which the widest view has this width, in pixels; 1 where none is as wide.
+    """Return the scale at which the widest view has this width in pixels; 1 if no view is as wide.
 
     Raises:
         UserError: the width is not positive.
@@ -129,7 +128,7 @@ def scale_for_width(views: Sequence[View], width: int) -> float:
 def area_average(
     values: Float32[np.ndarray, "H W *C"], width: int, height: int
 ) -> Float32[np.ndarray, "h w *C"]:
-    """Area means at a smaller size, partial pixels weighted; the image itself where the size is the same."""
+    """Return area means at a smaller size, with weights for partially covered pixels."""
     if values.shape[:2] == (height, width):
         return values
     averaged = cv2.resize(np.ascontiguousarray(values), (width, height), interpolation=cv2.INTER_AREA)
@@ -137,12 +136,12 @@ def area_average(
 
 
 def area_share(marked: Bool[np.ndarray, "H W"], width: int, height: int) -> Float32[np.ndarray, "h w"]:
-    """The share of the area of each pixel that is marked."""
+    """Return the share of the area of each pixel that is marked."""
     return area_average(marked.astype(np.float32), width, height)
 
 
 def nearest(values: Shaped[np.ndarray, "H W *C"], width: int, height: int) -> Shaped[np.ndarray, "h w *C"]:
-    """What is at the centres of fewer pixels: for values that have no mean, as depths across an edge."""
+    """Return the nearest values at a smaller size, for values that must not be averaged, such as depths."""
     rows = ((np.arange(height) + 0.5) * values.shape[0] / height).astype(np.int64)
     columns = ((np.arange(width) + 0.5) * values.shape[1] / width).astype(np.int64)
     return values[rows[:, None], columns]

@@ -1,11 +1,11 @@
-"""Where the scene is, for captures that do not say: from points, from silhouettes, or from the cameras.
+"""Find the scene box of a capture that does not state it: from points, from silhouettes, or from the cameras.
 
-The scene frame has the object in the unit sphere; a box gives its centre and half of its largest extent
-(METHOD's normalisation). What is known best decides: points on the surface, then the masks, whose visual hull
-holds the object; the cameras know only what they look at. Points without masks may reach far beyond that, to
-walls and trees. A box that holds those holds the cameras as well, or nearly so, and every view could be
-explained by fog before its own lens: there the box is about what the cameras look at, and ends well before
-them.
+The scene frame has the object in the unit sphere; the box gives its centre and half of its largest extent.
+The most reliable source is used: points on the surface, then the masks, whose visual hull contains the
+object, then the cameras. Points without masks may extend far beyond the object, to walls and trees. A box
+around all of them would contain the cameras as well, and every view could then be explained by density close
+to its own camera. In this case the box is placed around the point that the cameras look at, and ends well
+before them.
 """
 
 from __future__ import annotations
@@ -24,37 +24,42 @@ from neilfpp_method.errors import UserError
 __all__ = ["SceneBox", "box_of_cameras", "box_of_focus", "box_of_points", "find_box"]
 
 OUTLIERS = 0.01
-"""Share of the points on each side of an axis that the box leaves out."""
+"""Share of the points that the box leaves out at either end of each axis."""
 MARGIN = 1.1
-"""Size of the box over that of its points."""
+"""Ratio of the size of the box to the extent of its points."""
 MIN_POINTS = 20
-"""Points from which a box is computed."""
+"""Smallest number of points from which a box is computed."""
 CELLS = 32
+"""Grid points along each axis of the visual hull."""
+
 REFINEMENTS = 3
+"""Number of grids, each of which covers the hull that the previous one found."""
+
 REACH = 0.55
-"""Radius of the box around what the cameras look at, over their median distance from it. Half of the cameras
-are then at least 1.8 scene units away, and one at three quarters of the median is 1.36 away.
-"""
+"""Ratio of the radius of a box around the focus of the cameras to their median distance from it. Half of the
+cameras are then at least 1.8 scene units away, and a camera at three quarters of the median distance is 1.36
+away."""
 
 
 @dataclass(frozen=True)
 class SceneBox:
-    """The scene frame and what told it."""
+    """The normalisation to the scene frame, and its source."""
 
     normalisation: Normalisation
     source: SceneSource
 
 
 def find_box(views: Sequence[View], points: Float64[np.ndarray, "P 3"] | None = None) -> SceneBox:
-    """The scene box of a capture that has none.
+    """Find the scene box of a capture that does not state it.
 
     Args:
-        views: the capture's views, with their masks or alpha channels where they have any.
-        points: points on the scene's surface, in the world frame; outliers are put up with. Where there are
-            masks, only points within them count.
+        views: the views of the capture, with masks or alpha channels if they have any.
+        points: points on the surface of the scene, in the world frame; outliers are tolerated. If there are
+            masks, only points inside them are used.
 
     Raises:
-        UserError: a camera is malformed, a mask cannot be read, or nothing tells where the scene is.
+        UserError: a camera is malformed, a mask cannot be read, or the extent of the scene cannot be
+            determined.
     """
     for view in views:
         check_camera(view.camera, str(view.image))
@@ -63,7 +68,7 @@ def find_box(views: Sequence[View], points: Float64[np.ndarray, "P 3"] | None = 
         points = points[agreement(outlines, points) >= AGREEMENT]
     if points is not None and len(points) >= MIN_POINTS:
         box = box_of_points(points)
-        # Points within masks are the object's own.
+        # Points inside the masks belong to the object, so their box is not too large.
         focus = None if outlines else box_of_focus(views)
         return (
             SceneBox(box, "points") if focus is None or box.scale <= focus.scale else SceneBox(focus, "focus")
@@ -74,18 +79,20 @@ def find_box(views: Sequence[View], points: Float64[np.ndarray, "P 3"] | None = 
 
 
 def box_of_points(points: Float64[np.ndarray, "P 3"]) -> Normalisation:
-    """The box that holds all but the outermost per cent of the points on every side, and a margin.
+    """Return the box of all points but 1 % at either end of each axis, with a margin.
 
     Raises:
-        UserError: the points lie in one place.
+        UserError: all points are equal.
     """
     low, high = np.quantile(points, [OUTLIERS, 1 - OUTLIERS], axis=0)
     return _box(low, high)
 
 
 def box_of_focus(views: Sequence[View]) -> Normalisation | None:
-    """A ball about the place that most cameras look at, which ends at `REACH` of their median distance; none:
-    there is no such place (`focus`).
+    """Return a ball around the point that most cameras look at, with `REACH` of their median distance as
+    radius.
+
+    Returns None if there is no such point (`find_focus`).
     """
     focus = find_focus(views)
     if focus is None:
@@ -95,12 +102,12 @@ def box_of_focus(views: Sequence[View]) -> Normalisation | None:
 
 
 def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalisation:
-    """A guess: what the cameras look at, as large as the circle that fits into their images, times `fill`.
+    """Guess the box from the cameras: `fill` times the largest circle that fits into their images.
 
-    The centre is where most cameras look, or else the least-squares point nearest to all optical axes.
+    The centre is the point that most cameras look at, or else the least-squares point of all optical axes.
 
     Raises:
-        UserError: the axes do not come near one point in front of the cameras.
+        UserError: the axes are parallel, or meet behind the cameras.
     """
     where = views[0].image.parent
     axes, focus = axes_of(views), find_focus(views)
@@ -133,7 +140,7 @@ def _box(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> Nor
 
 
 def _carve(outlines: Sequence[Outline], start: Normalisation) -> Normalisation:
-    """The box of the places that nearly all silhouettes hold, on grids that close in on it."""
+    """The box of the visual hull: of the points in nearly all silhouettes, on successively finer grids."""
     centre, half = np.array(start.centre), np.full(3, start.scale)
     low, high = centre - half, centre + half
     for _ in range(REFINEMENTS):

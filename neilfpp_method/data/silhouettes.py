@@ -1,4 +1,4 @@
-"""Silhouettes of many views, and which places they hold in common."""
+"""Silhouettes of many views, and the points that lie in most of them."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from neilfpp_method.data.views import Camera, View, project
 __all__ = ["AGREEMENT", "MAX_VIEWS", "Outline", "Sightings", "agreement", "read_outlines", "sightings"]
 
 AGREEMENT = 0.9
-"""Share of the views that see a place which must have it in their silhouette."""
+"""Smallest share of the views that see a point whose silhouettes must contain it."""
 MAX_VIEWS = 32
-"""Evenly chosen views whose silhouettes are read."""
+"""Largest number of views, evenly chosen, whose silhouettes are read."""
 MAX_SIDE = 512
-"""Pixels along the longer side of a silhouette: places are resolved to hundredths of the scene only."""
+"""Longer side of a reduced silhouette, in pixels; the scene box needs a precision of hundredths only."""
 
 
 @dataclass(frozen=True)
 class Outline:
-    """A view with its silhouette; where that misses the border, places beyond the image are outside it."""
+    """A view with its silhouette. If it is `complete`, points beyond the image lie outside the silhouette."""
 
     view: View
     inside: Bool[np.ndarray, "H W"]
@@ -37,11 +37,13 @@ class Outline:
 
 
 def read_outlines(views: Sequence[View], most: int = MAX_VIEWS, longest: int = MAX_SIDE) -> list[Outline]:
-    """The silhouettes, by mask or alpha, of at most `most` evenly chosen views, with matching cameras.
+    """Read the silhouettes of at most `most` evenly chosen views from their masks or alpha channels.
 
-    None where fewer than half of these have one. An alpha channel that is opaque all over is none. The masks
-    are read one after the other, and those with more than `longest` pixels along a side are made smaller: a
-    pixel is then inside where most of it was.
+    Masks with more than `longest` pixels a side are reduced, and a pixel is inside if most of it was. The
+    cameras of the returned views have the size of the silhouettes.
+
+    Returns:
+        The silhouettes; an empty list if fewer than half of the chosen views have a mask.
 
     Raises:
         UserError: a mask cannot be read.
@@ -73,14 +75,14 @@ def _of_size(camera: Camera, height: int, width: int) -> Camera:
 
 @dataclass(frozen=True)
 class Sightings:
-    """Of each of P places: how many views can tell of it, and in how many of their silhouettes it lies."""
+    """For each of P points, the number of views that see it and the number of silhouettes that contain it."""
 
     seen: Int64[np.ndarray, " P"]
     inside: Int64[np.ndarray, " P"]
 
 
 def sightings(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -> Sightings:
-    """What the views tell of points, which are in the frame of the views' cameras."""
+    """Count views and silhouettes for points in the frame of the cameras."""
     seen, inside = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     for outline in outlines:
         camera = outline.view.camera
@@ -98,9 +100,9 @@ def sightings(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -
 
 
 def agreement(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, " P"]:
-    """Share of the views that see a point with it in their silhouette; 0 where under half of them see it.
+    """Return the share of the views seeing a point whose silhouette contains it; 0 if fewer than half see it.
 
-    Points are in the frame of the views' cameras.
+    Points are in the frame of the cameras.
     """
     found = sightings(outlines, points)
     return np.where(found.seen >= len(outlines) / 2, found.inside / np.maximum(found.seen, 1), 0.0)

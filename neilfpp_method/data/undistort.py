@@ -1,4 +1,4 @@
-"""From images of a lens to those of a pinhole, for layouts that know no lenses. Training needs none of it."""
+"""Resample images to pinhole cameras, for layouts without lens distortion. Training does not need it."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ __all__ = ["resample", "straight_camera"]
 
 
 def straight_camera(camera: Camera) -> Camera:
-    """The pinhole of the same pose that shows as much as possible of what a camera with a lens shows.
+    """Return the pinhole of the same pose that covers as much as possible of the image of a camera.
 
-    A pinhole is returned as it is.
+    A pinhole is returned unchanged.
     """
     if camera.lens is None:
         return camera
@@ -30,11 +30,11 @@ def straight_camera(camera: Camera) -> Camera:
 def resample(
     values: Float32[np.ndarray, "H W C"], camera: Camera, straight: Camera
 ) -> Float32[np.ndarray, "h w C"]:
-    """An image of a camera with a lens as its pinhole sees it, bilinear; the border is continued."""
+    """Resample an image to a pinhole camera, bilinearly, with replicated borders."""
     rows, columns = np.mgrid[: straight.height, : straight.width].reshape(2, -1) + 0.5
     plane = (np.stack([columns, rows], axis=1) - straight.intrinsics[2:]) / straight.intrinsics[:2]
     pixel = camera.lens.bend(plane) * camera.intrinsics[:2] + camera.intrinsics[2:]
-    # OpenCV counts from the centre of the first pixel.
+    # In OpenCV the centre of the first pixel is (0, 0).
     where = (pixel - 0.5).astype(np.float32).reshape(straight.height, straight.width, 2)
     moved = cv2.remap(values, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return moved.reshape(straight.height, straight.width, values.shape[2])

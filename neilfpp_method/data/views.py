@@ -106,15 +106,20 @@ def check_camera(camera: Camera, where: str) -> None:
 class View:
     """One image with its camera in the world frame.
 
-    `name` is unique in the capture and a plain file name, most often the image's stem; `index` its number in
-    the capture's own list, which counts views that are left out as well.
+    Linear radiance = pixel / (`exposure` · `white_balance`), so that all images of a capture have one scale.
 
-    `mask` is white on the object. `valid` is white where a pixel can be used and black where it is saturated
-    or otherwise without meaning. Linear radiance = pixel / (`exposure` · `white_balance`), so that all images
-    of a capture share one scale.
-
-    `file_size` is the width and height of the view's files where its camera is of another size (`scaling`);
-    pixels are brought to the size of the camera where they are read.
+    Attributes:
+        name: unique in the capture and a valid file name, in most layouts the stem of the image.
+        index: number of the view in the layout's own list, which also counts views that are left out.
+        camera: the camera, in the world frame.
+        image: the image.
+        mask: mask of the object, white on it; None if there is none.
+        valid: validity mask, black where a pixel is saturated or has no meaning; None if all pixels are
+            valid.
+        exposure: exposure relative to other views.
+        white_balance: factors of red, green and blue.
+        file_size: width and height of the files if the camera has another size (`scaling`), to which pixels
+            are scaled when they are read; else None.
     """
 
     name: str
@@ -136,34 +141,37 @@ class Normalisation:
     centre: tuple[float, float, float]
 
     def to_scene(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
-        """World positions in the scene frame."""
+        """Transform positions from the world frame to the scene frame."""
         return (points - points.new_tensor(self.centre)) / self.scale
 
     def to_world(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
-        """Scene positions in the world frame."""
+        """Transform positions from the scene frame to the world frame."""
         return points * self.scale + points.new_tensor(self.centre)
 
     def camera(self, camera: Camera) -> Camera:
-        """The camera in the scene frame: the same image, with depths divided by `scale`."""
+        """Return the camera in the scene frame: with the same image, and depths divided by `scale`."""
         w2c = camera.w2c.copy()
         w2c[:3, 3] = (w2c[:3, :3] @ np.array(self.centre) + w2c[:3, 3]) / self.scale
         return replace(camera, w2c=w2c)
 
 
 SceneSource = Literal["box", "points", "focus", "masks", "cameras"]
-"""What told where the scene is: the capture itself; points; what the cameras look at, as the points reach
-beyond it; the visual hull of the masks; the cameras alone.
-"""
+"""Source of the scene box: the capture states it ("box"); points; the point that the cameras look at, because
+the points extend far beyond it ("focus"); the visual hull of the masks; or only the cameras."""
 
 
 @dataclass(frozen=True)
 class CaptureFiles:
-    """What a reader finds in a folder: the views in order, the scene frame, and where the rest lies.
+    """The content of a capture folder, as a reader returns it.
 
-    `inputs` is the folder that listed paths start from: masks, depth maps and the like lie in it. `test`
-    names the views that the capture itself holds out, and `hdr` says whether it declares its pixels linear;
-    none: it does not say. `scene_from` is what told the normalisation: a box that the capture has, or else
-    what `scene_box` found.
+    Attributes:
+        inputs: folder to which listed paths are relative, with masks, depth maps and other files.
+        views: the views, in order.
+        normalisation: the transformation from the world frame to the scene frame.
+        point_cloud: oriented point cloud; None if there is none.
+        test: names of the test views; None if the capture states no split.
+        hdr: whether pixels are linear radiance; None if the capture does not state it.
+        scene_from: source of the normalisation.
     """
 
     inputs: Path

@@ -1,4 +1,4 @@
-"""`neilfpp demo`: train on the scene in the package, measure, and write a report to look at."""
+"""`neilfpp demo`: train on the example scene of the package, evaluate, and write a report."""
 
 from __future__ import annotations
 
@@ -22,27 +22,31 @@ from neilfpp_method.train.run import load_run
 __all__ = ["demo_config", "demo_scene", "run_demo"]
 
 STEPS = {"sdf_steps": 1600, "material_steps": 1200, "joint_steps": 100}
-"""Of the three stages: some less than the preset has, for five to ten minutes on two cores of today."""
+"""Steps of the three stages: fewer than in the preset, for five to ten minutes on two current CPU cores."""
 VIEWS = 3
-"""In the report."""
+"""Number of views in the report."""
 SHORT = 20
-"""A short demo takes one step in so many."""
+"""Divisor of the numbers of steps in a short demo."""
 
 
 def demo_scene() -> Path:
-    """The capture in the package: a table top under three lamps, 24 views to learn from and 4 to test on."""
+    """Folder of the example capture: a table top under three lamps, with 24 training and 4 test views."""
     return Path(str(resources.files("neilfpp_method.demo") / "scene"))
 
 
 def demo_config(short: bool) -> NeilfConfig:
-    """The preset `fast` with fewer steps; short: hardly any."""
+    """The preset `fast` with fewer steps, or with very few if `short`."""
     config = preset("fast")
     steps = {name: count // SHORT for name, count in STEPS.items()} if short else STEPS
     return dataclasses.replace(config, train=dataclasses.replace(config.train, **steps))
 
 
 def run_demo(out: Path, *, short: bool, resume: bool, device: str, console: Console) -> Path:
-    """Train, evaluate, write `report.html` and `contact_sheet.png` into `out`; returns the report's path."""
+    """Train, evaluate, and write `report.html` and `contact_sheet.png` into `out`.
+
+    Returns:
+        The path of the report.
+    """
     run_training(
         data=demo_scene(),
         out=out,
@@ -57,11 +61,11 @@ def run_demo(out: Path, *, short: bool, resume: bool, device: str, console: Cons
         command="neilfpp demo",
     )
     run = load_run(out, pick_device(device))
-    console.print("measuring on the test views …")
+    console.print("evaluating the test views …")
     rendered = render_test_views(run)
     metrics = evaluate(run, rendered=rendered)
     write_metrics(out / "metrics.json", run, metrics)
-    console.print("drawing the report …")
+    console.print("writing the report …")
     write_contact_sheet(run, out / "contact_sheet.png", rendered)
     report = write_report(out, out / REPORT, ReportOptions(VIEWS, confidence=True), str(pick_device(device)))
     console.print(f"done: open {report}", soft_wrap=True)

@@ -1,6 +1,7 @@
-"""Which effects a scene calls for, told by evidence (docs/effects.md).
+"""Decide by measurement which effects are simulated for a scene (docs/effects.md).
 
-`catalogue` lists the effects, each a change of settings; `asked` reads what a person wants of them; `plan`
-holds what was decided, and makes the settings that follow from it; `looks` measures a model at the moments
-when a measurement is cheap, with `visibility` and the other modules of evidence; `table` shows a plan.
+`catalogue` lists the effects, each a change of settings. `asked` parses the option `--effects`. `plan`
+records the decisions and derives the settings that follow from them. `looks` runs the measurements at the
+moments of training when they are cheap; `visibility`, `material` and the other modules implement them.
+`table` formats a plan.
 """

@@ -1,4 +1,4 @@
-"""What a person asks of effects: `auto`, `all`, `none` or `as-set`, and names with + and −."""
+"""Parse the option `--effects`: `auto`, `all`, `none` or `as-set`, and names of effects with + or −."""
 
 from __future__ import annotations
 
@@ -13,16 +13,21 @@ from neilfpp_method.settings.types import NeilfConfig
 __all__ = ["BASES", "Asked", "check_asked", "read_asked"]
 
 BASES = ("auto", "all", "none", "as-set")
-"""Who decides an effect that is not named: evidence; nobody (all on or all off); the settings."""
+"""How effects that are not named are decided: by evidence, all on, all off, or by the settings."""
 ELSEWHERE = {
-    "response": "what pixels are of radiance is told from the files; say it with --response linear or srgb",
+    "response": "it is read from the image files; override it with --response linear or srgb",
 }
-"""What the table shows and other options decide."""
+"""Effects of the table that another option sets, with the remedy of the error message."""
 
 
 @dataclass(frozen=True)
 class Asked:
-    """`base` is one of `BASES`; `named` says on or off for the effects that are named."""
+    """The value of `--effects`.
+
+    Attributes:
+        base: one of `BASES`.
+        named: whether each effect that is named is to be on.
+    """
 
     base: str = "auto"
     named: Mapping[str, bool] = field(default_factory=dict)
@@ -32,10 +37,10 @@ class Asked:
 
 
 def read_asked(text: str) -> Asked:
-    """The value of `--effects`.
+    """Parse the value of `--effects`.
 
     Raises:
-        UserError: a name that no effect has, or one that is named twice.
+        UserError: if a name is unknown, has no sign, or occurs twice.
 
     Example:
         >>> read_asked("auto,-lamps")
@@ -51,24 +56,24 @@ def read_asked(text: str) -> Asked:
         if sign not in "+-" and word in EFFECTS:
             raise UserError(f"--effects: '{word}' has no sign", f"write +{word} or -{word}")
         if sign not in "+-":
-            raise _unknown(word, f"'{word}' is no choice")
+            raise _unknown(word, f"'{word}' is not a choice")
         if name in ELSEWHERE:
-            raise UserError(f"--effects: {name} is not switched here", ELSEWHERE[name])
+            raise UserError(f"--effects: {name} cannot be set here", ELSEWHERE[name])
         if name not in EFFECTS:
             raise _unknown(name, f"no effect '{name}'")
         if name in named:
             raise UserError(f"--effects: {name} is named twice", "name it once")
         named[name] = sign == "+"
     if not text.strip():
-        raise _unknown("", "nothing is given")
+        raise _unknown("", "the value is empty")
     return Asked(base, named)
 
 
 def check_asked(asked: Asked, config: NeilfConfig) -> None:
-    """That every effect that is named can be switched with these settings.
+    """Check that every named effect can be switched with these settings.
 
     Raises:
-        UserError: one cannot.
+        UserError: if one cannot, or if it needs another effect that is off.
     """
     for name, on in asked.named.items():
         obstacle = EFFECTS[name].obstacle(config)
@@ -80,11 +85,12 @@ def check_asked(asked: Asked, config: NeilfConfig) -> None:
         needs = EFFECTS[name].needs
         if on and needs and not asked.named.get(needs, asked.base != "none"):
             raise UserError(
-                f"--effects +{name}: there is none without {needs}", f"add +{needs}, or leave {name} out"
+                f"--effects +{name}: {name} requires {needs}", f"add +{needs}, or leave {name} out"
             )
 
 
 def _unknown(word: str, what: str) -> UserError:
+    """The error for a word that is no name, with the most similar name as the remedy."""
     near = get_close_matches(word, EFFECTS, n=1)
     remedy = (
         f"did you mean '{near[0]}'?"

@@ -1,4 +1,4 @@
-"""The effects that can be simulated or left out, as data. Each is a change of settings."""
+"""The effects that can be simulated or left out, as data. Switching an effect is a change of settings."""
 
 from __future__ import annotations
 
@@ -15,21 +15,23 @@ __all__ = ["EFFECTS", "Effect", "switched"]
 
 @dataclass(frozen=True)
 class Effect:
-    """Something that light does, or that a scene has, and what it takes to simulate it.
+    """A property of the scene or of light transport that can be simulated or left out.
 
     Attributes:
-        name: on the command line and in `effects.json`.
-        title: for people.
-        is_on: whether settings simulate it, or leave it open.
+        name: name on the command line and in `effects.json`.
+        title: description for the report.
+        is_on: whether given settings simulate the effect or leave it to evidence.
         on: the settings that switch it on.
         off: the settings that switch it off.
-        obstacle: why it cannot be switched with these settings; empty: it can.
-        cost: what it takes while a material is learned.
-        risk: what goes wrong where it is left out of a scene that has it.
-        unjudged: why no evidence decides with these settings; empty: evidence does.
-        advised: evidence is shown and changes nothing: it cannot tell that the effect is not needed.
-        needs: an effect without which there is none of this; empty: nothing.
-        solved: the light solver decides it again at each fit, so evidence changes no setting.
+        obstacle: why it cannot be switched with given settings; empty if it can.
+        cost: what it costs while material is trained.
+        risk: what goes wrong if it is left out although the scene has it.
+        unjudged: why no evidence is collected with given settings; empty if it is.
+        advised: whether evidence is shown but never changes the effect, because it cannot show reliably that
+            the effect is not needed.
+        needs: the effect without which this one does not exist; empty if there is none.
+        solved: whether the light solver decides the effect at every fit, so that evidence changes no
+            setting.
     """
 
     name: str
@@ -47,7 +49,7 @@ class Effect:
 
 
 def switched(config: NeilfConfig, effect: Effect, on: bool) -> NeilfConfig:
-    """The same settings with one effect on or off."""
+    """The same settings with one effect switched on or off."""
     return changed(config, effect.on(config) if on else effect.off)
 
 
@@ -57,8 +59,8 @@ def _none(config: NeilfConfig) -> str:
 
 def _traced_on(config: NeilfConfig) -> Mapping[str, Any]:
     settings = config.inter_reflection
-    usual = "soft" if isinstance(config.light, FreeLightConfig) else "hard"
-    return {"inter_reflection.mode": usual if settings.mode == "off" else settings.mode}
+    default = "soft" if isinstance(config.light, FreeLightConfig) else "hard"
+    return {"inter_reflection.mode": default if settings.mode == "off" else settings.mode}
 
 
 def _traced_cost(config: NeilfConfig) -> str:
@@ -91,65 +93,66 @@ def _given_map(config: NeilfConfig) -> str:
 
 def _joint_obstacle(config: NeilfConfig) -> str:
     if isinstance(config.host, MeshConfig):
-        return "the surface is given, and the material moves with R from the start"
-    return "" if config.train.joint_steps else "no steps are set for it (train.joint_steps)"
+        return "the surface is given, so material and R are trained together from the start"
+    return "" if config.train.joint_steps else "the settings give it no steps (train.joint_steps)"
 
 
-UNKNOWN_IN_FREE_LIGHT = "not judged: a light that is free at every point explains any material"
+UNKNOWN_IN_FREE_LIGHT = "not measured: a light that is free at every point can explain any material"
+"""Why no evidence on the material is collected with the paper's light field."""
 
 EFFECTS: Mapping[str, Effect] = {
     effect.name: effect
     for effect in (
         Effect(
             name="inter-reflection",
-            title="shadows, and light from surface to surface",
+            title="shadows and inter-reflection",
             is_on=lambda config: config.inter_reflection.mode != "off",
             on=_traced_on,
             off={"inter_reflection.mode": "off"},
             obstacle=_none,
             cost=_traced_cost,
-            risk="shadows and light between surfaces become base colour",
+            risk="shadows and inter-reflections are baked into the base colour",
         ),
         Effect(
             name="lamps",
-            title="lamps close by",
+            title="near lamps",
             is_on=lambda config: isinstance(config.light, MapLightConfig) and config.light.kind != "distant",
             on=lambda config: {"light.kind": "distant_near"},
             off={"light.kind": "distant"},
-            obstacle=_free_light("a light that is free at every point holds that of lamps"),
+            obstacle=_free_light("a light that is free at every point includes that of lamps"),
             cost=lambda config: (
                 f"a second fit of the light every {_every(config)} steps, and a shadow ray per point and lamp"
             ),
-            risk="the glow of a lamp becomes base colour",
+            risk="the light of near lamps is baked into the base colour",
             solved=True,
         ),
         Effect(
             name="environment-map",
-            title="an environment map, not one colour from everywhere",
+            title="an environment map instead of even light",
             is_on=lambda config: _is_map(config) and config.light.environment_height > 1,
             on=_map_on,
             off={"light.environment_height": 1},
             obstacle=lambda config: (
-                _free_light("a light that is free at every point is no map")(config) or _given_map(config)
+                _free_light("a light that is free at every point is not a map")(config) or _given_map(config)
             ),
             cost=lambda config: (
-                f"{config.shading.train_samples * config.train.rays} look-ups a step, half of the directions "
-                f"drawn by the light, and fits of {2 * config.light.environment_height**2} texels"
+                f"{config.shading.train_samples * config.train.rays} map look-ups a step, half of them in "
+                f"directions drawn from the map, and fits of {2 * config.light.environment_height**2} texels"
                 if _is_map(config)
                 else ""
             ),
-            risk="shading and reflections of the light become base colour",
+            risk="shading and reflections are baked into the base colour",
             advised=True,
         ),
         Effect(
             name="coloured-light",
-            title="colours in the map, not white light",
+            title="a coloured map instead of grey light",
             is_on=lambda config: not config.light.monochrome,
             on=lambda config: {"light.monochrome": False},
             off={"light.monochrome": True},
             obstacle=_given_map,
-            cost=lambda config: "three unknowns a texel, not one",
-            risk="colours of the light become base colour",
+            cost=lambda config: "three unknowns per texel instead of one",
+            risk="the colours of the light are baked into the base colour",
             advised=True,
             unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
         ),
@@ -161,10 +164,10 @@ EFFECTS: Mapping[str, Effect] = {
             off={"shading.specular": False},
             obstacle=_none,
             cost=lambda config: (
-                f"a lobe in {config.shading.train_samples * config.train.rays} directions a step, and three "
-                "matrices in fits of the light, not one"
+                f"the specular lobe in {config.shading.train_samples * config.train.rays} directions a step, "
+                "and three transport matrices per fit of the light instead of one"
             ),
-            risk="gloss becomes base colour",
+            risk="highlights are baked into the base colour",
             advised=True,
             unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
         ),
@@ -174,36 +177,36 @@ EFFECTS: Mapping[str, Effect] = {
             is_on=lambda config: config.brdf.metals,
             on=lambda config: {"brdf.metals": True},
             off={"brdf.metals": False},
-            obstacle=_without_reflection("a surface without reflection shows no metal"),
+            obstacle=_without_reflection("surfaces without specular reflection have no metallic"),
             cost=lambda config: "one more unknown at every point",
-            risk="metal becomes dark gloss",
+            risk="metal becomes a dark glossy dielectric",
             unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
             needs="reflection",
         ),
         Effect(
             name="varying-roughness",
-            title="roughness that varies from place to place",
+            title="roughness that varies over the surface",
             is_on=lambda config: config.brdf.varying_roughness,
             on=lambda config: {"brdf.varying_roughness": True},
             off={"brdf.varying_roughness": False},
-            obstacle=_without_reflection("a surface without reflection has no roughness"),
+            obstacle=_without_reflection("surfaces without specular reflection have no roughness"),
             cost=lambda config: "one more unknown at every point",
-            risk="all gloss is as sharp as that in the middle",
+            risk="all highlights have the average sharpness",
             advised=True,
             unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
             needs="reflection",
         ),
         Effect(
             name="lobe-sampling",
-            title="directions drawn by the specular lobe",
+            title="importance sampling of the specular lobe",
             is_on=lambda config: config.shading.sampler in ("mis", "lobe"),
             on=lambda config: {"shading.sampler": "mis"},
             off={"shading.sampler": "no_lobe"},
-            obstacle=_without_reflection("a surface without reflection has no lobe"),
+            obstacle=_without_reflection("surfaces without specular reflection have no lobe"),
             cost=lambda config: (
-                f"the lobe's density in {config.shading.train_samples * config.train.rays} directions a step"
+                f"the pdf of the lobe in {config.shading.train_samples * config.train.rays} directions a step"
             ),
-            risk="sharp reflections are noise",
+            risk="sharp reflections are noisy",
             unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
             needs="reflection",
         ),
@@ -213,9 +216,9 @@ EFFECTS: Mapping[str, Effect] = {
             is_on=lambda config: config.shading.lobe == "ggx",
             on=lambda config: {"shading.lobe": "ggx"},
             off={"shading.lobe": "spherical_gaussian"},
-            obstacle=_without_reflection("a surface without reflection has no highlights"),
+            obstacle=_without_reflection("surfaces without specular reflection have no highlights"),
             cost=lambda config: "none",
-            risk="the glow about highlights becomes roughness",
+            risk="the wide tails of highlights are explained by more roughness",
             unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
             needs="reflection",
         ),
@@ -225,9 +228,11 @@ EFFECTS: Mapping[str, Effect] = {
             is_on=lambda config: config.background.kind != "constant",
             on=lambda config: {"background.kind": "inverted_sphere"},
             off={"background.kind": "constant"},
-            obstacle=lambda config: "R paints the scene sphere" if config.background.kind == "none" else "",
+            obstacle=lambda config: (
+                "R represents the background on the scene sphere" if config.background.kind == "none" else ""
+            ),
             cost=lambda config: f"{config.background.samples} network queries per ray",
-            risk="what lies behind the scene becomes surfaces in it",
+            risk="the background becomes surfaces within the scene",
         ),
         Effect(
             name="exposure",
@@ -236,33 +241,33 @@ EFFECTS: Mapping[str, Effect] = {
             on=lambda config: {"optimizer.exposure": config.optimizer.exposure or EXPOSURE_RATE},
             off={"optimizer.exposure": 0.0},
             obstacle=_none,
-            cost=lambda config: "three unknowns for each photograph",
-            risk="photographs of one place that differ become gloss, fog, and light that is uneven",
+            cost=lambda config: "three unknowns per photograph",
+            risk="differences of exposure become gloss, fog and uneven light",
         ),
         Effect(
             name="response",
-            title="pixels are display values, not radiance",
+            title="pixels that hold display values instead of radiance",
             is_on=lambda config: False,
             on=lambda config: {},
             off={},
-            obstacle=lambda config: "told from the files, or by --response",
-            cost=lambda config: "a curve over the pixels",
-            risk="dark pixels count too much, and all light is wrong",
+            obstacle=lambda config: "set by the image files or --response",
+            cost=lambda config: "the sRGB curve on every pixel",
+            risk="radiance, and with it all light, is wrong",
         ),
         Effect(
             name="joint-stage",
-            title="surface and material trained together",
+            title="joint training of surface and material",
             is_on=lambda config: config.train.joint_steps > 0,
             on=lambda config: {},
             off={"train.joint_steps": 0},
             obstacle=_joint_obstacle,
-            cost=lambda config: f"{config.train.joint_steps} steps that move everything",
-            risk="the surface keeps the errors that shading shows",
+            cost=lambda config: f"{config.train.joint_steps} steps that train all fields",
+            risk="errors of the surface that only shading reveals remain",
             advised=True,
         ),
     )
 }
-"""By name, in the order of the table."""
+"""All effects by name, in the order of the table."""
 
 
 def _every(config: NeilfConfig) -> int:

@@ -1,7 +1,7 @@
-"""Evidence for the joint stage: how much worse light and material explain pixels than R does.
+"""Evidence for the joint stage: how much larger the error of shaded pixels is than that of R.
 
-R knows no physics and paints what cameras saw, as far as its surface lets it. Where shading on the same
-surface comes as close, there is nothing that moving the surface could mend.
+R is not constrained by physics and reproduces the images as well as the surface permits. If shading on the
+same surface is as accurate, moving the surface in the joint stage cannot improve it.
 """
 
 from __future__ import annotations
@@ -21,14 +21,19 @@ from neilfpp_method.structures import Observed
 __all__ = ["WORTH", "ShownSurface", "shading_disagreement"]
 
 WORTH = 0.01
-"""Relative error that shading must have beyond that of R."""
+"""Excess of the relative error of shading over that of R above which the joint stage is worth its cost."""
 AT_ONCE = 256
-"""Points that are shaded together; bounds the memory."""
+"""Maximum number of points that are shaded at once; it bounds memory."""
 
 
 @dataclass(frozen=True)
 class ShownSurface:
-    """Surface points with what an image holds of them, scene frame, and the radiance that R has there."""
+    """P surface points with their pixels.
+
+    Attributes:
+        observed: the points in the scene frame, and their pixels.
+        radiance: the radiance that R renders for the same pixels.
+    """
 
     observed: Observed
     radiance: Float[Tensor, "P 3"]
@@ -36,19 +41,24 @@ class ShownSurface:
 
 @torch.no_grad()
 def shading_disagreement(model: NeilfModel, seen: ShownSurface) -> Measurement:
-    """The relative error of shaded points beyond that of R, in the mean; the model is in evaluation mode."""
-    what = "error of shading beyond that of R"
+    """Mean relative error of shaded pixels minus that of R.
+
+    Args:
+        model: the model, in evaluation mode.
+        seen: surface points with their pixels and the radiance of R.
+    """
+    what = "error of shading in excess of that of R"
     response, unit = model.facts.response, model.units.physical
 
     def error(radiance: Float[Tensor, "N 3"], pixel: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-        off = (apply_response(radiance, response) - pixel) / error_unit(pixel, response, unit)
-        return off.abs().clamp_max(1).mean(-1)
+        difference = apply_response(radiance, response) - pixel
+        return (difference / error_unit(pixel, response, unit)).abs().clamp_max(1).mean(-1)
 
-    beyond = []
+    excess = []
     for start in range(0, len(seen.radiance), AT_ONCE):
         part, radiance = seen.observed[start : start + AT_ONCE], seen.radiance[start : start + AT_ONCE]
         material = model.materials(part.position)
         samples = model.config.shading.eval_samples
         shaded = model.shade(part.position, part.normal, part.wo, material, samples).color
-        beyond.append(error(shaded, part.pixel) - error(radiance, part.pixel))
-    return mean_of(torch.cat(beyond) if beyond else seen.radiance[:, 0], what, WORTH)
+        excess.append(error(shaded, part.pixel) - error(radiance, part.pixel))
+    return mean_of(torch.cat(excess) if excess else seen.radiance[:, 0], what, WORTH)

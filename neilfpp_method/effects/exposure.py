@@ -1,12 +1,13 @@
-"""Evidence for photographs of unequal exposure or white balance: the same places, brighter in some of them.
+"""Evidence for unequal exposure or white balance of the photographs.
 
-The points of the capture's cloud are looked up in every photograph that faces them. A place has its own
-colour, and a photograph its own gain for each channel. Errors count by their size, not by their square, so
-that a view in which something hides a place, or a highlight lies on it, has little say.
+The points of the capture's point cloud are looked up in every photograph that faces them. The model is that
+a point has a colour, and a photograph a gain per channel. Absolute rather than squared errors are minimised,
+so that a view in which the point is occluded or has a highlight has little influence.
 
-A table that mirrors a window in some photographs is brighter there as well, at all of its points. An exposure
-goes with the photograph, a sheen with the way that a surface faces. So gains of the points that face one way
-are judged at those that face another, and the worse of the two ways decides.
+Reflections can look like exposure: a table that mirrors a window in some photographs is brighter there at
+all of its points. But a gain belongs to the photograph, whereas such a reflection depends on the orientation
+of the surface. So the gains are fitted to points of one orientation and evaluated at points of another, in
+both directions, and the smaller of the two improvements counts.
 """
 
 from __future__ import annotations
@@ -27,30 +28,33 @@ from neilfpp_method.structures import OrientedPoints
 __all__ = ["WORTH", "Exposures", "judge_gains", "measure_exposures"]
 
 WORTH = 0.01
-"""Relative error that gains must save at points that they were not fitted to."""
+"""Reduction of the relative error, at points that were not fitted, above which gains are used."""
 POINTS = 2000
-"""So many points of the cloud, drawn at random: a second or two, and gains within a percent."""
+"""Number of cloud points, drawn at random. They take one or two seconds and give gains within 1 %."""
 MIN_VIEWS = 3
-"""Views that must show a point: of fewer, nothing tells which of them is hidden from it."""
+"""Minimum number of views per point. With fewer it cannot be decided in which view the point is occluded."""
 MIN_COSINE = 0.2
-"""A view that faces a point at a flatter angle does not count: it covers too much of what lies beside it."""
+"""Minimum cosine between normal and viewing direction. At flatter angles a pixel covers too much of the
+surroundings of the point.
+"""
 DARK = 1e-3
-"""Linear values below this share of the mean are noise."""
+"""Linear values below this share of the mean are treated as noise and left out."""
 ROUNDS = 50
-"""Of means over the places and over the photographs in turns, with weights by the errors before."""
+"""Rounds of iteratively reweighted least squares, which alternates between point colours and gains."""
 QUADRATIC_BELOW = 0.01
-"""Errors below this, relative, count by their square."""
+"""Offset of the errors in the weights of that iteration; smaller errors are about quadratic in the loss."""
 SPLITS = 10
-"""Steps in which points are parted by their normals (k-means); they settle in three or four."""
+"""Maximum number of k-means iterations that split the points by orientation; three or four suffice."""
 
 
 @dataclass(frozen=True)
 class Exposures:
-    """What the photographs say of their own gains.
+    """Measured relative exposures of the training photographs.
 
     Attributes:
-        log_gain: natural logarithms, of the training views and channels; their mean over the views is 0.
-        measured: the error that gains save at points that face another way than those they were fitted to.
+        log_gain: natural logarithm of the gain of each training view and channel; the mean over the views is
+            0.
+        measured: reduction of the error by gains at points of another orientation than the fitted ones.
     """
 
     log_gain: Float[Tensor, "V 3"]
@@ -59,11 +63,11 @@ class Exposures:
 
 @torch.no_grad()
 def measure_exposures(pixels: PixelDataset, cloud: OrientedPoints) -> Exposures:
-    """The gains of the training photographs, and whether they are worth having.
+    """Measure the gains of the training photographs and how much they improve the agreement of the views.
 
     Args:
-        pixels: of the training views.
-        cloud: of the surface, scene frame; points without a surface there do no harm while they are few.
+        pixels: the training pixels.
+        cloud: oriented surface points in the scene frame; a few outliers do no harm.
     """
     chosen = torch.from_numpy(np.random.default_rng(0).permutation(len(cloud))[:POINTS])
     points = cloud[chosen]
@@ -74,24 +78,27 @@ def measure_exposures(pixels: PixelDataset, cloud: OrientedPoints) -> Exposures:
 
 
 def judge_gains(seen: Float[Tensor, "P V 3"], normal: Float[Tensor, "P 3"]) -> Measurement:
-    """The error that gains save at points that face another way than those that they were fitted to.
+    """The reduction of the error by gains, at points of another orientation than the fitted ones.
 
     Args:
-        seen: the logarithm of what each view shows at each point; NaN where it shows nothing of use.
-        normal: of the points, unit.
+        seen: logarithm of the linear value of each point in each view; NaN where a view is not usable.
+        normal: unit normals of the points.
+
+    Returns:
+        The smaller of the two improvements; one with too few samples if either has too few.
     """
-    what = "error that gains of photographs save at points that face another way"
-    group, measured = _facing(normal), []
-    for back in (group, ~group):
-        gain = _gains(seen[~back])
-        saved = _error(seen[back], torch.zeros_like(gain)) - _error(seen[back], gain)
+    what = "reduction of the error by gains, at points of another orientation"
+    group, measured = _split_by_orientation(normal), []
+    for held_back in (group, ~group):
+        gain = _gains(seen[~held_back])
+        saved = _error(seen[held_back], torch.zeros_like(gain)) - _error(seen[held_back], gain)
         measured.append(mean_of(saved[~saved.isnan()], what, WORTH))
-    few = [found for found in measured if found.favours(chosen=False) is None]
-    return (few or sorted(measured, key=lambda found: found.value))[0]
+    undecided = [one for one in measured if one.favours(chosen=False) is None]
+    return (undecided or sorted(measured, key=lambda one: one.value))[0]
 
 
-def _facing(normal: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
-    """Points in two groups by the way that they face."""
+def _split_by_orientation(normal: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
+    """Split points into two groups by their normals, by k-means."""
     group = torch.zeros(len(normal), dtype=torch.bool)
     if not len(normal):
         return group
@@ -107,13 +114,13 @@ def _facing(normal: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
 
 
 def _seen(pixels: PixelDataset, points: OrientedPoints) -> Float[Tensor, "P V 3"]:
-    """The logarithm of what each view shows at each point, linear; NaN where it shows nothing of use."""
+    """Logarithm of the linear value of each point in each view; NaN where the view is not usable."""
     seen = torch.full((len(points), len(pixels.views), 3), torch.nan)
     for number, view in enumerate(pixels.views):
         camera = pixels.capture.normalisation.camera(view.camera)
         shown = project(camera, points.position)
         column, row = shown.pixel.floor().long().unbind(-1)
-        # The eight pixels around must be there, too.
+        # The eight neighbouring pixels must lie in the image as well.
         within = (column > 0) & (row > 0) & (column < camera.width - 1) & (row < camera.height - 1)
         at = torch.nonzero(within & (shown.depth > 0) & (_cosine(camera, points) > MIN_COSINE))[:, 0]
         if len(at):
@@ -122,13 +129,15 @@ def _seen(pixels: PixelDataset, points: OrientedPoints) -> Float[Tensor, "P V 3"
 
 
 def _cosine(camera: Camera, points: OrientedPoints) -> Float[Tensor, " P"]:
-    towards = torch.as_tensor(camera.c2w[:, 3], dtype=points.position.dtype) - points.position
-    return (torch.nn.functional.normalize(towards, dim=-1) * points.normal).sum(-1)
+    """Cosine between the normal of each point and the direction to the camera."""
+    to_camera = torch.as_tensor(camera.c2w[:, 3], dtype=points.position.dtype) - points.position
+    return (torch.nn.functional.normalize(to_camera, dim=-1) * points.normal).sum(-1)
 
 
 def _around(pixels: PixelDataset, number: int, column: Tensor, row: Tensor) -> Float[Tensor, "N 3"]:
-    """The logarithm of the mean of nine pixels each; NaN where one of them is clipped, dark, invalid or off
-    the object.
+    """Logarithm of the mean over the 3 × 3 pixels around each given pixel.
+
+    It is NaN if one of the nine is clipped, invalid or off the object, or if their mean is too dark.
     """
     step = torch.arange(-1, 2)
     rows = (row[:, None, None] + step[:, None]) * pixels.views[number].camera.width
@@ -144,21 +153,22 @@ def _around(pixels: PixelDataset, number: int, column: Tensor, row: Tensor) -> F
 
 
 def _gains(seen: Float[Tensor, "P V 3"]) -> Float[Tensor, "V 3"]:
-    """Log gains, and with them the colours of the places, of the least sum of sizes of errors; 0 for a view
-    that shows none of the points.
+    """Log gains that minimise the sum of absolute errors, jointly with the colours of the points.
+
+    The gain of a view that shows none of the points is about 0.
     """
-    there = ~seen.isnan()
-    known, weight = seen.nan_to_num(0.0), there.float()
-    gain, place = torch.zeros(seen.shape[1:]), torch.zeros(len(seen), 1, 3)
+    usable = ~seen.isnan()
+    known, weight = seen.nan_to_num(0.0), usable.float()
+    gain, color = torch.zeros(seen.shape[1:]), torch.zeros(len(seen), 1, 3)
     for _ in range(ROUNDS):
-        place = (weight * (known - gain)).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(1e-6)
-        gain = (weight * (known - place)).sum(0) / weight.sum(0).clamp_min(1e-6)
+        color = (weight * (known - gain)).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(1e-6)
+        gain = (weight * (known - color)).sum(0) / weight.sum(0).clamp_min(1e-6)
         gain = gain - gain.mean(0)
-        weight = there / ((known - place - gain).abs() + QUADRATIC_BELOW)
+        weight = usable / ((known - color - gain).abs() + QUADRATIC_BELOW)
     return gain
 
 
 def _error(seen: Float[Tensor, "P V 3"], gain: Float[Tensor, "V 3"]) -> Float[Tensor, " P"]:
-    """How far the views of a place are from its median, in the mean, as a share of it."""
+    """Mean relative deviation of the views of each point from their median, after division by the gains."""
     common = seen - gain
     return (common - common.nanmedian(1, keepdim=True).values).abs().nanmean((1, 2))

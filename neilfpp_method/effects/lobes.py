@@ -1,9 +1,8 @@
-"""Evidence for the long tails of GGX: places that are fitted with it, with views kept back, against the same
-places with the paper's spherical Gaussian.
+"""Evidence for the long tails of GGX against the paper's spherical Gaussian.
 
-The two agree about the middle of a highlight. GGX has a wide, faint glow about it, as most real surfaces do.
-Metals show it best: all that they send is highlight. So where some places are taken for metal, only those
-count.
+Places are fitted with either lobe, and the fits are compared in held-back views. The two lobes agree in the
+centre of a highlight; GGX also has wide, faint tails, as most real surfaces do. The tails are most visible on
+metals, which reflect only specularly. So if enough places are classified as metal, only those count.
 """
 
 from __future__ import annotations
@@ -19,39 +18,43 @@ from neilfpp_method.structures import SceneTracer
 __all__ = ["lobe_evidence"]
 
 PLACES = 700
-"""How many are looked at."""
-FOLDS, TURNS = 4, 2
-"""Of the views one in four is kept back, in two of the four possible ways."""
+"""Maximum number of places."""
+FOLDS = 4
+"""Number of folds of the views; one fold is held back at a time."""
+TURNS = 2
+"""Number of folds that are held back in turn. Two of the four keep the time within bounds."""
 METAL = 0.5
-"""Metallic above which a place is taken for metal."""
+"""Metallic above which a place is classified as metal."""
 SCALE = 0.33
-"""Mean base colour of both fits: the scale of light and base colour is no part of the question."""
+"""Mean base colour of both fits. The comparison does not depend on the scale of light and base colour."""
 WORTH = 0.0
-"""Relative error that GGX must save: any that is not chance, as it costs nothing."""
+"""Threshold for the reduction of the relative error by GGX: since GGX has no cost, any significant reduction
+is enough.
+"""
 
 
 @torch.no_grad()
 def lobe_evidence(places: Places, scene: SceneTracer | None, typical: float, metals: bool) -> Measurement:
-    """How much lower the relative error of kept-back pixels is with GGX than with the spherical Gaussian.
+    """Reduction of the relative error of held-back pixels by GGX against the spherical Gaussian.
 
-    Arguments as of `find_first_light`.
+    The arguments are those of `find_first_light`.
     """
     places = places.where(torch.nonzero(places.place < PLACES)[:, 0])
-    carried = [place_transport(places, LOBES[name], scene) for name in ("spherical_gaussian", "ggx")]
+    transports = [place_transport(places, LOBES[name], scene) for name in ("spherical_gaussian", "ggx")]
     gains, metal = [], []
     for turn in range(TURNS):
-        back = places.view % FOLDS == turn
-        fitted, kept_back = torch.nonzero(~back)[:, 0], torch.nonzero(back)[:, 0]
-        known, unknown = places.where(fitted), places.where(kept_back)
-        fits = [fit_places(known, part[fitted], typical, metals, SCALE) for part in carried]
+        is_held_back = places.view % FOLDS == turn
+        fitted, held_back = torch.nonzero(~is_held_back)[:, 0], torch.nonzero(is_held_back)[:, 0]
+        known, unknown = places.where(fitted), places.where(held_back)
+        fits = [fit_places(known, part[fitted], typical, metals, SCALE) for part in transports]
         errors = [
-            unknown.mean(place_errors(fit, unknown, part[kept_back], typical))
-            for fit, part in zip(fits, carried, strict=True)
+            unknown.mean(place_errors(fit, unknown, part[held_back], typical))
+            for fit, part in zip(fits, transports, strict=True)
         ]
-        shown = unknown.place.unique()
-        gains.append((errors[0] - errors[1])[shown])
-        metal.append(torch.stack([fit.material(shown).metallic[:, 0] > METAL for fit in fits]).any(0))
-    gain, of_metal = torch.cat(gains), torch.cat(metal)
-    if of_metal.sum() >= MIN_SAMPLES:
-        gain = gain[of_metal]
-    return mean_of(gain, "error that GGX saves over a spherical Gaussian in views kept back", WORTH)
+        numbers = unknown.place.unique()
+        gains.append((errors[0] - errors[1])[numbers])
+        metal.append(torch.stack([fit.material(numbers).metallic[:, 0] > METAL for fit in fits]).any(0))
+    gain, is_metal = torch.cat(gains), torch.cat(metal)
+    if is_metal.sum() >= MIN_SAMPLES:
+        gain = gain[is_metal]
+    return mean_of(gain, "reduction of the error in held-back views by GGX", WORTH)

@@ -1,4 +1,7 @@
-"""When evidence is measured: before and after a material stage, and after each fit of the light."""
+"""Collect evidence and record decisions at the moments of training when a measurement is cheap.
+
+These are before training, before material init, before the joint stage, and after each fit of the light.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,10 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.structures import Observed, PixelBatch
 
 __all__ = [
+    "FEWEST_PIXELS",
     "LOOKED_AT",
+    "MIN_PHOTOGRAPHS",
+    "MOST_PIXELS",
     "after_fit",
     "look_at_light",
     "look_at_surface",
@@ -31,29 +37,35 @@ __all__ = [
 ]
 
 LOOKED_AT = 1024
-"""Training pixels whose surface points are measured: the standard error of a 1 % share is 0.3 %."""
-MIN_PHOTOGRAPHS = 8
-"""Training views from which a light is found to start with: fewer tell too little of its scale."""
-LIGHT_PIXELS = 4096
-"""Training pixels among which places are looked for that many views show."""
-PLACES, VIEWS, MIN_VIEWS = 1200, 20, 4
-"""How many places the light starts from at most, and how many views of each; fewer views than these do not
-tell materials apart. 10,000 pixels take 200 MB.
+"""Number of training pixels whose surface points are measured. The standard error of a share of 1 % is then
+0.3 %.
 """
+MIN_PHOTOGRAPHS = 8
+"""Minimum number of training views for an initial light: fewer do not determine its scale."""
+LIGHT_PIXELS = 4096
+"""Number of training pixels whose surface points are candidates for places."""
+PLACES = 1200
+"""Maximum number of places for the initial light."""
+VIEWS = 20
+"""Maximum number of views per place. 10,000 pixels take 200 MB."""
+MIN_VIEWS = 4
+"""Minimum number of views per place: fewer do not distinguish materials."""
 AT_ONCE = 512
-"""Rays that are rendered together; bounds the memory."""
+"""Maximum number of rays that are rendered at once; it bounds memory."""
+USUAL_VIEWS = 8
+"""Number of views per place that is assumed when a number of pixels is converted to a number of places."""
+FEWEST_PIXELS = MIN_PLACES * USUAL_VIEWS
+"""Minimum number of pixels for an initial light."""
+MOST_PIXELS = PLACES * VIEWS
+"""Maximum number of pixels of the places for the initial light."""
 
 
 def note_facts(plan: Plan, facts: SceneFacts) -> None:
-    """What the files of the capture decide before training."""
+    """Record the decisions that follow from the files of the capture, before training."""
     if plan.newest("background") is None:
         on = facts.background == "inverted_sphere"
-        seen = (
-            "the borders of the images show more than one colour"
-            if on
-            else "one colour is all that the borders show"
-        )
-        plan.decisions.append(Decision(0, "background", on, "files", seen))
+        reason = f"the borders of the images show {'more than one colour' if on else 'a single colour'}"
+        plan.decisions.append(Decision(0, "background", on, "files", reason))
     response = plan.newest("response")
     if response is None or response.by != "files":
         on = facts.response == "srgb"
@@ -62,39 +74,48 @@ def note_facts(plan: Plan, facts: SceneFacts) -> None:
 
 
 def note_exposures(plan: Plan, found: Exposures | None) -> None:
-    """What the photographs say of their exposures before training; none where nothing shows them the same
-    places.
+    """Record the decision on gains of the photographs, before training.
+
+    Args:
+        plan: the plan to which the decision is added, unless it has one already.
+        found: the measured exposures; None if the capture has no point cloud.
     """
     if plan.newest("exposure") is not None:
         return
     if found is None:
-        unknown = "without a point cloud nothing tells the same place in two photographs"
-        plan.decisions.append(Decision(0, "exposure", False, "files", unknown))
+        reason = "not measured: this needs a point cloud"
+        plan.decisions.append(Decision(0, "exposure", False, "files", reason))
         return
     on, reason = found.measured.favours(chosen=False) is True, found.measured.in_words()
     plan.decisions.append(Decision(0, "exposure", on, "files", reason, found.measured))
 
 
 def wants_surface(plan: Plan) -> bool:
-    """Whether a look at the surface could decide anything."""
+    """Whether measurements at the surface could decide anything."""
     return any(plan.is_open(name) for name in ("inter-reflection", *JUDGED, "joint-stage"))
 
 
 @torch.no_grad()
 def look_at_light(
-    plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int
+    plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int, most: int = MOST_PIXELS
 ) -> tuple[list[Decision], FirstLight | None]:
-    """Decide on the lobe of highlights where that is open, and find the light that training starts with.
+    """Decide on the specular lobe if that is open, and find an initial light.
 
-    Arguments as of `look_at_surface`; the model computes as the plan says afterwards.
+    The model uses the settings of the plan afterwards. The arguments are those of `look_at_surface`, and
+    `most`, the maximum number of pixels of the places; below `FEWEST_PIXELS` nothing is measured.
+
+    Returns:
+        The decisions, and the initial light; the light is None if there are too few views or places, or if
+        surfaces have no specular lobe.
     """
-    if len(pixels.views) < MIN_PHOTOGRAPHS:
+    if len(pixels.views) < MIN_PHOTOGRAPHS or most < FEWEST_PIXELS:
         return [], None
     mode = model.training
     model.eval()
     surface = _shown_surface(model, pixels.sample(LIGHT_PIXELS, gradients=False)).observed
-    position, normal = surface.position[:PLACES], surface.normal[:PLACES]
-    places = gather_places(model, pixels, position, normal, VIEWS).in_views(MIN_VIEWS)
+    count = min(PLACES, most // USUAL_VIEWS)
+    position, normal = surface.position[:count], surface.normal[:count]
+    places = gather_places(model, pixels, position, normal, VIEWS).in_views(MIN_VIEWS).first(most)
     typical, decisions = model.facts.median_radiance, []
     if len(places.place.unique()) < MIN_PLACES:
         model.train(mode)
@@ -112,35 +133,45 @@ def look_at_light(
 
 @torch.no_grad()
 def look_at_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int) -> list[Decision]:
-    """Decide what a surface tells, before a material is learned on it and again when it has moved.
+    """Take the decisions that depend on the surface: before material init, and before the joint stage.
 
     Args:
-        plan: takes the decisions.
-        model: as it is after `step` steps; it stays in the mode that it is in.
-        pixels: of the training views.
-        step: how many steps have been trained.
+        plan: the plan to which the decisions are added.
+        model: the model after `step` steps; its training mode is left unchanged.
+        pixels: the training pixels.
+        step: number of steps trained so far.
+
+    Returns:
+        The new decisions.
     """
     mode = model.training
     model.eval()
-    seen = _shown_surface(model, pixels.sample(LOOKED_AT, gradients=False))
-    surface = seen.observed
+    rendered = _shown_surface(model, pixels.sample(LOOKED_AT, gradients=False))
+    surface = rendered.observed
     decisions = []
     if plan.is_open("inter-reflection"):
         measured = self_visibility(model, plan.settings.inter_reflection, surface.position, surface.normal)
         decisions.append(plan.decide("inter-reflection", measured, step))
     names = frozenset(name for name in JUDGED if plan.is_open(name))
-    found = material_evidence(model, pixels, surface.position, surface.normal, names) if names else {}
-    decisions += [plan.decide(name, measured, step) for name, measured in found.items()]
+    evidence = material_evidence(model, pixels, surface.position, surface.normal, names) if names else {}
+    decisions += [plan.decide(name, measured, step) for name, measured in evidence.items()]
     if plan.is_open("joint-stage") and has_material(step, plan.settings.train):
-        decisions.append(plan.decide("joint-stage", shading_disagreement(model, seen), step))
+        decisions.append(plan.decide("joint-stage", shading_disagreement(model, rendered), step))
     model.train(mode)
     return decisions
 
 
 def after_fit(plan: Plan, found: Evidence | None, lit: int, step: int) -> list[Decision]:
-    """What a fit of the light with and without lamps found: the solver chooses, the plan records it.
+    """Record the decision on lamps that the light solver has taken in a fit.
 
-    Nothing is noted where the choice is what it was.
+    Args:
+        plan: the plan to which the decision is added.
+        found: the comparison of the fits with and without lamps; None if there was none.
+        lit: number of lamps after the fit.
+        step: number of steps trained so far.
+
+    Returns:
+        The new decision; empty if it is the same as before.
     """
     if found is None or not plan.is_open("lamps"):
         return []
@@ -148,7 +179,11 @@ def after_fit(plan: Plan, found: Evidence | None, lit: int, step: int) -> list[D
     if before is not None and before.on == on:
         return []
     measured = Measurement(
-        "error that lamps save at points kept back", found.gain, found.deviation, MIN_GAIN, found.points
+        "reduction of the error at held-back points by lamps",
+        found.gain,
+        found.deviation,
+        MIN_GAIN,
+        found.points,
     )
     reason = measured.in_words() if before is None else f"revised: {measured.in_words()}"
     plan.decisions.append(Decision(step, "lamps", on, "evidence", reason, measured))
@@ -156,6 +191,7 @@ def after_fit(plan: Plan, found: Evidence | None, lit: int, step: int) -> list[D
 
 
 def _shown_surface(model: NeilfModel, pixels: PixelBatch) -> ShownSurface:
+    """Render pixels and keep those whose ray hits the object."""
     pixels = pixels[torch.nonzero(pixels.mask > 0.5)[:, 0]]
     parts = []
     for start in range(0, len(pixels), AT_ONCE):

@@ -1,18 +1,17 @@
-"""Evidence for reflection, metals, varying roughness, an uneven light and its colours: places that many views
-show, explained with each of them and without.
+"""Evidence for specular reflection, metals, varying roughness, an environment map and its colours.
 
-A dark gloss under a bright light explains a single view of a metal, and a metal explains a single view of a
-paint. How a place changes from view to view tells them apart. So light and materials are fitted to most
-views, with something and without it, and compared at pixels of the other views: metals first, and all else
-with metals where they are worth it. Lamps are no part of these fits.
+Places that many views show are fitted with each of these effects and without it. A single view of a metal can
+also be explained by a dark glossy dielectric under a bright light, and vice versa; only the change from view
+to view distinguishes the two. So light and materials are fitted to most of the views, and the fits are
+compared at pixels of the held-back views. Metals are decided first; all other effects are then measured with
+metals if these are accepted. Lamps are not part of the fits.
 
-The base colour of every place is free. So a place without gloss says nothing of the light, and what an
-uneven light or its colours save is less than what they are worth.
+The base colour of every place is free. A place without specular reflection therefore contains no information
+about the light, and the benefit of an environment map and of its colours is underestimated.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -28,13 +27,13 @@ from neilfpp_method.effects.place_fit import (
     METALLICS,
     ROUGHNESSES,
     ROUNDS,
-    ROWS,
     STEPS,
     PlaceFit,
     any_map,
     fit_places,
     place_errors,
     place_transport,
+    seconds_of_step,
 )
 from neilfpp_method.effects.places import Places, gather_places
 from neilfpp_method.lighting.transport import Transport
@@ -43,40 +42,45 @@ from neilfpp_method.shading import LOBES
 
 __all__ = ["JUDGED", "WORTH", "judge_material", "material_evidence", "seconds_of_evidence"]
 
-PLACES, VIEWS = 160, 20
-"""How many places, and of each at most so many views: seconds, and 300 MB, on a laptop."""
-FOLDS, TURNS = 4, 2
-"""Of the views one in four is kept back, in two of the four possible ways."""
+PLACES = 160
+"""Maximum number of places. With `VIEWS` this takes seconds and 300 MB on a laptop."""
+VIEWS = 20
+"""Maximum number of views per place."""
+FOLDS = 4
+"""Number of folds of the views; one fold is held back at a time."""
+TURNS = 2
+"""Number of folds that are held back in turn. Two of the four keep the time within bounds."""
 MIN_VIEWS = 4
-"""Views that must show a place: fewer do not tell materials apart."""
+"""Minimum number of views per place: fewer do not distinguish materials."""
 WORTH = 0.01
-"""Relative error that an effect must save."""
-FITS, TRIED, REST = 50, 3, 0.5
-"""An estimate of how long looks at places take: so many fits of this size for materials, lobe and the light
-that training starts with; steps of a descent that are tried; and the share that other work adds.
+"""Reduction of the relative error above which an effect is worth its cost."""
+FITS = 20
+"""Number of fits of this size to which the measurements at places before one stage amount (estimate): 16
+fits, and the noise of lobe sampling.
 """
+REST = 0.5
+"""Time of all work other than descent, as a share of that of descent (estimate)."""
 METAL = 0.5
-"""Metallic above which a place is taken for metal."""
-
-
+"""Metallic above which a place is classified as metal."""
 SHARED = (2, 4, 6, 8)
-"""Roughnesses that all places may share, by their numbers in the grid."""
+"""Indices in `ROUGHNESSES` that are tried as the common roughness of all places."""
 ANOTHER = 2
-"""Steps of the grid by which the roughness of a place must be off from the shared one to be another."""
+"""A place has another roughness than the common one if its index differs by at least this much."""
 LIGHT_FORMS: Mapping[str, Callable[[Tensor], Tensor]] = {
     "environment-map": lambda log_radiance: log_radiance.mean((1, 2), keepdim=True).expand_as(log_radiance),
     "coloured-light": lambda log_radiance: log_radiance.mean(0, keepdim=True).expand_as(log_radiance),
 }
-"""What is left of a map without an effect: one colour, or shades of grey."""
+"""Projection of a map onto the maps that are possible without an effect: a single colour, or grey."""
 SAVED: Mapping[str, str] = {
-    "reflection": "error that reflection saves in views kept back",
-    "metals": "error that metals save in views kept back, at places taken for metal",
-    "varying-roughness": "error that other roughnesses save in views kept back, at places that have them",
-    "environment-map": "error that a map saves over one colour in views kept back",
-    "coloured-light": "error that colours of the map save in views kept back",
+    "reflection": "reduction of the error in held-back views by specular reflection",
+    "metals": "reduction of the error in held-back views by metals, at places classified as metal",
+    "varying-roughness": "reduction of the error in held-back views by varying roughness, where it differs",
+    "environment-map": "reduction of the error in held-back views by a map over a single colour",
+    "coloured-light": "reduction of the error in held-back views by colours of the map",
 }
+"""What is measured for each effect, as it appears in the table of effects."""
 JUDGED = (*SAVED, "lobe-sampling")
-"""What these places can judge, by the names of the catalogue."""
+"""Names of the effects that are measured at places."""
 
 
 @torch.no_grad()
@@ -87,18 +91,19 @@ def material_evidence(
     normal: Float[Tensor, "P 3"],
     names: frozenset[str],
 ) -> dict[str, Measurement]:
-    """How much lower the relative error of kept-back pixels is with an effect than without; for lobe
-    sampling, how much less of a pixel is noise.
+    """Measure the reduction of the relative error of held-back pixels by each effect.
+
+    For lobe sampling it is the reduction of the noise of a pixel.
 
     Args:
-        model: its surface, and what it sends (R), are taken as they are; its material and its light play no
-            part.
-        pixels: of the training views.
-        position, normal: points on the surface, scene frame; the first `PLACES` are taken.
-        names: of `JUDGED`, what to judge.
+        model: provides the surface and R; its material and light are not used.
+        pixels: the training pixels.
+        position: points on the surface, scene frame; the first `PLACES` are used.
+        normal: unit normals at these points.
+        names: the effects to measure, a subset of `JUDGED`.
 
     Returns:
-        A measurement for each name, of no samples where views show too little.
+        A measurement for each name. It has no samples if no place is seen by `MIN_VIEWS` views.
     """
     places = gather_places(model, pixels, position[:PLACES], normal[:PLACES], VIEWS).in_views(MIN_VIEWS)
     if not len(places.place):
@@ -111,24 +116,23 @@ def material_evidence(
 
 
 def seconds_of_evidence(device: torch.device) -> float:
-    """About how long looks at places take here, where all of them are seen by many views.
+    """Estimate the time of the measurements at places before one stage on this machine, in seconds.
 
-    Most of it are products of the transport to all pixels with the texels of the map, and back, one of each
-    in every step of the light's descent; two are measured. `REST` of that is added for all else.
+    The estimate assumes that every place has `VIEWS` views. Most of the time goes to the descent on the
+    light, whose steps are timed (`place_fit.seconds_of_step`).
     """
-    rows, texels = 3 * PLACES * VIEWS * (FOLDS - 1) // FOLDS, 2 * ROWS**2
-    transport, light = torch.ones(rows, texels, device=device), torch.ones(texels, 3, device=device)
-    began = time.perf_counter()
-    for _ in range(TRIED):
-        back = transport.T @ (transport @ light)
-    back.sum().item()  # waits for a device
-    step = (time.perf_counter() - began) / TRIED
+    step = seconds_of_step(PLACES * VIEWS * (FOLDS - 1) // FOLDS, device)
     return (1 + REST) * FITS * (FIRST_STEPS + (ROUNDS - 1) * STEPS) * step
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A measurement for each effect, and a fit with reflection."""
+    """The result of `judge_material`.
+
+    Attributes:
+        measured: a measurement for each effect.
+        glossy: a fit with specular reflection, and with metals if these are accepted.
+    """
 
     measured: dict[str, Measurement]
     glossy: PlaceFit
@@ -136,13 +140,13 @@ class Judged:
 
 @dataclass(frozen=True)
 class Model:
-    """What places may be made of.
+    """The set of materials and lights that a fit may choose from.
 
     Attributes:
-        reflects: whether they have a specular lobe.
-        metals: whether metallic may be more than 0.
-        roughness: of all, by its number in the grid; none: each has its own.
-        form: of the map (`fit_places`).
+        reflects: whether surfaces have a specular lobe.
+        metals: whether metallic may be greater than 0.
+        roughness: index of the common roughness of all places; None if each place has its own.
+        form: projection of the map (see `fit_places`).
     """
 
     reflects: bool = True
@@ -150,22 +154,26 @@ class Model:
     roughness: int | None = None
     form: Callable[[Tensor], Tensor] = any_map
 
-    def sees(self, carried: Transport) -> Transport:
-        """The transport with what such places have of it."""
+    def restrict(self, transport: Transport) -> Transport:
+        """The transport with the specular layers that this model permits."""
         if not self.reflects:
-            keeps = torch.zeros(len(carried.sources), 1, 1, device=carried.scene.device)
-            keeps[0] = 1
-            return Transport(carried.sources * keeps.half(), carried.scene * keeps)
+            keep = torch.zeros(len(transport.sources), 1, 1, device=transport.scene.device)
+            keep[0] = 1
+            return Transport(transport.sources * keep.half(), transport.scene * keep)
         if self.roughness is None:
-            return carried
+            return transport
         layers = [0] + [1 + 2 * self.roughness, 2 + 2 * self.roughness] * len(ROUGHNESSES)
-        return Transport(carried.sources[layers], carried.scene[layers])
+        return Transport(transport.sources[layers], transport.scene[layers])
 
 
 @dataclass(frozen=True)
 class Explained:
-    """A fit, its error at the pixels that it was fitted to, and that of each place in views that were kept
-    back, NaN where none shows it.
+    """A fit of a model and its errors.
+
+    Attributes:
+        fit: the fitted light and materials.
+        fitted_error: mean relative error of the pixels that were fitted.
+        error: mean relative error of each place in the held-back views; NaN if none of them shows it.
     """
 
     fit: PlaceFit
@@ -175,67 +183,78 @@ class Explained:
 
 @dataclass(frozen=True)
 class Trial:
-    """Pixels that models are fitted to, and pixels of other views at which they are compared."""
+    """The pixels of one split of the views.
+
+    Attributes:
+        known: the pixels to which models are fitted.
+        transport: the transport to these pixels.
+        held_back: the pixels of the held-back views.
+        held_back_transport: the transport to the held-back pixels.
+        typical: radiance of a typical pixel.
+    """
 
     known: Places
-    carried: Transport
-    kept_back: Places
-    carried_back: Transport
+    transport: Transport
+    held_back: Places
+    held_back_transport: Transport
     typical: float
 
-    def of(self, model: Model) -> Explained:
-        """The places as a model explains them."""
-        carried, typical = model.sees(self.carried), self.typical
-        fit = fit_places(self.known, carried, typical, model.metals, form=model.form)
+    def fit(self, model: Model) -> Explained:
+        """Fit a model and evaluate it in the held-back views."""
+        transport, typical = model.restrict(self.transport), self.typical
+        fit = fit_places(self.known, transport, typical, model.metals, form=model.form)
         if model.roughness is not None:
             fit = replace(fit, roughness=torch.full_like(fit.roughness, model.roughness))
-        fitted = place_errors(fit, self.known, carried, typical).mean().item()
-        error = self.kept_back.mean(place_errors(fit, self.kept_back, model.sees(self.carried_back), typical))
-        seen = torch.bincount(self.kept_back.place, minlength=self.kept_back.count) > 0
-        return Explained(fit, fitted, torch.where(seen, error, torch.nan))
+        fitted = place_errors(fit, self.known, transport, typical).mean().item()
+        held_back, held_back_transport = self.held_back, model.restrict(self.held_back_transport)
+        error = held_back.mean(place_errors(fit, held_back, held_back_transport, typical))
+        has_pixels = torch.bincount(held_back.place, minlength=held_back.count) > 0
+        return Explained(fit, fitted, torch.where(has_pixels, error, torch.nan))
 
 
 @torch.no_grad()
 def judge_material(places: Places, transport: Transport, typical: float, names: frozenset[str]) -> Judged:
-    """What each of `names` saves at views that are kept back.
+    """Measure the reduction of the error in held-back views by each of `names`.
 
     Args:
-        places: with linear radiance.
-        transport: of the same pixels (`place_transport`).
+        places: places with their pixels, in linear radiance.
+        transport: the transport to these pixels (`place_transport`).
         typical: radiance of a typical pixel.
-        names: what to judge.
+        names: the effects to measure.
     """
     trials = []
     for turn in range(TURNS):
-        back = places.view % FOLDS == turn
-        known, kept_back = torch.nonzero(~back)[:, 0], torch.nonzero(back)[:, 0]
-        parts = (places.where(known), transport[known], places.where(kept_back), transport[kept_back])
+        is_held_back = places.view % FOLDS == turn
+        known, held_back = torch.nonzero(~is_held_back)[:, 0], torch.nonzero(is_held_back)[:, 0]
+        parts = (places.where(known), transport[known], places.where(held_back), transport[held_back])
         trials.append(Trial(*parts, typical))
     measured: dict[str, Measurement] = {}
 
-    def explained(model: Model) -> list[Explained]:
-        return [trial.of(model) for trial in trials]
+    def fit_all(model: Model) -> list[Explained]:
+        return [trial.fit(model) for trial in trials]
 
-    paint = Model()
-    of_paint, of_metal = explained(paint), explained(replace(paint, metals=True))
-    counts = [_metallic(one.fit) > METAL for one in of_metal]
-    measured["metals"] = _saved("metals", of_paint, of_metal, counts)
+    dielectric = Model()
+    with_metals = replace(dielectric, metals=True)
+    dielectric_fits, metal_fits = fit_all(dielectric), fit_all(with_metals)
+    counted = [_metallic(one.fit) > METAL for one in metal_fits]
+    measured["metals"] = _saved("metals", dielectric_fits, metal_fits, counted)
     metals = measured["metals"].favours(False) is True
-    glossy, of_glossy = (replace(paint, metals=True), of_metal) if metals else (paint, of_paint)
+    glossy, glossy_fits = (with_metals, metal_fits) if metals else (dielectric, dielectric_fits)
     if "varying-roughness" in names:
-        shared = min(SHARED, key=lambda number: trials[0].of(replace(glossy, roughness=number)).fitted_error)
-        of_shared = explained(replace(glossy, roughness=shared))
-        counts = [(one.fit.roughness - shared).abs() >= ANOTHER for one in of_glossy]
-        measured["varying-roughness"] = _saved("varying-roughness", of_shared, of_glossy, counts)
+        shared = min(SHARED, key=lambda number: trials[0].fit(replace(glossy, roughness=number)).fitted_error)
+        shared_fits = fit_all(replace(glossy, roughness=shared))
+        counted = [(one.fit.roughness - shared).abs() >= ANOTHER for one in glossy_fits]
+        measured["varying-roughness"] = _saved("varying-roughness", shared_fits, glossy_fits, counted)
     if "reflection" in names:
-        measured["reflection"] = _saved("reflection", explained(Model(reflects=False)), of_glossy)
+        measured["reflection"] = _saved("reflection", fit_all(Model(reflects=False)), glossy_fits)
     for name, form in LIGHT_FORMS.items():
         if name in names:
-            measured[name] = _saved(name, explained(replace(glossy, form=form)), of_glossy)
-    return Judged({name: measured[name] for name in SAVED if name in names}, of_glossy[0].fit)
+            measured[name] = _saved(name, fit_all(replace(glossy, form=form)), glossy_fits)
+    return Judged({name: measured[name] for name in SAVED if name in names}, glossy_fits[0].fit)
 
 
 def _metallic(fit: PlaceFit) -> Float[Tensor, " P"]:
+    """Metallic of each place."""
     return torch.tensor(METALLICS, device=fit.metallic.device)[fit.metallic]
 
 
@@ -243,11 +262,11 @@ def _saved(
     name: str,
     without: Sequence[Explained],
     having: Sequence[Explained],
-    counts: Sequence[Bool[Tensor, " P"]] | None = None,
+    counted: Sequence[Bool[Tensor, " P"]] | None = None,
 ) -> Measurement:
-    """How much lower the error is with something than without, at the places that count."""
+    """The reduction of the error by an effect, averaged over the places that are `counted`."""
     gains = [one.error - other.error for one, other in zip(without, having, strict=True)]
-    if counts is not None:
-        gains = [gain[counted] for gain, counted in zip(gains, counts, strict=True)]
+    if counted is not None:
+        gains = [gain[rows] for gain, rows in zip(gains, counted, strict=True)]
     gain = torch.cat(gains)
     return mean_of(gain[gain.isfinite()], SAVED[name], WORTH)

@@ -1,4 +1,4 @@
-"""A number that speaks for or against an effect, how sure it is, and what it must exceed."""
+"""A measured benefit of an effect, its standard error, and the threshold that it must exceed."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from torch import Tensor
 __all__ = ["MIN_SAMPLES", "Measurement", "mean_of"]
 
 MIN_SAMPLES = 20
-"""Independent samples from which something is concluded."""
+"""Minimum number of independent samples for a decision."""
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """What was measured of an effect.
+    """The measured benefit of an effect.
 
     Attributes:
-        what: of what `value` is the size, a clause.
-        value: the mean over the samples; a share, so 0.01 is one hundredth.
-        deviation: its standard error.
-        threshold: what an effect must be worth; from the module that measured.
-        samples: how many independent ones.
+        what: description of the measured quantity, for the table of effects.
+        value: mean over the samples, a share (0.01 is 1 %).
+        deviation: standard error of the mean.
+        threshold: value above which the effect is worth its cost.
+        samples: number of independent samples.
     """
 
     what: str
@@ -32,11 +32,14 @@ class Measurement:
     samples: int
 
     def favours(self, chosen: bool) -> bool | None:
-        """Whether to simulate the effect, given whether it is now (`chosen`). None: too few samples.
+        """Whether the effect should be simulated; None if there are too few samples.
 
-        An effect that is off must be worth more than the threshold, and more than chance brings about once in
-        forty times. One that is on stays unless it is worth less than the threshold, as surely. So nothing
-        goes back and forth by chance.
+        An effect that is off is switched on if its value is significant (two standard errors) and above the
+        threshold. One that is on stays on unless its value is below the threshold by two standard errors.
+        This hysteresis prevents an effect from being switched back and forth by chance.
+
+        Args:
+            chosen: whether the effect is on now.
         """
         if self.samples < MIN_SAMPLES:
             return None
@@ -45,7 +48,7 @@ class Measurement:
         return self.value > max(2 * self.deviation, self.threshold)
 
     def in_words(self) -> str:
-        """For people.
+        """One clause for the console and the report.
 
         >>> Measurement("directions that meet the surface", 0.042, 0.003, 0.01, 1024).in_words()
         'directions that meet the surface: 4.20 ± 0.30 % (threshold 1 %)'

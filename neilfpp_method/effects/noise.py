@@ -1,8 +1,8 @@
-"""Evidence for sampling the specular lobe: how much less noise a shaded pixel has with it.
+"""Evidence for importance sampling of the specular lobe: the reduction of the noise of a shaded pixel.
 
-A rough surface gains nothing: what the lobe draws, the cosine draws as well. So places whose light and
-material are fitted are shaded again and again with either set of directions, as many as a training step has,
-and the spread of the results is compared.
+A rough surface gains nothing, because its lobe is about as wide as the cosine. So places with fitted light
+and material are shaded repeatedly with and without lobe sampling, with as many directions as in a training
+step, and the standard deviations of the results are compared.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.effects.measurement import Measurement, mean_of
-from neilfpp_method.effects.place_fit import METALLICS, ROUGHNESSES, PlaceFit
+from neilfpp_method.effects.place_fit import PlaceFit
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import Lamps
@@ -20,35 +20,30 @@ from neilfpp_method.incident import Sources, arriving, draw_directions
 from neilfpp_method.lighting.objective import FLOOR
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading import LOBES, shade
-from neilfpp_method.structures import Material
 
 __all__ = ["WORTH", "lobe_noise"]
 
 WORTH = 0.01
-"""Relative noise of a pixel that the lobe must save."""
+"""Reduction of the relative noise of a pixel above which the lobe is sampled."""
 TIMES = 8
-"""That a pixel is shaded; its spread is then known to a quarter."""
+"""Number of times that a pixel is shaded; its standard deviation is then known to about 25 %."""
 
 
 @torch.no_grad()
 def lobe_noise(model: NeilfModel, places: Places, fit: PlaceFit) -> Measurement:
-    """How much lower the relative noise of a training step's pixels is where the lobe is sampled.
+    """Measure the reduction of the relative noise of training pixels by lobe sampling.
 
     Args:
-        model: its surface, what it sends, and how many directions it takes.
-        places: one pixel of each is shaded.
+        model: provides the surface, R, and the number of directions per pixel.
+        places: the places; one pixel of each is shaded.
         fit: their materials, and the map.
     """
-    what = "noise of a pixel that sampling the lobe saves"
-    shown, first = torch.unique(places.place, return_inverse=True)
-    rows = torch.zeros_like(shown).scatter_(0, first, torch.arange(len(first), device=first.device))
+    what = "reduction of the noise of a pixel by lobe sampling"
+    numbers, place = torch.unique(places.place, return_inverse=True)
+    rows = torch.zeros_like(numbers).scatter_(0, place, torch.arange(len(place), device=place.device))
     observed = places.observed[rows]
-    device = shown.device
-    material = Material(
-        fit.base_color[shown],
-        torch.tensor(ROUGHNESSES, device=device)[fit.roughness[shown]][:, None],
-        torch.tensor(METALLICS, device=device)[fit.metallic[shown]][:, None],
-    )
+    device = numbers.device
+    material = fit.material(numbers)
     light = EnvironmentLight(fit.log_radiance.shape[1], 1.0).to(device)
     light.show(fit.log_radiance.exp())
     sources = Sources(light, Lamps(0, model.lamps.radius).to(device), model.scene)

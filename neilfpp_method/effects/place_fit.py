@@ -1,15 +1,16 @@
-"""Light and materials that explain some places together: an environment map, and at each place one base
-colour, one roughness of a grid, and one metallic of a grid.
+"""Jointly fit an environment map and the materials of surface places.
 
-With few places everything is small: transport is a matrix for each roughness, the best material under a light
-is found by trying all pairs of roughness and metallic, the best light under the materials by descent, and the
-two take turns.
+Each place has a base colour, a roughness from a grid, and a metallic from a grid. Because there are few
+places, the transport is stored as a matrix for each roughness. Two steps alternate: the best material under
+the current light is found by trying all pairs of roughness and metallic, and the best light under the current
+materials is found by gradient descent.
 """
 
 from __future__ import annotations
 
 import functools
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -25,43 +26,69 @@ from neilfpp_method.lighting.transport import Transport, from_texels_at
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import Material, SceneTracer
 
-__all__ = ["PlaceFit", "any_map", "fit_places", "place_errors", "place_transport"]
+__all__ = [
+    "PlaceFit",
+    "any_map",
+    "fit_places",
+    "place_errors",
+    "place_transport",
+    "seconds_of_step",
+]
 
 ROUGHNESSES = (0.08, 0.14, 0.2, 0.28, 0.36, 0.45, 0.55, 0.66, 0.8, 1.0)
-"""Of the grid; the lobe's width changes by about a half from one to the next."""
+"""Grid of roughness. The width of the lobe changes by about a half from one value to the next."""
 METALLICS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
-"""Of the grid."""
+"""Grid of metallic."""
 ROWS = 16
-"""Of the map: texels of 12°. What is finer is left to training, which sees more pixels."""
+"""Rows of the map, whose texels are 11° high. Finer detail is left to training, which uses more pixels."""
 DIRECTIONS = 4
-"""Directions in each texel for each pixel: lobes of roughness 0.2 are narrower than a texel."""
+"""Random directions per texel and pixel: a lobe of roughness 0.2 is narrower than a texel."""
 ROUNDS = 6
-"""Turns of material and light."""
-FIRST_STEPS, STEPS = 100, 40
-"""Of the light in the first turn and in each later one."""
-RATE, GAIN_RATE = 0.1, 0.03
-"""Of log radiance, and of the logarithms of base colours."""
+"""Number of alternations between light and material."""
+FIRST_STEPS = 100
+"""Descent steps on the light in the first round."""
+STEPS = 40
+"""Descent steps on the light in each later round."""
+RATE = 0.1
+"""Learning rate of log radiance."""
+GAIN_RATE = 0.03
+"""Learning rate of the logarithms of base colours."""
 SMOOTHNESS = 0.02
-"""Weight of the map's total variation, as preset `fast` has it."""
-BOUND, BOUND_WEIGHT = 0.95, 1.0
-"""Base colours above this pay for it, so that light rather than a bound takes up the scale."""
+"""Weight of the map's total variation, as in preset `fast`."""
+BOUND = 0.95
+"""Base colours above this value are penalised, so that the light takes up the scale before base colours reach
+1 and are clamped.
+"""
+BOUND_WEIGHT = 1.0
+"""Weight of that penalty, the mean squared excess."""
 SCALE_WEIGHT = 10.0
-"""Of the squared distance of the mean log base colour from where it is held."""
+"""Weight of the squared deviation of the mean log base colour from its given value."""
 NEIGHBOURS_SHARE = 1 / 200
-"""Share of the places that decide together on roughness and metallic, as neighbours often are of one
-material, and the views of one place hardly tell them.
+"""Share of the places whose errors are added when roughness and metallic of a place are chosen. The views of
+one place hardly determine them, and neighbouring places are often of one material.
 """
 REWEIGHTED = 4
-"""Solves for the base colour, in each of which pixels count by the inverse of their last error."""
-START_BASE_COLOR, START_ROUGHNESS = 0.3, 4
-"""What places start as; roughness by its number."""
+"""Iterations of reweighted least squares for the base colour."""
+START_BASE_COLOR = 0.3
+"""Initial base colour of all places."""
+START_ROUGHNESS = 4
+"""Index of the initial roughness of all places."""
 MIN_BASE_COLOR = 0.01
-"""Darker places count as this dark."""
+"""Smallest base colour, so that its logarithm is finite."""
+TRIED = 3
+"""Number of descent steps that `seconds_of_step` times."""
 
 
 @dataclass(frozen=True)
 class PlaceFit:
-    """A map and the materials of P places; `roughness` and `metallic` by their numbers in the grids."""
+    """A map and the materials of P places.
+
+    Attributes:
+        log_radiance: logarithm of the radiance of the map.
+        base_color: base colour of each place.
+        roughness: roughness of each place, as an index in `ROUGHNESSES`.
+        metallic: metallic of each place, as an index in `METALLICS`.
+    """
 
     log_radiance: Float[Tensor, "3 H W"]
     base_color: Float[Tensor, "P 3"]
@@ -70,11 +97,11 @@ class PlaceFit:
 
     @property
     def radiance(self) -> Float[Tensor, "T 3"]:
-        """Of the texels, row by row."""
+        """Radiance of the texels, row by row."""
         return self.log_radiance.exp().flatten(1).t()
 
     def material(self, place: Int[Tensor, " N"]) -> Material:
-        """Of places by number."""
+        """Materials of the places with these numbers."""
         roughness = torch.tensor(ROUGHNESSES, device=place.device)[self.roughness[place]]
         metallic = torch.tensor(METALLICS, device=place.device)[self.metallic[place]]
         return Material(self.base_color[place], roughness[:, None], metallic[:, None])
@@ -82,7 +109,10 @@ class PlaceFit:
 
 @torch.no_grad()
 def place_transport(places: Places, lobe: Lobe, scene: SceneTracer | None) -> Transport:
-    """To N pixels from the texels of a map, in the layers of `from_texels_at`: 21 kB a pixel."""
+    """The transport from the texels of a map to N pixels, with the layers of `from_texels_at`.
+
+    It takes 21 kB per pixel.
+    """
     environment = EnvironmentLight(ROWS, 1.0).to(places.place.device)
     drawn = [
         from_texels_at(environment, places.observed, ROUGHNESSES, lobe, scene) for _ in range(DIRECTIONS)
@@ -94,8 +124,23 @@ def place_transport(places: Places, lobe: Lobe, scene: SceneTracer | None) -> Tr
     return Transport(sources, scene_light)
 
 
+def seconds_of_step(pixels: int, device: torch.device) -> float:
+    """Measure the approximate time of one descent step on the light for this number of pixels, in seconds.
+
+    Most of a step is the multiplication of the transport matrix and of its transpose, which is timed.
+    """
+    transport = torch.ones(3 * pixels, 2 * ROWS**2, device=device)
+    light = torch.ones(2 * ROWS**2, 3, device=device)
+    began = time.perf_counter()
+    for _ in range(TRIED):
+        back = transport.T @ (transport @ light)
+    # `item` waits for the device.
+    back.sum().item()
+    return (time.perf_counter() - began) / TRIED
+
+
 def any_map(log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-    """A map whose texels and channels have nothing to do with each other."""
+    """The identity: every texel and channel of the map is a free unknown."""
     return log_radiance
 
 
@@ -109,20 +154,21 @@ def fit_places(
     rounds: int = ROUNDS,
     form: Callable[[Float[Tensor, "3 H W"]], Float[Tensor, "3 H W"]] = any_map,
 ) -> PlaceFit:
-    """Light and materials of places.
+    """Fit light and materials of places.
 
     Args:
-        places: with linear radiance.
-        transport: of the same pixels.
+        places: places with their pixels, in linear radiance.
+        transport: the transport to these pixels.
         typical: radiance of a typical pixel.
-        metals: whether metallic may be more than 0.
-        mean_base_color: where the geometric mean over places and channels is held; none: it is free.
-        start: what the search starts from; none: grey paint under an even light.
-        rounds: turns of light and material.
-        form: makes the map of log radiance from as many unknowns.
+        metals: whether metallic may be greater than 0.
+        mean_base_color: value of the geometric mean of base colour over places and channels; None if it is
+            free.
+        start: initial values; None for a grey dielectric under an even light.
+        rounds: number of alternations between light and material.
+        form: projection of log radiance onto the permitted maps.
     """
-    held = START_BASE_COLOR if mean_base_color is None else mean_base_color
-    fit = _even_start(places, typical, held) if start is None else start
+    base_color = START_BASE_COLOR if mean_base_color is None else mean_base_color
+    fit = _even_start(places, typical, base_color) if start is None else start
     near = _neighbours(places)
     for turn in range(rounds):
         steps = FIRST_STEPS if start is None and turn == 0 else STEPS
@@ -132,7 +178,7 @@ def fit_places(
 
 
 def _even_start(places: Places, typical: float, base_color: float) -> PlaceFit:
-    """Grey paint under an even light."""
+    """A grey dielectric under an even light."""
     device, count = places.place.device, places.count
     return PlaceFit(
         log_radiance=torch.full((3, ROWS, 2 * ROWS), math.log(typical / base_color), device=device),
@@ -143,31 +189,31 @@ def _even_start(places: Places, typical: float, base_color: float) -> PlaceFit:
 
 
 def _neighbours(places: Places) -> Int[Tensor, "P K"]:
-    """Of each place itself and those next to it."""
-    middle = places.mean(places.observed.position)
+    """Indices of the K places nearest to each place, including itself."""
+    centre = places.mean(places.observed.position)
     count = max(1, min(places.count, round(NEIGHBOURS_SHARE * places.count)))
-    return torch.cdist(middle, middle).topk(count, largest=False).indices
+    return torch.cdist(centre, centre).topk(count, largest=False).indices
 
 
 @torch.no_grad()
 def place_errors(fit: PlaceFit, places: Places, transport: Transport, typical: float) -> Float[Tensor, " N"]:
-    """Relative error of each pixel, at most 1, mean of its channels."""
-    shown = _at_roughness(transport, fit.roughness[places.place])
-    sent = shown.arriving(fit.radiance)
+    """Relative error of each pixel, clipped at 1 and averaged over the channels."""
+    selected = _at_roughness(transport, fit.roughness[places.place])
+    sent = selected.arriving(fit.radiance)
     material = fit.material(places.place)
     outgoing = _outgoing(sent, material.base_color, material.metallic)
     return _relative_error(outgoing, places, typical).abs().clamp_max(1).mean(-1)
 
 
 def _at_roughness(transport: Transport, number: Int[Tensor, " N"]) -> Transport:
-    """The diffuse, the facing and the grazing part of each pixel at a roughness of its own."""
+    """The diffuse, facing and grazing parts of each pixel at the roughness of its place."""
     rows = torch.arange(len(number), device=number.device)
     layers = torch.stack((torch.zeros_like(number), 1 + 2 * number, 2 + 2 * number))
     return Transport(transport.sources[layers, rows].float(), transport.scene[layers, rows])
 
 
 def _outgoing(sent: Tensor, base_color: Tensor, metallic: Tensor) -> Tensor:
-    """Radiance from the diffuse, the facing and the grazing part (`lighting.transport`)."""
+    """Outgoing radiance from the diffuse, facing and grazing parts (see `lighting.transport`)."""
     diffuse, facing, grazing = sent
     reflectance = 0.04 * (1 - metallic) + base_color * metallic
     return (1 - metallic) * base_color * diffuse + reflectance * facing + grazing
@@ -187,8 +233,8 @@ def _better_light(
     mean_base_color: float | None,
     form: Callable[[Tensor], Tensor],
 ) -> PlaceFit:
-    """The light by descent, and the base colours with it, at the roughness and metallic that places have."""
-    shown = _at_roughness(transport, fit.roughness[places.place])
+    """Improve the light and the base colours by descent, with fixed roughness and metallic."""
+    selected = _at_roughness(transport, fit.roughness[places.place])
     metallic = fit.material(places.place).metallic
     log_radiance = fit.log_radiance.clone().requires_grad_()
     gain = torch.zeros_like(fit.base_color, requires_grad=True)
@@ -197,10 +243,9 @@ def _better_light(
     with torch.enable_grad():
         for _ in range(steps):
             base_color = fit.base_color * gain.exp()
-            sent = shown.arriving(form(log_radiance).exp().flatten(1).t())
-            error = _relative_error(
-                _outgoing(sent, base_color.clamp(0, 1)[places.place], metallic), places, typical
-            )
+            sent = selected.arriving(form(log_radiance).exp().flatten(1).t())
+            outgoing = _outgoing(sent, base_color.clamp(0, 1)[places.place], metallic)
+            error = _relative_error(outgoing, places, typical)
             loss = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER)
             loss = loss + SMOOTHNESS * total_variation(log_radiance)
             loss = loss + BOUND_WEIGHT * (base_color - BOUND).clamp_min(0).square().mean()
@@ -227,10 +272,10 @@ def _best_material(
     metallics: tuple[float, ...],
     near: Int[Tensor, "P K"],
 ) -> PlaceFit:
-    """Of all pairs of roughness and metallic at a place the one whose best base colours leave the smallest
-    error there and at the places near it.
+    """Choose roughness and metallic of each place from all pairs of the grids, under a fixed light.
 
-    Radiance is linear in the base colour, b · slope + rest, so the best is a weighted mean.
+    For each pair, the base colour of a place is the best one by iteratively reweighted least squares;
+    outgoing radiance is linear in it. The pair with the smallest error at the place and its neighbours wins.
     """
     layers = torch.stack([part.float() @ fit.radiance for part in transport.sources]) + transport.scene
     diffuse, unit = layers[0], places.observed.pixel + FLOOR * typical
@@ -240,22 +285,20 @@ def _best_material(
     for k in range(len(ROUGHNESSES)):
         facing, grazing = layers[1 + 2 * k], layers[2 + 2 * k]
         for j, m in enumerate(metallics):
+            # The relative error of a pixel is base_color · slope − target.
             slope = ((1 - m) * diffuse + m * facing) / unit
-            wanted = (places.observed.pixel - 0.04 * (1 - m) * facing - grazing) / unit
+            target = (places.observed.pixel - 0.04 * (1 - m) * facing - grazing) / unit
             weight = torch.ones_like(slope)
             for _ in range(REWEIGHTED):
-                per_place = places.mean(weight * slope * wanted) / places.mean(
-                    weight * slope.square()
-                ).clamp_min(1e-12)
-                tried = per_place.clamp(MIN_BASE_COLOR, 1)
-                error = tried[places.place] * slope - wanted
+                squares = places.mean(weight * slope.square()).clamp_min(1e-12)
+                candidate = (places.mean(weight * slope * target) / squares).clamp(MIN_BASE_COLOR, 1)
+                error = candidate[places.place] * slope - target
                 weight = 1 / error.abs().clamp_min(OUTLIER)
-            size = functional.smooth_l1_loss(
-                error, torch.zeros_like(error), beta=OUTLIER, reduction="none"
-            ).mean(-1)
-            left = (pixels * places.mean(size))[near].sum(1) / pixels[near].sum(1).clamp_min(1)
-            better = left < best
-            best = torch.where(better, left, best)
-            base_color = torch.where(better[:, None], tried, base_color)
+            zero = torch.zeros_like(error)
+            loss = functional.smooth_l1_loss(error, zero, beta=OUTLIER, reduction="none").mean(-1)
+            loss = (pixels * places.mean(loss))[near].sum(1) / pixels[near].sum(1).clamp_min(1)
+            better = loss < best
+            best = torch.where(better, loss, best)
+            base_color = torch.where(better[:, None], candidate, base_color)
             roughness, metallic = torch.where(better, k, roughness), torch.where(better, j, metallic)
     return PlaceFit(fit.log_radiance, base_color, roughness, metallic)

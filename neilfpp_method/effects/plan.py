@@ -1,4 +1,4 @@
-"""What is decided of the effects of a run, one decision after the other, and the settings that follow."""
+"""The decisions on the effects of a run in order, and the settings that follow from them."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ By = Literal["asked", "settings", "files", "evidence"]
 
 @dataclass(frozen=True)
 class Decision:
-    """Whether an effect is simulated from a step on.
+    """A decision whether an effect is simulated.
 
     Attributes:
-        step: of the training; 0: from the start.
-        effect: by name, as in `EFFECTS`.
-        on: whether it is simulated.
-        by: who decided: a person by --effects, the settings, the files of the capture before training, or
-            evidence of the model that trains.
-        reason: for people, a clause.
-        evidence: what was measured; none where nothing was.
+        step: training step from which on it holds.
+        effect: name of the effect, a key of `EFFECTS`.
+        on: whether the effect is simulated.
+        by: origin of the decision: the option `--effects` ("asked"), the settings, the files of the capture
+            before training, or evidence from the model in training.
+        reason: explanation for the console and the report.
+        evidence: the measurement; None if nothing was measured.
     """
 
     step: int
@@ -39,14 +39,15 @@ class Decision:
 
     @property
     def before_training(self) -> bool:
-        """Whether the model is built after it."""
+        """Whether it was taken before the model was built."""
         return self.by != "evidence"
 
 
 def decided_settings(settings: NeilfConfig, decisions: Sequence[Decision]) -> NeilfConfig:
-    """The settings with the newest decision on each effect.
+    """Apply the newest decision on each effect to settings.
 
-    Requested effects are set as asked. Evidence only removes: a kept effect is as the settings have it.
+    A decision by `--effects` can switch an effect on or off. Evidence only switches effects off: an effect
+    that it keeps stays as it is in the settings.
     """
     newest = {decision.effect: decision for decision in decisions}
     for name, decision in newest.items():
@@ -64,9 +65,9 @@ class Plan:
     """The effects of a run.
 
     Attributes:
-        asked: what a person asked for.
-        settings: those of the run before any decision.
-        decisions: in the order in which they were taken; the newest on each effect counts.
+        asked: the value of `--effects`.
+        settings: the settings of the run before any decision.
+        decisions: all decisions in order; the newest one on each effect holds.
     """
 
     asked: Asked
@@ -75,77 +76,87 @@ class Plan:
 
     @staticmethod
     def begin(asked: Asked, settings: NeilfConfig) -> Plan:
-        """A plan with what is decided before anything is looked at."""
+        """A plan with the decisions that need no measurement."""
         plan = Plan(asked, settings)
+
+        def decide(name: str, on: bool, by: By, reason: str) -> None:
+            plan.decisions.append(Decision(0, name, on, by, reason))
+
         for name, effect in EFFECTS.items():
-            obstacle = effect.obstacle(settings)
+            obstacle, is_on = effect.obstacle(settings), effect.is_on(settings)
             if name in asked.named:
-                plan.decisions.append(Decision(0, name, asked.named[name], "asked", "asked for by name"))
+                sign = "+" if asked.named[name] else "-"
+                decide(name, asked.named[name], "asked", f"--effects {sign}{name}")
             elif obstacle:
-                plan.decisions.append(Decision(0, name, effect.is_on(settings), "settings", obstacle))
+                decide(name, is_on, "settings", obstacle)
             elif asked.base in ("all", "none"):
-                plan.decisions.append(
-                    Decision(0, name, asked.base == "all", "asked", f"--effects {asked.base}")
-                )
+                decide(name, asked.base == "all", "asked", f"--effects {asked.base}")
             elif asked.base == "as-set":
-                plan.decisions.append(
-                    Decision(0, name, effect.is_on(settings), "settings", "as the settings say")
-                )
-            elif not effect.is_on(settings):
-                plan.decisions.append(Decision(0, name, False, "settings", "off in the settings"))
+                decide(name, is_on, "settings", f"{'on' if is_on else 'off'} in the settings")
+            elif not is_on:
+                decide(name, False, "settings", "off in the settings")
             elif effect.unjudged(settings):
-                plan.decisions.append(Decision(0, name, True, "settings", effect.unjudged(settings)))
-        plan._leave_out_what_needs_others()
+                decide(name, True, "settings", effect.unjudged(settings))
+        plan._leave_out_dependent_effects()
         return plan
 
     @property
     def config(self) -> NeilfConfig:
-        """The settings that the run goes on with."""
+        """The settings with all decisions applied."""
         return decided_settings(self.settings, self.decisions)
 
     @property
     def config_of_model(self) -> NeilfConfig:
-        """The settings that the model of the run is built from: evidence of a model changes what is computed
-        with it, and none of its tensors.
+        """The settings from which the model is built.
+
+        Only decisions from before training are applied. Later ones change what is computed with the model,
+        but none of its parameters, so that checkpoints stay compatible.
         """
         return decided_settings(self.settings, [d for d in self.decisions if d.before_training])
 
     def newest(self, name: str) -> Decision | None:
-        """What was decided last of an effect; none: nothing yet."""
+        """The newest decision on an effect; None if there is none yet."""
         return next((d for d in reversed(self.decisions) if d.effect == name), None)
 
     def is_on(self, name: str) -> bool:
-        """Whether an effect is simulated, or still open."""
+        """Whether an effect is simulated; an open effect is as the settings have it."""
         newest = self.newest(name)
         return newest.on if newest else EFFECTS[name].is_on(self.settings)
 
     def is_open(self, name: str) -> bool:
-        """Whether evidence of the model may decide an effect."""
+        """Whether evidence may decide an effect: nothing else has decided it."""
         newest = self.newest(name)
         return newest is None or newest.by == "evidence"
 
-    def _leave_out_what_needs_others(self) -> None:
-        """Decide against what there is none of without an effect that is off."""
+    def _leave_out_dependent_effects(self) -> None:
+        """Switch off every effect that needs another effect which is off."""
         for name, effect in EFFECTS.items():
             cause = self.newest(effect.needs) if effect.needs else None
             if cause is None or cause.on or not self.is_on(name) or effect.obstacle(self.settings):
                 continue
-            why = f"there is none without {effect.needs}"
-            self.decisions.append(Decision(0, name, False, cause.by, why))
+            reason = f"requires {effect.needs}, which is off"
+            self.decisions.append(Decision(0, name, False, cause.by, reason))
 
     def decide(self, name: str, measured: Measurement, step: int, must_be_earned: bool = False) -> Decision:
-        """Decide an open effect by evidence, from now on; without enough samples it stays as it is.
+        """Decide an open effect by evidence and record the decision.
 
-        Where evidence only advises (`Effect.advised`), it is noted, and the effect stays as it is.
-        `must_be_earned`: the effect counts as off so far, whatever the settings say.
+        The effect stays as it is if there are too few samples, or if evidence only advises (see
+        `Effect.advised`).
+
+        Args:
+            name: name of the effect.
+            measured: the evidence.
+            step: number of steps trained so far.
+            must_be_earned: whether the effect counts as off so far, even if the settings have it on, so that
+                only significant evidence keeps it on (see `Measurement.favours`).
         """
         before = self.is_on(name)
         favoured = measured.favours(before and not must_be_earned)
         advised = EFFECTS[name].advised
         on = before if favoured is None or advised else favoured
-        reason = f"{measured.in_words()}; advice, it stays as it is" if advised else measured.in_words()
+        reason = f"{measured.in_words()}; shown as advice only" if advised else measured.in_words()
         if favoured is None:
-            reason = f"{measured.samples} samples are too few to say anything of {measured.what}"
+            reason = f"not decided: only {measured.samples} samples of the {measured.what}"
         elif self.newest(name) is not None and on != before:
             reason = f"revised: {reason}"
         decision = Decision(step, name, on, "evidence", reason, measured)

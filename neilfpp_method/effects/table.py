@@ -1,4 +1,4 @@
-"""A plan as a table for the terminal, and as plain values for whoever reads a run."""
+"""A plan of effects as a table for the terminal, and as plain values for `effects.json`."""
 
 from __future__ import annotations
 
@@ -12,30 +12,31 @@ from neilfpp_method.effects.plan import Plan
 __all__ = ["rows", "table"]
 
 OPEN = "open"
+"""Value of `decision` for an effect on which nothing has been decided yet."""
 
 
 def rows(plan: Plan) -> list[dict[str, Any]]:
-    """Every effect with what was decided last, in the order of the catalogue.
+    """A row for each effect with its newest decision, in the order of the catalogue.
 
-    `decision` is "on", "off" or "open"; `cost` is what the effect takes, and takes nothing when off; `value`,
-    `deviation`, `threshold`, `samples` are those of the evidence, or null.
+    `decision` is "on", "off" or "open". `cost` is the cost of the effect when it is on. `value`, `deviation`,
+    `threshold` and `samples` belong to the evidence; they are None if there is none.
     """
     config = plan.config
-    found = []
+    result = []
     for name, effect in EFFECTS.items():
         newest = plan.newest(name)
         evidence = newest.evidence if newest else None
         simulated = (
             config if effect.obstacle(config) or effect.is_on(config) else switched(config, effect, on=True)
         )
-        found.append(
+        result.append(
             {
                 "effect": name,
                 "title": effect.title,
                 "decision": OPEN if newest is None else "on" if newest.on else "off",
                 "by": newest.by if newest else "evidence",
                 "step": newest.step if newest else None,
-                "reason": newest.reason if newest else "evidence decides when there is a surface",
+                "reason": newest.reason if newest else "to be measured once there is a surface",
                 "value": evidence.value if evidence else None,
                 "deviation": evidence.deviation if evidence else None,
                 "threshold": evidence.threshold if evidence else None,
@@ -44,14 +45,14 @@ def rows(plan: Plan) -> list[dict[str, Any]]:
                 "risk": effect.risk,
             }
         )
-    return found
+    return result
 
 
 def table(plan: Plan) -> Table:
-    """For the terminal."""
-    shown = Table(title=f"effects ({plan.asked})", title_justify="left", show_lines=False)
-    for heading in ("effect", "decision", "evidence", "cost when on", "left out by mistake"):
-        shown.add_column(heading, overflow="fold")
+    """A table of the effects for the terminal."""
+    result = Table(title=f"effects ({plan.asked})", title_justify="left", show_lines=False)
+    for heading in ("effect", "decision", "reason", "cost when on", "risk when off"):
+        result.add_column(heading, overflow="fold")
     for row in rows(plan):
-        shown.add_row(row["effect"], row["decision"], row["reason"], row["cost"], row["risk"])
-    return shown
+        result.add_row(row["effect"], row["decision"], row["reason"], row["cost"], row["risk"])
+    return result

@@ -1,9 +1,9 @@
-"""Evidence for shadows and light between surfaces: how much of what a surface looks at is the scene itself.
+"""Evidence for shadows and inter-reflection: the share of the hemisphere that the scene itself occludes.
 
-A surface point that sees a share q of its hemisphere blocked, by the cosine, gets a share q of its light from
-the scene and not from the light, if that is even; where light comes from one side, a share q of all such
-points is in shadow in the mean over the sides. So a mean q is the size of the relative error of leaving both
-out. A convex body has none.
+If a cosine-weighted share q of the hemisphere of a point is occluded, then under an even light a share q of
+its irradiance is missing or comes from other surfaces. Under light from a single direction, the probability
+that the point is in shadow is q on average over the directions. The mean q is thus the relative error that
+is made if shadows and inter-reflection are left out. It is 0 for a convex body.
 """
 
 from __future__ import annotations
@@ -22,11 +22,15 @@ from neilfpp_method.structures import RayBatch
 __all__ = ["WORTH", "blocked_share", "self_visibility"]
 
 WORTH = 0.01
-"""Share of the hemisphere below which nothing is traced; lamps must save as much (`lighting.fit`)."""
+"""Mean occluded share above which shadows and inter-reflection are simulated. It equals the threshold for
+lamps (`lighting.fit.MIN_GAIN`).
+"""
 DIRECTIONS = 16
-"""Per point, by the cosine. The standard error is mostly that of the choice of points."""
+"""Cosine-distributed directions per point. More would not reduce the standard error much, because it is
+dominated by the choice of points.
+"""
 RAYS_AT_ONCE = 2048
-"""Rays that are rendered at once, where the host does not trace; bounds the memory."""
+"""Maximum number of rays that are rendered at once if the host cannot trace; it bounds memory."""
 
 
 @torch.no_grad()
@@ -36,15 +40,16 @@ def self_visibility(
     position: Float[Tensor, "N 3"],
     normal: Float[Tensor, "N 3"],
 ) -> Measurement:
-    """The share of the hemisphere of surface points, by the cosine, that the scene itself fills.
+    """Measure the cosine-weighted share of the hemisphere that the scene itself occludes.
 
     Args:
-        model: its host traces, or renders where it does not.
-        settings: how, when the effect is on; the model may have it off.
-        position, normal: of points that cameras see, scene frame.
+        model: its host traces the rays, or renders them if it cannot trace.
+        settings: settings of the rays; those of the model may have inter-reflection off.
+        position: surface points that cameras see, scene frame.
+        normal: unit normals at these points.
     """
     share = blocked_share(model, settings, position, normal) if len(position) else position[:, 0]
-    return mean_of(share, "directions of surface points that meet the surface", WORTH)
+    return mean_of(share, "directions of surface points that the scene occludes", WORTH)
 
 
 def blocked_share(
@@ -53,7 +58,7 @@ def blocked_share(
     position: Float[Tensor, "N 3"],
     normal: Float[Tensor, "N 3"],
 ) -> Float[Tensor, " N"]:
-    """Of each point."""
+    """The occluded share of the hemisphere of each point. Arguments as in `self_visibility`."""
     drawn = cosine(normal).draw(DIRECTIONS, True)
     host, hit_share = model.host, model.config.shading.hit_share
     if settings.mode == "hard":
@@ -63,7 +68,6 @@ def blocked_share(
         up, directions = normal.repeat_interleave(DIRECTIONS, 0), drawn.reshape(-1, 3)
         rays = RayBatch(off_surface(host, start, up, directions, settings.offset), directions)
         parts = [rays[i : i + RAYS_AT_ONCE] for i in range(0, len(rays), RAYS_AT_ONCE)]
-        hit = torch.cat([host.render(part).is_hit(hit_share) for part in parts]).view(
-            len(position), DIRECTIONS
-        )
+        hit = torch.cat([host.render(part).is_hit(hit_share) for part in parts])
+        hit = hit.view(len(position), DIRECTIONS)
     return hit.float().mean(1)

@@ -1,1 +1,1 @@
-"""What a run is worth: metrics, the protocols that put them together, pictures and reports."""
+"""Measure a run: metrics, evaluation protocols, expected errors, and images beside the truth."""

@@ -1,11 +1,16 @@
 """Expected error of a run's material at surface points, from how well the training views determine it.
 
-Two things stand between the images and the material. Noise, and what no model explains, is different in every
-view; its size is that of the run's own residuals. Errors of the light are the same for all views of a point:
-the radiance that arrives is uncertain patch of directions by patch, and as a whole. More views do not help
-against those; a light that varies does, as does a lobe that moves across it. An error that all points have in
-common is a scale of the base colour and no error, so each patch counts for what a point receives from it
-more, or less, than a typical one (`Evidence.typical`).
+The error model has two parts:
+
+- Errors that are independent between views: noise, and residuals that the model does not explain. Their size
+  is measured from the run's own residuals.
+- Errors of the estimated light, which all views of a point share. The incident radiance is uncertain per
+  patch of directions, and by a common factor. More views do not reduce these errors; light that varies over
+  directions does, and so does a specular lobe that moves across it.
+
+An error that all points share is a scale of the base colour, which no image can determine and which is not
+counted. Each patch therefore contributes in proportion to the difference between the share of light that a
+point receives from it and the share that a typical point receives (`Evidence.typical`).
 """
 
 from __future__ import annotations
@@ -22,9 +27,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from neilfpp_method.data.views import camera_rays
-from neilfpp_method.evaluate.looks import possible_looks, sent_by_patch
+from neilfpp_method.evaluate.outgoing import radiance_parts, sent_by_patch
 from neilfpp_method.evaluate.patches import PATCHES, by_patch, light_by_patch, patch_count
-from neilfpp_method.evaluate.posterior import Deviation, Sights, expected_error, guessed_error
+from neilfpp_method.evaluate.posterior import Deviation, Observations, expected_error, prior_error
 from neilfpp_method.evaluate.sightings import Sightings, TrainingViews
 from neilfpp_method.evaluate.views import RenderedView
 from neilfpp_method.lighting.objective import error_unit
@@ -38,46 +43,50 @@ __all__ = [
     "deviations_at",
     "gather_evidence",
     "material_deviation",
-    "shown_surface",
+    "surface_at_pixels",
     "with_deviation",
 ]
 
 VIEWS = 16
-"""Largest number of views of a point. Views between these add little information."""
+"""Largest number of training views used per point. Further views lie between these and add little."""
 DIRECT, REFLECTED, OVERALL = 0.3, 0.2, 1.0
-"""Relative standard deviations of light from outside the scene, of light from its surfaces (which the cameras
-see), and of a common factor on all light from outside, which nothing else fixes.
+"""Relative standard deviations of: light from outside the scene, per patch; light from surfaces of the scene,
+which is smaller because cameras observe those surfaces; and a common factor on all light from outside, which
+the images do not determine.
 """
 KNOWN = 0.05
-"""Relative standard deviation of a light that was given."""
+"""Relative standard deviation of light from outside if the environment map was given."""
 PIXELS = 1024
-"""Training pixels that measure how well the run explains its images, and the light at typical points."""
-TYPICAL_LOOKS = 1
-"""Prior views of a point: as many of typical error are added to the observed ones."""
+"""Number of training pixels from which `Evidence` is computed."""
+PRIOR_VIEWS = 1
+"""Weight of the prior in `_birge_ratio`: this many views of typical error are added to the observed ones."""
 POINTS_AT_ONCE, SIGHTED_AT_ONCE = 512, 2**16
-"""Points that are shaded together, and points whose views are found together: bounds the memory."""
+"""Batch sizes, which bound the memory: points that are shaded together, and points whose views are searched
+together.
+"""
 NEIGHBOURS, NEAR, TURN = 9, 0.1, 0.1
-"""Largest neighbourhood of a point, itself included; its radius, scene units; what a radian between
-normals adds to a distance, scene units.
+"""Neighbourhood of a point in `_smoothed`: its largest size, the point included; its radius, scene units; and
+the distance, scene units, that one radian between two normals adds.
 """
 MIN_NOISE = 1e-3
-"""Least typical relative error of the images."""
+"""Lower bound of the relative errors in `Evidence`, so that a perfect fit does not divide by zero."""
 STEP = 1e-3
-"""Difference of display values from which the slope of radiance over them is taken."""
+"""Step, in display values, of the finite difference that gives the slope of radiance over display values."""
 TINY = 1e-9
-"""Least divisor."""
+"""Smallest divisor."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a run's images tell of any of its points.
+    """Training views of a run and statistics of how well the run reproduces them.
 
     Attributes:
         views: the training views.
-        noise: half of the relative errors of radiance are below it; they are relative to what was seen and a
-            share of what is typical (`lighting.objective.FLOOR`).
-        misfit: half of the points have a root mean square of their relative errors below it.
-        typical: the mean over points of the shares of diffuse light that come from each patch.
+        noise: median absolute relative error of radiance over pixels. The error is divided by the observed
+            radiance plus a fraction of the typical radiance (`lighting.objective.FLOOR`).
+        misfit: median over points of the root mean square relative error over the views of a point.
+        typical: share of the diffuse light that comes from each of K patches, per colour channel, averaged
+            over points.
     """
 
     views: TrainingViews
@@ -88,9 +97,10 @@ class Evidence:
 
 @torch.no_grad()
 def gather_evidence(run: Run) -> Evidence:
-    """Load a run's training views, and compare what they hold of some points with what the run shows of them.
+    """Load a run's training views and compare about `PIXELS` of their pixels with the rendering equation.
 
-    Where it shows no surface in any of them, the noise is as large as the pixels.
+    If the run shows no surface in any training view, `noise` and `misfit` are 1: errors as large as the
+    radiance.
 
     Raises:
         UserError: there are no training views, or one cannot be read.
@@ -98,23 +108,23 @@ def gather_evidence(run: Run) -> Evidence:
     model = run.model
     views = TrainingViews(run.capture, next(model.parameters()).device)
     errors, misfits, shares = [], [], []
-    pixels = views.evenly(PIXELS)
+    pixels = views.evenly_spaced_pixels(PIXELS)
     for start in range(0, len(pixels), POINTS_AT_ONCE):
         hits = model.host.render(pixels[start : start + POINTS_AT_ONCE].rays)
         hits = hits[torch.nonzero(hits.is_hit(run.config.shading.hit_share))[:, 0]]
         normal = model.shading_normals(hits.position, hits.normal)
-        seen = views.sightings(model, hits.position, normal, VIEWS)
-        rows = torch.nonzero(seen.seen.any(1))[:, 0]
+        sightings = views.sightings(model, hits.position, normal, VIEWS)
+        rows = torch.nonzero(sightings.visible.any(1))[:, 0]
         if not len(rows):
             continue
-        position, normal, seen = hits.position[rows], normal[rows], seen[rows]
+        position, normal, sightings = hits.position[rows], normal[rows], sightings[rows]
         material = model.materials(position)
-        incident = light_by_patch(model, position, normal, seen.wo, material)
+        incident = light_by_patch(model, position, normal, sightings.wo, material)
         error = _relative_error(
-            model, sent_by_patch(model, incident, material, normal, seen.wo).sum(-1), seen
+            model, sent_by_patch(model, incident, material, normal, sightings.wo).sum(-1), sightings
         )
-        errors.append(error[seen.seen].abs().flatten())
-        misfits.append(_mean_over_looks(error.square(), seen).sqrt())
+        errors.append(error[sightings.visible].abs().flatten())
+        misfits.append(_mean_over_views(error.square(), sightings).sqrt())
         parts = by_patch(incident.light, incident.patch, patch_count(model))
         shares.append(parts / parts.sum(-1, keepdim=True).clamp_min(TINY))
     if not errors:
@@ -131,78 +141,88 @@ def material_deviation(
     normal: Float[Tensor, "N 3"],
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> Deviation:
-    """The expected errors of a model's material at surface points, the same at every call.
+    """Estimate the error of a model's material at surface points. Deterministic.
 
     Args:
-        model: in evaluation mode.
-        evidence: of the model's run.
-        position: on the model's surface, scene frame.
-        normal: unit, away from the surface.
-        on_progress: told the share that is done.
+        model: the model, in evaluation mode.
+        evidence: evidence gathered from the model's run.
+        position: points on the model's surface, scene frame.
+        normal: unit normals, away from the surface.
+        on_progress: called with the fraction of the work that is done.
 
     Returns:
-        Root mean square errors, of each point the median of its neighbours' among these: base colour up to a
-        factor per channel that is one for all points. Points that no view sees have those of a guess.
-        Roughness and metallic mean nothing where the run's shading is Lambertian.
+        Expected root mean square errors, smoothed by a median over neighbouring points. The error of base
+        colour does not include a factor per channel that all points share. A point that no view sees has the
+        error of a guess (`posterior.prior_error`). If the run's shading is Lambertian, the values for
+        roughness and metallic are meaningless.
     """
     parts = [Deviation(*position.new_zeros(3, 0, 1))]
     for block in range(0, len(position), SIGHTED_AT_ONCE):
         end = min(block + SIGHTED_AT_ONCE, len(position))
-        sightings = evidence.views.sightings(model, position[block:end], normal[block:end], VIEWS)
+        block_sightings = evidence.views.sightings(model, position[block:end], normal[block:end], VIEWS)
         for start in range(block, end, POINTS_AT_ONCE):
             rows = slice(start, min(start + POINTS_AT_ONCE, end))
-            seen = sightings[rows.start - block : rows.stop - block]
-            parts.append(_deviation(model, evidence, position[rows], normal[rows], seen))
+            sightings = block_sightings[rows.start - block : rows.stop - block]
+            parts.append(_deviation(model, evidence, position[rows], normal[rows], sightings))
             on_progress(rows.stop / len(position))
     deviation = Deviation(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Deviation)))
-    return _evened(deviation, position, normal)
+    return _smoothed(deviation, position, normal)
 
 
 def deviations_at(run: Run, points: OrientedPoints) -> Float[Tensor, "N 3"]:
-    """`material_deviation` of a run at points of its surface: of base colour, roughness and metallic."""
+    """Gather evidence and compute `material_deviation`; the columns are base colour, roughness, metallic."""
     deviation = material_deviation(run.model, gather_evidence(run), points.position, points.normal)
     return torch.cat([deviation.base_color, deviation.roughness, deviation.metallic], dim=-1)
 
 
 def with_deviation(run: Run, evidence: Evidence, view: RenderedView, step: int = 1) -> RenderedView:
-    """A rendered view with the maps base_color_std, roughness_std and metallic_std, 0 off the surface.
+    """Add the maps base_color_std, roughness_std and metallic_std to a rendered view; 0 off the surface.
 
-    With a `step` of k only every k-th pixel of every k-th row is asked, and the k × k about it take after it.
-    A Lambertian run has the first map alone.
+    With a `step` of k only every k-th pixel of every k-th row is computed, and each result fills a block of
+    k × k pixels. A Lambertian run gets base_color_std only.
     """
     height, width = view.maps["opacity"].shape[:2]
-    asked = np.zeros((height, width), bool)
-    asked[::step, ::step] = view.maps["opacity"][::step, ::step, 0] > 0.5
-    points = shown_surface(run, view, np.flatnonzero(asked))
+    computed = np.zeros((height, width), bool)
+    computed[::step, ::step] = view.maps["opacity"][::step, ::step, 0] > 0.5
+    points = surface_at_pixels(run, view, np.flatnonzero(computed))
     deviation = material_deviation(run.model, evidence, points.position, points.normal)
     maps = dict(view.maps)
     for name in ("base_color", "roughness", "metallic") if run.config.shading.specular else ("base_color",):
         values = np.zeros((height, width, 1), np.float32)
-        values[asked] = getattr(deviation, name).cpu().numpy()
+        values[computed] = getattr(deviation, name).cpu().numpy()
         maps[f"{name}_std"] = values[::step, ::step].repeat(step, 0).repeat(step, 1)[:height, :width]
     return replace(view, maps=maps)
 
 
-def shown_surface(run: Run, view: RenderedView, pixels: Int[np.ndarray, " P"]) -> OrientedPoints:
-    """The surface at pixels of a rendered view, counted row by row, on the device of the run's model."""
+def surface_at_pixels(run: Run, view: RenderedView, pixels: Int[np.ndarray, " P"]) -> OrientedPoints:
+    """Position and normal of the surface at pixels of a rendered view, on the device of the run's model.
+
+    Args:
+        run: the run that rendered the view.
+        view: the rendered view.
+        pixels: row-major pixel indices.
+    """
     camera = next(v.camera for v in run.capture.views if v.name == view.name)
     rays = camera_rays(run.capture.normalisation.camera(camera))[torch.from_numpy(pixels)]
-    depth, normal = (
-        torch.from_numpy(view.maps[name].reshape(-1, size)[pixels])
-        for name, size in (("depth", 1), ("normal", 3))
-    )
-    return OrientedPoints(rays.origins + depth * rays.directions, normal).to(
-        next(run.model.parameters()).device
-    )
+    depth = torch.from_numpy(view.maps["depth"].reshape(-1, 1)[pixels])
+    normal = torch.from_numpy(view.maps["normal"].reshape(-1, 3)[pixels])
+    points = OrientedPoints(rays.origins + depth * rays.directions, normal)
+    return points.to(next(run.model.parameters()).device)
 
 
-def _evened(deviation: Deviation, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> Deviation:
-    """Medians over neighbours. Directions are drawn for each point by itself, and what the views of one point
-    do not tell those of its neighbours may: the material is a field.
+def _smoothed(
+    deviation: Deviation, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
+) -> Deviation:
+    """Take the median over the neighbours of each point.
+
+    Directions are sampled for each point separately, so single values are noisy. Also, the material is a
+    continuous field: views of neighbouring points constrain a point that its own views do not.
     """
-    place = torch.cat((position, TURN * normal), -1).cpu().numpy()
-    nearest = cKDTree(place).query(place, k=range(1, 1 + NEIGHBOURS), distance_upper_bound=NEAR)[1]
-    # Where there are fewer, the tree says a row past the last.
+    coordinates = torch.cat((position, TURN * normal), -1).cpu().numpy()
+    tree = cKDTree(coordinates)
+    nearest = tree.query(coordinates, k=range(1, 1 + NEIGHBOURS), distance_upper_bound=NEAR)[1]
+    # If a point has fewer neighbours, the tree returns the index after the last row; that row is padded
+    # with NaN here, which nanmedian ignores.
     values = (
         functional.pad(getattr(deviation, f.name), (0, 0, 0, 1), value=math.nan)[nearest]
         for f in fields(Deviation)
@@ -215,53 +235,60 @@ def _deviation(
     evidence: Evidence,
     position: Float[Tensor, "N 3"],
     normal: Float[Tensor, "N 3"],
-    seen: Sightings,
+    sightings: Sightings,
 ) -> Deviation:
-    """Of points that are treated together."""
+    """Expected errors of one batch of points, not smoothed."""
     material = model.materials(position)
-    incident = light_by_patch(model, position, normal, seen.wo, material)
-    sent = sent_by_patch(model, incident, material, normal, seen.wo)
+    incident = light_by_patch(model, position, normal, sightings.wo, material)
+    sent = sent_by_patch(model, incident, material, normal, sightings.wo)
     deviations = _light_deviations(model).to(sent)
-    peculiar = sent - sent.sum(-1, keepdim=True) * evidence.typical
-    outside = torch.cat((peculiar[..., :PATCHES], peculiar[..., 2 * PATCHES :]), -1).sum(-1, keepdim=True)
-    shared = torch.cat((peculiar * deviations[:-1], outside * deviations[-1]), -1)
-    sights = Sights(
-        seen.seen, _to_radiance(model, seen.pixel), evidence.noise * _unit_error(model, seen.pixel), shared
+    atypical = sent - sent.sum(-1, keepdim=True) * evidence.typical
+    outside = torch.cat((atypical[..., :PATCHES], atypical[..., 2 * PATCHES :]), -1).sum(-1, keepdim=True)
+    observations = Observations(
+        visible=sightings.visible,
+        radiance=_to_radiance(model, sightings.pixel),
+        noise=evidence.noise * _unit_error(model, sightings.pixel),
+        shared=torch.cat((atypical * deviations[:-1], outside * deviations[-1]), -1),
     )
-    looks = possible_looks(model, incident, normal, seen.wo)
-    deviation = expected_error(looks, sights, material, model.config.shading.specular)
-    return _widened(deviation, guessed_error(material), _birge_ratio(model, evidence, sent.sum(-1), seen))
+    parts = radiance_parts(model, incident, normal, sightings.wo)
+    deviation = expected_error(parts, observations, material, model.config.shading.specular)
+    return _widened(deviation, prior_error(material), _birge_ratio(model, evidence, sent.sum(-1), sightings))
 
 
 def _birge_ratio(
-    model: NeilfModel, evidence: Evidence, sent: Float[Tensor, "N V 3"], seen: Sightings
+    model: NeilfModel, evidence: Evidence, sent: Float[Tensor, "N V 3"], sightings: Sightings
 ) -> Float[Tensor, "N 1"]:
-    """How far off a point's own pixels are, against those of a typical point; 1 where nothing was seen."""
-    off = (_relative_error(model, sent, seen) / evidence.misfit).square()
-    looks = seen.seen.sum(1)
-    return ((TYPICAL_LOOKS + looks * _mean_over_looks(off, seen)) / (TYPICAL_LOOKS + looks)).sqrt()[:, None]
+    """Ratio of a point's root mean square residual to that of a typical point; 1 if no view sees the point.
+
+    Expected errors are multiplied by it, as measurements that disagree more than their errors allow are in
+    the method of Birge (Physical Review 40, 1932).
+    """
+    error = (_relative_error(model, sent, sightings) / evidence.misfit).square()
+    views = sightings.visible.sum(1)
+    mean = (PRIOR_VIEWS + views * _mean_over_views(error, sightings)) / (PRIOR_VIEWS + views)
+    return mean.sqrt()[:, None]
 
 
 def _widened(deviation: Deviation, guess: Deviation, ratio: Float[Tensor, "N 1"]) -> Deviation:
-    """Deviations times the ratio, which makes none worse than a guess."""
+    """Multiply deviations by the ratio, but do not raise any above that of a guess."""
     pairs = ((getattr(deviation, f.name), getattr(guess, f.name)) for f in fields(Deviation))
     return Deviation(*((own * ratio).minimum(own.maximum(worst)) for own, worst in pairs))
 
 
 def _relative_error(
-    model: NeilfModel, sent: Float[Tensor, "N V 3"], seen: Sightings
+    model: NeilfModel, sent: Float[Tensor, "N V 3"], sightings: Sightings
 ) -> Float[Tensor, "N V 3"]:
-    """Of the radiance that a model sends towards views, against what they saw."""
-    return (sent - _to_radiance(model, seen.pixel)) / _unit_error(model, seen.pixel)
+    """Relative error of the radiance that the model sends towards each view, against the observed pixel."""
+    return (sent - _to_radiance(model, sightings.pixel)) / _unit_error(model, sightings.pixel)
 
 
-def _mean_over_looks(values: Float[Tensor, "N V 3"], seen: Sightings) -> Float[Tensor, " N"]:
-    """Over the channels of the views that saw a point; 0 where there is none."""
-    return (values.mean(-1) * seen.seen).sum(1) / seen.seen.sum(1).clamp_min(1)
+def _mean_over_views(values: Float[Tensor, "N V 3"], sightings: Sightings) -> Float[Tensor, " N"]:
+    """Mean over the channels and the views that see a point; 0 if there is no such view."""
+    return (values.mean(-1) * sightings.visible).sum(1) / sightings.visible.sum(1).clamp_min(1)
 
 
 def _light_deviations(model: NeilfModel) -> Float[Tensor, " E"]:
-    """Of each patch, and last of all light from outside together."""
+    """Relative standard deviations of the light: one for each patch, then that of the common factor."""
     known = model.config.known_map is not None
     direct, overall = (KNOWN, KNOWN) if known else (DIRECT, OVERALL)
     lamps = patch_count(model) - 2 * PATCHES
@@ -269,7 +296,7 @@ def _light_deviations(model: NeilfModel) -> Float[Tensor, " E"]:
 
 
 def _unit_error(model: NeilfModel, pixel: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
-    """The radiance that a relative error of 1 means at a pixel, as in fits of the light (`Objective`)."""
+    """Radiance that corresponds to a relative error of 1 at a pixel, as in the light fit (`Objective`)."""
     response = model.facts.response
     typical = apply_response(torch.tensor(model.facts.median_radiance), response)
     unit = error_unit(pixel, response, response_slope(typical, response).item())

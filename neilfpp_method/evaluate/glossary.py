@@ -1,4 +1,4 @@
-"""What each figure of `protocols.evaluate` means, in plain words."""
+"""Title, number format and meaning of each figure that an evaluation protocol computes, for display."""
 
 from __future__ import annotations
 
@@ -11,7 +11,14 @@ __all__ = ["Entry", "explain"]
 
 @dataclass(frozen=True)
 class Entry:
-    """How a figure is shown: title, number format (`%`-style), which way is better, and its meaning."""
+    """How a figure is displayed.
+
+    Attributes:
+        title: short name.
+        pattern: `%`-style format of the value with its unit.
+        better: whether higher or lower values are better.
+        meaning: one sentence for the reader of a report.
+    """
 
     title: str
     pattern: str
@@ -19,7 +26,7 @@ class Entry:
     meaning: str
 
     def format(self, value: float) -> str:
-        """The value with its unit."""
+        """Format a value with its unit."""
         return self.pattern % value
 
 
@@ -35,8 +42,8 @@ def _millimetres(title: str, meaning: str) -> Entry:
     return Entry(title, "%.3f mm", "lower", meaning)
 
 
-def _similar(title: str) -> Entry:
-    return Entry(title, "%.4f", "higher", "Likeness of local structure; 1 is the same.")
+def _similarity(title: str) -> Entry:
+    return Entry(title, "%.4f", "higher", "Structural similarity (SSIM); 1 means identical.")
 
 
 def _log(title: str, meaning: str) -> Entry:
@@ -45,83 +52,71 @@ def _log(title: str, meaning: str) -> Entry:
 
 def _ratio(title: str) -> Entry:
     meaning = (
-        "Error of the surest half of the pixels over that of the other half; 1 is no better than chance."
+        "Error of the half of the pixels with the smaller expected error, over that of the other half; "
+        "1 is chance."
     )
     return Entry(title, "%.2f", "lower", meaning)
 
 
-EXPOSED = "New views times the factor per channel that brings each closest, as their exposure is unknown."
+EXPOSED = "After the best factor per view and channel, because the exposure of a new view is unknown."
+SCALED_LIGHT = "The same after the best factor per channel."
 
 ENTRIES: Mapping[str, Entry] = {
     "volume_psnr": _decibels(
-        "Image, volume rendering", "New views as the outgoing radiance field shows them, tone-mapped."
+        "Image, volume rendering", "Test views rendered from the outgoing radiance field, tone-mapped."
     ),
-    "volume_ssim": Entry(
-        "Structure, volume rendering", "%.4f", "higher", "Likeness of local structure; 1 is the same."
-    ),
+    "volume_ssim": _similarity("Structure, volume rendering"),
     "volume_psnr_linear": _decibels(
-        "Image, volume rendering, linear", "On linear radiance, where highlights weigh most."
+        "Image, volume rendering, linear", "On linear radiance, which gives highlights the most weight."
     ),
-    "volume_psnr_exposed": _decibels(
-        "Image, volume rendering, exposed alike",
-        EXPOSED,
-    ),
-    "pbr_psnr_exposed": _decibels(
-        "Image, rendering equation, exposed alike",
-        EXPOSED,
-    ),
+    "volume_psnr_exposed": _decibels("Image, volume rendering, same exposure", EXPOSED),
     "pbr_psnr": _decibels(
-        "Image, rendering equation", "New views rendered from material and incident light, tone-mapped."
+        "Image, rendering equation", "Test views rendered from material and incident light, tone-mapped."
     ),
-    "pbr_ssim": Entry(
-        "Structure, rendering equation", "%.4f", "higher", "Likeness of local structure; 1 is the same."
-    ),
+    "pbr_ssim": _similarity("Structure, rendering equation"),
     "pbr_psnr_linear": _decibels(
-        "Image, rendering equation, linear", "On linear radiance, where highlights weigh most."
+        "Image, rendering equation, linear", "On linear radiance, which gives highlights the most weight."
     ),
+    "pbr_psnr_exposed": _decibels("Image, rendering equation, same exposure", EXPOSED),
     "base_color_psnr": _decibels(
-        "Base colour", "As estimated, with the free factor between light and base colour."
+        "Base colour", "As estimated; images determine it only up to a factor per channel."
     ),
     "base_color_psnr_gamma": _decibels(
         "Base colour, one gamma", "After one global exponent that matches the medians."
     ),
     "base_color_psnr_scaled": _decibels(
-        "Base colour, scaled", "After the best factor per channel: the free factor is out."
+        "Base colour, scaled", "After the best factor per channel, which images do not determine."
     ),
-    "roughness_psnr": _decibels("Roughness", "As estimated; 0 is a mirror, 1 is matt."),
-    "metallic_psnr": _decibels("Metallic", "As estimated; 0 is no metal, 1 is metal."),
+    "roughness_psnr": _decibels("Roughness", "As estimated; 0 is a mirror, 1 is matte."),
+    "metallic_psnr": _decibels("Metallic", "As estimated; 0 is a non-metal, 1 is a metal."),
     "normal_mae_deg": Entry("Normals", "%.2f°", "lower", "Mean angle between estimated and true normals."),
     "chamfer": _length(
         "Surface", "Mean distance between the surfaces, scene units (the object has radius 1)."
     ),
     "chamfer_accuracy": _length(
-        "Surface, accuracy", "From the estimate to the truth: what is there and should not be."
+        "Surface, accuracy", "From the estimate to the truth; surface that should not exist increases it."
     ),
     "chamfer_completeness": _length(
-        "Surface, completeness", "From the truth to the estimate: what should be there and is not."
+        "Surface, completeness", "From the truth to the estimate; missing surface increases it."
     ),
     "incident_light_log_mae": _log(
         "Incident light", "Mean |ln(estimate/truth)| over points and directions; 0.69 is a factor of 2."
     ),
-    "incident_light_log_mae_scaled": _log(
-        "Incident light, scaled", "As above, with one factor per channel taken out."
-    ),
+    "incident_light_log_mae_scaled": _log("Incident light, scaled", SCALED_LIGHT),
     "incident_light_log_mae_occluded": _log(
-        "Light from surfaces", "As above, over the directions that meet the scene again."
+        "Light from surfaces", "Mean |ln(estimate/truth)| over directions that hit the scene again."
     ),
-    "incident_light_log_mae_occluded_scaled": _log(
-        "Light from surfaces, scaled", "As above, with one factor per channel taken out."
-    ),
-    "render_psnr": _decibels("Image", "New views, as the protocol shows them."),
-    "render_ssim": _similar("Structure of the image"),
+    "incident_light_log_mae_occluded_scaled": _log("Light from surfaces, scaled", SCALED_LIGHT),
+    "render_psnr": _decibels("Image", "Test views, encoded as the protocol requires."),
+    "render_ssim": _similarity("Structure of the image"),
     "render_psnr_h": _decibels(
-        "Image, linear", "New views, linear, brought to the level of a display, up to 4."
+        "Image, linear", "Test views in linear radiance, scaled to display brightness and clipped at 4."
     ),
-    "render_psnr_l": _decibels("Image, as displayed", "New views as a display shows them."),
-    "albedo_psnr": _decibels("Albedo, scaled", "After the factor per channel that the protocol takes."),
-    "albedo_ssim": _similar("Structure of the albedo, scaled"),
+    "render_psnr_l": _decibels("Image, as displayed", "Test views, clipped and encoded as sRGB."),
+    "albedo_psnr": _decibels("Albedo, scaled", "After the factor per channel of the protocol."),
+    "albedo_ssim": _similarity("Structure of the albedo, scaled"),
     "albedo_single_psnr": _decibels("Albedo, one factor", "After one factor for all channels."),
-    "albedo_single_ssim": _similar("Structure of the albedo, one factor"),
+    "albedo_single_ssim": _similarity("Structure of the albedo, one factor"),
     "roughness_mse": Entry("Roughness", "%.4f", "lower", "Mean squared error over the frame."),
     "normal_distance": Entry("Normals, 1 − cosine", "%.4f", "lower", "Mean over the eroded mask."),
     "depth_mse": Entry(
@@ -134,7 +129,7 @@ ENTRIES: Mapping[str, Entry] = {
         "Gamma of base colour",
         "%.3f",
         "neither",
-        "The power that matches the medians; 1 would change nothing.",
+        "The exponent that matches the medians; 1 means no change.",
     ),
     "confidence_base_color_ratio": _ratio("Confidence, base colour"),
     "confidence_roughness_ratio": _ratio("Confidence, roughness"),
@@ -143,15 +138,23 @@ ENTRIES: Mapping[str, Entry] = {
 
 
 def explain(name: str) -> Entry:
-    """The entry of a figure; a baseline has that of its figure, and an unknown figure its own name."""
+    """Look up how a figure is displayed.
+
+    A `baseline_` figure and a `_frame` figure get the entry of their base figure with a changed title. An
+    unknown figure gets its own name as title.
+    """
     if name in ENTRIES:
         return ENTRIES[name]
     base = ENTRIES.get(name.removeprefix("baseline_"))
     if base is not None:
         return replace(
-            base, title=f"{base.title}, without a method", meaning="A constant, or the mean image."
+            base,
+            title=f"{base.title}, naive baseline",
+            meaning="Without a method: a constant, or the mean observed colour.",
         )
-    whole = ENTRIES.get(name.removesuffix("_frame"))
-    if whole is not None:
-        return replace(whole, title=f"{whole.title}, whole frame", meaning="The background counts as right.")
+    masked = ENTRIES.get(name.removesuffix("_frame"))
+    if masked is not None:
+        return replace(
+            masked, title=f"{masked.title}, whole frame", meaning="The background counts as free of error."
+        )
     return Entry(name.replace("_", " ").capitalize(), "%.4g", "higher", "")

@@ -1,6 +1,6 @@
-"""Numbers that compare an estimate with the truth: pure functions on arrays.
+"""Metrics that compare an estimate with the truth: pure functions on arrays.
 
-Image metrics take one view each: views may differ in size, and published tables average over views.
+Image metrics take one view each, because views may differ in size and published tables average over views.
 """
 
 from __future__ import annotations
@@ -31,16 +31,22 @@ __all__ = [
 ]
 
 PERFECT = 1e-10
-"""Least mean squared error over the squared peak: a perfect estimate scores 100 dB, valid in JSON."""
+"""Lower bound of mean squared error over squared peak. A perfect estimate then scores 100 dB instead of
+infinity, which JSON cannot hold.
+"""
 
 SSIM_WINDOW = 11
-"""Side of the SSIM window, pixels (Wang et al. 2004): Gaussian, σ = 1.5, to 3.5 σ. Least image side."""
+"""Side of the SSIM window, pixels (Wang et al. 2004): Gaussian with σ = 1.5, cut off at 3.5 σ. It is also the
+least side of an image.
+"""
 
 LOG_FLOOR = 1e-3
-"""Radiance added before a logarithm: true radiance can be 0, and far smaller differences are invisible."""
+"""Radiance added before a logarithm, because true radiance can be 0 and much smaller values are invisible."""
 
 QUERIES = 20_000
-"""Points of one nearest-neighbour query: one of all points is slow where two surfaces are far apart."""
+"""Number of nearest-neighbour queries per surface, up to a factor of 2. A query of every point takes long if
+two surfaces are far apart.
+"""
 
 
 # ----------------------------------------------------------------------------------------------------- images
@@ -65,9 +71,9 @@ def psnr_frame(
     mask: Bool[np.ndarray, "H W"],
     peak: float = 1.0,
 ) -> float:
-    """As `psnr`, over the whole frame with the background counted as free of error (METHOD §8).
+    """Peak signal-to-noise ratio over the whole frame, with the background counted as free of error, dB.
 
-    Higher than the masked figure by 10 log10(all pixels / masked pixels).
+    It exceeds `psnr` by 10 log10(all pixels / masked pixels), up to the limit of 100 dB.
     """
     return _decibels((_squared_error(estimate, truth) * mask[..., None]).mean(), peak)
 
@@ -75,14 +81,14 @@ def psnr_frame(
 def ssim(
     estimate: Float[np.ndarray, "H W C"], truth: Float[np.ndarray, "H W C"], mask: Bool[np.ndarray, "H W"]
 ) -> float:
-    """Structural similarity of one view, values in [0, 1]: the mean of its map over the masked pixels.
+    """Structural similarity of one view with values in [0, 1], averaged over the masked pixels.
 
-    Windows as in Wang et al. 2004. They reach across the mask's border; what they see there is the truth for
-    both, so that the background, which nobody asked for, cannot lower the score.
+    The window is that of Wang et al. 2004. Outside of the mask the estimate is replaced by the truth, so that
+    windows which reach across the border of the mask are not affected by the background.
     """
-    pasted = np.where(mask[..., None], estimate, truth)
+    composited = np.where(mask[..., None], estimate, truth)
     _, similarity = structural_similarity(
-        pasted,
+        composited,
         truth,
         channel_axis=-1,
         data_range=1.0,
@@ -97,9 +103,10 @@ def ssim(
 def angular_error(
     estimate: Float[np.ndarray, "H W 3"], truth: Float[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]
 ) -> float:
-    """Mean angle between normals, degrees, over masked pixels where both are non-zero; NaN without any.
+    """Mean angle between normals over masked pixels at which both are non-zero, degrees; NaN if none is.
 
-    Normals need not be unit. atan2(‖a × b‖, a · b) keeps its digits at small angles, where acos loses them.
+    Normals need not have unit length. The angle is atan2(‖a × b‖, a · b), which is accurate at small angles;
+    acos is not.
     """
     rows = mask & estimate.any(-1) & truth.any(-1)
     a, b = estimate[rows].astype(np.float64), truth[rows].astype(np.float64)
@@ -121,8 +128,8 @@ def _decibels(squared_error: float, peak: float) -> float:
 def align_gamma(estimate: Float[np.ndarray, "P C"], truth: Float[np.ndarray, "P C"]) -> float:
     """The exponent γ for which estimate^γ has the truth's median: ln(median truth) / ln(median estimate).
 
-    One number for all channels and pixels, as in the paper's published code. Medians are held off 0 and 1,
-    where the quotient has no value.
+    One number for all channels and pixels, as in the paper's published code. Medians are clamped to
+    [0.001, 0.999], because the quotient is undefined at 0 and 1.
     """
     medians = np.clip([np.median(truth), np.median(estimate)], 1e-3, 1.0 - 1e-3)
     return float(np.log(medians[0]) / np.log(medians[1]))
@@ -131,10 +138,9 @@ def align_gamma(estimate: Float[np.ndarray, "P C"], truth: Float[np.ndarray, "P 
 def align_scale(
     estimate: Float[np.ndarray, "P C"], truth: Float[np.ndarray, "P C"]
 ) -> Float[np.ndarray, " C"]:
-    """The factor per channel that brings the estimate closest to the truth, in least squares (Stanford-ORB):
-    Σet / Σe².
+    """The least-squares factor per channel from estimate to truth, Σet / Σe² (Stanford-ORB).
 
-    1 for a channel whose estimate is zero throughout.
+    The factor is 1 for a channel whose estimate is zero everywhere.
     """
     e, t = estimate.astype(np.float64), truth.astype(np.float64)
     energy = (e * e).sum(0)
@@ -160,22 +166,22 @@ class Chamfer:
 
 
 def chamfer(estimate: Float[np.ndarray, "P 3"], truth: Float[np.ndarray, "Q 3"]) -> Chamfer:
-    """Distances from the points of each surface to the nearest point of the other.
+    """Mean distances from the points of each surface to the nearest point of the other.
 
-    All points are there to be found, but of a large set only every k-th looks for its neighbour, fewer than
-    twice `QUERIES` of them: dense sets keep the distance between samples small, and the mean needs no more
-    terms.
+    Distances are measured from every k-th point of a large set, fewer than 2 · `QUERIES` points, to all
+    points of the other set. A dense target set keeps the bias from the spacing of samples small, and the mean
+    needs no more terms.
     """
     return Chamfer(_mean_distance(estimate, truth), _mean_distance(truth, estimate))
 
 
 def _mean_distance(points: Float[np.ndarray, "P 3"], surface: Float[np.ndarray, "Q 3"]) -> float:
-    asking = points[:: max(1, len(points) // QUERIES)]
-    return float(cKDTree(surface).query(asking)[0].mean())
+    queries = points[:: max(1, len(points) // QUERIES)]
+    return float(cKDTree(surface).query(queries)[0].mean())
 
 
 def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int = 0) -> Float[np.ndarray, "count 3"]:
-    """Points spread evenly over the area of a mesh; the same ones for the same seed."""
+    """Sample points uniformly over the area of a mesh. Deterministic for a given seed."""
     points, _ = trimesh.sample.sample_surface(mesh, count, seed=seed)
     return np.asarray(points, dtype=np.float64)
 
@@ -186,7 +192,7 @@ def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int = 0) -> Float[np
 def log_ratio(
     estimate: Float[np.ndarray, "P C"], truth: Float[np.ndarray, "P C"]
 ) -> Float[np.ndarray, "P C"]:
-    """ln(estimate + LOG_FLOOR) − ln(truth + LOG_FLOOR): radiance spans orders of magnitude."""
+    """ln(estimate + LOG_FLOOR) − ln(truth + LOG_FLOOR), for radiance, which spans orders of magnitude."""
     return np.log(estimate.astype(np.float64) + LOG_FLOOR) - np.log(truth.astype(np.float64) + LOG_FLOOR)
 
 
@@ -199,7 +205,10 @@ def log_error(ratio: Float[np.ndarray, "P C"]) -> float:
 
 
 def confidence_ratio(error: Float[np.ndarray, " P"], expected: Float[np.ndarray, " P"]) -> float | None:
-    """Mean error of the half with the smallest expected error over that of the other; none if that is 0."""
+    """Mean error of the half with the smaller expected errors, divided by that of the other half.
+
+    1 means that expected errors are no better than chance. None if the other half has no error.
+    """
     order = np.argsort(expected, kind="stable")
-    sure, unsure = np.split(error[order], [len(order) // 2])
-    return float(sure.mean() / unsure.mean()) if len(sure) and unsure.mean() > 0 else None
+    confident, uncertain = np.split(error[order], [len(order) // 2])
+    return float(confident.mean() / uncertain.mean()) if len(confident) and uncertain.mean() > 0 else None

@@ -1,12 +1,12 @@
-"""Pictures to look at: maps as 8-bit displays, unrolled incident light, and contact sheets.
+"""Images for display: maps in 8 bits, incident light in latitude-longitude projection, and contact sheets.
 
-Pure functions on arrays. Nothing here is measured: what a metric reads is never what a picture shows.
+Pure functions on arrays. Metrics never read these images.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -34,48 +34,55 @@ __all__ = [
 ]
 
 PAPER = (250, 250, 248)
+"""Background colour of a sheet, sRGB bytes."""
 INK = (28, 30, 34)
+"""Colour of titles."""
 PALE_INK = (112, 116, 124)
+"""Colour of notes and lines."""
 
 
 # ------------------------------------------------------------------------------------------------------- maps
 
 
 def display(name: str, values: Float[np.ndarray, "H W C"]) -> UInt8[np.ndarray, "H W C"]:
-    """A map by its name in `Maps`: normals as colours, depth normalised, one channel grey, else tone-mapped.
+    """Convert a map to 8 bits, according to its name in `structures.Maps`.
 
-    Depths that are not finite belong to no surface: they are black and do not count in the range.
+    Normals become colours, depth is normalised to its 2nd and 98th percentile, other maps with one channel
+    are grey, and colours are tone-mapped. Depths that are not finite belong to no surface: they are black and
+    do not count in the range.
     """
     if name == "normal":
         return _to_bytes(0.5 * (values + 1.0))
     if name == "depth":
-        seen = values[np.isfinite(values)]
-        return display_depth(values, *(np.percentile(seen, [2, 98]) if seen.size else (0.0, 1.0)))
+        finite = values[np.isfinite(values)]
+        return display_depth(values, *(np.percentile(finite, [2, 98]) if finite.size else (0.0, 1.0)))
     return _to_bytes(values) if values.shape[-1] == 1 else display_color(values)
 
 
 def display_color(radiance: Float[np.ndarray, "H W 3"], exposure: float = 1.0) -> UInt8[np.ndarray, "H W 3"]:
-    """Linear RGB times the exposure, clipped and sRGB-encoded."""
+    """Multiply linear RGB by the exposure, clip to [0, 1] and encode as sRGB."""
     scaled = torch.from_numpy(np.asarray(radiance * exposure, dtype=np.float32))
     return _to_bytes(tone_map(scaled).numpy())
 
 
 def display_depth(depth: Float[np.ndarray, "H W 1"], near: float, far: float) -> UInt8[np.ndarray, "H W 1"]:
-    """Grey, from white at `near` to black at `far` and where there is no depth."""
+    """Convert depth to grey, white at `near` and black at `far`; pixels without depth are black."""
     return _to_bytes((far - np.where(np.isfinite(depth), depth, far)) / max(far - near, 1e-6))
 
 
 def display_error(error: Float[np.ndarray, "H W"], largest: float) -> UInt8[np.ndarray, "H W 3"]:
-    """Dark where there is no error, through red to pale yellow at `largest` and above."""
+    """Convert errors to colours: black at 0, through red to pale yellow at `largest` and above."""
     return cv2.applyColorMap(_to_bytes(error / largest), cv2.COLORMAP_INFERNO)[..., ::-1]
 
 
 def cut_out(
-    picture: UInt8[np.ndarray, "H W C"], mask: Bool[np.ndarray, "H W"], ground: tuple[int, int, int] = PAPER
+    picture: UInt8[np.ndarray, "H W C"],
+    mask: Bool[np.ndarray, "H W"],
+    background: tuple[int, int, int] = PAPER,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The picture inside the mask, on the colour of the sheet or another ground."""
-    shown = np.broadcast_to(picture, (*mask.shape, 3))
-    return np.where(mask[..., None], shown, np.array(ground, dtype=np.uint8))
+    """Replace the pixels outside of the mask by a background colour."""
+    rgb = np.broadcast_to(picture, (*mask.shape, 3))
+    return np.where(mask[..., None], rgb, np.array(background, dtype=np.uint8))
 
 
 def _to_bytes(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
@@ -86,9 +93,10 @@ def _to_bytes(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"
 
 
 def lat_long_directions(height: int) -> Float[np.ndarray, "height W 3"]:
-    """Unit directions of the pixels of a latitude-longitude picture, W = 2 · height.
+    """Unit directions of the pixels of a latitude-longitude image of width W = 2 · height.
 
-    Row j is at θ = π (j + ½)/height from +z, column i at φ = 2π (i + ½)/W: (sin φ sin θ, cos φ sin θ, cos θ).
+    Row j has θ = π (j + ½)/height from +z and column i has φ = 2π (i + ½)/W; the direction is
+    (sin φ sin θ, cos φ sin θ, cos θ).
     """
     theta = np.pi * (np.arange(height) + 0.5)[:, None] / height
     phi = np.pi * (np.arange(2 * height) + 0.5)[None] / height
@@ -99,7 +107,7 @@ def lat_long_directions(height: int) -> Float[np.ndarray, "height W 3"]:
 def nearest_radiance(
     wi: Float[np.ndarray, "S 3"], radiance: Float[np.ndarray, "S 3"], directions: Float[np.ndarray, "H W 3"]
 ) -> Float[np.ndarray, "H W 3"]:
-    """Radiance known along `wi`, looked up along `directions`: that of the nearest direction."""
+    """Look up radiance that is known along `wi` in other directions, by the nearest neighbour."""
     return radiance[cKDTree(wi).query(directions.reshape(-1, 3))[1]].reshape(directions.shape)
 
 
@@ -108,7 +116,10 @@ def ring(
     directions: Float[np.ndarray, "K 3"],
     color: tuple[int, int, int] = (255, 64, 64),
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A latitude-longitude picture with rings about unit directions; inverse of `lat_long_directions`."""
+    """Draw rings around unit directions into a copy of a latitude-longitude image.
+
+    Pixels correspond to directions as in `lat_long_directions`.
+    """
     height, width, _ = picture.shape
     marked = np.ascontiguousarray(picture).copy()
     for x, y, z in directions:
@@ -119,7 +130,10 @@ def ring(
 
 
 def auto_exposure(radiance: Float[np.ndarray, "P 3"]) -> float:
-    """The factor that brings the 90th percentile of luminance to 0.7 (lamps clip); 1 for no radiance."""
+    """The factor that scales the 90th percentile of luminance to 0.7; 1 if there is no radiance.
+
+    Brighter values, such as those of lamps, may clip.
+    """
     if not len(radiance):
         return 1.0
     level = np.percentile(luminance(torch.from_numpy(np.asarray(radiance, dtype=np.float32))).numpy(), 90)
@@ -131,7 +145,7 @@ def auto_exposure(radiance: Float[np.ndarray, "P 3"]) -> float:
 
 @dataclass(frozen=True)
 class Group:
-    """Neighbouring columns under one title."""
+    """Adjacent columns under a common title."""
 
     title: str
     columns: tuple[str, ...]
@@ -139,9 +153,13 @@ class Group:
 
 @dataclass(frozen=True)
 class Row:
-    """Pictures, one a column, with a title and a note to their left; none leaves a cell empty.
+    """One row of a section.
 
-    `scale` is the error at the bright end of the error pictures, with unit; the row shows the legend.
+    Attributes:
+        title: shown to the left of the row.
+        pictures: one image per column; None leaves the cell empty.
+        note: shown under the title.
+        scale: the error at the bright end of the colour scale, with its unit; if given, a legend is drawn.
     """
 
     title: str
@@ -152,46 +170,47 @@ class Row:
 
 @dataclass(frozen=True)
 class Section:
-    """Rows that share their columns."""
+    """Rows that have the same columns."""
 
     groups: tuple[Group, ...]
     rows: tuple[Row, ...]
 
 
+# Lengths of the layout, pixels.
 MARGIN = 40
+"""Width of the empty border of a sheet."""
 GAP = 8
+"""Distance between cells."""
 GROUP_GAP = 28
+"""Distance between groups of columns, and between sections."""
 LABEL_WIDTH = 250
+"""Width of the titles and notes to the left of the rows."""
 TITLE_HEIGHT = 96
+"""Height of the title and subtitle of a sheet."""
 HEADER_HEIGHT = 70
+"""Height of the column titles of a section."""
 MIN_ROW_HEIGHT = 100
+"""Least height of a row, so that its title, note and legend fit."""
 TITLE, HEADING, TEXT, NOTE = 34, 24, 20, 16
+"""Font sizes: titles of sheets, titles of groups, titles of rows, notes."""
 
 
 def contact_sheet(
     title: str, subtitle: str, sections: Sequence[Section], cell_width: int = 240
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Lay sections out below one another; every picture is scaled to the cell's width, proportions kept.
+    """Draw sections below one another. Every image is scaled to the width of a cell; aspect ratios are kept.
 
-    A sheet without a title has no head.
+    If `title` is empty, no space is reserved for title and subtitle.
     """
-    fitted = [
-        Section(
-            s.groups,
-            tuple(
-                Row(r.title, tuple(_fit(p, cell_width) for p in r.pictures), r.note, r.scale) for r in s.rows
-            ),
-        )
-        for s in sections
-    ]
+    fitted = [_fit_section(section, cell_width) for section in sections]
     width = LABEL_WIDTH + max(_columns_width(s.groups, cell_width) for s in sections) + 2 * MARGIN
-    head = TITLE_HEIGHT if title else 0
-    height = 2 * MARGIN - GROUP_GAP + head + sum(_section_height(section) for section in fitted)
+    title_height = TITLE_HEIGHT if title else 0
+    height = 2 * MARGIN - GROUP_GAP + title_height + sum(_section_height(section) for section in fitted)
     sheet = Image.new("RGB", (width, height), PAPER)
     draw = ImageDraw.Draw(sheet)
     _write(draw, (MARGIN, MARGIN), title, TITLE)
     _write(draw, (MARGIN, MARGIN + 46), subtitle, TEXT, PALE_INK)
-    top = MARGIN + head
+    top = MARGIN + title_height
     for section in fitted:
         _draw_section(sheet, draw, section, top, cell_width)
         top += _section_height(section)
@@ -249,6 +268,14 @@ def _column_lefts(groups: Sequence[Group], cell_width: int) -> Iterator[int]:
 
 def _columns_width(groups: Sequence[Group], cell_width: int) -> int:
     return max(_column_lefts(groups, cell_width)) + cell_width - MARGIN - LABEL_WIDTH
+
+
+def _fit_section(section: Section, cell_width: int) -> Section:
+    rows = (
+        replace(row, pictures=tuple(_fit(picture, cell_width) for picture in row.pictures))
+        for row in section.rows
+    )
+    return replace(section, rows=tuple(rows))
 
 
 def _fit(picture: Shaped[np.ndarray, "H W C"] | None, width: int) -> UInt8[np.ndarray, "h w 3"] | None:

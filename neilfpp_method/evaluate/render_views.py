@@ -1,4 +1,4 @@
-"""Views of a run on disk: a PNG per map to look at, and one layered EXR per view that holds the values."""
+"""Write rendered views to disk: a PNG per map for display, and one layered EXR per view with the values."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ from neilfpp_method.train.run import Run
 __all__ = ["render_run"]
 
 LAYERS = {"normal": "XYZ"}
-PART = 0.95
-"""Share of the work on a view that is rendering; the rest is writing."""
+"""Channel names of EXR layers that are not RGB."""
+RENDERING = 0.95
+"""Fraction of the progress of a view that rendering takes; the rest is for writing."""
 
 
 def render_run(
@@ -31,30 +32,30 @@ def render_run(
     confidence: bool = False,
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> list[Path]:
-    """Render views of a run: `<out>/<map>/<view>.png` to look at, and `<out>/<view>.exr` with all maps.
+    """Render views of a run to `<out>/<map>/<view>.png` for display and `<out>/<view>.exr` with all maps.
 
-    A view is written with its EXR last, and one whose EXR is there is skipped: a render that was stopped goes
-    on where it was. In the EXR a map is a layer (`base_color.R`, `normal.X`), or one channel by its own name;
-    colours are linear, normals and depths in the scene frame.
+    The EXR of a view is written last, and views whose EXR exists are skipped, so an interrupted render can be
+    continued. In the EXR, a map with several channels is a layer (`base_color.R`, `normal.X`) and a map with
+    one channel has its own name. Colours are linear; normals and depths are in the scene frame.
 
     Args:
         run: the trained run.
         out: the folder to write.
         views: "test", "train", "all", or names of views.
-        overwrite: render again what is there.
-        confidence: also write how far off base colour, roughness and metallic may be
+        overwrite: also render views whose EXR exists.
+        confidence: also write the expected errors of base colour, roughness and metallic
             (`confidence.with_deviation`).
-        on_progress: told the share that is done, as it goes.
+        on_progress: called with the fraction of the work that is done.
 
     Returns:
         The EXR files, in the order of the capture.
 
     Raises:
-        UserError: a view that the capture does not have, or confidence of a material that is not there yet.
+        UserError: the capture has no such view, or `confidence` is set and the run has no material yet.
     """
     names = view_names(run.capture, views)
     if confidence and not run.has_material:
-        raise UserError(f"{run.path}: there is no material at step {run.step}", "train the next stage")
+        raise UserError(f"{run.path}: the run has no material at step {run.step}", "train the next stage")
     evidence = gather_evidence(run) if confidence else None
     written = []
     for i, view in enumerate(run.capture.views):
@@ -67,7 +68,7 @@ def render_run(
         if overwrite or not complete:
             done = len(written) - 1
             rendered = render_view(
-                run, i, lambda share, done=done: on_progress((done + PART * share) / len(names))
+                run, i, lambda share, done=done: on_progress((done + RENDERING * share) / len(names))
             )
             _write(rendered if evidence is None else with_deviation(run, evidence, rendered), out)
         on_progress(len(written) / len(names))
@@ -75,27 +76,27 @@ def render_run(
 
 
 def view_names(capture: Capture, views: str | Collection[str]) -> frozenset[str]:
-    """The views meant by "test", "train", "all" or by their names.
+    """Resolve "test", "train", "all" or names of views to a set of names.
 
     Raises:
         UserError: the capture has no such view.
     """
-    everything = frozenset(view.name for view in capture.views)
-    groups = {"all": everything, "test": capture.test, "train": everything - capture.test}
+    existing = frozenset(view.name for view in capture.views)
+    groups = {"all": existing, "test": capture.test, "train": existing - capture.test}
     if isinstance(views, str) and views in groups:
         return groups[views]
-    wanted = frozenset([views] if isinstance(views, str) else views)
-    if missing := sorted(wanted - everything):
+    names = frozenset([views] if isinstance(views, str) else views)
+    if missing := sorted(names - existing):
         raise UserError(
             f"{capture.root}: there is no view '{missing[0]}'", "give test, train, all, or names of views"
         )
-    return wanted
+    return names
 
 
 def _write(view: RenderedView, out: Path) -> None:
-    # Where a ray meets nothing its depth means nothing; the picture's range is that of the surface.
-    seen = np.where(view.maps["opacity"] > 0.5, view.maps["depth"], np.nan)
-    for name, values in {**view.maps, "depth": seen}.items():
+    # The depth of a ray that hits nothing is meaningless, so it must not affect the range of the PNG.
+    surface_depth = np.where(view.maps["opacity"] > 0.5, view.maps["depth"], np.nan)
+    for name, values in {**view.maps, "depth": surface_depth}.items():
         write_png(_picture(out, name, view.name), display(name, values))
     channels = {key: plane for name, values in view.maps.items() for key, plane in _channels(name, values)}
     write_exr(out / f"{view.name}.exr", channels)

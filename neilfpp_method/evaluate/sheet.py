@@ -1,4 +1,4 @@
-"""Pictures of a run for documents: a contact sheet beside the truth, and the light alone."""
+"""Write a contact sheet of a run beside the truth, and images of its incident light."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy as np
 
 from neilfpp_method.data.images import write_png
 from neilfpp_method.evaluate.confidence import gather_evidence, with_deviation
-from neilfpp_method.evaluate.panels import albedo_scale, light_sections, view_sections
+from neilfpp_method.evaluate.light_panels import light_sections
+from neilfpp_method.evaluate.panels import albedo_scale, view_sections
 from neilfpp_method.evaluate.pictures import contact_sheet
 from neilfpp_method.evaluate.views import RenderedView, known_test_views, render_view
 from neilfpp_method.schedule import stage_steps
@@ -19,23 +20,23 @@ from neilfpp_method.train.run import Run
 __all__ = ["write_contact_sheet", "write_light_picture"]
 
 SHOWN_VIEWS = 3
-"""Views on a contact sheet."""
+"""Number of views on a contact sheet."""
 CONFIDENCE_STEP = 2
-"""Expected errors are computed for every n-th pixel of every n-th row."""
+"""Expected errors are computed for every n-th pixel of every n-th row, to save time."""
 
 
 def write_contact_sheet(run: Run, path: Path, rendered: Sequence[RenderedView] = ()) -> None:
-    """Write up to three views of a run with the light at four points, as a PNG.
+    """Write a PNG that shows up to three views of a run, and the incident light at four points.
 
     Args:
-        run: the run; its test views are shown, its training views where none is held out.
-        path: the file.
-        rendered: views that somebody has rendered already; the others are rendered here.
+        run: the run. Its test views are shown, or its training views if no view is held out.
+        path: the file to write.
+        rendered: views that were rendered before; any other view is rendered here.
     """
     shown = _with_shown_views(run)
-    at_hand = {view.name: view for view in rendered}
+    by_name = {view.name: view for view in rendered}
     rendered = [
-        at_hand.get(view.name) or render_view(run, run.capture.views.index(view))
+        by_name.get(view.name) or render_view(run, run.capture.views.index(view))
         for view in shown.capture.test_views
     ]
     known = known_test_views(shown, rendered).views
@@ -51,7 +52,7 @@ def write_contact_sheet(run: Run, path: Path, rendered: Sequence[RenderedView] =
 
 
 def write_light_picture(run: Run, path: Path) -> bool:
-    """Write the pictures of incident light alone, as a PNG. Returns whether the run has any to show."""
+    """Write a PNG with images of the incident light. Returns False, and writes nothing, if there are none."""
     if not run.has_material:
         return False
     shown = _with_shown_views(run)
@@ -64,7 +65,7 @@ def write_light_picture(run: Run, path: Path) -> bool:
 
 
 def _with_shown_views(run: Run) -> Run:
-    """The run with up to three views held out, spread over the test views, or else the training views."""
+    """The run with up to three test views, chosen evenly from its test views or else its training views."""
     views = run.capture.test_views or run.capture.train_views
     rows = np.linspace(0, len(views) - 1, SHOWN_VIEWS).round().astype(int)
     return replace(run, capture=replace(run.capture, test=frozenset(views[row].name for row in rows)))

@@ -1,4 +1,4 @@
-"""Which training views see a surface point, from where, and what they hold of it."""
+"""Find the training views that see a surface point, their directions, and their pixels of the point."""
 
 from __future__ import annotations
 
@@ -11,34 +11,40 @@ from torch import Tensor
 
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.data.views import Camera, project
+from neilfpp_method.data.views import Camera, Projection, project
 from neilfpp_method.fields.exposure import at_mean_exposure
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.structures import Indexable, PixelBatch, RayBatch
 
-__all__ = ["Sightings", "TrainingViews"]
+__all__ = ["Sightings", "TrainingViews", "pixel_index"]
 
 TOLERANCE = 0.05
-"""Distance, scene units, within which two surfaces count as one, as for a hit."""
+"""Distance, scene units, within which two surface points count as the same; that of the hit criterion."""
 MIN_COSINE = 0.05
-"""Flatter views are left out: a pixel then covers much surface."""
+"""Least cosine between view direction and normal. At grazing angles a pixel covers too large an area."""
 
 
 @dataclass(frozen=True)
 class Sightings(Indexable):
-    """N points as up to V views see them; without a view `wo` is the normal and the pixel black."""
+    """Observations of N points in up to V views.
 
-    seen: Bool[Tensor, "N V"]
+    Attributes:
+        visible: whether the entry holds a view.
+        wo: unit direction to the camera; the normal if the entry holds no view.
+        pixel: pixel of the view, at the mean exposure of the capture; 0 if the entry holds no view.
+    """
+
+    visible: Bool[Tensor, "N V"]
     wo: Float[Tensor, "N V 3"]
     pixel: Float[Tensor, "N V 3"]
 
 
 class TrainingViews:
-    """The training views of a capture, ordered such that the first few look from all around.
+    """The training views of a capture, ordered so that the first few look from different sides.
 
     Args:
-        capture: where the views come from.
-        device: where the pixels are kept, and points are looked for.
+        capture: the capture.
+        device: device that holds the pixels; points must be on it too.
     """
 
     def __init__(self, capture: Capture, device: torch.device | str = "cpu") -> None:
@@ -48,10 +54,10 @@ class TrainingViews:
         self.centres = torch.stack(
             [torch.as_tensor(camera.c2w[:, 3], dtype=torch.float32) for camera in self.cameras]
         ).to(device)
-        self.order = _far_from_one_another(self.centres)
+        self.order = _farthest_first(self.centres)
 
-    def evenly(self, count: int) -> PixelBatch:
-        """About `count` pixels of the object, evenly over the views and over each; the same at every call."""
+    def evenly_spaced_pixels(self, count: int) -> PixelBatch:
+        """Return about `count` pixels of the object, evenly over and within the views. Deterministic."""
         each = max(1, count // len(self.cameras))
         batches = []
         for i in range(len(self.cameras)):
@@ -64,66 +70,68 @@ class TrainingViews:
 
     @torch.no_grad()
     def sightings(
-        self, model: NeilfModel, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"], most: int
+        self, model: NeilfModel, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"], max_views: int
     ) -> Sightings:
-        """The first views, `most` at most, in which nothing hides a point and whose pixel there can be used:
-        it is valid, on the object, and not clipped.
+        """Find views in which each point is unoccluded and its pixel is valid, on the object and not clipped.
+
+        The first `max_views` such views in `order` are returned.
         """
-        seen = torch.zeros(len(position), most, dtype=torch.bool, device=position.device)
-        wo = normal[:, None].repeat(1, most, 1)
+        visible = torch.zeros(len(position), max_views, dtype=torch.bool, device=position.device)
+        wo = normal[:, None].repeat(1, max_views, 1)
         pixel = torch.zeros_like(wo)
         for i in self.order:
-            rows = torch.nonzero(~seen.all(1))[:, 0]
+            rows = torch.nonzero(~visible.all(1))[:, 0]
             if not len(rows):
                 break
-            view, index = (
-                self.pixels.view(i, gradients=False),
-                _pixel_numbers(self.cameras[i], position[rows]),
-            )
+            view = self.pixels.view(i, gradients=False)
+            index = pixel_index(project(self.cameras[i], position[rows]), self.cameras[i])
             usable = (view.mask > 0.5) & self.pixels.valid(i) & (self.hdr | (view.color < 1).all(-1))
-            towards = self.centres[i] - position[rows]
-            distance = towards.norm(dim=-1)
-            direction = towards / distance[:, None]
+            to_camera = self.centres[i] - position[rows]
+            distance = to_camera.norm(dim=-1)
+            direction = to_camera / distance[:, None]
             kept = (index >= 0) & usable[index] & ((direction * normal[rows]).sum(-1) > MIN_COSINE)
             rows, direction, distance, index = rows[kept], direction[kept], distance[kept], index[kept]
-            free = _nothing_between(model, self.centres[i], position[rows], direction, distance)
-            rows, slot, index = rows[free], seen[rows[free]].sum(1), index[free]
-            seen[rows, slot], wo[rows, slot] = True, direction[free]
+            unoccluded = _unoccluded(model, self.centres[i], position[rows], direction, distance)
+            rows, index = rows[unoccluded], index[unoccluded]
+            slot = visible[rows].sum(1)
+            visible[rows, slot], wo[rows, slot] = True, direction[unoccluded]
             pixel[rows, slot] = at_mean_exposure(
                 model.gains, view.color[index], view.view[index], model.facts.response
             )
-        return Sightings(seen, wo, pixel)
+        return Sightings(visible, wo, pixel)
 
 
-def _nothing_between(
+def _unoccluded(
     model: NeilfModel,
     centre: Float[Tensor, " 3"],
     position: Float[Tensor, "N 3"],
     direction: Float[Tensor, "N 3"],
     distance: Float[Tensor, " N"],
 ) -> Bool[Tensor, " N"]:
-    """Whether a camera sees surface points within its picture: traced as light is, or rendered."""
+    """Whether nothing lies between surface points and a camera.
+
+    If the model traces light through the scene, the same tracer is used; otherwise the host is rendered.
+    """
     scene, share = model.scene, model.config.shading.hit_share
     if scene is not None:
         return scene(position, direction[:, None]).distance[:, 0] >= distance - TOLERANCE
-    free = torch.zeros_like(distance, dtype=torch.bool)
-    for rows in torch.arange(len(free), device=free.device).split(model.config.train.eval_chunk):
+    unoccluded = torch.zeros_like(distance, dtype=torch.bool)
+    for rows in torch.arange(len(distance), device=distance.device).split(model.config.train.eval_chunk):
         hits = model.host.render(RayBatch(centre.expand(len(rows), 3), -direction[rows]))
-        free[rows] = hits.is_hit(share) & ((hits.position - position[rows]).norm(dim=-1) <= TOLERANCE)
-    return free
+        unoccluded[rows] = hits.is_hit(share) & ((hits.position - position[rows]).norm(dim=-1) <= TOLERANCE)
+    return unoccluded
 
 
-def _pixel_numbers(camera: Camera, position: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
-    """Which pixel of a camera points are in, counted row by row; −1 outside of its picture."""
-    at = project(camera, position)
-    size = at.pixel.new_tensor([camera.width, camera.height])
-    inside = (at.depth > 0) & ((at.pixel >= 0) & (at.pixel < size)).all(-1)
-    column, row = torch.where(inside[:, None], at.pixel, 0.0).long().unbind(-1)
+def pixel_index(projected: Projection, camera: Camera) -> Int[Tensor, " N"]:
+    """Row-major index of the pixel that each projected point falls in; −1 outside of the image."""
+    size = projected.pixel.new_tensor([camera.width, camera.height])
+    inside = (projected.depth > 0) & ((projected.pixel >= 0) & (projected.pixel < size)).all(-1)
+    column, row = torch.where(inside[:, None], projected.pixel, 0.0).long().unbind(-1)
     return torch.where(inside, row * camera.width + column, -1)
 
 
-def _far_from_one_another(centres: Float[Tensor, "C 3"]) -> list[int]:
-    """An order in which each centre is as far as can be from all before it; the first is the first."""
+def _farthest_first(centres: Float[Tensor, "C 3"]) -> list[int]:
+    """Order in which each centre is the one farthest from all before it, starting with the first."""
     order = [0]
     distance = torch.full_like(centres[:, 0], torch.inf)
     while len(order) < len(centres):

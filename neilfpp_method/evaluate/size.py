@@ -1,4 +1,4 @@
-"""The size at which views are rendered: by default large enough to look at and to measure."""
+"""The size at which views are rendered, by default limited to what measurements and displays need."""
 
 from __future__ import annotations
 
@@ -16,23 +16,25 @@ from neilfpp_method.data.scaling import (
 from neilfpp_method.errors import UserError
 from neilfpp_method.train.run import Run
 
-__all__ = ["at_size", "size_in_words", "what_is_measured"]
+__all__ = ["at_size", "describe_size", "measured_views"]
 
 
 def at_size(run: Run, scale: float | None = None, width: int | None = None) -> Run:
-    """The run with its views at another size; images, masks and truths are averaged over the area of a pixel.
+    """Return the run with its views at another size; images, masks and truth are averaged over pixel areas.
+
+    If neither `scale` nor `width` is given, views keep the size that the run was trained at, but are reduced
+    to a mean of `PIXELS_OF_A_VIEW` pixels if they are larger.
 
     Args:
-        run: the run; its own views have the size that it was trained at.
-        scale: size over that of the files; 1 renders every pixel of a photograph.
-        width: of the widest view, pixels. Without either, `PIXELS_OF_A_VIEW` pixels a view, and no more than
-            the run was trained at.
+        run: the run, whose views have the size that it was trained at.
+        scale: size relative to the image files; 1 renders every pixel of a photograph.
+        width: width of the widest view, pixels.
 
     Raises:
-        UserError: both are given, or one cannot be.
+        UserError: both `scale` and `width` are given, or one has an impossible value.
     """
     if scale is not None and width is not None:
-        raise UserError("--scale and --width both say how large views are", "give one of them")
+        raise UserError("--scale and --width both set the size of views", "give only one of them")
     views = run.capture.views
     if width is not None:
         scale = scale_for_width(views, width)
@@ -44,19 +46,20 @@ def at_size(run: Run, scale: float | None = None, width: int | None = None) -> R
     return replace(run, capture=at_scale(run.capture, scale))
 
 
-def size_in_words(run: Run) -> str | None:
-    """How large the views of a run are and how to get larger ones; none where they have full size."""
+def describe_size(run: Run) -> str | None:
+    """One line on the size of a run's views and how to change it; None if they have the size of the files."""
     view = max(run.capture.views, key=lambda view: view.camera.width)
     width, height = view.camera.width, view.camera.height
     if (width, height) == file_size(view):
         return None
     files = "×".join(map(str, file_size(view)))
-    return f"views of {width}×{height} pixels, files of {files}; --width or --scale for another size"
+    return f"views have {width}×{height} pixels, the files {files}; --width or --scale changes the size"
 
 
-def what_is_measured(run: Run) -> dict[str, Any]:
-    """Which views figures are of, at what size in pixels, and after how many steps: what has to agree for
-    figures of two runs to be compared. The size is that of the widest view.
+def measured_views(run: Run) -> dict[str, Any]:
+    """Describe what figures were measured on: names of the test views, size of the widest one, training step.
+
+    Figures of two runs can be compared only if the views and the size agree.
     """
     views = run.capture.test_views
     widest = max((view.camera for view in views), key=lambda camera: camera.width)

@@ -1,4 +1,4 @@
-"""What a run shows of a view, and what is known of it: made once, then measured, drawn or written."""
+"""Rendered views of a run, and the images and true maps of the same views, for metrics and pictures."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import View, camera_rays, project
 from neilfpp_method.errors import UserError
+from neilfpp_method.evaluate.sightings import pixel_index
 from neilfpp_method.shading.color import srgb_to_linear
 from neilfpp_method.structures import Maps
 from neilfpp_method.train.run import Run
@@ -37,40 +38,45 @@ __all__ = [
 
 @dataclass(frozen=True)
 class RenderedView:
-    """The maps of one view by their names in `structures.Maps`, (H, W, C) float32. Colours are linear."""
+    """The maps of one rendered view, float32, by their names in `structures.Maps`. Colours are linear."""
 
     name: str
     maps: Mapping[str, Float[np.ndarray, "H W C"]]
+
+    @property
+    def surface_mask(self) -> Bool[np.ndarray, "H W"]:
+        """Pixels that show a surface: opacity above one half."""
+        return self.maps["opacity"][..., 0] > 0.5
 
 
 def render_view(
     run: Run, view_index: int, on_progress: Callable[[float], None] = lambda share: None
 ) -> RenderedView:
-    """Render view `view_index` of `run.capture.views` at the size of its camera; the same picture every time.
+    """Render view `view_index` of `run.capture.views` at the size of its camera. Deterministic.
 
-    `config.train.eval_chunk` rays are in flight at once, from all over the view, so that each such part takes
-    about as long as any other; the share that is done is reported after each. A run without a material has
-    the host's colour for `rgb`, and zeros for what a material would show.
+    Rays are processed in batches of `config.train.eval_chunk`. Each batch is spread over the whole view, so
+    that all batches take about the same time; `on_progress` is called with the fraction that is done after
+    each. If the run has no material yet, `rgb` is the host's colour, and the maps of the material are 0.
     """
     view = run.capture.views[view_index]
     device = next(run.model.parameters()).device
     rays = camera_rays(run.capture.normalisation.camera(view.camera))
     parts = -(-len(rays) // run.config.train.eval_chunk)
-    whole: dict[str, Tensor] = {}
+    combined: dict[str, Tensor] = {}
     for k in range(parts):
         rows = torch.arange(k, len(rays), parts)
         maps = run.model.maps(rays[rows].to(device), run.has_material)
         for name in (f.name for f in fields(Maps)):
             values = getattr(maps, name).float().cpu()
-            whole.setdefault(name, values.new_empty(len(rays), values.shape[1]))[rows] = values
+            combined.setdefault(name, values.new_empty(len(rays), values.shape[1]))[rows] = values
         on_progress((k + 1) / parts)
-    return RenderedView(view.name, {name: _image(values, view) for name, values in whole.items()})
+    return RenderedView(view.name, {name: _image(values, view) for name, values in combined.items()})
 
 
 def render_test_views(
     run: Run, on_progress: Callable[[float], None] = lambda share: None
 ) -> tuple[RenderedView, ...]:
-    """Render every view that is held out, in order; reports the share that is done as it goes.
+    """Render every held-out view, in order; `on_progress` is called with the fraction that is done.
 
     Raises:
         UserError: no view is held out.
@@ -91,9 +97,15 @@ def render_test_views(
 
 @dataclass(frozen=True)
 class KnownView:
-    """What is known of a view: `image` as captured, the pixels that count, and the truth where known.
+    """The captured image of a view, and its true maps as far as the capture has them.
 
-    `depth` is along the camera's axis, scene units; `material` maps base_color, roughness and metallic.
+    Attributes:
+        view: the view.
+        image: the image as captured: linear radiance, or display values in [0, 1].
+        mask: the pixels that metrics count.
+        depth: true depth along the camera's axis, scene units, or None.
+        normal: true unit normals, scene frame, or None.
+        material: true maps base_color, roughness and metallic by name, or None.
     """
 
     view: View
@@ -106,26 +118,31 @@ class KnownView:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """The test views, and what decides which of their pixels count, as `mask_source` names it."""
+    """The test views, and the source of their masks (see `mask_source`)."""
 
     views: tuple[KnownView, ...]
     mask_source: str
 
 
 def mask_source(capture: Capture) -> str:
-    """What decides which pixels of the test views count; one source for all of them.
+    """Name the source of the masks of the test views; it is the same for all of them.
 
-    "true depth" where every view has it; else "capture masks" where there are any, or where pixels that show
-    exactly the background stand for them; else "rendered opacity" above one half, which lets the estimate
-    choose its pixels.
+    Returns:
+        "true depth" if every test view has a true depth map; else "capture masks" if any view has a mask, or
+        pixels that show exactly the background; else "rendered opacity", a threshold of one half on the
+        estimate. With the last, the estimate chooses the pixels on which it is measured.
     """
     return _mask_source(_known_depths(capture), _file_values(capture, capture.test_views))
 
 
 def known_test_views(run: Run, rendered: Sequence[RenderedView]) -> HeldOut:
-    """What is known of the test views; `rendered` are the same views, in order.
+    """Load images, masks and true maps of the test views.
 
-    Masks are as `mask_source` says, without the pixels that the capture marks as invalid.
+    Masks come from the source that `mask_source` names; pixels that the capture marks as invalid are removed.
+
+    Args:
+        run: the run.
+        rendered: the rendered test views, in order.
     """
     capture, truth = run.capture, Truth(run.capture)
     depths, stored = _known_depths(capture), _file_values(capture, capture.test_views)
@@ -153,7 +170,7 @@ def known_test_views(run: Run, rendered: Sequence[RenderedView]) -> HeldOut:
 
 
 def _file_values(capture: Capture, views: Sequence[View]) -> PixelDataset:
-    """The pixels of views as their files have them, which a training keeps in fewer bits."""
+    """The pixels of views with the precision of their files; training stores them in fewer bits."""
     return PixelDataset(capture, views, exact=True)
 
 
@@ -173,25 +190,31 @@ def _image(values: Shaped[Tensor, "P ..."], view: View) -> Shaped[np.ndarray, "H
     return values.reshape(view.camera.height, view.camera.width, -1).numpy()
 
 
-# --------------------------------------------------------------------------------------- what other views saw
+# ------------------------------------------------------------------------------- observed colours of surfaces
 
 VISIBLE = 0.02
-"""Largest difference from a view's depth map, scene units, at which the view sees a point."""
+"""A view sees a point if its depth map, at the point's pixel, differs by at most this, scene units."""
 
 
 def surface_points(capture: Capture, known: KnownView) -> Float[Tensor, "P 3"]:
-    """Where the masked pixels of a view meet the true surface, scene frame; the view must have its depth."""
+    """Points of the true surface at the masked pixels of a view with true depth, scene frame."""
     camera = capture.normalisation.camera(known.view.camera)
     rays = camera_rays(camera)[torch.from_numpy(known.mask).reshape(-1)]
-    along_axis = rays.directions @ torch.as_tensor(camera.w2c[2, :3], dtype=rays.directions.dtype)
-    return rays.origins + rays.directions * (torch.from_numpy(known.depth[known.mask]) / along_axis)[:, None]
+    cosine = rays.directions @ torch.as_tensor(camera.w2c[2, :3], dtype=rays.directions.dtype)
+    return rays.origins + rays.directions * (torch.from_numpy(known.depth[known.mask]) / cosine)[:, None]
 
 
 def mean_observed_color(capture: Capture, points: Float[Tensor, "P 3"]) -> Float[np.ndarray, "P 3"] | None:
-    """The mean linear colour of surface points over training views that see them; none without true depths.
+    """Mean linear colour of surface points over the training views that see them.
 
-    A view sees a point when its depth map, at the point's pixel, agrees within `VISIBLE`. A point that no
-    view sees takes the mean over the others.
+    A point that no view sees gets the mean over all others.
+
+    Args:
+        capture: the capture.
+        points: surface points, scene frame.
+
+    Returns:
+        Linear colours, or None if no training view has true depth.
     """
     truth = Truth(capture)
     views = [view for view in capture.train_views if truth.depth(view) is not None]
@@ -200,12 +223,10 @@ def mean_observed_color(capture: Capture, points: Float[Tensor, "P 3"]) -> Float
     pixels = _file_values(capture, views)
     total, count = torch.zeros_like(points), torch.zeros(len(points), 1)
     for i, view in enumerate(views):
-        size = torch.tensor([view.camera.width, view.camera.height])
-        seen = project(capture.normalisation.camera(view.camera), points)
-        inside = (seen.depth > 0) & (seen.pixel >= 0).all(-1) & (seen.pixel < size).all(-1)
-        column, row = torch.where(inside[:, None], seen.pixel, 0.0).long().unbind(-1)
-        index = row * view.camera.width + column
-        visible = inside & pixels.valid(i)[index] & ((truth.depth(view)[index] - seen.depth).abs() <= VISIBLE)
+        projected = project(capture.normalisation.camera(view.camera), points)
+        index = pixel_index(projected, view.camera)
+        same_depth = (truth.depth(view)[index] - projected.depth).abs() <= VISIBLE
+        visible = (index >= 0) & pixels.valid(i)[index] & same_depth
         color = pixels.view(i, gradients=False).color[index]
         total += visible[:, None] * (color if capture.hdr else srgb_to_linear(color))
         count += visible[:, None]

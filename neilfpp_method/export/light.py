@@ -1,8 +1,11 @@
-"""The light of a run as files: environment map, lamps before it, and light probes (docs/light.md).
+"""Write the light of a run to files: environment map, lamps, and light probes (docs/light.md).
 
-<out>/environment.exr    radiance from far away, where the run has an environment map <out>/lamps.json
-lamps close to the scene, in the world frame of the capture; beside every environment map <out>/probes/<k>.exr
-what arrives at points of the surface <out>/probes.json        where these points are
+Files:
+
+    <out>/environment.exr    radiance of distant light, if the run has an environment map
+    <out>/lamps.json         lamps near the scene, in the world frame; written with every environment map
+    <out>/probes/<k>.exr     incident radiance at points of the surface
+    <out>/probes.json        positions and normals of these points
 """
 
 from __future__ import annotations
@@ -20,60 +23,58 @@ from neilfpp_method.export.probes import probe, spread_over_surface
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.train.run import Run, write_json
 
-__all__ = ["ExportedLight", "check_light", "export_light", "has_light", "lamps_in_world"]
+__all__ = ["ExportedLight", "check_light", "export_light", "lamps_in_world"]
 
 FORMAT = 1
+"""Version of the format of the JSON files."""
 PROBE_HEIGHT = 64
+"""Height of the image of a probe, pixels."""
 FREE_PROBES = 16
-"""Probes of a light that is free at every point, of which nothing else can be exported."""
+"""Default number of probes for a free light, which can only be exported as probes."""
 MAX_PROBES = 1024
+"""Largest number of probes."""
 
 
 @dataclass(frozen=True)
 class ExportedLight:
-    """What was written: the map or none, and how many lamps and probes."""
+    """What was written: the file of the environment map or None, and the numbers of lamps and probes."""
 
     environment: Path | None
     lamps: int
     probes: int
 
 
-def has_light(run: Run) -> bool:
-    """Whether a stage has moved the light."""
-    return run.step > run.config.train.sdf_steps
-
-
 def check_light(run: Run, probes: int | None) -> None:
-    """That there is what `export_light` is asked for.
+    """Check that `export_light` is possible.
 
     Raises:
-        UserError: no stage has moved the light, or the number of probes is not within 0 … 1024.
+        UserError: no stage has estimated the light, or the number of probes is not within 0 … 1024.
     """
-    if not has_light(run):
+    if not run.has_material:
         raise UserError(f"{run.path}: there is no light yet at step {run.step}", "train the next stage")
     if probes is not None and not 0 <= probes <= MAX_PROBES:
-        raise UserError(f"{probes} probes", f"ask for 0 to {MAX_PROBES} with --probes")
+        raise UserError(f"cannot export {probes} probes", f"give 0 to {MAX_PROBES} with --probes")
 
 
 def export_light(run: Run, out: Path, probes: int | None = None) -> ExportedLight:
-    """Write the light of a run. Radiance is in image units, lengths in those of the capture's world.
+    """Write the light of a run. Radiance is in the unit of the images, lengths are in world units.
 
     Args:
         run: the run.
         out: the folder to write.
-        probes: how many; none: 16 for a light that is free at every point, else 0.
+        probes: number of probes; None for 16 if the light is free, else 0.
 
     Raises:
-        UserError: see `check_light`; or there is no surface for probes.
+        UserError: `check_light` fails, or there is no surface for probes.
     """
     check_light(run, probes)
     light, lamps, environment = run.model.light, 0, None
     if isinstance(light, EnvironmentLight):
         environment = out / "environment.exr"
         write_exr(environment, {"RGB": light.log_radiance.exp().permute(1, 2, 0).cpu().numpy()})
-        described = lamps_in_world(run)
-        lamps = len(described)
-        write_json(out / "lamps.json", {"format": FORMAT, "frame": "world", "lamps": described})
+        entries = lamps_in_world(run)
+        lamps = len(entries)
+        write_json(out / "lamps.json", {"format": FORMAT, "frame": "world", "lamps": entries})
     if probes is None:
         probes = 0 if environment else FREE_PROBES
     written = _write_probes(run, out, probes) if probes else 0
@@ -81,9 +82,10 @@ def export_light(run: Run, out: Path, probes: int | None = None) -> ExportedLigh
 
 
 def lamps_in_world(run: Run) -> list[dict[str, Any]]:
-    """The lamps of a run as in `lamps.json` (docs/light.md), in the capture's world; none without lamps.
+    """The lamps of a run in the format of `lamps.json` (docs/light.md), in the world frame.
 
-    Radiance is the same in every frame; intensity, radiance times a disc's area, scales as the area.
+    Radiance is the same in every frame. Intensity is radiance times the area of a disc, so it scales with the
+    square of length.
     """
     lamps = run.model.lamps
     frame = run.capture.normalisation
@@ -107,14 +109,14 @@ def lamps_in_world(run: Run) -> list[dict[str, Any]]:
 
 def _write_probes(run: Run, out: Path, count: int) -> int:
     points = spread_over_surface(run, count)
-    described = []
+    entries = []
     for position, normal in zip(points.position, points.normal, strict=True):
-        name = f"probes/{len(described):04d}.exr"
+        name = f"probes/{len(entries):04d}.exr"
         write_exr(out / name, {"RGB": probe(run, position, normal, PROBE_HEIGHT).cpu().numpy()})
-        described.append({"file": name, "position": _in_world(run, position), "normal": normal.tolist()})
-    # Last: what it lists is there.
-    write_json(out / "probes.json", {"format": FORMAT, "frame": "world", "probes": described})
-    return len(described)
+        entries.append({"file": name, "position": _in_world(run, position), "normal": normal.tolist()})
+    # Written last, so that all files which it lists exist.
+    write_json(out / "probes.json", {"format": FORMAT, "frame": "world", "probes": entries})
+    return len(entries)
 
 
 def _in_world(run: Run, position: Float[Tensor, " 3"]) -> list[float]:

@@ -1,11 +1,10 @@
-"""The surface of a run as a triangle mesh: the one that it was given, or marching cubes on a grid that is
-queried only near the zero set.
-"""
+"""The surface of a run as a triangle mesh: the mesh it was given, or marching cubes on a sparse grid."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -29,32 +28,38 @@ __all__ = ["export_mesh", "extract_mesh", "has_surface", "materials_in_parts", "
 Sdf = Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]
 
 BLOCK = 8
-"""Grid points along an edge of a block."""
+"""Number of grid points along an edge of a block."""
 SLACK = 1.5
-"""A block is skipped when |sdf| at its centre exceeds this many of its half-diagonals. With blocks of 8
-points nothing is lost, the edges between blocks included, for every field whose slope stays below 1.29.
+"""A block is skipped if |sdf| at its centre exceeds this multiple of its half-diagonal. With blocks of 8
+points no part of the surface is lost, including the edges between blocks, if the slope of the field is below
+1.29.
 """
 POINTS_AT_ONCE = 65_536
-"""Points at which the material is asked together: bounds the memory."""
+"""Number of points per evaluation of the material, which bounds the memory."""
 
 
 @torch.no_grad()
 def extract_mesh(
     sdf: Sdf, radius: float, resolution: int = 256, chunk: int = 65_536, device: torch.device | str = "cpu"
 ) -> trimesh.Trimesh:
-    """The zero set of a signed distance field within a sphere about the origin; faces are wound outwards.
+    """Extract the zero set of a signed distance field within a sphere around the origin.
 
-    The grid is asked for its block centres first, then for all points of blocks that the surface may cross.
+    The field is evaluated at the centres of blocks first, and then at all grid points of the blocks that the
+    surface may cross.
 
     Args:
         sdf: signed distance, negative inside; its slope should be about 1.
         radius: only the surface within this distance of the origin is kept.
-        resolution: grid points along the edge of the cube around that sphere, rounded up to a multiple of 8.
-        chunk: points asked at once; bounds the memory.
-        device: where the points are made.
+        resolution: number of grid points along an edge of the cube around the sphere, rounded up to a
+            multiple of 8.
+        chunk: number of points per evaluation of the field, which bounds the memory.
+        device: device of the points.
+
+    Returns:
+        The mesh; faces are oriented outwards.
 
     Raises:
-        UserError: the field has no zero set there.
+        UserError: the field has no zero set within the sphere.
     """
     blocks = math.ceil(resolution / BLOCK)
     step = 2.0 * radius / (blocks * BLOCK - 1)
@@ -63,7 +68,7 @@ def extract_mesh(
     )
     if not volume.min() < 0.0 < volume.max():
         raise _no_surface(radius)
-    # scikit-image winds faces by the left hand towards growing values by default, which is outwards.
+    # By default, scikit-image orients faces towards increasing values, which is outwards.
     vertices, faces, _, _ = marching_cubes(volume, 0.0, allow_degenerate=False)
     vertices = vertices * step - radius
     inside = np.linalg.norm(vertices, axis=-1) <= radius
@@ -76,20 +81,21 @@ def extract_mesh(
 
 
 def has_surface(run: Run) -> bool:
-    """Whether the host of a run has a surface that can be written as a mesh."""
+    """Whether the host of a run has a distance field or a mesh, so that a mesh can be written."""
     return isinstance(run.model.host, HasSdf | MeshHost)
 
 
 def surface_mesh(run: Run, resolution: int = 256) -> trimesh.Trimesh:
-    """The surface of a run in the scene frame; faces are wound outwards.
+    """Return the surface of a run in the scene frame; faces are oriented outwards.
+
+    A mesh that the run was given keeps its triangles; corners at the same position are merged.
 
     Args:
         run: the run.
-        resolution: of `extract_mesh`; a mesh that the run was given keeps its triangles, and corners at one
-            place become one.
+        resolution: resolution of `extract_mesh` for a distance field.
 
     Raises:
-        UserError: the host has no surface that is known as one, or none is found.
+        UserError: the host has neither a distance field nor a mesh, or the field has no zero set.
     """
     host = run.model.host
     if isinstance(host, MeshHost):
@@ -103,25 +109,24 @@ def surface_mesh(run: Run, resolution: int = 256) -> trimesh.Trimesh:
             "export from a run of another host",
         )
     volume = run.config.volume
-    # The sphere that may close the scene (METHOD §3) is no surface of the object.
+    # Stay inside the sphere that may close the scene, which is no surface of the object.
     device = next(run.model.parameters()).device
     return extract_mesh(host.sdf, volume.radius - HIT_RADIUS, resolution, device=device)
 
 
 def export_mesh(run: Run, path: Path, resolution: int = 256) -> trimesh.Trimesh:
-    """Write the surface of a run as a PLY file, in the frame and the scale of its capture.
+    """Write the surface of a run as a PLY file in the world frame of its capture.
 
-    Vertices carry normals and, once a stage has moved the material, the base colour, sRGB-encoded, and the
-    properties `roughness` and `metallic`, floats in [0, 1].
+    Vertices have normals. If a stage has estimated the material, they also have the base colour,
+    sRGB-encoded, and the properties `roughness` and `metallic`, floats in [0, 1].
 
     Raises:
-        UserError: see `surface_mesh`.
+        UserError: `surface_mesh` fails.
     """
     mesh = surface_mesh(run, resolution)
-    position = torch.as_tensor(
-        np.array(mesh.vertices), dtype=torch.float32, device=next(run.model.parameters()).device
-    )
-    if run.step > run.config.train.sdf_steps:
+    device = next(run.model.parameters()).device
+    position = torch.as_tensor(np.array(mesh.vertices), dtype=torch.float32, device=device)
+    if run.has_material:
         material = materials_in_parts(run, position)
         mesh.visual.vertex_colors = (tone_map(material.base_color) * 255.0).round().byte().cpu().numpy()
         mesh.vertex_attributes["roughness"] = material.roughness[:, 0].cpu().numpy()
@@ -134,27 +139,25 @@ def export_mesh(run: Run, path: Path, resolution: int = 256) -> trimesh.Trimesh:
 
 @torch.no_grad()
 def materials_in_parts(run: Run, position: Float[Tensor, "N 3"]) -> Material:
-    """The material at any number of points of the scene frame."""
+    """Evaluate the material at any number of points of the scene frame, in batches."""
     parts = [run.model.materials(part) for part in position.split(POINTS_AT_ONCE)]
     return Material(
-        *(
-            torch.cat([getattr(part, name) for part in parts])
-            for name in ("base_color", "roughness", "metallic")
-        )
+        **{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Material)}
     )
 
 
 def _sparse_grid(
     sdf: Sdf, radius: float, blocks: int, step: float, device: torch.device | str
 ) -> Float[np.ndarray, "G G G"]:
-    """sdf on the grid of cubes; a block far from the surface holds the value of its centre throughout."""
+    """Values of the field on the grid; a block far from the surface holds the value at its centre."""
     corners = _lattice(blocks, device) * (BLOCK * step) - radius
     half_edge = 0.5 * (BLOCK - 1) * step
     half_diagonal = math.sqrt(3.0) * half_edge
     centres = corners + half_edge
     coarse = sdf(centres)
     near = coarse.abs() <= SLACK * half_diagonal
-    # A block beyond the sphere is cut away later; two steps keep the edges that lead into it true.
+    # Blocks beyond the sphere are cut off later. The margin of two steps keeps the grid edges that cross the
+    # sphere exact.
     near &= centres.norm(dim=-1) <= radius + half_diagonal + 2.0 * step
     values = coarse[:, None].repeat(1, BLOCK**3)
     points = corners[near][:, None] + _lattice(BLOCK, device) * step
@@ -165,7 +168,7 @@ def _sparse_grid(
 
 
 def _lattice(count: int, device: torch.device | str) -> Float[Tensor, "P 3"]:
-    """All triples of 0 … count − 1, the last one running fastest."""
+    """All triples of 0 … count − 1; the last index varies fastest."""
     axis = torch.arange(count, dtype=torch.float32, device=device)
     return torch.cartesian_prod(axis, axis, axis)
 
@@ -173,5 +176,5 @@ def _lattice(count: int, device: torch.device | str) -> Float[Tensor, "P 3"]:
 def _no_surface(radius: float) -> UserError:
     return UserError(
         f"no surface within {radius:g} scene units",
-        "train the stage sdf_init for longer, and look at its previews",
+        "train the stage sdf_init for longer, and check its previews",
     )

@@ -138,8 +138,7 @@ def position_encoding(
 class SphericalHarmonics(nn.Module):
     """Encoding of unit vectors by real spherical harmonics, without Condon–Shortley phase.
 
-    The functions are sorted by band, and within a band by ascending order m. They are orthonormal over the
-    sphere.
+    The functions are sorted by band, and within a band by ascending order m. They are orthonormal.
 
     Args:
         degree: number of bands, 1 to 5.

@@ -1,5 +1,5 @@
-"""Whether a run is sound: what goes wrong without an error, likely causes, remedies (docs/health.md).
+"""Detect trainings that go wrong without an error, with likely causes and remedies (docs/health.md).
 
-`look` measures what a model shows of some training pixels, `cases` turns measurements into findings, and
-`watch` follows a training.
+`look` takes measurements at some training pixels, `cases` derives findings from them, and `watch` collects
+the findings during a training.
 """

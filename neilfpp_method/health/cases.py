@@ -1,7 +1,7 @@
-"""From measurements of a run to findings: each case with its limit, its likely cause and its remedy.
+"""Derive findings from measurements of a run: each case has a limit, a likely cause and a remedy.
 
-The limits rest on reasoning and on few runs (docs/health.md): a finding means that something is wrong, its
-absence does not mean that all is well.
+The limits are based on reasoning and on a few runs (docs/health.md). A finding means that something is wrong;
+its absence does not prove that the result is good.
 """
 
 from __future__ import annotations
@@ -27,19 +27,23 @@ __all__ = [
 Verdict = Literal["sound", "doubtful", "failed"]
 
 MIN_OPAQUE = 0.05
-"""Share of the object's pixels that must show something; an empty scene shows nothing anywhere."""
+"""Minimum share of the object's pixels whose rays are opaque. It is 0 if the scene is empty."""
 MIN_SHARP = 0.5
-"""Share of opaque rays that must meet one surface; in fog a ray's weight spreads, and few do."""
+"""Minimum share of the opaque rays that hit a single surface. In fog the weights of a ray are spread out, so
+only few rays do.
+"""
 MAX_AT_BOUND = 0.5
-"""Share of the surface that may have a base colour at a bound: a scene of black or white things has less."""
+"""Maximum share of the surface whose base colour is black or white. Even scenes of black or white objects
+have less.
+"""
 MAX_EMPTY_STEPS = 50
-"""Steps of a material stage in a row that may shade nothing."""
+"""Number of consecutive steps of a material stage without a surface point that is a finding."""
 MIN_LIGHT_POINTS = 100
-"""Surface points from which a light of thousands of texels can be fitted at all."""
+"""Minimum number of surface points for a fit of a light with thousands of texels."""
 MAX_SKIPPED = 0.05
-"""Share of the steps that may be skipped for a loss or a gradient that is not finite."""
+"""Maximum share of steps that are skipped because a loss or gradient is not finite."""
 MIN_STEPS = 100
-"""Steps before which a share of skipped steps says nothing."""
+"""Number of steps below which the share of skipped steps is not significant."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +51,12 @@ class Finding:
     """Something that is wrong with a run.
 
     Attributes:
-        case: its name, as in docs/health.md.
-        severe: the result is of no use; otherwise it is to be doubted.
-        step: of the training, where it was found.
-        what, cause, remedy: for the person, a clause each.
+        case: name of the case, as in docs/health.md.
+        severe: whether the result is unusable rather than doubtful.
+        step: training step at which it was found.
+        what: description of the problem.
+        cause: the likely cause.
+        remedy: what to do.
     """
 
     case: str
@@ -61,23 +67,23 @@ class Finding:
     remedy: str
 
     def line(self) -> str:
-        """For the terminal."""
+        """One line for the console."""
         return f"step {self.step}: {self.what}; likely {self.cause}; {self.remedy}"
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:
-    """The worst of all findings."""
+    """The verdict that follows from all findings: that of the worst one."""
     severe = [finding.severe for finding in findings]
     return "failed" if any(severe) else "doubtful" if severe else "sound"
 
 
 @dataclass(frozen=True)
 class Health:
-    """A verdict and what it rests on.
+    """A verdict and the findings on which it is based.
 
     Attributes:
-        verdict: the worst of all findings.
-        findings: what is wrong, a case each; none where the verdict is "sound".
+        verdict: the verdict.
+        findings: one finding per case; empty if the verdict is "sound".
     """
 
     verdict: Verdict
@@ -85,16 +91,16 @@ class Health:
 
     @staticmethod
     def of(findings: Iterable[Finding]) -> Health:
-        """The health that findings come to."""
-        found = tuple(findings)
-        return Health(verdict_of(found), found)
+        """The health that follows from findings."""
+        all_findings = tuple(findings)
+        return Health(verdict_of(all_findings), all_findings)
 
     def __str__(self) -> str:
         return self.verdict + (": " + "; ".join(f.what for f in self.findings) if self.findings else "")
 
 
 def surface_findings(seen: Look, step: int) -> list[Finding]:
-    """What a look says of the surface, at the end of a stage that moves it or later."""
+    """Findings on the surface, at the end of a stage that trains it or later."""
     if seen.opaque < MIN_OPAQUE:
         return [
             Finding(
@@ -121,7 +127,7 @@ def surface_findings(seen: Look, step: int) -> list[Finding]:
 
 
 def material_findings(seen: Look, step: int) -> list[Finding]:
-    """What a look says of the material."""
+    """Findings on the material."""
     if seen.at_bound is None or seen.at_bound <= MAX_AT_BOUND:
         return []
     return [
@@ -137,7 +143,7 @@ def material_findings(seen: Look, step: int) -> list[Finding]:
 
 
 def nothing_shaded(steps: int, step: int) -> list[Finding]:
-    """What it means that `steps` steps in a row had no surface point to shade."""
+    """Finding that `steps` consecutive steps had no surface point to shade."""
     if steps < MAX_EMPTY_STEPS:
         return []
     return [
@@ -153,7 +159,7 @@ def nothing_shaded(steps: int, step: int) -> list[Finding]:
 
 
 def few_light_points(points: int, step: int) -> list[Finding]:
-    """What it means that the light was fitted to so many points."""
+    """Finding that the light was fitted to too few points."""
     if points >= MIN_LIGHT_POINTS:
         return []
     return [
@@ -169,7 +175,7 @@ def few_light_points(points: int, step: int) -> list[Finding]:
 
 
 def skipped_steps(skipped: int, step: int) -> list[Finding]:
-    """What it means that so many of `step` steps were skipped."""
+    """Finding that too many of the first `step` steps were skipped."""
     if step < MIN_STEPS or skipped <= MAX_SKIPPED * step:
         return []
     return [

@@ -1,12 +1,14 @@
-"""Leaves out steps that are not finite, in loops whose optimisers are somebody else's.
+"""Skip optimizer steps that are not finite, in training loops outside of this package.
 
     guard = StepGuard(warn=print)
     guard.watch(optimizer)
-    guard.begin_step(total.terms, step)   # in every step, with the losses by name
+    # In every step, with the losses by name:
+    guard.begin_step(total.terms, step)
     loss.backward()
-    optimizer.step()                      # moves nothing where a loss or a gradient is not finite
+    # Changes no parameter if a loss or gradient is not finite:
+    optimizer.step()
 
-The loop of `neilfpp train` does the same by itself (`train.loop`).
+The loop of `neilfpp train` has its own implementation (`train.loop`).
 """
 
 from __future__ import annotations
@@ -23,18 +25,19 @@ from neilfpp_method.errors import Diverged
 __all__ = ["MAX_SKIPPED_IN_A_ROW", "StepGuard"]
 
 MAX_SKIPPED_IN_A_ROW = 10
-"""So many steps in a row without a finite loss and gradient are no accident."""
+"""Number of consecutive skipped steps after which the training has diverged."""
 
 
 class StepGuard:
-    """Drops all gradients of a step where one of them, or a loss, is not finite: optimisers move nothing that
-    has no gradient. Every such step is counted and named.
+    """Removes all gradients of a step if one of them, or a loss, is not finite.
+
+    Optimizers do not change a parameter without a gradient. Every such step is counted and reported.
 
     Args:
-        warn: says a line to the person.
+        warn: prints a line for the user.
 
     Attributes:
-        skipped: steps that were left out so far.
+        skipped: number of steps skipped so far.
     """
 
     def __init__(self, warn: Callable[[str], None]) -> None:
@@ -47,25 +50,26 @@ class StepGuard:
         self._judged = False
 
     def watch(self, optimizer: Optimizer) -> None:
-        """Judge the gradients of an optimiser before each of its steps, together with those of the others
-        that are watched.
-        """
+        """Check the gradients of this and all other watched optimizers before each step of the optimizer."""
         if not any(optimizer is known for known in self._optimizers):
             self._optimizers.append(optimizer)
             optimizer.register_step_pre_hook(self._before_step)
 
     def begin_step(self, terms: Mapping[str, Tensor], step: int) -> None:
-        """A step begins: its losses by name, scalars, and its number. The next step of an optimiser judges
-        it.
+        """Announce a training step; it is checked before the next step of a watched optimizer.
+
+        Args:
+            terms: the losses by name, scalars.
+            step: number of the step.
         """
         self._terms, self._step, self._judged = terms, step, False
 
     @torch.no_grad()
     def _before_step(self, *_: object) -> None:
-        """Judge a step once, before the first of its optimisers moves anything.
+        """Check a training step once, before the first of its optimizers changes anything.
 
         Raises:
-            Diverged: ten steps in a row were not finite.
+            Diverged: if ten steps in a row were not finite.
         """
         if self._judged:
             return
@@ -87,7 +91,7 @@ class StepGuard:
             )
 
     def _culprit(self) -> str | None:
-        """What is not finite; none: all is. One transfer from the device where all is."""
+        """The name of a loss or gradient that is not finite, or None; needs one transfer from the device."""
         groups = [group for optimizer in self._optimizers for group in optimizer.param_groups]
         norms = {}
         for i, group in enumerate(groups):

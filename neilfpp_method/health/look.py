@@ -1,4 +1,4 @@
-"""What a model shows at some training pixels: is there a surface, and is its material within bounds?"""
+"""Measure at some training pixels whether a model has a surface, and whether its material is plausible."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from neilfpp_method.structures import Material, PixelBatch, SurfaceHits
 __all__ = ["Look", "look", "look_at_hits"]
 
 OPAQUE = 0.5
-"""Opacity above which a ray shows something."""
+"""Opacity above which a ray counts as opaque."""
 AT_BOUND = 0.02
-"""Distance from 0 or 1 within which a parameter of the material counts as at its bound."""
+"""Distance from 0 or 1 within which a channel of base colour counts as at its bound."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """Shares between 0 and 1.
+    """The result of a measurement; shares are between 0 and 1.
 
     Attributes:
-        rays: how many pixels on the object, as far as masks tell, were looked at.
-        opaque: share of them that show something.
-        sharp: share of the opaque ones that meet one surface rather than fog or the mean of several surfaces.
-        at_bound: share of the surface points whose base colour is within 0.02 of 0 or of 1 in every channel;
-            none without a material.
+        rays: number of rendered pixels on the object, according to the masks.
+        opaque: share of these rays that are opaque.
+        sharp: share of the opaque rays that hit a single surface, rather than fog or several surfaces.
+        at_bound: share of the surface points whose base colour is within `AT_BOUND` of 0 or 1 in every
+            channel; None without a material.
     """
 
     rays: int
@@ -37,25 +37,24 @@ class Look:
 
 @torch.no_grad()
 def look(model: NeilfModel, pixels: PixelBatch, with_material: bool) -> Look:
-    """Render pixels of training views; the model stays in the mode that it is in.
+    """Render training pixels and measure surface and material.
 
     Args:
-        model: on any host.
-        pixels: on the device of the model.
-        with_material: whether the stage has a material to look at.
+        model: a model on any host; its training mode is left unchanged.
+        pixels: training pixels on the device of the model; those off the object are ignored.
+        with_material: whether there is a material to measure.
     """
     mode = model.training
     model.eval()
-    seen = look_at_hits(
-        model, model.host.render(pixels[torch.nonzero(pixels.mask > 0.5)[:, 0]].rays), with_material
-    )
+    hits = model.host.render(pixels[torch.nonzero(pixels.mask > 0.5)[:, 0]].rays)
+    result = look_at_hits(model, hits, with_material)
     model.train(mode)
-    return seen
+    return result
 
 
 @torch.no_grad()
 def look_at_hits(model: NeilfModel, hits: SurfaceHits, with_material: bool) -> Look:
-    """As `look`, of pixels on the object that the host has rendered already."""
+    """The same as `look`, for pixels on the object that the host has already rendered."""
     opaque = hits.opacity > OPAQUE
     sharp = opaque & hits.is_hit(model.config.shading.hit_share)
     at_bound = None

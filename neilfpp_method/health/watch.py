@@ -1,4 +1,4 @@
-"""Follows a training: warns at once, and leaves a verdict in `RUN/health.json`."""
+"""Collect the findings of a training: warn at once, and record the verdict in `RUN/health.json`."""
 
 from __future__ import annotations
 
@@ -25,17 +25,20 @@ __all__ = ["FILE", "FORMAT", "LOOKED_AT", "Watch"]
 
 FILE = "health.json"
 FORMAT = 1
+"""Version of the layout of the file."""
 LOOKED_AT = 512
-"""Training pixels that are rendered for a look at the end of a stage: as many as a step has."""
+"""Number of training pixels that are rendered at the end of a stage: about as many as in a step."""
 
 
 @dataclass
 class Watch:
-    """The findings of a training so far, by case; what a later look finds mended is dropped.
+    """The findings of a training so far. A finding is dropped if a later measurement does not confirm it.
 
     Attributes:
-        pixels: of training views, on the device of the model; none where looks are handed in (`judge`).
-        warn: says a line to the person.
+        pixels: training pixels on the device of the model; None if measurements are passed to `judge`.
+        warn: prints a line for the user.
+        findings: the findings by case.
+        empty_steps: number of consecutive steps so far without a surface point.
     """
 
     pixels: PixelBatch | None
@@ -44,34 +47,35 @@ class Watch:
     empty_steps: int = 0
 
     def after_step(self, plan: StagePlan, computed: StepResult, step: int) -> None:
-        """What the step shaded; costs nothing."""
+        """Check whether a step had surface points to shade."""
         if not plan.moves_material:
             return
         self.empty_steps = 0 if len(computed.surface_rows) else self.empty_steps + 1
         self._replace(("nothing_shaded",), nothing_shaded(self.empty_steps, step))
 
     def after_fit(self, points: int, step: int) -> None:
-        """How many points the light was fitted to."""
+        """Check the number of points to which the light was fitted."""
         self._replace(("few_light_points",), few_light_points(points, step))
 
     def after_stage(self, model: NeilfModel, plan: StagePlan, skipped: int, step: int) -> None:
-        """A look at the surface, and at its material where there is one."""
+        """Measure and check the surface, and the material in a stage that trains it."""
         self.judge(look(model, self.pixels, plan.moves_material), skipped, step)
 
     def judge(self, seen: Look, skipped: int, step: int) -> None:
-        """What a look says, and so many skipped steps."""
+        """Check a measurement and the number of steps skipped so far."""
         self._replace(("no_surface", "fog"), surface_findings(seen, step))
         self._replace(("material_at_bounds",), material_findings(seen, step))
         self._replace(("skipped_steps",), skipped_steps(skipped, step))
 
-    def _replace(self, cases: Sequence[str], found: Sequence[Finding]) -> None:
+    def _replace(self, cases: Sequence[str], findings: Sequence[Finding]) -> None:
+        """Replace the findings of some cases, and warn of those that are new."""
         known = {case: self.findings.pop(case) for case in cases if case in self.findings}
-        for finding in found:
+        for finding in findings:
             if finding.case not in known:
                 self.warn(finding.line())
             self.findings[finding.case] = known.get(finding.case, finding)
 
     def record(self) -> dict[str, Any]:
-        """For `health.json`."""
-        found = [dataclasses.asdict(finding) for finding in self.findings.values()]
-        return {"format": FORMAT, "verdict": verdict_of(self.findings.values()), "findings": found}
+        """The content of `health.json`."""
+        findings = [dataclasses.asdict(finding) for finding in self.findings.values()]
+        return {"format": FORMAT, "verdict": verdict_of(self.findings.values()), "findings": findings}

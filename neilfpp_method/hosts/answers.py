@@ -1,18 +1,18 @@
-"""What a host has rendered, in whatever form it hands that out, as `SurfaceHits`.
+"""Convert rendered outputs of a host to `SurfaceHits`.
 
-| form                      | how it is read                                          |
-|---------------------------|---------------------------------------------------------|
-| `SurfaceHits`             | as it is                                                |
-| a dictionary              | by the host's own `read_outputs`, or by the names below |
-| (color, position, normal) | as the answer of a function: a zero normal is a miss    |
+| form                      | conversion                                                   |
+|---------------------------|--------------------------------------------------------------|
+| `SurfaceHits`             | none                                                         |
+| dictionary                | by the host's `read_outputs`, else by the names below        |
+| (color, position, normal) | as the result of a function: a ray with a zero normal misses |
 
-| of a dictionary | names                                                                              |
-|-----------------|------------------------------------------------------------------------------------|
-| color           | `color`, `rgb`: linear radiance                                                    |
-| position        | `position`; or `depth`, a distance along the unit ray                              |
-| normal          | `normal`, `normals`: vectors of any length                                         |
-| opacity         | `opacity`, `accumulation`, `alpha`, (N,) or (N, 1); else 1 where there is a normal |
-| concentration   | `concentration`; else the opacity                                                  |
+| field         | names in a dictionary                                                             |
+|---------------|-----------------------------------------------------------------------------------|
+| color         | `color`, `rgb`: linear radiance                                                   |
+| position      | `position`; or `depth`, a distance along the unit ray                             |
+| normal        | `normal`, `normals`: vectors of any length                                        |
+| opacity       | `opacity`, `accumulation`, `alpha`, (N,) or (N, 1); else 1 if the normal is not 0 |
+| concentration | `concentration`; else the opacity                                                 |
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from neilfpp_method.structures import RayBatch, SurfaceHits
 __all__ = ["Rendered", "as_hits", "in_precision", "no_hits"]
 
 Rendered = SurfaceHits | Mapping[str, Tensor] | Sequence[Tensor]
-"""What a host may hand out for rays."""
+"""Rendered outputs of a host, in any form that this module reads."""
 
 COLOR, POSITION, DEPTH, NORMAL = ("color", "rgb"), ("position",), ("depth",), ("normal", "normals")
 OPACITY, CONCENTRATION = ("opacity", "accumulation", "alpha"), ("concentration",)
 
 
 def as_hits(host: object, rays: RayBatch, rendered: Rendered) -> SurfaceHits:
-    """The hits of rays that a host has rendered already; see the tables of this module.
+    """Convert what a host rendered for rays to hits; see the tables of this module.
 
     Example:
         >>> hits = as_hits(host, rays, {"rgb": rgb, "depth": depth, "normal": normal, "accumulation": alpha})
 
     Raises:
-        UserError: something is missing, or has another shape than the rays ask for.
+        UserError: an output is missing, or its shape does not match the rays.
     """
     name = host_name(host)
     if isinstance(rendered, Mapping):
@@ -62,12 +62,12 @@ def as_hits(host: object, rays: RayBatch, rendered: Rendered) -> SurfaceHits:
 
 
 def in_precision(hits: SurfaceHits, dtype: torch.dtype) -> SurfaceHits:
-    """The hits in the float type of the material; gradients pass."""
+    """Convert hits to a floating-point type, keeping gradients."""
     return replace(hits, **{f.name: getattr(hits, f.name).to(dtype) for f in fields(hits)})
 
 
 def no_hits(rays: RayBatch) -> SurfaceHits:
-    """A miss for every ray: black, at its origin."""
+    """Hits in which every ray misses: black, with its position at the origin of the ray."""
     nothing, zero = torch.zeros_like(rays.origins), torch.zeros_like(rays.origins[:, 0])
     return SurfaceHits(nothing, rays.origins, nothing, zero, zero)
 
@@ -91,16 +91,16 @@ def _optional(outputs: Mapping[str, Tensor], names: Sequence[str]) -> Tensor | N
 
 
 def _first(name: str, outputs: Mapping[str, Tensor], names: Sequence[str]) -> Tensor:
-    found = _optional(outputs, names)
-    if isinstance(found, Tensor):
-        return found
+    value = _optional(outputs, names)
+    if isinstance(value, Tensor):
+        return value
     wanted = " or ".join(f"'{wanted}'" for wanted in names)
     held = ", ".join(outputs) or "nothing"
     raise UserError(f"{name}: its outputs have no tensor {wanted}, but {held}", "add one, a row per ray")
 
 
 def _column(name: str, output: str, rays: RayBatch, value: Tensor) -> Float[Tensor, " N"]:
-    """One number a ray, given as (N,) or (N, 1)."""
+    """One number per ray, given as (N,) or (N, 1)."""
     if value.shape not in ((len(rays),), (len(rays), 1)):
         raise UserError(
             f"{name}: its {output} has the shape {tuple(value.shape)}",

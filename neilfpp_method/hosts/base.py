@@ -1,7 +1,7 @@
-"""What the method asks of geometry and radiance, so that it can sit on any NeRF-like system.
+"""The host contract: what the method needs from a system that provides geometry and radiance.
 
-A host renders rays. All else is an optional capability, found by `isinstance` on one of the small protocols
-below: a host that lacks one loses what the protocol says, nothing more.
+A host renders rays. Everything else is an optional capability with a small protocol below, detected by
+`isinstance`. The docstring of each protocol says what happens without it.
 """
 
 from __future__ import annotations
@@ -37,30 +37,33 @@ __all__ = [
 
 @runtime_checkable
 class Host(Protocol):
-    """Geometry and radiance of a scene. One that cannot answer rays that leave a surface says so by the
-    attribute `answers_secondary_rays = False`; `render` is then asked with camera rays alone.
+    """Geometry and radiance of a scene.
+
+    A host that cannot render rays that start at a surface sets the attribute `answers_secondary_rays =
+    False`; `render` then only gets camera rays.
     """
 
     def render(self, rays: RayBatch) -> SurfaceHits:
-        """Colour, hit position and normal of each ray, differentiable in the host's parameters."""
+        """Color, hit position and normal of each ray, differentiable in the host's parameters."""
         ...
 
 
 @runtime_checkable
 class ImageHost(Protocol):
-    """Geometry and radiance that come as whole images: splats and other rasterisers. It answers no secondary
-    rays; what a surface sends to another is asked of a proxy (`hosts.proxy`), and the hits of a training step
-    are handed to `losses`.
+    """Geometry and radiance that are rendered as whole images: splats and other rasterisers.
+
+    Light between surfaces is traced by a proxy (`hosts.proxy`). The training loop passes the hits of each
+    step to `AttachedNeilf.losses`.
     """
 
     def render_image(self, camera: Camera) -> SurfaceHits:
-        """What the camera sees, scene frame, a row per pixel; `hosts.image.image_hits` makes it."""
+        """Hits of all pixels of a camera, one row per pixel, scene frame; see `hosts.image.image_hits`."""
         ...
 
 
 @dataclass(frozen=True)
 class RegularisedHits:
-    """Rendered rays with the host's own losses at the places that rendering visited."""
+    """Hits of rendered rays, and the host's own losses at the points that rendering evaluated."""
 
     hits: SurfaceHits
     terms: LossTerms
@@ -68,35 +71,35 @@ class RegularisedHits:
 
 @runtime_checkable
 class Regularised(Protocol):
-    """A host with losses of its own. Without: L_vol alone moves the geometry."""
+    """A host with losses of its own. Without it only the losses of the method train the geometry."""
 
     def render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
-        """As `render`, and the named losses that the host has; losses not named are not computed."""
+        """As `render`, with those of the named losses that the host has; others are not computed."""
         ...
 
 
 @runtime_checkable
 class LightsItself(Protocol):
-    """A host that traces many rays cheaply. Without: hard inter-reflection renders every ray, slowly."""
+    """A host that traces many rays cheaply. Without it hard inter-reflection renders every ray."""
 
     def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
-        """What arrives at surface points x from the scene's own surfaces along wi; no gradient."""
+        """Light that arrives at surface points x from the scene's own surfaces along wi; no gradient."""
         ...
 
 
 @runtime_checkable
 class KnowsMisses(Protocol):
-    """A host that knows cheaply which rays meet nothing. Without: every ray for L_ref is rendered."""
+    """A host that can tell cheaply that rays miss the scene. Without it every ray of L_ref is rendered."""
 
     def may_meet(self, rays: RayBatch) -> Bool[Tensor, " N"]:
-        """Which of the rays, which leave a surface, may meet one: the others are not worth rendering."""
+        """Which rays, all of which start at a surface, may hit a surface; the others are not rendered."""
         ...
 
 
 @runtime_checkable
 class KnowsRadiance(Protocol):
-    """A host that knows what a point of its surface sends, without a ray. Without: the proxy of a host that
-    traces no rays brings the mean of what the training rays saw there.
+    """A host that can evaluate its radiance at surface points. Without it the proxy of a host that traces no
+    rays returns the mean radiance that training rays saw there.
     """
 
     def radiance(self, x: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
@@ -106,45 +109,47 @@ class KnowsRadiance(Protocol):
 
 @runtime_checkable
 class ReadsOutputs(Protocol):
-    """A host whose renderer returns its own dictionary. Without: the names of `hosts.answers` apply."""
+    """A host whose renderer returns its own dictionary. Without it the names of `hosts.answers` apply."""
 
     def read_outputs(self, rays: RayBatch, outputs: Mapping[str, Tensor]) -> SurfaceHits:
-        """The hits of the rays, from what the host's renderer returned for them."""
+        """Convert the dictionary that the host's renderer returned for these rays to hits."""
         ...
 
 
 @runtime_checkable
 class HasSurfaceWidth(Protocol):
-    """A host whose surface is a soft layer. Without: rays for L_ref start at a fixed distance from it."""
+    """A host whose surface is a soft layer. Without it rays of L_ref start at a fixed distance from it."""
 
     def surface_width(self) -> Float[Tensor, ""]:
-        """Scale of the layer, scene units (VolSDF's β)."""
+        """Width of the layer, scene units (VolSDF's β)."""
         ...
 
 
 @runtime_checkable
 class SmoothsNormals(Protocol):
-    """A host with wavy normals that knows better ones. Without: surfaces are shaded with hit normals."""
+    """A host that can smooth its normals for shading. Without it surfaces are shaded with the hit normals."""
 
     def smooth_normals(
         self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
-        """Unit normals at hits for shading; constants, no gradient."""
+        """Smoothed unit normals at hits, without gradient."""
         ...
 
 
 @runtime_checkable
 class HasParameterGroups(Protocol):
-    """A host whose parameters are ours to optimise. Without: its own trainer moves it, or nothing does."""
+    """A host that is trained together with material and light. Without it the host is borrowed: its own
+    trainer, if any, trains it.
+    """
 
     def parameter_groups(self) -> Mapping[str, list[Parameter]]:
-        """Parameters by field: geometry, beta, radiance, background."""
+        """Parameters by field; the keys are among geometry, beta, radiance and background."""
         ...
 
 
 @runtime_checkable
 class HasSdf(Protocol):
-    """A host whose surface is the zero set of a distance field. Without: there is no mesh to export."""
+    """A host whose surface is the zero set of a distance field. Without it no mesh can be exported."""
 
     def sdf(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
         """Signed distance at points of the scene frame, negative inside."""
@@ -153,6 +158,6 @@ class HasSdf(Protocol):
 
 @runtime_checkable
 class HasStages(Protocol):
-    """A host that does not train as a distance field does. Without: the stages of the paper."""
+    """A host with a stage table of its own (`schedule`). Without it the stages of the paper apply."""
 
     stages: StageTable

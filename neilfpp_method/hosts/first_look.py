@@ -1,6 +1,6 @@
-"""What goes wrong when a host first meets the method: looked for in the first batches, said once.
+"""Check the first batches of an attached host for common mistakes.
 
-An error where nothing right can come of it; a warning where it may be meant.
+A mistake that makes the result wrong is an error. Something that may be intended is a warning, given once.
 """
 
 from __future__ import annotations
@@ -18,29 +18,31 @@ from neilfpp_method.structures import PixelBatch, SurfaceHits
 __all__ = ["FirstLook", "check_batch", "check_points", "check_rows"]
 
 BATCHES = 10
-"""Batches that are looked at; each look waits for the device."""
+"""Number of batches that are checked; each check synchronises with the device."""
 UNIT = 1e-3
-"""Most that the length of a direction may differ from 1."""
+"""Largest difference of the length of a direction from 1."""
 OFF_RAY = 0.02
-"""How far a hit may lie beside its ray, in shares of its distance."""
+"""Largest distance of a hit from its ray, relative to its distance from the origin of the ray."""
 MAX_OFF = 0.5
-"""Share of hits that may be off their rays or turned away: blended hits at edges are, a few."""
+"""Largest share of hits that may be off their rays or have normals that face away. A few blended hits do."""
 REACH = 1.5
-"""Distance from the centre at which positions are outside the scene, scene units; a ground has room."""
+"""Median distance of hits from the origin above which the scene is too large, scene units. An object in the
+unit sphere may stand on a ground.
+"""
 SIZES = 30.0
-"""Factor between the median of the pixels and `median_radiance` that no exposure explains."""
+"""Factor between the median of the pixels and `median_radiance` above which they do not belong together."""
 
 log = logging.getLogger(__name__)
 
 
 class FirstLook:
-    """Looks at the first batches.
+    """Checks the first batches and their hits.
 
     Args:
-        name: of the host.
-        hit_share: least concentration of a hit.
-        response: what the pixels are, "linear" or "srgb".
-        median_radiance: median linear luminance of the object, as the caller says.
+        name: name of the host in messages.
+        hit_share: smallest concentration of a hit.
+        response: meaning of pixel values, "linear" or "srgb".
+        median_radiance: median linear luminance of the object, as given to `attach_neilf`.
     """
 
     def __init__(self, name: str, hit_share: float, response: str, median_radiance: float) -> None:
@@ -50,18 +52,18 @@ class FirstLook:
         self.median_radiance = median_radiance
         self.batches = 0
         self.any_hit = False
-        self._said: set[str] = set()
+        self._warned: set[str] = set()
 
     @property
     def over(self) -> bool:
-        """Whether enough was seen."""
+        """Whether enough batches have been checked."""
         return self.batches >= BATCHES
 
     def pixels(self, batch: PixelBatch) -> None:
-        """Look at a batch before the host is asked.
+        """Check a batch before the host renders it.
 
         Raises:
-            UserError: pixels or rays that cannot be used.
+            UserError: pixels or rays cannot be used.
         """
         if self.over:
             return
@@ -69,9 +71,9 @@ class FirstLook:
         worst = (length - 1.0).abs().max().item() if len(batch) else 0.0
         if not worst <= UNIT:
             raise UserError(
-                f"directions of rays are no unit vectors: the lengths go from {length.min():.3g} to "
+                f"ray directions are not unit vectors: their lengths are between {length.min():.3g} and "
                 f"{length.max():.3g}",
-                "divide them by their lengths, so that a distance along a ray is a length",
+                "divide them by their lengths",
             )
         for name in ("origins", "color"):
             rows = ~getattr(batch, name).isfinite().all(-1)
@@ -80,13 +82,13 @@ class FirstLook:
                     f"{name} of {int(rows.sum())} of {len(batch)} pixels are not finite",
                     "leave those pixels out",
                 )
-        self._look_at_colors(batch.color[batch.mask > 0.5])
+        self._check_colors(batch.color[batch.mask > 0.5])
 
     def hits(self, batch: PixelBatch, hits: SurfaceHits) -> None:
-        """Look at what the host says of a batch.
+        """Check the hits of a batch.
 
         Raises:
-            UserError: hits that cannot be used.
+            UserError: hits cannot be used.
         """
         if self.over:
             return
@@ -97,45 +99,45 @@ class FirstLook:
             if rows.any():
                 raise UserError(
                     f"{self.name}: its {name} is not finite for {int(rows.sum())} of {len(batch)} rays",
-                    "return zeros, and the concentration 0, where a ray meets nothing; look for a division "
-                    "by zero elsewhere",
+                    "return zeros and concentration 0 for a ray that misses; otherwise look for a division "
+                    "by zero",
                 )
         self.any_hit = self.any_hit or bool(hit.any())
         if hit.any():
-            self._look_at_surface(batch, hits.detach(), hit)
-            self._look_at_median(batch.color[hit])
+            self._check_surface(batch, hits.detach(), hit)
+            self._check_median(batch.color[hit])
         elif not self.any_hit:
-            self._say(
+            self._warn(
                 "no hit",
-                f"none of {len(batch)} rays meets a surface, so nothing is learned of them",
-                "is the frame of the rays the host's, the object in the unit sphere? A hit has a "
-                f"concentration of {self.hit_share} or more (of a function: a normal)",
+                f"none of {len(batch)} rays hits a surface, so material and light are not trained",
+                "are the rays in the host's frame, with the object in the unit sphere? A hit has a "
+                f"concentration of at least {self.hit_share} (for a function: a normal that is not zero)",
             )
 
-    def _look_at_colors(self, color: Tensor) -> None:
+    def _check_colors(self, color: Tensor) -> None:
         if len(color) == 0:
             return
         if color.min() < -1e-3 * self.median_radiance:
-            self._say(
+            self._warn(
                 "negative", "some pixels are negative", "give linear radiance or display values, 0 and above"
             )
         if self.response == "srgb" and color.max() > 1.001:
             raise UserError(
-                f"pixels reach {color.max():.3g}, and display values end at 1",
+                f"pixels reach {color.max():.3g}, but display values are at most 1",
                 "divide 8-bit pixels by 255, or attach with response='linear' if these are radiance",
             )
 
-    def _look_at_median(self, color: Tensor) -> None:
+    def _check_median(self, color: Tensor) -> None:
         median = color.mean(-1).median().item()
-        told = apply_response(torch.tensor(self.median_radiance), self.response).item()
-        if median > 0 and not 1 / SIZES < median / told < SIZES:
-            self._say(
+        expected = apply_response(torch.tensor(self.median_radiance), self.response).item()
+        if median > 0 and not 1 / SIZES < median / expected < SIZES:
+            self._warn(
                 "median",
-                f"the median of the pixels is {median:.3g}, median_radiance says {told:.3g}",
-                "give attach_neilf the median_radiance of your images; 8-bit pixels are to be divided by 255",
+                f"the median of the pixels is {median:.3g}, but median_radiance means {expected:.3g}",
+                "give attach_neilf the median_radiance of your images, and divide 8-bit pixels by 255",
             )
 
-    def _look_at_surface(self, batch: PixelBatch, hits: SurfaceHits, hit: Tensor) -> None:
+    def _check_surface(self, batch: PixelBatch, hits: SurfaceHits, hit: Tensor) -> None:
         offset = (hits.position - batch.origins)[hit]
         directions = batch.directions[hit]
         depth = (offset * directions).sum(-1)
@@ -155,24 +157,23 @@ class FirstLook:
             )
         reach = hits.position[hit].norm(dim=-1).median().item()
         if reach > REACH:
-            self._say(
+            self._warn(
                 "far",
-                f"half of its hits lie {reach:.3g} and more from the origin; material and light know the "
-                "unit sphere",
+                f"half of its hits are {reach:.3g} or more from the origin",
                 "move and scale cameras and host so that the object lies in the unit sphere",
             )
 
-    def _say(self, what: str, problem: str, remedy: str) -> None:
-        if what not in self._said:
-            self._said.add(what)
+    def _warn(self, kind: str, problem: str, remedy: str) -> None:
+        if kind not in self._warned:
+            self._warned.add(kind)
             log.warning("%s: %s; %s", self.name, problem, remedy)
 
 
 def check_batch(batch: PixelBatch) -> None:
-    """Shapes and types of a batch, at every step: that costs nothing.
+    """Check shapes and types of a batch; cheap enough for every step.
 
     Raises:
-        UserError: integers for pixels, or a shape that repeats rows.
+        UserError: a tensor has integers, or another shape than one row per pixel.
     """
     for name in ("origins", "directions", "color"):
         check_rows(name, getattr(batch, name), len(batch), 3)
@@ -181,16 +182,16 @@ def check_batch(batch: PixelBatch) -> None:
 
 
 def check_rows(name: str, value: Tensor, count: int, width: int | None = None) -> None:
-    """That there is a row per pixel, of floats.
+    """Check that a tensor has one row of floating-point numbers per pixel.
 
     Args:
-        name: of what it is.
-        value: to look at.
-        count: of pixels.
-        width: numbers of a pixel; none: one, without an axis of its own.
+        name: name of the tensor in messages.
+        value: the tensor.
+        count: number of pixels.
+        width: numbers per pixel, in a second axis; None: one number per pixel without a second axis.
 
     Raises:
-        UserError: there is not.
+        UserError: it does not.
     """
     if not value.is_floating_point():
         remedy = (
@@ -201,18 +202,18 @@ def check_rows(name: str, value: Tensor, count: int, width: int | None = None) -
     if tuple(value.shape) != wanted:
         pixels = math.prod(value.shape[:-1]) if width is not None and value.ndim > 2 else count
         shape = (
-            f"({pixels}, {width}): a row per pixel, reshape(-1, {width})"
+            f"({pixels}, {width}): one row per pixel, reshape(-1, {width})"
             if width
-            else f"({pixels},): a number per pixel"
+            else f"({pixels},): one number per pixel"
         )
         raise UserError(f"{name} of the batch has the shape {tuple(value.shape)}", f"give {shape}")
 
 
 def check_points(name: str, x: Tensor, axes: int = 2) -> None:
-    """That points, or directions at them, come in rows.
+    """Check that points are (N, 3), or with `axes` = 3 directions (N, S, 3), of floating-point numbers.
 
     Raises:
-        UserError: another shape, or integers.
+        UserError: they have another shape, or are integers.
     """
     wanted = "(N, 3)" if axes == 2 else "(N, S, 3)"
     if x.ndim != axes or x.shape[-1] != 3:

@@ -1,5 +1,7 @@
-"""A host that somebody else wrote, as the method asks it: never with zero rays, always in the precision of
-the rays, and with a proxy in its place where it traces no rays.
+"""Adapter for hosts of other projects.
+
+It never calls a host with zero rays, converts its outputs to the precision of the rays, and uses a proxy for
+rays that the host cannot trace.
 """
 
 from __future__ import annotations
@@ -34,45 +36,49 @@ PASSED_ON = (
     "stages",
     "scene_light",
 )
-"""Optional capabilities of `hosts.base` that are the host's own."""
+"""Optional methods of `hosts.base` that are forwarded to the host unchanged."""
 COARSE = (torch.float16, torch.bfloat16)
+"""Types that are too coarse for positions."""
 
 log = logging.getLogger(__name__)
 
 
 def answers_secondary_rays(host: object) -> bool:
-    """Whether a host renders rays that leave a surface; not if it draws whole images, or declares no."""
+    """Whether a host renders rays that start at a surface: not if it draws images, or declares otherwise."""
     return hasattr(host, "render") and bool(getattr(host, "answers_secondary_rays", True))
 
 
 def proxy_for(host: object, config: NeilfConfig) -> SurfaceProxy | None:
-    """What traces rays between surfaces for a host that does not, or not cheaply, where the settings ask for
-    them; none: nobody needs to.
+    """Make a proxy if the settings need rays between surfaces that the host cannot trace, or not cheaply.
+
+    Returns None if no proxy is needed.
     """
     settings = config.inter_reflection
-    asked = settings.mode != "off" and not answers_secondary_rays(host)
-    if isinstance(host, LightsItself) or not (asked or settings.mode == "hard"):
+    cannot_trace = settings.mode != "off" and not answers_secondary_rays(host)
+    if isinstance(host, LightsItself) or not (cannot_trace or settings.mode == "hard"):
         return None
     radiance = host.radiance if isinstance(host, KnowsRadiance) else None
     return SurfaceProxy(config.volume.radius, GRID_RESOLUTION, config.shading.hit_share, radiance)
 
 
 class ForeignHost(nn.Module):
-    """The host contract around a host.
+    """A host of another project behind the full host contract.
 
     Args:
         host: a `Host` or an `ImageHost`.
-        borrowed: it belongs to another trainer, and is none of this module's business.
-        proxy: answers the rays between surfaces; none: the host renders them.
+        borrowed: whether the host belongs to another trainer, so that it must not become a submodule.
+        proxy: traces rays between surfaces; None: the host renders them.
     """
 
     def __init__(self, host: object, borrowed: bool, proxy: SurfaceProxy | None = None) -> None:
         super().__init__()
         if borrowed or not isinstance(host, nn.Module):
-            object.__setattr__(self, "inner", host)  # past nn.Module, which would take it in
+            # Bypass nn.Module, which would register the host as a submodule.
+            object.__setattr__(self, "inner", host)
         else:
             self.inner = host
-        object.__setattr__(self, "proxy", proxy)  # belongs to whoever attaches
+        # The proxy is a submodule of `AttachedNeilf`, not of this module.
+        object.__setattr__(self, "proxy", proxy)
         self.name = host_name(host)
         self.coarse_said = False
         for capability in PASSED_ON:
@@ -84,10 +90,10 @@ class ForeignHost(nn.Module):
             object.__setattr__(self, "render_regularised", self._render_regularised)
 
     def render(self, rays: RayBatch) -> SurfaceHits:
-        """The host's hits; those of the proxy where the host answers no rays of ours.
+        """Hits by the host, or by the proxy if the host cannot render rays that start at a surface.
 
         Raises:
-            UserError: what came back breaks the contract.
+            UserError: the output breaks the contract.
         """
         if len(rays) == 0:
             return no_hits(rays)
@@ -98,24 +104,23 @@ class ForeignHost(nn.Module):
         return self._usable(rays, self.inner.render(rays))
 
     def camera_hits(self, rays: RayBatch) -> SurfaceHits:
-        """The host's own hits of camera rays.
+        """Hits of camera rays by the host itself.
 
         Raises:
-            UserError: it draws whole images, and nobody has handed them in.
+            UserError: the host draws whole images, so the caller has to pass their hits.
         """
         if not hasattr(self.inner, "render"):
             raise UserError(
                 f"{self.name} draws whole images, not rays",
-                "hand in what it has drawn: losses(batch, step, hits) and maps(rays, hits), see "
-                "docs/hosts.md",
+                "pass its hits: losses(batch, step, hits) and maps(rays, hits), see docs/hosts.md",
             )
         return no_hits(rays) if len(rays) == 0 else self._usable(rays, self.inner.render(rays))
 
     def image_hits(self, camera: Camera, like: Tensor) -> tuple[RayBatch, SurfaceHits]:
-        """The rays of all pixels of a camera, and the host's hits of them.
+        """The rays of all pixels of a camera, and the host's hits.
 
         Raises:
-            UserError: it has no `render_image`.
+            UserError: the host has no `render_image`.
         """
         if not isinstance(self.inner, ImageHost):
             raise UserError(
@@ -125,15 +130,15 @@ class ForeignHost(nn.Module):
         return rays, self.read(rays, self.inner.render_image(camera))
 
     def read(self, rays: RayBatch, rendered: object) -> SurfaceHits:
-        """What the host has rendered of these rays, in any form that `hosts.answers` reads.
+        """Convert what the host rendered for these rays, in any form that `hosts.answers` reads.
 
         Raises:
-            UserError: it cannot be read.
+            UserError: it cannot be converted.
         """
         return self._precise(rays, as_hits(self.inner, rays, rendered))
 
     def show_proxy(self, rays: RayBatch, hits: SurfaceHits) -> None:
-        """Let the proxy learn from a training step's camera rays; before the first it looks around."""
+        """Add the camera rays of a training step to the proxy; the first call also explores the surface."""
         if self.proxy is None or len(rays) == 0:
             return
         if self.proxy.steps == 0 and answers_secondary_rays(self.inner):
@@ -155,8 +160,7 @@ class ForeignHost(nn.Module):
             self.coarse_said = True
             digits = torch.finfo(hits.position.dtype).eps
             log.warning(
-                "%s: its position is %s, which knows places to %.0e; leave half precision for the position: "
-                "return float32",
+                "%s: its position is %s, whose relative precision is %.0e; return positions in float32",
                 self.name,
                 hits.position.dtype,
                 digits,

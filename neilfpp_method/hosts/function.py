@@ -18,10 +18,10 @@ RenderFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 
 
 class CallableHost:
-    """A function (origins, directions) → (color, position, normal) as a host.
+    """Makes a host of a function (origins, directions) → (color, position, normal).
 
-    A ray misses where its normal is shorter than one half or not finite. This is no `nn.Module`: a function
-    that is one stays where it belongs.
+    A ray whose normal is shorter than ½ or not finite is a miss. This class is not an `nn.Module`, so that a
+    function that is one is not registered as a submodule.
     """
 
     def __init__(self, function: RenderFunction) -> None:
@@ -29,7 +29,7 @@ class CallableHost:
         self.name = getattr(function, "__qualname__", type(function).__name__)
 
     def render(self, rays: RayBatch) -> SurfaceHits:
-        """The function's answer; opacity and concentration are 1 for a hit, 0 for a miss.
+        """Call the function; opacity and concentration are 1 for a hit and 0 for a miss.
 
         Raises:
             UserError: it does not return three tensors of the right shape on the device of the rays.
@@ -38,11 +38,11 @@ class CallableHost:
 
 
 def function_hits(name: str, rays: RayBatch, answer: Any) -> SurfaceHits:
-    """The hits of rays from (color, position, normal), each (N, 3).
+    """Convert (color, position, normal), each (N, 3), to hits.
 
     Args:
-        name: of the function, for errors.
-        rays: what it was asked.
+        name: name of the function, for error messages.
+        rays: the rays that it was called with.
         answer: what it returned.
 
     Raises:
@@ -53,7 +53,8 @@ def function_hits(name: str, rays: RayBatch, answer: Any) -> SurfaceHits:
         raise UserError(f"{name}: returns {kind}", "return color, position and normal, each (N, 3)")
     check_tensors(name, rays, dict(zip(("color", "position", "normal"), answer, strict=True)))
     color, position, normal = answer
-    hit = normal.detach().square().sum(-1) > 0.25  # not so for NaN
+    # The comparison is False for NaN.
+    hit = normal.detach().square().sum(-1) > 0.25
     position = torch.where(hit[:, None], position, rays.origins.to(position.dtype))
     share = hit.to(color.dtype)
     return SurfaceHits(color, position, torch.where(hit[:, None], normal, 0.0), share, share)

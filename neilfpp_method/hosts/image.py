@@ -1,8 +1,11 @@
-"""Whole images as hits: what a rasteriser draws (splats, meshes), a row per pixel.
+"""Convert whole images of a rasteriser (splats, meshes) to hits, one row per pixel.
 
-hits = image_hits(camera, color, depth, opacity)        # (H, W, 3), (H, W), (H, W) as the rasteriser returns
-them batch = pixel_batch(rays.origins, rays.directions, photograph.reshape(-1, 3))       # rays =
-camera_rays(camera) loss = loss + neilf.losses(batch[rows], step, hits[rows]).loss
+Example:
+    # color (H, W, 3), depth (H, W) and opacity (H, W), as the rasteriser returns them
+    hits = image_hits(camera, color, depth, opacity)
+    rays = camera_rays(camera)
+    batch = pixel_batch(rays.origins, rays.directions, photograph.reshape(-1, 3))
+    loss = loss + neilf.losses(batch[rows], step, hits[rows]).loss
 """
 
 from __future__ import annotations
@@ -19,9 +22,9 @@ from neilfpp_method.structures import RayBatch, SurfaceHits
 __all__ = ["depth_normals", "image_hits", "rays_like"]
 
 JUMP = 0.1
-"""Neighbouring pixels whose distances differ by more than this share of them are on two surfaces."""
+"""Relative difference of their distances above which neighboring pixels belong to two surfaces."""
 SOLID = 0.5
-"""Least opacity of a pixel that has a surface."""
+"""Smallest opacity of a pixel that shows a surface."""
 
 
 def rays_like(camera: Camera, like: Tensor) -> RayBatch:
@@ -38,16 +41,17 @@ def image_hits(
     *,
     along_ray: bool = False,
 ) -> SurfaceHits:
-    """Maps of one view as hits, H·W rows, row by row; gradients pass.
+    """Convert the maps of one view to hits: H·W rows in row-major order, with gradients.
 
     Args:
-        camera: in the scene frame, OpenCV axes.
+        camera: camera in the scene frame, OpenCV axes.
         color: linear radiance, background included.
-        depth: of the surface, scene units, along the camera's axis (z-depth, what rasterisers draw). Blended
-            depths are to be divided by the opacity before.
-        opacity: share of the ray that the surface stops. A pixel below one half is a miss.
-        normal: of any length, scene frame, away from the surface; none: of the depths of neighbouring pixels.
-        along_ray: depth is a distance along the ray.
+        depth: depth of the surface along the camera's axis (z-depth), scene units. Divide blended depths by
+            the opacity first.
+        opacity: opacity of each pixel; below ½ the pixel is a miss.
+        normal: outward normals of any length, scene frame. None: they are computed from the depths of
+            neighboring pixels.
+        along_ray: whether `depth` is a distance along the ray instead.
 
     Raises:
         UserError: a map has another size than the camera.
@@ -61,7 +65,7 @@ def image_hits(
         if tuple(value.shape) != wanted:
             shape = tuple(value.shape)
             raise UserError(
-                f"the {name} of an image has the shape {shape}", f"give {wanted}, as the camera has it"
+                f"the {name} of an image has the shape {shape}", f"give {wanted}, the size of the camera"
             )
     rays = rays_like(camera, color)
     axis = torch.as_tensor(camera.w2c[2, :3], dtype=color.dtype, device=color.device)
@@ -83,8 +87,10 @@ def image_hits(
 
 
 def depth_normals(position: Float[Tensor, "H W 3"], eye: Float[Tensor, " 3"]) -> Float[Tensor, "H W 3"]:
-    """Unit normals of a surface from the positions of pixels, towards the eye: the cross product of the steps
-    to the nearer of both neighbours along each axis. Zero where a neighbour lies on another surface.
+    """Unit normals from the positions of pixels, oriented towards the eye.
+
+    They are cross products of differences to the neighbor with the closer depth along each axis. A normal is
+    zero if both neighbors along an axis lie on another surface.
     """
     distance = (position - eye).norm(dim=-1)
     right, right_ok = _nearer_step(position, distance, 1)
@@ -97,7 +103,7 @@ def depth_normals(position: Float[Tensor, "H W 3"], eye: Float[Tensor, " 3"]) ->
 def _nearer_step(
     position: Float[Tensor, "H W 3"], distance: Float[Tensor, "H W"], axis: int
 ) -> tuple[Tensor, Tensor]:
-    """The step along an axis to the neighbour of nearest depth, and whether it is on the same surface."""
+    """The difference to the neighbor of closer depth along an axis, and whether both are on one surface."""
     forward, backward = (position.roll(-1, axis) - position), (position - position.roll(1, axis))
     rise = (distance.roll(-1, axis) - distance).abs()
     edge = torch.arange(position.shape[axis], device=position.device).view(-1, *([1] * (1 - axis)))

@@ -1,4 +1,4 @@
-"""Geometry that is given: a triangle mesh that shows a surface light field (METHOD §5)."""
+"""Host with given geometry: a triangle mesh with a surface light field (METHOD §5)."""
 
 from __future__ import annotations
 
@@ -27,16 +27,18 @@ from neilfpp_method.structures import RayBatch, SceneLight, SurfaceHits
 __all__ = ["MeshHost", "corner_normals"]
 
 TINY = 1e-18
-"""Length under which a sum of edge products has no direction: triangles may be small."""
+"""Length below which a cross product of edges has no direction; tiny, as triangles may be small."""
 CREASE = math.radians(40)
-"""Faces that meet at a sharper angle make an edge; between others normals are interpolated."""
+"""Angle between the normals of two faces above which their common edge is sharp; otherwise normals are
+interpolated across it.
+"""
 RADIANCE_AT_ONCE = 2**16
-"""Points at which R is asked together where light is traced: bounds the memory."""
+"""Number of points per evaluation of R when light is traced; limits memory."""
 
 
 @dataclass(frozen=True)
 class Crossings:
-    """The rays that meet the mesh: their rows, hit positions, normals, and whether on its outside."""
+    """Rays that hit the mesh: their rows, hit positions and normals, and whether they hit the outside."""
 
     rows: Int[Tensor, " K"]
     position: Float[Tensor, "K 3"]
@@ -45,17 +47,18 @@ class Crossings:
 
 
 class MeshHost(nn.Module):
-    """A mesh and R on it. Positions and normals are constants; the colour moves R.
+    """A triangle mesh and R on it. Only R and the background are trained.
 
-    Faces are wound outwards: their inside stops a ray, but is no surface point. Weights hold no geometry.
+    Faces are oriented outwards. The inside of a face stops a ray but is not a hit. Checkpoints do not contain
+    the mesh.
 
     Args:
         mesh: triangles in the scene frame.
         config: the settings.
-        radiance_scale: the largest radiance that R can reach.
-        background: "inverted_sphere", or whatever else for a constant one.
-        background_color: linear RGB of a constant background.
-        radiance_start: what R starts near.
+        radiance_scale: largest radiance of R.
+        background: "inverted_sphere"; any other value means a constant background.
+        background_color: linear RGB of a constant background, and initial color of an inverted sphere.
+        radiance_start: initial radiance of R.
     """
 
     stages = FIXED_GEOMETRY
@@ -92,7 +95,7 @@ class MeshHost(nn.Module):
     # -------------------------------------------------------------------------------------- the host contract
 
     def render(self, rays: RayBatch) -> SurfaceHits:
-        """What each ray meets first, and R there; what lies beyond where it meets nothing."""
+        """First hit of each ray with R there; the background for a ray that misses."""
         with torch.no_grad():
             met = self.cross(rays)
         wo = -rays.directions[met.rows]
@@ -108,14 +111,14 @@ class MeshHost(nn.Module):
 
     @torch.no_grad()
     def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
-        """R where directions meet the mesh again; its inside stops them and is dark."""
+        """R where rays from x along wi hit the mesh; the inside of the mesh stops rays and is black."""
         directions = wi.reshape(-1, 3)
         origins = (x[:, None] + self.offset * wi).reshape(-1, 3)
         met = self.cross(RayBatch(origins, directions))
         radiance, distance = torch.zeros_like(directions), torch.full_like(directions[:, 0], torch.inf)
         distance[met.rows] = (met.position - origins[met.rows]).norm(dim=-1)
-        seen = torch.nonzero(met.outside)[:, 0]
-        for part in seen.split(RADIANCE_AT_ONCE):
+        outside = torch.nonzero(met.outside)[:, 0]
+        for part in outside.split(RADIANCE_AT_ONCE):
             rows, position = met.rows[part], met.position[part]
             radiance[rows] = self.radiance_field(
                 position, -directions[rows], met.normal[part], position[:, :0]
@@ -127,28 +130,28 @@ class MeshHost(nn.Module):
     def smooth_normals(
         self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
-        """For noisy meshes, normals of `volume.normal_radius` about hits, edges kept; 0: the hits' own."""
+        """Normals smoothed within `volume.normal_radius` of hits; the hit normals if it is 0."""
         if self.normal_radius == 0:
             return normal
         up = normal.repeat_interleave(NEIGHBOURS, 0)
 
-        def beneath(x: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+        def normals_below(x: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
             met = self.cross(RayBatch(x + self.normal_radius * up, -up))
             return torch.zeros_like(x).index_put((met.rows,), met.normal * met.outside[:, None])
 
-        return smooth_normals(beneath, position, normal, self.normal_radius)
+        return smooth_normals(normals_below, position, normal, self.normal_radius)
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
-        """R, and the background where it is a field."""
+        """The parameters of R and, if it is a field, of the background."""
         groups = {"radiance": list(self.radiance_field.parameters())}
-        return (
-            groups if self.background is None else groups | {"background": list(self.background.parameters())}
-        )
+        if self.background is not None:
+            groups["background"] = list(self.background.parameters())
+        return groups
 
     # ----------------------------------------------------------------------------------------------- geometry
 
     def cross(self, rays: RayBatch) -> Crossings:
-        """Where rays meet the mesh first."""
+        """First hits of rays with the mesh, on either side."""
         numbers = self._first_hits()(rays.origins, rays.directions)
         rows = torch.nonzero(numbers >= 0)[:, 0]
         numbers, origins, directions = numbers[rows], rays.origins[rows], rays.directions[rows]
@@ -157,7 +160,7 @@ class MeshHost(nn.Module):
         smooth = safe_normalize(
             (meeting.weights[..., None] * self.corner_normals[numbers].to(origins.dtype)).sum(1)
         )
-        # At grazing angles the interpolated normal can point away from the viewer; the triangle's cannot.
+        # At grazing angles the interpolated normal can face away from the viewer; then use the triangle's.
         faces_viewer = (smooth * directions).sum(-1, keepdim=True) < 0.0
         return Crossings(
             rows=rows,
@@ -167,7 +170,7 @@ class MeshHost(nn.Module):
         )
 
     def _first_hits(self) -> FirstHits:
-        """Embree on a CPU, the tree anywhere else; made when the first ray comes to a device."""
+        """The tracer of the current device, made at first use: Embree on a CPU if installed, else a tree."""
         device = self.triangles.device
         if device not in self._tracers:
             embree = embree_tracer(self.triangles) if device.type == "cpu" else None
@@ -175,7 +178,7 @@ class MeshHost(nn.Module):
         return self._tracers[device]
 
     def _beyond(self, rays: RayBatch, met: Int[Tensor, " K"]) -> Float[Tensor, "N 3"]:
-        """What the rays see that meet nothing."""
+        """Radiance of the background for rays that miss; rows of other rays are not meaningful."""
         if self.background is None:
             return self.background_color.expand(len(rays), 3)
         missed = torch.nonzero(torch.ones_like(rays.origins[:, 0]).index_fill(0, met, 0.0))[:, 0]
@@ -184,9 +187,16 @@ class MeshHost(nn.Module):
 
 
 def corner_normals(mesh: Mesh, outward: Float[Tensor, "F 3"]) -> Float[Tensor, "F 3 3"]:
-    """Unit normals at the corners of faces: of the faces around the vertex that lie on the same side of every
-    crease, by their angles there, as of how many triangles a face is made says nothing (Thürmer and Wüthrich
-    1998). Vertices that faces do not share make edges.
+    """Unit normals at the corners of faces, for interpolation within faces.
+
+    The normal of a corner is the mean over the faces around its vertex that are connected to its face without
+    crossing a sharp edge (`CREASE`). Faces are weighted by their angle at the vertex, so that the mean does
+    not depend on the triangulation (Thürmer and Wüthrich 1998). Faces that do not share their vertices are
+    not connected.
+
+    Args:
+        mesh: the triangles.
+        outward: unit normals of the faces.
     """
     count, faces = 3 * len(mesh.faces), mesh.faces.numpy()
     shape = trimesh.Trimesh(mesh.vertices.numpy(), faces, process=False)
@@ -194,7 +204,7 @@ def corner_normals(mesh: Mesh, outward: Float[Tensor, "F 3"]) -> Float[Tensor, "
     first, second = outward.numpy()[pair].swapaxes(0, 1)
     smooth = (first * second).sum(-1) > math.cos(CREASE)
     pair, ends = pair[smooth], ends[smooth]
-    # Corners of one vertex in two faces that share a smooth edge are one corner.
+    # Corners at the same vertex, in two faces that share a smooth edge, belong to one group.
     slot = (faces[pair][:, :, None] == ends[:, None, :, None]).argmax(-1)
     corner = 3 * pair[..., None] + slot
     joined = coo_array(

@@ -1,6 +1,6 @@
-"""First hits of rays with triangles: in plain tensors on the device of the rays, or by Embree on a CPU.
+"""First hits of rays with triangles: by tensor operations on the device of the rays, or by Embree on a CPU.
 
-Both answer which triangle a ray meets first; `meet` says where.
+Both return the triangle that each ray hits first; `meet` computes where.
 """
 
 from __future__ import annotations
@@ -17,21 +17,25 @@ from torch import Tensor
 __all__ = ["BoxTree", "FirstHits", "Meeting", "build_tree", "embree_tracer", "meet", "tree_tracer"]
 
 FirstHits = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N 3"]], Int[Tensor, " N"]]
-"""Origins and unit directions → the triangle that each ray meets first, −1 for none."""
+"""Maps origins and unit directions to the index of the triangle that each ray hits first, −1 for a miss."""
 
 BRANCHES = 8
+"""Children per node of the tree."""
 MORTON_BITS = 20
+"""Bits per coordinate of Morton codes: three times as many fit into 64 bits."""
 RAYS_AT_ONCE = 8192
-"""Bounds the memory: some hundred triangles are tried per ray."""
+"""Rays per batch; limits memory, as about a hundred triangles are tested per ray."""
 SLACK = 1e-6
-"""In shares of a triangle: rays through an edge that two triangles share must not slip between them."""
+"""Tolerance of barycentric coordinates, and of boxes relative to the scene, so that rays through an edge that
+two triangles share do not pass between them.
+"""
 MIN_COMPONENT = 1e-12
-"""A direction's component is kept off zero by this, so that its inverse is finite."""
+"""Lower bound on the size of a direction's components, so that their inverses are finite."""
 
 
 @dataclass(frozen=True)
 class Meeting:
-    """Where rays meet their triangles: the length along the ray, and the weights of the three corners."""
+    """Where rays hit their triangles: the distance along the ray, and barycentric weights of the corners."""
 
     distance: Float[Tensor, " N"]
     weights: Float[Tensor, "N 3"]
@@ -40,12 +44,12 @@ class Meeting:
 def meet(
     origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"], triangles: Float[Tensor, "N 3 3"]
 ) -> Meeting:
-    """Each ray with the plane of its own triangle (Möller & Trumbore 1997); not finite for a ray along it."""
-    corner, first, second = (
-        triangles[:, 0],
-        triangles[:, 1] - triangles[:, 0],
-        triangles[:, 2] - triangles[:, 0],
-    )
+    """Intersect each ray with the plane of its triangle (Möller & Trumbore 1997).
+
+    The result is not finite for a ray parallel to the plane.
+    """
+    corner = triangles[:, 0]
+    first, second = triangles[:, 1] - corner, triangles[:, 2] - corner
     across = torch.linalg.cross(directions, second)
     determinant = (first * across).sum(-1)
     offset = origins - corner
@@ -60,7 +64,7 @@ def meet(
 
 @dataclass(frozen=True)
 class Boxes:
-    """The lower and the upper corners of K boxes along the axes."""
+    """The lower and upper corners of K axis-aligned boxes."""
 
     low: Float[Tensor, "K 3"]
     high: Float[Tensor, "K 3"]
@@ -68,11 +72,10 @@ class Boxes:
 
 @dataclass(frozen=True)
 class BoxTree:
-    """Triangles along a space-filling curve, and boxes around every 8, 64, 512, … of them, the root first.
+    """Triangles sorted along a space-filling curve, and boxes around every 8, 64, 512, … of them, root first.
 
-    Node i of a level holds the nodes 8 i … 8 i + 7 of the next one, and of the last level the triangles.
-    Levels are filled up to eights with boxes that are inside out, and the triangles with ones that are not
-    finite.
+    Node i of a level contains the nodes 8 i … 8 i + 7 of the next level, or these triangles on the last
+    level. Levels are padded to multiples of 8 with empty (inverted) boxes, and triangles with NaN.
     """
 
     triangles: Float[Tensor, "P 3 3"]
@@ -81,7 +84,7 @@ class BoxTree:
 
 
 def build_tree(triangles: Float[Tensor, "F 3 3"]) -> BoxTree:
-    """Sort triangles by the Morton code of their centres, and box them in eights of eights."""
+    """Build a tree: sort triangles by the Morton codes of their centroids, and bound groups of 8."""
     order = torch.argsort(_morton(triangles.mean(dim=1)), stable=True)
     padded = _fill_up(triangles[order], torch.nan)
     numbers = _fill_up(order, -1)
@@ -96,7 +99,7 @@ def build_tree(triangles: Float[Tensor, "F 3 3"]) -> BoxTree:
 
 
 def tree_tracer(tree: BoxTree) -> FirstHits:
-    """First hits by way of the tree, on its device; deterministic."""
+    """Deterministic first hits by a tree, on its device."""
 
     def first_hits(origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
         parts = zip(origins.split(RAYS_AT_ONCE), directions.split(RAYS_AT_ONCE), strict=True)
@@ -108,7 +111,7 @@ def tree_tracer(tree: BoxTree) -> FirstHits:
 def _descend(
     tree: BoxTree, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]
 ) -> Int[Tensor, " N"]:
-    """All rays go down the tree together: a level takes pairs (ray, node) and leaves those that meet."""
+    """Descend the tree with all rays together: each level keeps the pairs (ray, node) that intersect."""
     count, device = len(origins), origins.device
     inverse = 1.0 / torch.where(
         directions < 0.0, directions.clamp_max(-MIN_COMPONENT), directions.clamp_min(MIN_COMPONENT)
@@ -117,16 +120,15 @@ def _descend(
     nodes = torch.zeros_like(rays)
     children = torch.arange(BRANCHES, device=device)
     for boxes in tree.levels:
-        kept = torch.nonzero(_meets_box(origins[rays], inverse[rays], boxes.low[nodes], boxes.high[nodes]))[
-            :, 0
-        ]
+        met = _meets_box(origins[rays], inverse[rays], boxes.low[nodes], boxes.high[nodes])
+        kept = torch.nonzero(met)[:, 0]
         rays = rays[kept].repeat_interleave(BRANCHES)
         nodes = (BRANCHES * nodes[kept][:, None] + children).reshape(-1)
     meeting = meet(origins[rays], directions[rays], tree.triangles[nodes])
     inside = (meeting.weights >= -SLACK).all(-1) & (meeting.distance > 0.0)
     distance = torch.where(inside, meeting.distance, torch.inf)
     nearest = distance.new_full((count,), torch.inf).scatter_reduce(0, rays, distance, "amin")
-    # Of triangles at the same distance along a ray, the last in the mesh: the same in every run.
+    # Of several triangles at the same distance take the one with the largest index, in every run.
     winner = torch.where(inside & (distance == nearest[rays]), tree.numbers[nodes], -1)
     return torch.full_like(nearest, -1, dtype=torch.int64).scatter_reduce(0, rays, winner, "amax")
 
@@ -137,7 +139,7 @@ def _meets_box(
     low: Float[Tensor, "K 3"],
     high: Float[Tensor, "K 3"],
 ) -> Bool[Tensor, " K"]:
-    """Whether rays pass through boxes. The direction chooses the sides, so an inverted box is never met."""
+    """Whether rays intersect boxes. Sides are chosen by the direction, so inverted boxes never intersect."""
     forward = inverse > 0.0
     enter = ((torch.where(forward, low, high) - origins) * inverse).amax(-1)
     leave = ((torch.where(forward, high, low) - origins) * inverse).amin(-1)
@@ -145,13 +147,13 @@ def _meets_box(
 
 
 def _fill_up(rows: Tensor, value: float | int) -> Tensor:
-    """The rows, and as many of a constant value as a multiple of 8 needs."""
+    """Pad rows with a constant to a multiple of 8."""
     missing = -len(rows) % BRANCHES
     return torch.cat([rows, rows.new_full((missing, *rows.shape[1:]), value)])
 
 
 def _morton(points: Float[Tensor, "F 3"]) -> Int[Tensor, " F"]:
-    """Interleaved bits of the coordinates: points that are close on the curve are close in space."""
+    """Morton codes: interleaved bits of the coordinates. Points with close codes are close in space."""
     low, high = points.amin(dim=0), points.amax(dim=0)
     cells = ((points - low) / (high - low).amax().clamp_min(MIN_COMPONENT) * (2**MORTON_BITS - 1)).long()
     code = torch.zeros_like(cells[:, 0])
@@ -165,7 +167,7 @@ def _morton(points: Float[Tensor, "F 3"]) -> Int[Tensor, " F"]:
 
 
 def embree_tracer(triangles: Float[Tensor, "F 3 3"]) -> FirstHits | None:
-    """First hits by Embree, for rays on a CPU; none where Embree is not installed."""
+    """First hits by Embree, for rays on a CPU; None if Embree is not installed."""
     try:
         from trimesh.ray.ray_pyembree import RayMeshIntersector
     except ImportError:

@@ -1,11 +1,11 @@
-"""Any ray-based nerfstudio `Model` as a host, unchanged: NeuS, nerfacto with normals, or your own.
+"""Use any ray-based nerfstudio `Model` as a host, unchanged: NeuS, nerfacto with normals, or your own.
 
-| of the host | output of the model, the first that it has                                       |
-|-------------|----------------------------------------------------------------------------------|
-| color       | `rgb`: display values (sRGB) or linear, times the radiance that its 1 stands for |
-| position    | `expected_depth`, `depth`: distance along a unit ray                             |
-| normal      | `normal` (a vector), `pred_normals`, `normals` (colours (n + 1)/2), made unit    |
-| opacity     | `accumulation`                                                                   |
+| field    | output of the model, the first that it has                                       |
+|----------|----------------------------------------------------------------------------------|
+| color    | `rgb`: display values (sRGB) or linear values, times `radiance_scale`            |
+| position | `expected_depth`, `depth`: distance along the unit ray                           |
+| normal   | `normal` (a vector), `pred_normals`, `normals` (colors (n + 1)/2); normalised    |
+| opacity  | `accumulation`                                                                   |
 """
 
 from __future__ import annotations
@@ -30,13 +30,14 @@ from neilfpp_method.structures import LossTerm, PixelBatch, RayBatch, SurfaceHit
 __all__ = ["OWN_LOSSES", "NerfstudioHost"]
 
 OWN_LOSSES = "own"
-"""Name of the term that holds what the model asks of itself; it is weighted already."""
+"""Name of the loss term that holds the model's own losses, weighted already."""
 
 DEPTHS = ("expected_depth", "depth")
 NORMALS = ("normal", "pred_normals", "normals")
 COLOR_CODED = ("pred_normals", "normals")
-# Cone-casting samplers read a pixel's area at distance 1; traced rays get that of a 1000-pixel view.
+"""Outputs that hold normals as colors (n + 1)/2."""
 PIXEL_AREA = 1e-6
+"""Area of a pixel at distance 1, which cone-casting samplers need: that of an image of 1000 pixels width."""
 SAME_FRAME = Normalisation(1.0, (0.0, 0.0, 0.0))
 
 Outputs = Mapping[str, Tensor]
@@ -45,17 +46,18 @@ Outputs = Mapping[str, Tensor]
 class NerfstudioHost(nn.Module):
     """A nerfstudio model behind the host contract.
 
-    The share of weight that lies close to the hit is not among a model's outputs: `concentration` is the
-    opacity. A ray that grazes two surfaces of a density model counts as a hit between them.
+    Models do not output the distribution of the rendering weight along a ray, so `concentration` is the
+    opacity: a ray that grazes two surfaces of a density model counts as a hit between them.
 
     Args:
-        model: a model that takes rays; `NeuSModel`, `NerfactoModel` with `predict_normals`, …
-        response: what the model draws: "srgb" (trained on 8-bit images) or "linear".
-        radiance_scale: the linear radiance that a drawn 1 stands for; above 1 for a model that draws [0, 1]
-            of an HDR scene.
-        frame: from the model's frame, as world, to the scene frame, where the object lies in the unit sphere.
-        own_losses: `render_regularised` adds the term `own`: the model's own losses but its `rgb_loss`. The
-            caller weighs it with 1. Off: the model is trained elsewhere, or not at all.
+        model: a model that takes rays: `NeuSModel`, `NerfactoModel` with `predict_normals`, …
+        response: meaning of the rendered color: "srgb" (trained on 8-bit images) or "linear".
+        radiance_scale: linear radiance of a rendered 1; above 1 for a model whose range [0, 1] shows an HDR
+            scene.
+        frame: transformation between the model's frame (as world frame) and the scene frame, in which the
+            object lies in the unit sphere.
+        own_losses: whether `render_regularised` adds the term `own`: all losses of the model except
+            `rgb_loss`, to be weighted by 1. False if the model is trained elsewhere or not at all.
     """
 
     def __init__(
@@ -74,32 +76,32 @@ class NerfstudioHost(nn.Module):
         self.radiance_scale = radiance_scale
         self.frame = frame
         self.own_losses = own_losses
-        # Noted now: a stage that freezes the host unfreezes it later, and some parameters never move.
+        # Recorded now: stages change requires_grad later, but some parameters are never trained.
         self._moving = [p for group in model.get_param_groups().values() for p in group if p.requires_grad]
 
     # -------------------------------------------------------------------------------------- the host contract
 
     def render(self, rays: RayBatch) -> SurfaceHits:
-        """What the model says of each ray.
+        """Render rays with the model.
 
         Raises:
-            UserError: the model has no output for the colour, the depth, the normal or the opacity.
+            UserError: the model has no output for the color, the depth, the normal or the opacity.
         """
-        if len(rays) == 0:  # some models cannot be asked for nothing
+        if len(rays) == 0:
+            # Some models fail without rays.
             return no_hits(rays)
-        return self.read_outputs(
-            rays, self._ask(rays, torch.zeros_like(rays.origins[:, 0], dtype=torch.long))
-        )
+        first_view = torch.zeros_like(rays.origins[:, 0], dtype=torch.long)
+        return self.read_outputs(rays, self._outputs(rays, first_view))
 
     def render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
-        """As `render`, with `eikonal` or `own` where the model has them and a gradient flows.
+        """As `render`, with the loss `eikonal` or `own` in training, if the model has it.
 
-        `eikonal` is asked for by its name, and counts the gradients that a `SurfaceModel` hands out in
-        training. With `own_losses` the model's own, with its own weights, stands in for it.
+        `eikonal` uses the gradients that a `SurfaceModel` outputs in training. With `own_losses` the term
+        `own`, with the model's own weights, replaces it.
         """
         if len(batch) == 0:
             return RegularisedHits(no_hits(batch.rays), {})
-        outputs = self._ask(batch.rays, batch.view)
+        outputs = self._outputs(batch.rays, batch.view)
         terms = {}
         if torch.is_grad_enabled() and self.training:
             if self.own_losses:
@@ -109,25 +111,25 @@ class NerfstudioHost(nn.Module):
         return RegularisedHits(self.read_outputs(batch.rays, outputs), terms)
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
-        """All that the model would train, as `geometry`: a nerfstudio field holds shape and colour in one."""
+        """All parameters that the model trains, as `geometry`: its fields hold shape and color together."""
         return {"geometry": self._moving}
 
     # ---------------------------------------------------------------------------------------------- the model
 
-    def _ask(self, rays: RayBatch, view: Int[Tensor, " N"]) -> Outputs:
+    def _outputs(self, rays: RayBatch, view: Int[Tensor, " N"]) -> Outputs:
         ones = torch.ones_like(rays.origins[:, :1])
         bundle = RayBundle(
             origins=self.frame.to_world(rays.origins),
             directions=rays.directions,
             pixel_area=PIXEL_AREA * ones,
             camera_indices=view[:, None],
-            # Surface models divide their depth by it; with 1 it stays a distance along the unit ray.
+            # Surface models divide the depth by this norm; 1 keeps it a distance along the unit ray.
             metadata={"directions_norm": ones},
         )
         return self.model(bundle)
 
     def read_outputs(self, rays: RayBatch, outputs: Outputs) -> SurfaceHits:
-        """The hits of rays, from what the model returned for them.
+        """Convert what the model returned for rays to hits.
 
         Raises:
             UserError: an output is missing.
@@ -140,7 +142,7 @@ class NerfstudioHost(nn.Module):
         opacity = outputs[self._first(outputs, ("accumulation",), "have it output the sum of its weights")][
             :, 0
         ]
-        drawn = outputs[self._first(outputs, ("rgb",), "use a model that renders a colour")]
+        drawn = outputs[self._first(outputs, ("rgb",), "use a model that renders a color")]
         linear = srgb_to_linear(drawn) if self.response == "srgb" else drawn
         return SurfaceHits(
             color=self.radiance_scale * linear,
@@ -160,10 +162,10 @@ class NerfstudioHost(nn.Module):
     def _own_losses(self, outputs: Outputs, batch: PixelBatch) -> LossTerm:
         pixels = {"image": self._as_drawn(batch.color)}
         metrics = self.model.get_metrics_dict(outputs, pixels)
-        asked = self.model.get_loss_dict(outputs, pixels, metrics)
-        regularisers = [value for name, value in asked.items() if not name.startswith("rgb_loss")]
+        model_losses = self.model.get_loss_dict(outputs, pixels, metrics)
+        regularisers = [value for name, value in model_losses.items() if not name.startswith("rgb_loss")]
         return LossTerm(torch.stack(regularisers).sum() if regularisers else batch.color.new_zeros(()))
 
     def _as_drawn(self, color: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """A pixel in the units that the model draws in; a pixel's response and the model's are the same."""
+        """Pixels in the units of the model's color. Pixels and model have the same response."""
         return color if self.response == "srgb" else color / self.radiance_scale

@@ -1,4 +1,4 @@
-"""What a host must hand out, and the line that a person reads when it does not."""
+"""Check the outputs of a host: shapes, types, devices, normals and gradients."""
 
 from __future__ import annotations
 
@@ -14,15 +14,21 @@ from neilfpp_method.structures import RayBatch, SurfaceHits
 __all__ = ["OutputCheck", "check_normals", "check_tensors", "host_name"]
 
 SHAPES = {"color": (3,), "position": (3,), "normal": (3,), "opacity": (), "concentration": ()}
+"""Shape of one row of each output."""
 UNIT = 1e-2
-"""Most that the length of a normal may differ from 1: blending in half precision costs some digits."""
+"""Largest difference of the length of a normal from 1: blending in half precision loses some digits."""
 
 
 class OutputCheck:
-    """Refuses what a host must not return.
+    """Rejects invalid outputs of a host.
 
-    Shapes, devices and graphs are looked at in every step and cost nothing. Normals are looked at until a
-    first hit was among them: after that, a step that is not finite is the training loop's affair.
+    Shapes, types, devices and the gradient graph are checked in every step, which costs nothing. Normals are
+    checked until a batch with a hit has passed; later steps that are not finite are left to the training
+    loop.
+
+    Args:
+        host: the host whose outputs are checked.
+        hit_share: smallest concentration of a hit.
     """
 
     def __init__(self, host: object, hit_share: float) -> None:
@@ -31,37 +37,37 @@ class OutputCheck:
         self.normals_known = False
 
     def __call__(self, rays: RayBatch, hits: Any, color_moves: bool) -> None:
-        """Look at what `rays` brought.
+        """Check the output of one call.
 
         Args:
-            rays: what the host was asked.
-            hits: what it answered: `SurfaceHits`, if all is well.
-            color_moves: a loss on the colour is about to send a gradient into the host.
+            rays: the rays that were rendered.
+            hits: what the host returned, `SurfaceHits` if the host is correct.
+            color_moves: whether the color must carry a gradient to the host.
 
         Raises:
-            UserError: names the host, the output and the remedy.
+            UserError: an output is invalid; the message names host, output and remedy.
         """
         check_tensors(self.name, rays, {f.name: getattr(hits, f.name, None) for f in fields(SurfaceHits)})
         if color_moves and not hits.color.requires_grad:
             raise UserError(
-                f"{self.name}: the colour is cut off from the host's parameters, and this stage trains them",
-                "render without torch.no_grad and detach, or set train.joint_steps to 0",
+                f"{self.name}: its color has no gradient to the host's parameters, which this stage trains",
+                "render without torch.no_grad and without detach, or set train.joint_steps to 0",
             )
         if not self.normals_known:
             self.normals_known = check_normals(self.name, hits, self.hit_share)
 
 
 def host_name(host: object) -> str:
-    """The class of a host, or the name of the function that is one."""
+    """Name of a host in messages: its `name` attribute, else its class."""
     name = getattr(host, "name", None)
     return name if isinstance(name, str) else type(host).__name__
 
 
 def check_tensors(name: str, rays: RayBatch, outputs: dict[str, object]) -> None:
-    """That outputs are floating-point tensors of the contract's shapes, on the device of the rays.
+    """Check that outputs are floating-point tensors of the required shapes on the device of the rays.
 
     Raises:
-        UserError: one is not.
+        UserError: one of them is not.
     """
     for output, value in outputs.items():
         wanted = (len(rays), *SHAPES[output])
@@ -81,27 +87,30 @@ def check_tensors(name: str, rays: RayBatch, outputs: dict[str, object]) -> None
 
 
 def check_normals(name: str, hits: SurfaceHits, hit_share: float) -> bool:
-    """That normals are finite, and unit where a ray hits; whether a hit was there to tell by.
+    """Check that normals are finite, and unit vectors where a ray hits.
+
+    Returns:
+        Whether there was a hit, so that the lengths could be checked.
 
     Raises:
-        UserError: they are not.
+        UserError: normals are not finite or not unit.
     """
     normal = hits.normal.detach()
     if not normal.isfinite().all():
         rows = int((~normal.isfinite()).any(-1).sum())
         raise UserError(
             f"{name}: its normal is not finite for {rows} of {len(normal)} rays",
-            "divide by the length with a floor under it, and return zeros where a ray meets nothing",
+            "divide by the length with a lower bound, and return zeros for rays that miss",
         )
     length = normal[hits.is_hit(hit_share)].norm(dim=-1)
-    # Where a ray meets both faces of a thin sheet, normals may cancel: zeros are excused unless most are.
+    # The normals of both faces of a thin sheet may cancel: zero normals are allowed unless most are zero.
     off = (length - 1.0).abs()
     wrong = off.where(length > 0.0, off.median()) if len(length) else off
     if len(length) and wrong.max() > UNIT:
         odd = length[wrong.argmax()].item()
         raise UserError(
-            f"{name}: its normal is no unit vector: that of a hit has the length {odd:.3g}",
-            "divide it by its length, and give a ray that meets nothing the concentration 0",
+            f"{name}: its normal is not a unit vector: that of a hit has the length {odd:.3g}",
+            "divide it by its length, and set the concentration of rays that miss to 0",
         )
     return len(length) > 0
 

@@ -1,12 +1,12 @@
-"""A traceable stand-in for the surface of a host without cheap tracing, built from training rays.
+"""A traceable proxy for the surface of a host without cheap tracing, built from training rays.
 
-Hits of camera rays are oriented points; the newest of them are fused into a grid of distances
-(`volume.fusion`) with the mean of the radiance that was seen there. Rays that leave a surface are
-sphere-traced in the grid. So visibility, hard inter-reflection, an environment map and lamps work on any
-host.
+Hits of camera rays are oriented points. The newest of them are fused into a grid of distances
+(`volume.fusion`) with the mean radiance that was seen there. Rays between surfaces are sphere-traced in the
+grid. So visibility, hard inter-reflection, an environment map and lamps work on any host.
 
-Before new rays go in, they are traced through what was known: that measures the error, and takes out points
-that they pass through. A host that moves is followed in that way, a few dozen steps behind.
+Before new rays are added, they are traced through the current grid. This measures its error, and removes
+points that the new rays pass through, so that the proxy follows a host that moves with a delay of a few dozen
+steps.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ from neilfpp_method.volume.fusion import FusedSurface, fuse, grid_normal, mean_a
 __all__ = ["ProxyReport", "SurfaceProxy"]
 
 POINTS = 32_768
-"""Points that are kept: some four a cell on a surface of ten square units in a grid of 96³."""
+"""Number of points kept: about four per cell on a surface of ten square units in a grid of 96³."""
 EVERY = 64
-"""Steps between two refreshes, once there have been as many; before that at steps 1, 2, 4, 8, …"""
+"""Steps between two refreshes. The first refreshes are at steps 1, 2, 4, 8, …"""
 ROUNDS, ROUND = 16, 512
-"""Batches of rays rendered before the first step, from the first cameras towards their hits."""
+"""Number of batches, and rays per batch, with which `look_around` explores the surface."""
 SPREAD = 0.2
-"""How far about a hit the look around aims, scene units: beside it is more of the surface."""
+"""Largest offset of the targets of `look_around` from known hits, per axis, scene units."""
 START = 0.75
-"""Height above the grid's surface at which rays leave it, in cells; tracing ends at a quarter cell."""
+"""Height above the grid's surface at which rays start, in cells; tracing ends at a quarter cell."""
 APART = 2.0
-"""A ray that goes this much further than the grid allows, in cells, passes through outdated points."""
+"""A ray that goes this much further than the grid's surface, in cells, shows that points are outdated."""
 CLEAR = 0.01
-"""Largest opacity of a ray that meets nothing."""
+"""Largest opacity of a ray that counts as a miss."""
 GRAZING = 0.2
-"""Least cosine between ray and normal in the last step onto the surface."""
+"""Lower bound on the cosine between ray and normal in the final Newton step onto the surface."""
 
 log = logging.getLogger(__name__)
 
@@ -52,14 +52,14 @@ Radiance = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N 3"]], Float[Tensor, 
 
 @dataclass(frozen=True)
 class ProxyReport:
-    """How good the proxy is: measured on the rays that came since the last refresh, before they went in.
+    """Error of the proxy, measured on the rays since the last refresh, before they were added.
 
     Attributes:
-        points: that it is made of.
-        age: mean number of steps since they were seen.
-        agreement: share of rays that meet a surface in both or in neither.
+        points: number of points that it consists of.
+        age: mean number of steps since the points were seen.
+        agreement: share of rays that hit in both host and proxy, or miss in both.
         error: median difference of the distances along rays that hit in both, scene units.
-        error_95: the difference that 95 % of them stay below.
+        error_95: 95th percentile of that difference.
         cell: edge of a cell of the grid, scene units.
     """
 
@@ -79,22 +79,22 @@ class ProxyReport:
 
 
 @dataclass(frozen=True)
-class Looks:
-    """Camera rays with what the host says of them: a distance, infinite for a miss."""
+class CameraRays:
+    """Camera rays with the distances of the host's hits, infinite for a miss."""
 
     rays: RayBatch
     distance: Float[Tensor, " N"]
 
 
 class SurfaceProxy(nn.Module):
-    """The newest points of a surface, and the grid made of them. A checkpoint holds the points alone.
+    """The newest points of a surface, and a grid made from them. A checkpoint holds only the points.
 
     Args:
-        radius: half the edge of the cube that holds the scene, scene units.
+        radius: half the edge of the cube that contains the scene, scene units.
         resolution: vertices of the grid along an edge.
-        hit_share: least concentration of a hit.
-        radiance: what a point of the surface sends, where the host knows it without a ray; none: the mean of
-            what was seen.
+        hit_share: smallest concentration of a hit.
+        radiance: radiance of the host at surface points x towards wo; None: the mean of the radiance that was
+            seen.
     """
 
     def __init__(
@@ -104,9 +104,9 @@ class SurfaceProxy(nn.Module):
         self.radius = radius
         self.resolution = resolution
         self.hit_share = hit_share
-        self.points = Ring(
-            POINTS, 10
-        )  # position, normal, radiance, the step that saw it; a normal of 0 is no point
+        # Columns: position, normal, radiance, and the step that saw the point. A zero normal marks a removed
+        # point.
+        self.points = Ring(POINTS, 10)
         self.steps = 0
         self._radiance = radiance
         self._pending: list[tuple[RayBatch, SurfaceHits]] = []
@@ -122,7 +122,7 @@ class SurfaceProxy(nn.Module):
 
     @torch.no_grad()
     def observe(self, rays: RayBatch, hits: SurfaceHits) -> None:
-        """A training step's camera rays and hits. Refreshes the grid when it is time."""
+        """Add the camera rays and hits of a training step, and refresh the grid when it is due."""
         self.steps += 1
         self._pending.append((rays.to(rays.origins.device), hits.detach()))
         if self.steps % EVERY == 0 or (self.steps < EVERY and self.steps & (self.steps - 1) == 0):
@@ -132,21 +132,28 @@ class SurfaceProxy(nn.Module):
     def look_around(
         self, render: Callable[[RayBatch], SurfaceHits], rays: RayBatch, hits: SurfaceHits
     ) -> None:
-        """Before the first step, see enough of the surface to trace: from the first rays to their hits."""
+        """Explore the surface before the first step, so that there is enough of it to trace.
+
+        Rays go from the origins of the first batch to points near its hits.
+
+        Args:
+            render: renders rays with the host.
+            rays, hits: the first batch and its hits.
+        """
         known = hits.position[hits.is_hit(self.hit_share)].detach()
         for _ in range(ROUNDS if len(known) else 0):
             origins = rays.origins[torch.randint(len(rays), (ROUND,), device=known.device)]
-            aims = known[torch.randint(len(known), (ROUND,), device=known.device)]
-            aims = aims + SPREAD * (2 * torch.rand_like(aims) - 1)
-            look = RayBatch(origins, safe_normalize(aims - origins))
-            found = render(look).detach()
-            self._pending.append((look, found))
-            known = torch.cat((known, found.position[found.is_hit(self.hit_share)]))
+            targets = known[torch.randint(len(known), (ROUND,), device=known.device)]
+            targets = targets + SPREAD * (2 * torch.rand_like(targets) - 1)
+            new_rays = RayBatch(origins, safe_normalize(targets - origins))
+            new_hits = render(new_rays).detach()
+            self._pending.append((new_rays, new_hits))
+            known = torch.cat((known, new_hits.position[new_hits.is_hit(self.hit_share)]))
         self.refresh()
 
     @torch.no_grad()
     def refresh(self) -> None:
-        """Measure what is known by the rays that came since, take them in, and make the grid anew."""
+        """Measure the error on the rays since the last refresh, add them, and rebuild the grid."""
         if not self._pending:
             return
         rays = RayBatch(
@@ -158,13 +165,14 @@ class SurfaceProxy(nn.Module):
         points, distance, hit, clear = joined
         self._pending.clear()
         if self._known_surface() is not None:
-            told = torch.nonzero(hit | clear)[:, 0]
-            self._measure(Looks(rays[told], distance[told]))
+            rows = torch.nonzero(hit | clear)[:, 0]
+            self._measure(CameraRays(rays[rows], distance[rows]))
         stamp = torch.full_like(points[:, :1], float(self.steps))
         self.points.keep(torch.cat((points, stamp), -1)[hit].flip(0))
         self._surface = self._fused()
 
     def _columns(self, rays: RayBatch, hits: SurfaceHits) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Position, normal and radiance in columns; distances; which rays hit, and which miss."""
         hit = hits.is_hit(self.hit_share) & (hits.normal.norm(dim=-1) > 0.5)
         distance = torch.where(hit, (hits.position - rays.origins).norm(dim=-1), torch.inf)
         columns = torch.cat((hits.position, hits.normal, hits.color), -1)
@@ -175,35 +183,36 @@ class SurfaceProxy(nn.Module):
         rows = rows[rows[:, 3:6].square().sum(-1) > 0]
         return fuse(rows[:, :3], rows[:, 3:6], rows[:, 6:9], self.radius, self.resolution)
 
-    def _measure(self, looks: Looks) -> None:
-        """Compare fresh rays with the grid, and drop the points that they pass through."""
-        found = self._trace(looks.rays)
-        hit = looks.distance.isfinite()
-        both = hit & found.hit
-        error = (found.distance - looks.distance)[both].abs()
+    def _measure(self, camera_rays: CameraRays) -> None:
+        """Compare new rays with the grid, and remove the points that they pass through."""
+        traced = self._trace(camera_rays.rays)
+        hit = camera_rays.distance.isfinite()
+        error = (traced.distance - camera_rays.distance)[hit & traced.hit].abs()
         rows = self.points.kept()
-        held = rows[:, 3:6].square().sum(-1) > 0
-        middle, most = (
+        valid = rows[:, 3:6].square().sum(-1) > 0
+        median, error_95 = (
             error.quantile(torch.tensor([0.5, 0.95]).to(error)).tolist() if len(error) else (0.0, 0.0)
         )
         self._report = ProxyReport(
-            points=int(held.sum()),
-            age=(self.steps - rows[held, 9]).mean().item() if held.any() else 0.0,
-            agreement=(hit == found.hit).float().mean().item() if len(hit) else 1.0,
-            error=middle,
-            error_95=most,
+            points=int(valid.sum()),
+            age=(self.steps - rows[valid, 9]).mean().item() if valid.any() else 0.0,
+            agreement=(hit == traced.hit).float().mean().item() if len(hit) else 1.0,
+            error=median,
+            error_95=error_95,
             cell=self.cell,
         )
-        through = found.hit & (looks.distance > found.distance + APART * self.cell)
-        place = looks.rays.origins + found.distance[:, None] * looks.rays.directions
-        stale = torch.zeros(self.resolution**3, dtype=torch.bool, device=place.device)
-        stale[self._cells(place[through])] = True
-        around = (
-            nn.functional.max_pool3d(stale.view(1, 1, *[self.resolution] * 3).float(), 3, 1, 1).view(-1) > 0
-        )
-        rows[around[self._cells(rows[:, :3])], 3:6] = 0.0  # a view of the ring: written in place
+        through = traced.hit & (camera_rays.distance > traced.distance + APART * self.cell)
+        crossed = camera_rays.rays.origins + traced.distance[:, None] * camera_rays.rays.directions
+        stale = torch.zeros(self.resolution**3, dtype=torch.bool, device=crossed.device)
+        stale[self._cells(crossed[through])] = True
+        # Points in neighboring cells are removed as well.
+        volume = stale.view(1, 1, *[self.resolution] * 3).float()
+        stale = nn.functional.max_pool3d(volume, 3, 1, 1).view(-1) > 0
+        # `rows` is a view of the ring: this writes to the stored points.
+        rows[stale[self._cells(rows[:, :3])], 3:6] = 0.0
 
     def _cells(self, x: Float[Tensor, "P 3"]) -> Int[Tensor, " P"]:
+        """Index of the vertex closest to each point."""
         i, j, k = ((x + self.radius) / self.cell).round().long().clamp(0, self.resolution - 1).unbind(-1)
         return (k * self.resolution + j) * self.resolution + i
 
@@ -211,26 +220,24 @@ class SurfaceProxy(nn.Module):
 
     @torch.no_grad()
     def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
-        """What the scene sends to surface points (`hosts.base.LightsItself`); nothing while nothing was seen.
+        """Light from the scene's surfaces (`hosts.base.LightsItself`); none before the first refresh.
 
-        Rays start above the grid's own surface, so that its error shadows nothing.
+        Rays start above the surface of the grid itself, so that its error casts no shadows.
         """
         directions = wi.reshape(-1, 3)
         surface = self._known_surface()
         if surface is None:
-            nothing = torch.zeros_like(wi[..., 0])
-            return SceneLight(nothing > 0, torch.zeros_like(wi), torch.full_like(nothing, torch.inf))
-        normal, height = (
-            grid_normal(surface.distance, self.radius, x),
-            look_up(surface.distance, self.radius, x),
-        )
+            zeros = torch.zeros_like(wi[..., 0])
+            return SceneLight(zeros > 0, torch.zeros_like(wi), torch.full_like(zeros, torch.inf))
+        normal = grid_normal(surface.distance, self.radius, x)
+        height = look_up(surface.distance, self.radius, x)
         lift = (START * self.cell - height).clamp(0, (START + 1) * self.cell)
         start = (x + lift[:, None] * normal)[:, None].expand_as(wi).reshape(-1, 3)
         found = self._trace(RayBatch(start, directions))
         rows = torch.nonzero(found.hit)[:, 0]
         place = start[rows] + found.distance[rows, None] * directions[rows]
         radiance = torch.zeros_like(directions)
-        radiance[rows] = self._sent(place, -directions[rows])
+        radiance[rows] = self._outgoing(place, -directions[rows])
         origin = x[:, None].expand_as(wi).reshape(-1, 3)[rows]
         distance = torch.full_like(directions[:, 0], torch.inf)
         distance[rows] = (place - origin).norm(dim=-1)
@@ -238,7 +245,7 @@ class SurfaceProxy(nn.Module):
 
     @torch.no_grad()
     def render(self, rays: RayBatch) -> SurfaceHits:
-        """What the grid shows along rays; constants, no gradient. Black where they meet nothing."""
+        """Hits of rays with the grid's surface, without gradient; the color of a miss is black."""
         surface = self._known_surface()
         nothing, zero = torch.zeros_like(rays.origins), torch.zeros_like(rays.origins[:, 0])
         if surface is None:
@@ -249,7 +256,7 @@ class SurfaceProxy(nn.Module):
         normal = grid_normal(surface.distance, self.radius, place)
         share = found.hit.to(zero.dtype)
         return SurfaceHits(
-            color=nothing.index_put((rows,), self._sent(place, -rays.directions[rows])),
+            color=nothing.index_put((rows,), self._outgoing(place, -rays.directions[rows])),
             position=rays.origins.index_put((rows,), place),
             normal=nothing.index_put((rows,), normal),
             opacity=share,
@@ -257,27 +264,29 @@ class SurfaceProxy(nn.Module):
         )
 
     def report(self) -> ProxyReport | None:
-        """How good the proxy is; none before the second refresh."""
+        """Error of the proxy; None before the second refresh."""
         return self._report
 
-    def _sent(self, place: Float[Tensor, "P 3"], wo: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+    def _outgoing(self, place: Float[Tensor, "P 3"], wo: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+        """Radiance of surface points towards wo: the host's, or the mean that was seen."""
         if self._radiance is not None and len(place):
             return self._radiance(place, wo)
         return mean_at(self._surface, self.radius, place)
 
     def _known_surface(self) -> FusedSurface | None:
-        if self._surface is None and self.points.filled:  # of a checkpoint
+        if self._surface is None and self.points.filled:
+            # The points come from a checkpoint.
             self._surface = self._fused()
         return self._surface
 
     def _trace(self, rays: RayBatch) -> GridHits:
-        """Where rays, which may start outside the cube, meet the grid's surface."""
+        """Where rays, which may start outside of the cube, hit the grid's surface."""
         grid = self._known_surface().distance
         enter, passes = self._entry(rays)
         start = rays.origins + enter[:, None] * rays.directions
         found = trace_grid(grid, self.radius, start, rays.directions)
         hit = found.hit & passes
-        # The tracing ends before the surface; the last bit is a step of Newton's method.
+        # Tracing ends a quarter cell above the surface; a Newton step covers the rest.
         rows = torch.nonzero(hit)[:, 0]
         directions = rays.directions[rows]
         place = start[rows] + found.distance[rows, None] * directions
@@ -286,7 +295,7 @@ class SurfaceProxy(nn.Module):
         return GridHits((enter + found.distance).index_add(0, rows, rest), hit)
 
     def _entry(self, rays: RayBatch) -> tuple[Float[Tensor, " P"], Bool[Tensor, " P"]]:
-        """The distance at which rays enter the cube, 0 from within, and which ones do."""
+        """The distance at which rays enter the cube (0 from inside), and whether they do."""
         direction = torch.where(rays.directions.abs() < 1e-9, 1e-9, rays.directions)
         ends = torch.stack(
             ((-self.radius - rays.origins) / direction, (self.radius - rays.origins) / direction)
@@ -297,12 +306,12 @@ class SurfaceProxy(nn.Module):
     # -------------------------------------------------------------------------------------------- checkpoints
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Steps that were observed, and the rays that came since the last refresh."""
+        """Number of observed steps, and the rays since the last refresh, for checkpoints."""
         pending = [{**_tensors(rays), **_tensors(hits)} for rays, hits in self._pending]
         return {"steps": self.steps, "pending": pending}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """The inverse of `get_extra_state`; the grid is made of the points again when it is asked."""
+        """Restore what `get_extra_state` returned; the grid is rebuilt from the points at its next use."""
         self.steps, self._surface, self._report = state["steps"], None, None
         self._pending = [
             (_made(RayBatch, tensors), _made(SurfaceHits, tensors)) for tensors in state["pending"]

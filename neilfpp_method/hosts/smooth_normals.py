@@ -1,10 +1,10 @@
-"""Normals for shading: those of a surface's neighbourhood, with its edges kept.
+"""Smooth normals for shading, except across edges.
 
-A learned distance field is a little wavy, by the cells of its grid, and a highlight moves twice as far as the
-normal that throws it: a ripple of three degrees blurs all that tells a metal from paint. So the normals
-around a point are fitted by a plane, robustly: they may turn evenly, as on a ball, and those beyond an edge
-do not count (Öztireli, Guennebaud and Gross 2009, "Feature preserving point set surfaces based on non-linear
-kernel regression").
+A learned distance field has ripples of the size of its grid cells. A highlight moves by twice the angle of
+the normal, so a ripple of three degrees hides what distinguishes metal from paint. So a linear function of
+the tangent plane is fitted robustly to the normals around a point: the normals may turn evenly, as on a ball,
+and those beyond an edge get little weight (Öztireli, Guennebaud and Gross 2009, "Feature preserving point set
+surfaces based on non-linear kernel regression").
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ from neilfpp_method.shading.frame import local_frame, safe_normalize
 __all__ = ["NEIGHBOURS", "smooth_normals"]
 
 RINGS = ((6, 1 / 3), (10, 2 / 3), (16, 1.0))
-"""Neighbours on each ring, and its share of the radius."""
+"""Number of neighbors on each ring around the point, and the ring's radius relative to the outermost."""
 NEIGHBOURS = sum(count for count, _ in RINGS)
+"""Number of points at which normals are evaluated, per shaded point."""
 UNLIKE = 0.2
-"""Distance between two unit normals, 11.5°, at which one counts for 1/√e."""
+"""Residual of a unit normal at which its weight is 1/√e; it corresponds to 11.5°."""
 ROUNDS = 4
-"""Of the fit; each weighs the neighbours by what the one before has left over."""
+"""Rounds of iteratively reweighted least squares."""
 RIDGE = 1e-2
-"""Of a neighbour's weight: what ties a slope to 0 where no neighbour says anything."""
+"""Ridge penalty, relative to the weight of one neighbor, for slopes that no neighbor determines."""
 
 
 @torch.no_grad()
@@ -39,32 +40,32 @@ def smooth_normals(
     normal: Float[Tensor, "N 3"],
     radius: float,
 ) -> Float[Tensor, "N 3"]:
-    """Unit normals of the surface around points.
+    """Smoothed unit normals at surface points.
 
     Args:
-        gradient: of the signed distance; asked at `NEIGHBOURS` places about each point.
+        gradient: gradient of the signed distance; called with `NEIGHBOURS` points around each point.
         position: points on the surface, scene frame.
-        normal: their unit normals, as noisy as they are.
-        radius: of the neighbourhood, scene units. Relief that is finer than this and flatter than `UNLIKE` is
-            lost.
+        normal: their unit normals, not smoothed.
+        radius: radius of the neighborhood, scene units. Relief that is finer than this and flatter than about
+            10° is lost.
     """
     ring = _rings(position)
     around = position[:, None] + radius * (ring @ local_frame(normal)[:, :2])
-    seen = torch.cat((normal[:, None], safe_normalize(gradient(around.flatten(0, 1))).view_as(around)), 1)
-    # What a plane is linear in: 1 and the place, in units of the radius. The point itself comes first.
-    places = functional.pad(torch.cat((torch.zeros_like(ring[:1]), ring)), (1, 0), value=1.0)
+    normals = torch.cat((normal[:, None], safe_normalize(gradient(around.flatten(0, 1))).view_as(around)), 1)
+    # Regressors of the linear function: 1 and the offset in units of the radius. The point itself is first.
+    design = functional.pad(torch.cat((torch.zeros_like(ring[:1]), ring)), (1, 0), value=1.0)
     ridge = RIDGE * torch.eye(3).to(ring)
-    left_over = seen - normal[:, None]
+    residual = normals - normal[:, None]
     for _ in range(ROUNDS):
-        weighted = places * torch.exp(-left_over.square().sum(-1, keepdim=True) / (2 * UNLIKE**2))
-        # Never singular, by the ridge; `solve` would have the host wait for the device to hear that.
-        plane = torch.linalg.solve_ex(weighted.mT @ places + ridge, weighted.mT @ seen).result
-        left_over = seen - places @ plane
-    return safe_normalize(plane[:, 0])
+        weighted = design * torch.exp(-residual.square().sum(-1, keepdim=True) / (2 * UNLIKE**2))
+        # The ridge makes the matrix regular. `solve` would synchronise with the device to check that.
+        coefficients = torch.linalg.solve_ex(weighted.mT @ design + ridge, weighted.mT @ normals).result
+        residual = normals - design @ coefficients
+    return safe_normalize(coefficients[:, 0])
 
 
 def _rings(like: Tensor) -> Float[Tensor, "K 2"]:
-    """Places in the tangent plane for a radius of 1; each ring is turned against the one before."""
+    """Offsets in the tangent plane for a radius of 1; each ring is rotated relative to the previous one."""
     angles = [
         (torch.arange(count) + 0.5 * number) * (2 * math.pi / count)
         for number, (count, _) in enumerate(RINGS)

@@ -1,10 +1,10 @@
-"""The host contract as a test, for whoever writes a host: `check_host(host, rays)`.
+"""A test suite of the host contract for authors of hosts: `check_host(host, rays)`.
 
-`testing_geometry` looks at surfaces twice, `testing_conduct` at how the host behaves; the rest is here. What
-the suite finds of planted defects is in docs/hosts.md.
+`testing_geometry` checks that surfaces look the same from several viewpoints, `testing_conduct` how the host
+behaves; the other checks are here. docs/hosts.md lists which of a set of planted defects the suite finds.
 
-What it cannot see is whether colours are linear: that takes a photograph whose radiance is known. It does see
-the commonest symptom, colours that stop at 1.
+The suite cannot find out whether colors are linear, which would need a photograph with known radiance. It
+does find the most common symptom: colors that are clipped at 1.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from neilfpp_method.structures import RayBatch, SurfaceHits
 __all__ = ["ContractBroken", "HostReport", "check_host"]
 
 OFF_RAY = 1e-2
-"""How far a hit may lie from its ray, in shares of its distance."""
+"""Largest distance of a hit from its ray, relative to its distance from the origin of the ray."""
 FACING = 0.9
-"""Least share of hits whose normal must face the viewer: blended normals at a silhouette may not."""
+"""Smallest share of hits whose normal must face the viewer; blended normals at silhouettes may face away."""
 CLIPPED = 0.01
-"""Share of colour values at exactly 1, their maximum, that is no chance."""
+"""Share of color values of exactly 1, if that is their maximum, above which colors count as clipped."""
 FAR = 100.0
-"""Distance of rays that lead away from the scene, scene units."""
+"""Distance from which rays start that lead away from the scene, scene units."""
 
 
 @dataclass(frozen=True)
 class HostReport:
-    """A host that kept the contract: how many rays hit, what was checked, and whether geometry is trained."""
+    """Result for a host that passed: hits, rays, the checks, and whether its geometry is trained."""
 
     host: str
     hits: int
@@ -52,16 +52,16 @@ class HostReport:
 def check_host(
     host: Host | RenderFunction, rays: RayBatch, parameters: Sequence[nn.Parameter] | None = None
 ) -> HostReport:
-    """Hold a host to `hosts.base.Host`.
+    """Check that a host keeps the contract of `hosts.base.Host`.
 
     Args:
-        host: the host, or a function (origins, directions) → (color, position, normal); its mode is left as
-            it is.
-        rays: some hundred rays in the scene frame, from outside the object; several must hit it.
-        parameters: what the host trains; none: its own parameters, where it is a module.
+        host: the host, or a function (origins, directions) → (color, position, normal). Its train/eval mode
+            is not changed.
+        rays: some hundred rays in the scene frame, from outside of the object; several must hit it.
+        parameters: the parameters that the host trains; None: all its parameters, if it is a module.
 
     Raises:
-        ContractBroken: an AssertionError. It breaks the contract; names the host and what it does.
+        ContractBroken: the host breaks the contract (an AssertionError that names the host and the defect).
 
     Example:
         >>> print(check_host(my_function, RayBatch(origins, directions)))
@@ -115,11 +115,11 @@ def _hits(case: Case) -> None:
     )
     for share in ("opacity", "concentration"):
         value = getattr(case.hits, share).detach()
-        case.require(((value >= 0.0) & (value <= 1.0 + 1e-3)).all(), f"its {share} leaves [0, 1]")
+        case.require(((value >= 0.0) & (value <= 1.0 + 1e-3)).all(), f"its {share} is outside of [0, 1]")
     solid = case.hits.opacity.detach()[case.hit].median().item()
     case.require(
         solid > 0.5,
-        f"its opacity is {solid:.2g} where it says that rays hit: pictures would show no surface there",
+        f"its opacity is {solid:.2g} where it says that rays hit: images would show no surface there",
     )
 
 
@@ -148,13 +148,13 @@ def _positions(case: Case) -> None:
 
 def _colors(case: Case) -> None:
     color = case.hits.color.detach()
-    case.require(color.isfinite().all(), "its colour is not finite")
-    case.require((color >= 0.0).all(), "its colour is negative")
+    case.require(color.isfinite().all(), "its color is not finite")
+    case.require((color >= 0.0).all(), "its color is negative")
     seen = color[case.hit]
     clipped = (seen == 1.0).float().mean().item()
     stops = seen.max() == 1.0 and CLIPPED < clipped < 1.0
     case.require(
-        not stops, f"{clipped:.0%} of its colours are exactly 1 and none is above: return them unclipped"
+        not stops, f"{clipped:.0%} of its colors are exactly 1 and none is above: return them unclipped"
     )
 
 
@@ -164,8 +164,8 @@ def _misses(case: Case) -> None:
     missed = render_checked(case.host, case.name, away)
     for field in fields(SurfaceHits):
         finite = getattr(missed, field.name).isfinite().all()
-        case.require(finite, f"its {field.name} is not finite where a ray meets nothing")
-    case.require(not missed.is_hit(HIT_SHARE).any(), "hits something with rays that lead away from the scene")
+        case.require(finite, f"its {field.name} is not finite for a ray that misses")
+    case.require(not missed.is_hit(HIT_SHARE).any(), "rays that lead away from the scene hit something")
     case.require((missed.opacity < 0.5).all(), "its opacity is high for rays that lead away from the scene")
 
 
@@ -173,12 +173,12 @@ def _gradients_flow(case: Case) -> None:
     if not case.parameters:
         return
     case.require(
-        _reaches(case, case.hits.color[case.hit]), "no gradient leads from its colour to its parameters"
+        _reaches(case, case.hits.color[case.hit]), "no gradient flows from its color to its parameters"
     )
     if case.trains_geometry:
         shape = torch.cat([case.hits.position[case.hit], case.hits.normal[case.hit]], dim=-1)
         case.require(
-            _reaches(case, shape), "no gradient leads from its hits to its parameters: L_phys moves nothing"
+            _reaches(case, shape), "no gradient flows from its hits to its parameters: L_phys cannot train it"
         )
 
 
@@ -194,10 +194,10 @@ def _gradients_stop(case: Case) -> None:
 
 
 def _reaches(case: Case, output: Tensor) -> bool:
-    """Whether a gradient of the output reaches a parameter, and is finite."""
+    """Whether a gradient of the output reaches a parameter; it must be finite."""
     if not output.requires_grad:
         return False
-    # Weights of both signs, for sums that are constant, such as the squares of a unit vector.
+    # Weights of both signs: a plain sum may be constant, like the sum of squares of a unit vector.
     weights = torch.linspace(-1.0, 1.5, output.numel(), dtype=output.dtype, device=output.device).reshape(
         output.shape
     )

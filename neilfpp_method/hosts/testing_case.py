@@ -1,4 +1,4 @@
-"""A host under test, and how the checks of `hosts.testing` look at it."""
+"""The state that the checks of `hosts.testing` share: a host under test, its rays and its hits."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neilfpp_method.structures import RayBatch, SurfaceHits
 __all__ = ["HIT_SHARE", "Case", "ContractBroken", "Modes", "render_checked"]
 
 HIT_SHARE = 0.8
-"""Least concentration of a hit, as in the presets."""
+"""Smallest concentration of a hit, as in the presets."""
 
 
 class ContractBroken(AssertionError):
@@ -27,19 +27,19 @@ class ContractBroken(AssertionError):
 
 @dataclass(frozen=True)
 class Modes:
-    """Of the modules that a host is made of, as far as they can be told, and of its parameters."""
+    """Train/eval mode of a host's modules, and `requires_grad` of its parameters."""
 
     training: tuple[bool, ...]
     moves: tuple[bool, ...]
 
     @staticmethod
     def of(modules: Sequence[nn.Module], parameters: Sequence[nn.Parameter]) -> Modes:
-        """As they are now."""
+        """Record the current modes."""
         parts = [part for module in modules for part in module.modules()]
         return Modes(tuple(part.training for part in parts), tuple(p.requires_grad for p in parameters))
 
     def restore(self, modules: Sequence[nn.Module], parameters: Sequence[nn.Parameter]) -> None:
-        """Make it so again."""
+        """Restore the recorded modes."""
         for part, training in zip(
             (p for module in modules for p in module.modules()), self.training, strict=True
         ):
@@ -50,19 +50,18 @@ class Modes:
 
 @dataclass(frozen=True)
 class Case:
-    """A host under test, and what it made of the rays.
+    """A host under test, with rays and the hits that it rendered.
 
     Attributes:
-        host: under test.
-        name: of the host, for messages.
-        before: the modes of the host's modules, and which parameters move, before it was asked for the first
-            time.
-        now: the same, as it is now.
-        rays: what it was asked.
-        parameters: what it trains.
+        host: the host under test.
+        name: name of the host in messages.
+        before: modes of the host before it was called for the first time.
+        now: returns the current modes of the host.
+        rays: the rays.
+        parameters: the parameters that the host trains.
         trains_geometry: whether L_phys may move its surface.
-        hits: what it answered.
-        hit: which rays meet a surface.
+        hits: what the host rendered for the rays.
+        hit: which rays hit a surface.
     """
 
     host: Host
@@ -76,32 +75,32 @@ class Case:
     hit: Tensor
 
     def require(self, kept: bool | Tensor, broken: str) -> None:
-        """Raise what is broken, unless it is kept."""
+        """Raise `ContractBroken` with the message `broken` unless `kept` is true."""
         if not kept:
             raise ContractBroken(f"{self.name}: {broken}")
 
     def seeded(self, rays: RayBatch, seed: int = 0) -> SurfaceHits:
-        """What the host renders after a seed; the random state is as before."""
+        """Render rays after seeding; the random state is restored."""
         with torch.random.fork_rng(devices=[rays.origins.device] if rays.origins.is_cuda else []):
             torch.manual_seed(seed)
             return render_checked(self.host, self.name, rays)
 
     def constants(self, rays: RayBatch, seed: int = 0) -> SurfaceHits:
-        """The same without a gradient."""
+        """As `seeded`, without gradients."""
         with torch.no_grad():
             return self.seeded(rays, seed).detach()
 
     @property
     def width(self) -> float:
-        """How thick the surface is, scene units; 0 for a host that does not say."""
+        """Width of the surface layer, scene units; 0 if the host has no `surface_width`."""
         return float(self.host.surface_width()) if isinstance(self.host, HasSurfaceWidth) else 0.0
 
 
 def render_checked(host: Host, name: str, rays: RayBatch) -> SurfaceHits:
-    """What the host renders, with the shapes and the device of the contract.
+    """Render rays, and check shapes, types and devices of the result.
 
     Raises:
-        ContractBroken: it has others, or cannot be asked.
+        ContractBroken: rendering fails with a `UserError`, or the result is invalid.
     """
     try:
         hits = host.render(rays)

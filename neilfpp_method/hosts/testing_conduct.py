@@ -1,4 +1,4 @@
-"""Checks of how a host behaves: the same for every batch, and leaving alone what is not its own."""
+"""Checks of a host's behavior: results do not depend on the batch, and there are no side effects."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from neilfpp_method.structures import RayBatch, SurfaceHits
 __all__ = ["CONDUCT_CHECKS"]
 
 RESTLESS = 0.005
-"""Most that half of the positions may move between two calls, scene units; a soft layer adds its width."""
+"""Largest median change of positions between two calls, scene units, plus the width of a soft layer."""
 SPREAD = 3.0
-"""Answers to a part of a batch may differ by so many times what two calls differ by."""
+"""Largest difference between a part of a batch and the whole, relative to that between two calls."""
 
 
 def _one_ray(case: Case) -> None:
     row = int(case.hit.nonzero()[0])
     try:
-        case.constants(case.rays[row : row + 1])  # shapes are looked at
+        # Rendering checks the shapes.
+        case.constants(case.rays[row : row + 1])
     except AssertionError as error:
-        raise type(error)(f"{error} (asked with one ray)") from error
+        raise type(error)(f"{error} (with one ray)") from error
     except Exception as error:
         case.require(False, f"cannot render a single ray ({error})")
 
@@ -60,7 +61,8 @@ def _repeatable(case: Case) -> None:
     other = case.constants(case.rays, seed=1)
     moved = (other.position - first.position)[case.hit].norm(dim=-1).median().item()
     broken = (
-        f"half of its positions move by {moved:.2g} and more from call to call: less noise, or more samples"
+        f"half of its positions change by {moved:.2g} or more between calls: "
+        "reduce the noise, or use more samples"
     )
     case.require(moved <= RESTLESS + case.width, broken)
 
@@ -72,7 +74,7 @@ def _same_without_gradient(case: Case) -> None:
         same = torch.allclose(
             getattr(kept, name), getattr(case.constants(case.rays), name), rtol=1e-3, atol=1e-4
         )
-        case.require(same, f"its {name} is another one under torch.no_grad")
+        case.require(same, f"its {name} differs under torch.no_grad")
 
 
 def _keeps_what_it_gave(case: Case) -> None:
@@ -81,15 +83,15 @@ def _keeps_what_it_gave(case: Case) -> None:
     case.constants(RayBatch(case.rays.origins, case.rays.directions.roll(1, dims=0)))
     for field, before in zip(fields(SurfaceHits), kept, strict=True):
         same = torch.equal(getattr(first, field.name), before)
-        case.require(same, f"its {field.name} changes when it is asked again: hand out a copy, not a buffer")
+        case.require(same, f"its {field.name} changes when it renders again: return a copy, not a buffer")
 
 
 def _leaves_modes_alone(case: Case) -> None:
     now = case.now()
     case.require(
-        now.training == case.before.training, "rendering calls train() or eval(): its mode is its owner's"
+        now.training == case.before.training, "rendering calls train() or eval(): leave the mode unchanged"
     )
-    case.require(now.moves == case.before.moves, "rendering freezes or frees its parameters")
+    case.require(now.moves == case.before.moves, "rendering changes requires_grad of its parameters")
     grad, dtype = torch.is_grad_enabled(), torch.get_default_dtype()
     case.host.render(case.rays)
     left = torch.is_grad_enabled() == grad and torch.get_default_dtype() == dtype
@@ -101,7 +103,7 @@ def _leaves_modes_alone(case: Case) -> None:
 def _leaves_randomness_alone(case: Case) -> None:
     case.require(
         not torch.equal(_next_draw(case, 1), _next_draw(case, 2)),
-        "calls torch.manual_seed: seeds are the loop's",
+        "calls torch.manual_seed: leave seeding to the caller",
     )
 
 

@@ -1,6 +1,6 @@
-"""Checks of the contract suite that look at a surface twice: from elsewhere, from close by, and beside.
+"""Checks that a surface is the same from other viewpoints: from the side, from afar, from close by.
 
-A surface stays where it is for every viewer. That exposes wrong depths, wrong normals and lost rays.
+They find wrong depths, wrong normals and rays that are lost.
 """
 
 from __future__ import annotations
@@ -15,28 +15,26 @@ from neilfpp_method.structures import RayBatch
 __all__ = ["GEOMETRY_CHECKS"]
 
 APART = 0.01
-"""Largest distance of the hits of two views of one place, scene units, plus twice a layer's width."""
+"""Largest distance between the hits of two views of one point, scene units, plus twice the layer's width."""
 AGREE = 0.6
-"""Least share of places that look the same from elsewhere. Others may be hidden or on a silhouette."""
+"""Smallest share of points that agree in both views. The others may be occluded or on a silhouette."""
 NEAR = 0.05
-"""Distance from which light between surfaces may see a place, scene units."""
+"""Distance from which rays between surfaces may see a point, scene units."""
 ASIDE = 0.6
 """Tangent of the angle between both views."""
 BESIDE = 0.01
-"""Distance of neighbouring rays, scene units."""
+"""Distance between neighboring rays, scene units."""
 STEEP = 8.0
-"""Neighbouring hits further apart than this many times their rays lie on two surfaces."""
+"""Neighboring hits that are further apart than this multiple of their rays' distance lie on two surfaces."""
 TILTED = 10.0
-"""Most that half of the normals may differ from what neighbouring hits say, degrees."""
+"""Largest median angle between normals and the surface through neighboring hits, degrees."""
 SPHERE = 1.5
-"""Where hits are outside the unit sphere, scene units; a little room for what an object stands on."""
+"""Largest median distance of hits from the origin, scene units; the object may stand on a ground."""
 
 
 def _in_the_sphere(case: Case) -> None:
     reach = case.hits.position.detach()[case.hit].norm(dim=-1).median().item()
-    broken = (
-        f"half of its hits lie {reach:.3g} and more from the origin: scale the scene into the unit sphere"
-    )
+    broken = f"half of its hits are {reach:.3g} or more from the origin: scale the scene into the unit sphere"
     case.require(reach < SPHERE, broken)
 
 
@@ -61,7 +59,7 @@ def _from_close_by(case: Case) -> None:
 
 
 def _normals_of_neighbours(case: Case) -> None:
-    """The cross product of the differences between hits of four rays around each ray."""
+    """Compare normals with cross products of differences between the hits of four neighboring rays."""
     d = case.rays.directions[case.hit]
     side = normalize(torch.linalg.cross(d, d.roll(1, dims=-1) + torch.tensor([0.3, 0.1, -0.2]).to(d)), dim=-1)
     up = torch.linalg.cross(d, side)
@@ -74,16 +72,17 @@ def _normals_of_neighbours(case: Case) -> None:
     near = torch.stack([across.norm(dim=-1), along.norm(dim=-1)]).amax(0) < 2 * STEEP * BESIDE
     rows = seen & near
     if rows.sum() < 8:
-        return  # too small or too rough a surface to tell
+        # The surface is too small or too rough for a decision.
+        return
     implied = normalize(torch.linalg.cross(across, along), dim=-1)[rows]
     normal = case.hits.normal.detach()[case.hit][rows]
     angle = (implied * normal).sum(-1).abs().clamp_max(1.0).acos().rad2deg().median().item()
-    broken = f"half of its normals are {angle:.0f}° and more off what neighbouring hits say"
+    broken = f"half of its normals differ by {angle:.0f}° or more from the surface through neighboring hits"
     case.require(angle < TILTED, f"{broken}: take the gradient of the field that is rendered")
 
 
 def _places(case: Case) -> tuple[Tensor, Tensor, Tensor]:
-    """Hits, their distances, and directions from which they can be seen as well."""
+    """Positions of hits, their distances, and directions from which they should be visible as well."""
     position, normal = case.hits.position.detach()[case.hit], case.hits.normal.detach()[case.hit]
     back = -case.rays.directions[case.hit]
     tangent = normalize(torch.linalg.cross(normal, back.roll(1, dims=-1)), dim=-1)
@@ -97,7 +96,7 @@ def _look_again(
     again = case.constants(RayBatch(start, -way))
     apart = (again.position - position).norm(dim=-1)
     same = (again.is_hit(HIT_SHARE) & (apart <= APART + 2 * case.width)).float().mean().item()
-    lost = f"{1 - same:.0%} of its hits are not where they were when looked at from {whence}"
+    lost = f"{1 - same:.0%} of its hits have another position when seen from {whence}"
     case.require(same >= AGREE, f"{lost}: {broken or 'is the depth a distance along the ray?'}")
 
 

@@ -17,33 +17,43 @@ from neilfpp_method.hosts.base import RegularisedHits
 from neilfpp_method.hosts.smooth_normals import smooth_normals
 from neilfpp_method.settings.types import NeilfConfig, VolumeConfig
 from neilfpp_method.shading.frame import safe_normalize
-from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayBatch, SceneLight, SurfaceHits
+from neilfpp_method.structures import (
+    LossTerm,
+    OrientedPoints,
+    PixelBatch,
+    RayBatch,
+    SceneLight,
+    Segments,
+    SurfaceHits,
+)
 from neilfpp_method.timing.ledger import doing
 from neilfpp_method.volume.compositing import Weights, composite, depth_weights, sample_weights, share_near
-from neilfpp_method.volume.density import LaplaceDensity, laplace_depth
+from neilfpp_method.volume.density import LaplaceDensity, laplace_density, laplace_depth
 from neilfpp_method.volume.distance_grid import GRID_RESOLUTION, cell_size, sample_grid, trace_grid
 from neilfpp_method.volume.empty_space import EmptySpace
 from neilfpp_method.volume.free_space import FreeSpace, cameras_within
-from neilfpp_method.volume.intersect import Interval, sphere_interval
+from neilfpp_method.volume.intersect import Interval, clip_to_sphere, sphere_interval
 from neilfpp_method.volume.samplers import error_bounded_samples
 
 __all__ = ["VolSdfHost"]
 
 POINTS_ABOUT_OBJECT = 2
-"""Points for regularisers per ray in the cube about the object, beside one in the cube about the scene: 8192
-and 4096 in the published code.
+"""Points for regularisers per ray in the cube around the object, besides one per ray in the cube around the
+scene (published code: 8192 and 4096 points).
 """
 HIT_RADIUS = 0.05
-"""Scene units: the blending weight this near to the blended hit is its concentration (METHOD §2)."""
+"""The concentration of a hit is the rendering weight within this distance of it, scene units (METHOD §2)."""
 SURFACE_WIDTH = {"scene": 10.0, "rays": 0.05}
-"""Scene units, by `loss.points`: width of the smoothed delta of L_surf. The former is the published one."""
+"""Width ε of the smoothed delta of L_surf by `loss.points`, scene units; "scene" has the published one."""
 GRID_LIFE = 100
-"""Steps in which the geometry moves before the distance grid is sampled again."""
+"""Training steps of the geometry after which the distance grid is sampled again."""
+SPARE_WEIGHT = 1e-6
+"""Weight added to the last sample in the mean depth of a ray, so that it exists for an empty ray."""
 
 
 @dataclass(frozen=True)
 class March:
-    """Samples along rays, from near to far: where they are, and what G says there."""
+    """Samples along rays from near to far, the values of G there, and the blended hits."""
 
     distances: Float[Tensor, "N M"]
     surface: SdfSample
@@ -52,7 +62,7 @@ class March:
 
 @dataclass(frozen=True)
 class Places:
-    """Where the regularisers look: ∇G for L_Eik, G for L_surf, and points for L_Hess."""
+    """Inputs of the regularisers: ∇G for L_Eik, G for L_surf, and points for L_Hess."""
 
     gradient: Float[Tensor, "A 3"]
     distance: Float[Tensor, " B"]
@@ -60,16 +70,16 @@ class Places:
 
 
 class VolSdfHost(nn.Module):
-    """G and R with the Laplace density between them.
+    """G and R, rendered as a volume with the Laplace density of G.
 
     Args:
         config: the settings.
-        radiance_scale: the largest radiance that R can reach.
-        background: "none", "constant" or "inverted_sphere" (`config.background.kind`, decided).
-        background_color: linear RGB of a constant background, and what an inverted sphere starts as.
-        points: oriented cloud on the surface, scene frame, for L_pcd.
-        radiance_start: what R starts near.
-        cameras: where cameras stand, scene frame: nothing can be close to them (`volume.free_space`).
+        radiance_scale: largest radiance of R.
+        background: "none", "constant" or "inverted_sphere", after "auto" has been resolved.
+        background_color: linear RGB of a constant background, and initial color of an inverted sphere.
+        points: oriented points on the surface, scene frame, for L_pcd.
+        radiance_start: initial radiance of R.
+        cameras: camera positions, scene frame; the space around them is empty (`volume.free_space`).
     """
 
     def __init__(
@@ -81,14 +91,18 @@ class VolSdfHost(nn.Module):
         points: OrientedPoints | None = None,
         radiance_start: float = MID_GREY,
         cameras: Float[Tensor, "V 3"] | None = None,
+        sight_lines: Segments | None = None,
     ) -> None:
         super().__init__()
         self.config = config
         self.radiance_scale = radiance_scale
         self.background_kind = background
-        # Buffers, to follow the host to its device; not stored, as the capture has them.
+        # Buffers follow the host to its device. They are not in checkpoints, as the capture has them.
         self.register_buffer("point_position", None if points is None else points.position, persistent=False)
         self.register_buffer("point_normal", None if points is None else points.normal, persistent=False)
+        empty = None if sight_lines is None else clip_to_sphere(sight_lines, config.volume.radius)
+        self.register_buffer("sight_start", empty.start if empty else None, persistent=False)
+        self.register_buffer("sight_end", empty.end if empty else None, persistent=False)
         radius = config.volume.radius
         sdf = config.host.sdf
         self.sdf_field = SdfField(sdf, config.encoding, radius)
@@ -105,28 +119,31 @@ class VolSdfHost(nn.Module):
         self.empty_space = EmptySpace(radius) if config.volume.skip_empty else None
         hard = config.inter_reflection.mode == "hard"
         resolution = GRID_RESOLUTION if hard else 0
-        # Kept in checkpoints, with its age: a resumed run must trace the very same grid.
+        # The grid and its age are in checkpoints, so that a resumed run traces the same grid.
         self.register_buffer("distance_grid", torch.zeros(resolution, resolution, resolution))
         self.grid_age: int | None = None
-        # For pictures only, so in no checkpoint: the versions of G's parameters, and their grid.
-        self._pictured: tuple[list[tuple[int, int]], EmptySpace] | None = None
+        # A grid for evaluation, with the versions of the parameters of G that it was sampled from. It is not
+        # in checkpoints.
+        self._eval_space: tuple[list[tuple[int, int]], EmptySpace] | None = None
 
     # -------------------------------------------------------------------------------------- the host contract
 
     def render(self, rays: RayBatch) -> SurfaceHits:
-        """Colour, position and normal of each ray, blended with the rendering weights (METHOD §3).
+        """Color, position and normal of each ray, blended with the rendering weights (METHOD §3).
 
-        In evaluation without gradients, with `volume.skip_empty`, only the parts of rays are looked at that
-        may show something, on a grid of the field as it is.
+        With `volume.skip_empty`, evaluation without gradients samples only the parts of rays that may be
+        visible, according to a grid of the current field.
         """
-        # Without a background R paints the scene sphere, so no ray shows nothing.
-        whole = self.empty_space is None or self.background_kind == "none"
-        if self.training or torch.is_grad_enabled() or whole:
+        # Without a background the scene sphere has the radiance R, so no ray can be skipped.
+        cannot_skip = self.empty_space is None or self.background_kind == "none"
+        if self.training or torch.is_grad_enabled() or cannot_skip:
             return self._march(rays).hits
-        return self._still(rays)
+        return self._render_visible_parts(rays)
 
     def render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
-        """As `render`, with those of eikonal, hessian, surface, point_cloud and mask that `names` holds."""
+        """As `render`, with those of the losses eikonal, hessian, surface, point_cloud and mask in
+        `names`.
+        """
         march = self._march(batch.rays)
         if march.surface.distance.requires_grad:
             if self.grid_age is not None:
@@ -152,42 +169,40 @@ class VolSdfHost(nn.Module):
 
     @torch.no_grad()
     def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
-        """What arrives at surface points from the scene: rays are traced on a grid of the SDF and read R.
+        """Light from the scene's surfaces at surface points: R where rays through a grid of the SDF hit.
 
-        A ray starts one cell of the grid above the surface, along the normal. The grid is sampled when first
-        asked for, and again after `GRID_LIFE` steps in which the geometry moved.
+        A ray starts one cell of the grid above the surface, along the normal. The grid is sampled at first
+        use, and again after `GRID_LIFE` training steps of the geometry.
         """
         radius = self.config.volume.radius
         grid = self._grid()
         normal = safe_normalize(self.sdf_field.with_gradient(x).gradient)
         origins = (x + cell_size(grid, radius) * normal)[:, None].expand_as(wi).reshape(-1, 3)
         directions = wi.reshape(-1, 3)
-        found = trace_grid(grid, radius, origins, directions)
-        rows = torch.nonzero(found.hit)[:, 0]
-        points = origins[rows] + found.distance[rows, None] * directions[rows]
+        traced = trace_grid(grid, radius, origins, directions)
+        rows = torch.nonzero(traced.hit)[:, 0]
+        points = origins[rows] + traced.distance[rows, None] * directions[rows]
         surface = self.sdf_field.with_gradient(points)
         radiance = torch.zeros_like(directions)
         radiance[rows] = self.radiance_field(
             points, -directions[rows], safe_normalize(surface.gradient), surface.feature
         )
-        distance = torch.where(found.hit, found.distance, torch.inf)
-        return SceneLight(found.hit.view(wi.shape[:2]), radiance.view(wi.shape), distance.view(wi.shape[:2]))
+        distance = torch.where(traced.hit, traced.distance, torch.inf)
+        return SceneLight(traced.hit.view(wi.shape[:2]), radiance.view(wi.shape), distance.view(wi.shape[:2]))
 
     @torch.no_grad()
     def smooth_normals(
         self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
-        """The normals of `volume.normal_radius` about hits, edges kept; at 0, those of the hits."""
+        """Normals smoothed within `volume.normal_radius` of hits; the hit normals if it is 0."""
         radius = self.config.volume.normal_radius
-        return (
-            smooth_normals(lambda x: self._surface(x).gradient, position, normal, radius)
-            if radius > 0
-            else normal
-        )
+        if radius == 0:
+            return normal
+        return smooth_normals(lambda x: self._surface(x).gradient, position, normal, radius)
 
     @torch.no_grad()
     def may_meet(self, rays: RayBatch) -> Bool[Tensor, " N"]:
-        """Which rays that leave a surface may meet one, by the grid of empty space; all without one."""
+        """Which rays that start at a surface may hit one, by the grid of empty space; all without a grid."""
         if self.empty_space is None:
             return torch.ones(len(rays), dtype=torch.bool, device=rays.origins.device)
         interval = sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
@@ -198,7 +213,7 @@ class VolSdfHost(nn.Module):
         return {"grid_age": self.grid_age}
 
     def set_extra_state(self, state: dict[str, int | None]) -> None:
-        """The inverse of `get_extra_state`."""
+        """Restore what `get_extra_state` returned."""
         self.grid_age = state["grid_age"]
 
     # ----------------------------------------------------------------------------------------------- geometry
@@ -215,11 +230,9 @@ class VolSdfHost(nn.Module):
     def sdf(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
         """Signed distance of the scene's surface: G, with free space cut out of it."""
         distance = self.sdf_field(x)
-        return (
-            distance
-            if self.free_space is None
-            else torch.maximum(distance, self.free_space(x).depth.to(distance.dtype))
-        )
+        if self.free_space is None:
+            return distance
+        return torch.maximum(distance, self.free_space(x).depth.to(distance.dtype))
 
     def _surface(self, x: Float[Tensor, "P 3"]) -> SdfSample:
         """As `sdf`, with its gradient and the feature for R."""
@@ -236,20 +249,20 @@ class VolSdfHost(nn.Module):
 
     # ---------------------------------------------------------------------------------------------- rendering
 
-    def _still(self, rays: RayBatch) -> SurfaceHits:
-        """Rays through a field that stands still: those that pass everything by cost a few look-ups."""
+    def _render_visible_parts(self, rays: RayBatch) -> SurfaceHits:
+        """Render a field that is not being trained; rays that miss the scene cost only grid look-ups."""
         versions = [(id(p), p._version) for p in self.sdf_field.parameters()]
-        if self._pictured is None or self._pictured[0] != versions:
-            self._pictured = versions, EmptySpace(self.config.volume.radius).to(rays.origins)
+        if self._eval_space is None or self._eval_space[0] != versions:
+            self._eval_space = versions, EmptySpace(self.config.volume.radius).to(rays.origins)
         interval = sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
-        span = self._pictured[1].may_show(self.sdf, rays, interval, self.surface_width())
-        nothing = torch.zeros_like(interval.far)
+        span = self._eval_space[1].may_show(self.sdf, rays, interval, self.surface_width())
+        zeros = torch.zeros_like(interval.far)
         missed = SurfaceHits(
-            color=self._beyond(rays, torch.ones_like(nothing), at_far=torch.zeros_like(rays.origins)),
+            color=self._beyond(rays, torch.ones_like(zeros), at_far=torch.zeros_like(rays.origins)),
             position=rays.origins + interval.far[:, None] * rays.directions,
             normal=torch.zeros_like(rays.origins),
-            opacity=nothing,
-            concentration=nothing,
+            opacity=zeros,
+            concentration=zeros,
         )
         rows = torch.nonzero(span.some)[:, 0]
         if not len(rows):
@@ -262,12 +275,12 @@ class VolSdfHost(nn.Module):
         )
 
     def _march(self, rays: RayBatch, part: Interval | None = None) -> March:
-        """Samples of rays; `part`: the part of each that is looked at, where that is known."""
+        """Sample and blend rays; `part` is the part of each ray to sample, if it is known."""
         interval = part or sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
         volume, narrowed = self.config.volume, part is not None
         if self.empty_space is not None and self.training:
             narrow = self.empty_space.narrow(self.sdf, rays, interval, self.surface_width())
-            # Without a background R paints the scene sphere: rays go on to it.
+            # Without a background the scene sphere has the radiance R: rays are sampled up to it.
             interval = Interval(narrow.near, interval.far) if self.background_kind == "none" else narrow
             narrowed = True
         if narrowed:
@@ -286,10 +299,10 @@ class VolSdfHost(nn.Module):
         near, far = interval.near, interval.far
         with torch.no_grad():
             beta = self.density.beta()
-            found = error_bounded_samples(
+            samples = error_bounded_samples(
                 self.sdf, rays.origins, rays.directions, near, far, beta, volume, self.training
             )
-        return found.distances
+        return samples.distances
 
     def _blend(
         self,
@@ -300,9 +313,9 @@ class VolSdfHost(nn.Module):
         radiance: Float[Tensor, "N M 3"],
     ) -> SurfaceHits:
         weights, opacity = sample_weights(intervals.weights), intervals.opacity
-        # A ray without weight ends at its last sample: a position that is finite and far from every surface.
-        spare = 1e-6
-        depth = ((weights * distances).sum(-1) + spare * distances[:, -1]) / (opacity + spare)
+        # The position of a ray without weight is its last sample: finite, and far from every surface.
+        depth = (weights * distances).sum(-1) + SPARE_WEIGHT * distances[:, -1]
+        depth = depth / (opacity + SPARE_WEIGHT)
         return SurfaceHits(
             color=composite(weights, radiance) + self._beyond(rays, intervals.transmittance, radiance[:, -1]),
             position=rays.origins + depth[:, None] * rays.directions,
@@ -314,10 +327,10 @@ class VolSdfHost(nn.Module):
     def _beyond(
         self, rays: RayBatch, transmittance: Float[Tensor, " N"], at_far: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
-        """What arrives from the scene sphere: from the background, or without one from R on the sphere.
+        """Radiance from beyond the samples: that of the background, or without one R on the scene sphere.
 
-        The published code makes the sphere a surface of the distance field that nothing passes; a ray that
-        reaches it shows R there, `at_far`. It is no surface of the object: opacity and hit leave it out.
+        In the published code the sphere is an opaque surface of the distance field, so a ray that reaches it
+        has the radiance R there (`at_far`). It is not a surface of the object: opacity and hits exclude it.
         """
         if self.background_kind == "none":
             return transmittance[:, None] * at_far
@@ -343,6 +356,8 @@ class VolSdfHost(nn.Module):
             terms["point_cloud"] = losses.point_cloud(
                 sample.distance, sample.gradient, self.point_normal[rows]
             )
+        if "free_space" in names and self.sight_start is not None:
+            terms["free_space"] = losses.free_space(self._depth_of_sight_lines(len(batch)))
         if "mask" in names:
             terms["mask"] = losses.mask(
                 march.hits.opacity, self._depth_of_object(march), batch.mask, batch.mask_known
@@ -350,12 +365,20 @@ class VolSdfHost(nn.Module):
         return terms
 
     def _depth_of_object(self, march: March) -> Float[Tensor, " N"]:
-        """The optical depth of rays. A mask moves surfaces, it makes no fog of them: β is given."""
+        """Optical depth of rays, with β detached: the mask loss must move surfaces, not widen them."""
         distance = march.surface.distance.view_as(march.distances)
         return laplace_depth(distance, march.distances, self.density.beta().detach()).sum(-1)
 
+    def _depth_of_sight_lines(self, count: int) -> Float[Tensor, " count"]:
+        """Optical depth of random lines of sight, estimated at one random point of each; β is detached."""
+        rows = torch.randint(len(self.sight_start), (count,), device=self.sight_start.device)
+        start, end = self.sight_start[rows], self.sight_end[rows]
+        point = torch.lerp(start, end, torch.rand(count, 1, device=start.device))
+        density = laplace_density(self.sdf(point), self.density.beta().detach())
+        return density * (end - start).norm(dim=-1)
+
     def _places(self, march: March) -> Places:
-        """Where the regularisers of G look (`loss.points`)."""
+        """Points of the regularisers of G (`loss.points`)."""
         position = march.hits.position.detach()
         if self.config.loss.points == "rays":
             near_surface = position + HIT_RADIUS * torch.randn_like(position)

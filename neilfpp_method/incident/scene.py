@@ -20,9 +20,7 @@ height h still crosses the optical depth exp(−h/β) / (2 cos θ): at 4 β that
 """
 
 MIN_COSINE = 0.1
-"""Lower bound on cos θ in the displacement of the start: directions within 6° of the surface use that of
-6°.
-"""
+"""Lower bound on cos θ in the displacement of the start; it acts within 6° of the surface."""
 
 RAYS_AT_ONCE = 2048
 """Number of rays per batch for a host without cheap tracing; limits memory."""

@@ -1,4 +1,4 @@
-"""What is wrong with a capture: figures held against limits, findings with remedies, a verdict."""
+"""Findings about a capture: figures that exceed limits, with remedies, and a verdict."""
 
 from __future__ import annotations
 
@@ -28,43 +28,44 @@ Severity = Literal["problem", "warning"]
 Quality = Literal["good", "limited", "poor"]
 
 JUMP = 1.5
-"""Brightness of a view over that of its neighbours, or its inverse, that counts as a jump."""
+"""Smallest ratio of the brightness of a view to that of its neighbours, or its inverse, that is reported."""
 BLURRED = 0.4
-"""Sharpness over the usual one, below which a view is blurred."""
+"""Ratio of the sharpness of a view to that of the others, below which it is blurred."""
 CLIPPED_VIEW, CLIPPED_A_BIT, CLIPPED_MUCH = 0.01, 0.001, 0.02
-"""Clipped share of a view, and of all views, that is worth a note or a warning."""
+"""Shares of clipped pixels that are reported: of a view; of all views, as a note; of all views, as a
+warning."""
 INVALID_VIEW = 0.5
-"""Share of invalid pixels from which a view is reported."""
+"""Share of invalid pixels above which a view is reported."""
 MIN_COUNT, ADVISED_COUNT = 3, 16
 """Fewer views than the first are a problem, fewer than the second a warning."""
 SPARSE_GAP = 25.0
 """Median angle to the nearest view, degrees, above which views are sparse."""
 MIN_COVERAGE = 0.25
-"""Share of the directions around the object that views should cover."""
+"""Smallest share of the directions around the object that the views should cover."""
 EDGE, STRAY_POINTS, SMALL_CLOUD = 1.05, 0.1, 0.2
-"""Scene units beyond which a point is outside the box; share of points outside that is
-reported; extent below which an object is small.
-"""
+"""Distance from the centre beyond which a point is outside the box, in scene units; share of such points that
+is reported; extent below which the object is small for its box, in scene units."""
 DISPLAY_LEVELS = 256
-"""Levels of 8 bits: radiance of no more levels was not recorded as such."""
+"""Number of levels of 8-bit images: linear radiance with so few levels was converted from them."""
 PIXELS_PER_LEVEL = 16
-"""Pixels needed per level for their number to mean anything."""
+"""Smallest number of pixels per level with which the number of levels is meaningful."""
 BETTER_WITHOUT: Mapping[str, str] = {
     "black": "black",
     "blurred": "blurred",
     "duplicate": "the same picture as another",
 }
-"""Findings whose views a capture is better without, and why, in a word or two."""
+"""Findings whose views `--auto` leaves out, with the reason in a few words."""
 MAX_NAMED = 6
-"""Views that a finding names; more are counted."""
+"""Largest number of views that a finding names; the others are counted."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that is wrong, and what to do about it.
+    """A defect of a capture, and its remedy.
 
-    A problem spoils or prevents a result, a warning worsens it. `views` are the names of the views concerned;
-    none: it is about the whole capture. `kind` is a short name that does not change between versions.
+    A problem spoils or prevents a result, a warning degrades it. `views` has the names of the affected views;
+    it is empty if the whole capture is affected. `kind` is a short name that does not change between
+    versions.
     """
 
     kind: str

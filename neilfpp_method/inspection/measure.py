@@ -1,4 +1,4 @@
-"""Figures of one view, from its image alone. They judge nothing."""
+"""Figures of one view from its image: brightness, sharpness, clipping. `findings` judges them."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from neilfpp_method.shading.color import linear_to_srgb, luminance, srgb_to_line
 __all__ = ["ViewFigures", "measure"]
 
 THUMBNAIL_SIDE = 160
-"""Longest side, pixels, of the picture that is kept of a view."""
+"""Longest side of the thumbnail of a view, in pixels."""
 SHARPNESS_SIDE = 1600
-"""Longest side, pixels, at which sharpness is measured: demosaicing blurs finer detail."""
+"""Longest side at which sharpness is measured, in pixels; finer detail is blurred by demosaicing."""
 MIDDLE_GREY = 0.18
 BORDER_SHARE = 0.5
 DARK = 1e-3
 FULL = 254.5 / 255
 PLATEAU_WIDTH = 1e-4
 MIN_CLIPPED = 16
-"""Pixels at the very maximum of an image that cannot be a coincidence."""
+"""Smallest number of pixels at the maximum of an image that counts as clipping."""
 LEVEL_SAMPLES = 200_000
-"""Pixels of which the levels are counted."""
+"""Number of pixels from which the distinct levels are counted."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class ViewFigures:
     """Figures of an image. Shares are of the object's pixels, by mask, alpha or an even background.
 
     Attributes:
-        name: the view's.
-        unreadable: why the pixels cannot be read, else empty; nothing else is known then.
+        name: name of the view.
+        unreadable: why the pixels cannot be read, and then all other figures are 0; else empty.
         luminance: the geometric mean of the linear luminance of the object, on the scale that all views
-            share; 0 for a black image. A median jumps where the image is half sky and half ground; the mean
-            of stops moves as the exposure does.
+            share; 0 for a black image. Unlike the median, it does not jump in an image that is half sky and
+            half ground.
         stops: between the 1st and the 99.9th percentile of that luminance, in powers of two.
         sharpness: variance of the Laplacian over the variance of the picture, at one brightness for all
             views.

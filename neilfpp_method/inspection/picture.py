@@ -16,9 +16,9 @@ PAPER, INK, PALE_INK = (250, 250, 248), (28, 30, 34), (150, 154, 160)
 PROBLEM, WARNING, FINE = (200, 40, 40), (225, 150, 20), (70, 130, 180)
 CELL, LABEL, GAP, MARGIN = 160, 40, 12, 32
 COLUMNS = 7
-"""Views in a row."""
+"""Number of views in a row."""
 PLAN = 420
-"""Side of a plan of the cameras, pixels."""
+"""Side of each plan of the cameras, in pixels."""
 MAX_DRAWN = 210
 """Largest number of views in the picture."""
 KEY = 0.25

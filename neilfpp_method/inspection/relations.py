@@ -16,14 +16,14 @@ from neilfpp_method.data.views import project
 __all__ = ["Stand", "duplicates", "exposure_factors", "stand"]
 
 NEIGHBOURS = 6
-"""Views nearest in pose that a view is compared with."""
+"""Number of views, nearest in pose, with which a view is compared."""
 THUMBNAIL = (32, 32)
 SAME = 0.02
-"""Root mean square difference of standardised thumbnails below which two views are one picture."""
+"""Root mean square difference of standardised thumbnails below which two views are duplicates."""
 SEEN_ANGLE = 30.0
-"""Degrees around a view within which directions count as covered."""
+"""Largest angle between a covered direction and the nearest view, in degrees."""
 SPHERE = 1000
-"""Directions that the sphere is sampled by."""
+"""Number of directions by which the sphere is sampled."""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
-"""What has kernels of its own: hash-grid encoding, rays through a distance grid, softplus units.
+"""Kernels for hash-grid encoding, sphere tracing in a distance grid, and softplus units.
 
-Every backend of the encoding computes what `reference.encode` computes, which the tests hold it to.
-`GridSpec.backend` names one; "auto" takes the compiled loops on a CPU, Triton's kernels on a GPU, and the
-reference anywhere else.
+Every backend of the encoding computes the same as `reference.encode`, which the tests check. The backend is
+chosen by `GridSpec.backend`; "auto" selects the compiled loops on a CPU, the Triton kernels on a GPU, and the
+reference on other devices.
 """
 
 from __future__ import annotations
@@ -24,27 +24,26 @@ from neilfpp_method.kernels.grid import Encoded, GridSpec, grid_spec
 __all__ = ["Encoded", "GridSpec", "encode", "grid_spec", "ray_tracer"]
 
 FASTEST: Mapping[str, str] = {"cpu": "cpu", "cuda": "triton"}
-"""The backend of each kind of device; the reference runs on those that are not named."""
+"""The fastest backend of each kind of device; on others it is the reference."""
 
 
 def encode(x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpec, jacobian: bool) -> Encoded:
-    """Features of a multiresolution grid at points of the unit cube, by the backend that `spec` names.
+    """Encode points of the unit cube by a multiresolution grid, with the backend that `spec` names.
 
     Args:
-        x01: points; outside [0, 1]³ the nearest point of the cube counts, and the derivative across its face
-            is 0.
-        table: `spec.entries` rows of `spec.features`.
+        x01: points; those outside of [0, 1]³ are clamped to it, and the derivative across its faces is 0.
+        table: `spec.entries` rows of `spec.features` numbers.
         spec: the layout of the table.
         jacobian: whether to return d features / d x01 as well.
 
     Returns:
         `spec.width` features per point, in the dtype of the table. Features and Jacobian can be
-        differentiated with respect to the table and the points, any number of times: the reference does what
-        goes beyond the first order, and types other than float32 and float64. The memory order of what is
-        returned is the backend's own.
+        differentiated any number of times with respect to the table and the points. Orders beyond the first,
+        and types other than float32 and float64, are computed by the reference. The memory order of the
+        result depends on the backend.
 
     Raises:
-        UserError: the backend that `spec` names does not run here.
+        UserError: if the backend that `spec` names does not run on this device.
     """
     kernels = _kernels(spec.backend, x01.device.type)
     if kernels is None or not fits(x01, table):
@@ -52,10 +51,11 @@ def encode(x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpe
     return encode_with(kernels, x01, table, spec, jacobian)
 
 
+# `torch.compile` must not trace the imports.
 @lru_cache(maxsize=8)
-@torch.compiler.disable  # nor into what imports them
+@torch.compiler.disable
 def _kernels(backend: str, device: str) -> Kernels | None:
-    """The kernels of a backend, loaded when first asked for; none: the reference."""
+    """The kernels of a backend, loaded at their first use; None for the reference."""
     name = FASTEST.get(device, "reference") if backend == "auto" else backend
     if name == "reference":
         return None
@@ -66,7 +66,7 @@ def _kernels(backend: str, device: str) -> Kernels | None:
             raise UserError(
                 f"hash-grid backend '{name}': {error}", "install what is missing, or set it to auto"
             ) from error
-        warnings.warn(f"hash grids take the slow reference: {error}", RuntimeWarning, stacklevel=3)
+        warnings.warn(f"hash grids use the slow reference backend: {error}", RuntimeWarning, stacklevel=3)
         return None
     if device not in module.KERNELS.devices:
         raise UserError(
@@ -79,11 +79,11 @@ def _kernels(backend: str, device: str) -> Kernels | None:
 @lru_cache(maxsize=8)
 @torch.compiler.disable
 def ray_tracer(device: str) -> Callable[..., None] | None:
-    """`tracing.sphere_trace`, where it runs on a device of this kind."""
+    """`tracing.sphere_trace` if it runs on this kind of device, otherwise None."""
     if device != "cpu":
         return None
     try:
         return importlib.import_module("neilfpp_method.kernels.tracing").sphere_trace
     except ImportError as error:
-        warnings.warn(f"rays are traced by the slow reference: {error}", RuntimeWarning, stacklevel=3)
+        warnings.warn(f"rays are traced by the slow reference code: {error}", RuntimeWarning, stacklevel=3)
         return None

@@ -1,7 +1,7 @@
 """Hash-grid encoding on the CPU by compiled loops.
 
-Points are shared out between threads; for the gradient of the table, levels are, whose rows are not shared:
-reruns agree to the last bit, whatever the number of threads.
+The points are divided among threads. For the gradient of the table the levels are divided instead, because
+they share no rows; so the result is bitwise the same for any number of threads.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from neilfpp_method.kernels.threads import for_each, shares
 
 __all__ = ["KERNELS"]
 
-MIN_PAIRS_PER_THREAD = 16_384  # points times levels that are worth waking a thread for
+MIN_PAIRS_PER_THREAD = 16_384
+"""Minimum work of a thread, in points times levels; with less, starting it costs more than it saves."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """A grid as the compiled loops read it: L levels, E = L + 1."""
+    """The layout of a grid with L levels as arrays for the compiled loops; E = L + 1."""
 
     offsets: Int[np.ndarray, " E"]
     cells: Int[np.ndarray, " L"]
@@ -96,11 +97,10 @@ def _arrays(*tensors: Tensor) -> tuple[np.ndarray, ...]:
 
 
 def _gradients(gradients: OutputGradients) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Both gradients, and whether there is one of the Jacobian; an empty one stands for none."""
+    """Both gradients as arrays, and whether that of the Jacobian exists; if not, its array is empty."""
     features, jacobian = gradients.features, gradients.jacobian
-    return *_arrays(
-        features, features.new_empty(0, 0, 3) if jacobian is None else jacobian
-    ), jacobian is not None
+    exists = jacobian is not None
+    return *_arrays(features, jacobian if exists else features.new_empty(0, 0, 3)), exists
 
 
 KERNELS = Kernels(("cpu",), forward, table_gradient, point_gradient)

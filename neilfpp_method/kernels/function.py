@@ -1,4 +1,4 @@
-"""Where kernels meet autograd: first order by the backend, every higher order by the reference."""
+"""Connect kernels to autograd: the backend computes the first order, the reference all higher orders."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["Kernels", "OutputGradients", "encode_with", "fits"]
 
 @dataclass(frozen=True)
 class OutputGradients:
-    """The gradient of a loss with respect to what an encoding returned, in any memory order."""
+    """The gradients of a loss with respect to features and Jacobian of an encoding, in any memory order."""
 
     features: Float[Tensor, "N F"]
     jacobian: Float[Tensor, "N F 3"] | None
@@ -26,13 +26,13 @@ class OutputGradients:
 
 @dataclass(frozen=True)
 class Kernels:
-    """What a backend computes; nothing in it knows of autograd.
+    """The functions of a backend, which are independent of autograd.
 
-    Points and table are contiguous; all is of one float type, on one device.
+    Points and table are contiguous. All tensors have the same float type and are on the same device.
     """
 
     devices: tuple[str, ...]
-    """Where they run."""
+    """The kinds of devices on which they run."""
     forward: Callable[[Tensor, Tensor, GridSpec, bool], Encoded]
     """Points, table → features and, on demand, the Jacobian."""
     table_gradient: Callable[[Tensor, GridSpec, OutputGradients], Tensor]
@@ -42,18 +42,19 @@ class Kernels:
 
 
 def fits(x01: Tensor, table: Tensor) -> bool:
-    """Whether kernels take these types: one for both, and of full precision. The reference takes any."""
+    """Whether kernels support these types: both float32, or both float64. The reference supports any."""
     return x01.dtype == table.dtype and table.dtype in (torch.float32, torch.float64)
 
 
-@torch.compiler.disable  # a compiler cannot look into kernels, and need not
+# `torch.compile` cannot trace the kernels.
+@torch.compiler.disable
 def encode_with(
     kernels: Kernels, x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpec, jacobian: bool
 ) -> Encoded:
     """See `neilfpp_method.kernels.encode`.
 
     Raises:
-        ValueError: the table is not the one that `spec` lays out; kernels do not look where they read.
+        ValueError: if the table does not have the shape that `spec` requires; kernels do not check bounds.
     """
     if table.shape != (spec.entries, spec.features) or x01.device != table.device:
         raise ValueError(
@@ -78,7 +79,8 @@ class _Encode(torch.autograd.Function):
     ) -> tuple[Tensor | None, Tensor | None, None, None, None]:
         x01, table = ctx.saved_tensors
         to_points, to_table = ctx.needs_input_grad[:2]
-        if torch.is_grad_enabled():  # somebody differentiates the gradient
+        # Gradients are enabled if the gradient itself will be differentiated.
+        if torch.is_grad_enabled():
             return *_through_reference(ctx, x01, table, features, jacobian), None, None, None
         gradients = OutputGradients(features, jacobian)
         points, rows = x01.contiguous(), table.contiguous()

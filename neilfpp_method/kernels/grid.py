@@ -1,7 +1,7 @@
-"""The layout of a multiresolution grid in memory, and what its encoding returns.
+"""The memory layout of a multiresolution grid, and the result of its encoding.
 
-A level of resolution r has (r + 1)³ vertices. Where they fit into the table of a level they are stored one
-after the other, x fastest; where they do not, vertices share entries by the spatial hash of Müller et al.
+A level of resolution r has (r + 1)³ vertices. If they fit into the table of the level, they are stored one
+after the other, with x varying fastest. Otherwise vertices share entries by the spatial hash of Müller et al.
 (2022, eq. 4).
 """
 
@@ -19,19 +19,19 @@ from neilfpp_method.errors import UserError
 __all__ = ["Encoded", "GridSpec", "grid_spec"]
 
 BASE_RESOLUTION = 16
-"""Cells along an edge at the coarsest level, and"""
+"""Cells along an edge at the coarsest level, as in Müller et al. (2022)."""
 FEATURES = 2
-"""numbers per vertex, as Müller et al. (2022) have them."""
+"""Features per vertex, as in Müller et al. (2022)."""
 
 
 @dataclass(frozen=True)
 class GridSpec:
-    """Levels, coarse to fine, of a grid over the unit cube, all one after the other in one table."""
+    """The layout of a grid over the unit cube. Its levels, coarse to fine, are stored in a single table."""
 
     resolutions: tuple[int, ...]
     """Cells along an edge, per level."""
     entries_per_level: tuple[int, ...]
-    """Table rows, per level: every vertex of a dense level, a power of two for a hashed one."""
+    """Table rows per level: one per vertex of a dense level, a power of two for a hashed one."""
     features: int
     """Length of a table row."""
     backend: str = "auto"
@@ -39,12 +39,12 @@ class GridSpec:
 
     @cached_property
     def offsets(self) -> tuple[int, ...]:
-        """First table row of each level, and the number of rows at the end."""
+        """First table row of each level, followed by the number of all rows."""
         return tuple(accumulate(self.entries_per_level, initial=0))
 
     @property
     def entries(self) -> int:
-        """Rows of the whole table."""
+        """Number of rows of the table."""
         return self.offsets[-1]
 
     @property
@@ -59,7 +59,7 @@ class GridSpec:
 
 @dataclass(frozen=True)
 class Encoded:
-    """Features at N points and, where asked for, their derivative with respect to the point."""
+    """Features at N points, and their derivative with respect to the point; None if not requested."""
 
     features: Float[Tensor, "N F"]
     jacobian: Float[Tensor, "N F 3"] | None
@@ -73,18 +73,18 @@ def grid_spec(
     features: int = FEATURES,
     backend: str = "auto",
 ) -> GridSpec:
-    """A layout whose resolutions grow geometrically from base to max.
+    """Make a layout whose resolutions grow geometrically from coarse to fine.
 
     Args:
-        levels: number of grids.
-        log2_entries: table size of one level, as a power of two.
+        levels: number of levels.
+        log2_entries: maximum number of table rows of a level, as a power of two.
         max_resolution: cells along an edge at the finest level.
-        base_resolution: the same at the coarsest.
-        features: numbers per vertex.
-        backend: who computes it: `GridSpec.backend`.
+        base_resolution: cells along an edge at the coarsest level.
+        features: features per vertex.
+        backend: see `GridSpec.backend`.
 
     Raises:
-        UserError: this describes no grid.
+        UserError: if no grid has these numbers.
     """
     if (
         levels < 1

@@ -1,6 +1,6 @@
-"""How a process computes: without denormal numbers, and with memory that it keeps.
+"""Process-wide settings for fast computation: flush denormal numbers to 0, and keep freed memory.
 
-Both are process-wide, so commands set them and a library does not. docs/performance.md: the gain.
+They affect the whole process, so only commands set them, not the library. docs/performance.md has the gain.
 """
 
 from __future__ import annotations
@@ -13,20 +13,23 @@ import torch
 
 __all__ = ["computing_fast"]
 
-# Options of glibc's allocator (malloc.h), and its own values in a process with large arrays.
 TRIM_THRESHOLD, MMAP_THRESHOLD, MMAP_MAX = -1, -3, -4
+"""Numbers of the options of glibc's allocator (malloc.h)."""
 OWN_TRIM, OWN_MMAP, OWN_MAPS = 64 << 20, 32 << 20, 65_536
+"""Values that glibc itself chooses for these options in a process with large arrays."""
 NEVER = 2**31 - 1
+"""Trim threshold at which memory is never returned to the system."""
 
 
 @contextmanager
 def computing_fast() -> Iterator[None]:
-    """Settings for long computations on a CPU; afterwards the process is as it started.
+    """Apply settings for long computations on a CPU, and restore the default ones afterwards.
 
-    Denormal numbers, below 1.2e-38 in float32, count as 0. A steep softplus brings them by the million, and
-    arithmetic on them takes some ten times as long; threads that start meanwhile inherit this. Memory that is
-    freed stays with the process: glibc hands large arrays back, and gets the next one page by page, which
-    takes longer than an elementwise pass over it. Where there is no glibc the second is left undone.
+    Denormal numbers, below 1.2e-38 in float32, are flushed to 0. A steep softplus produces millions of them,
+    and arithmetic on them takes about ten times as long. Threads that are started in the context inherit
+    this setting. Freed memory stays with the process: by default glibc returns large arrays to the system and
+    gets the next one page by page, which takes longer than an elementwise pass over it. Without glibc the
+    second setting is not made.
     """
     _set(fast=True)
     try:

@@ -1,12 +1,12 @@
 """Hash-grid encoding in plain torch: any device, any float dtype, any order of differentiation.
 
-Per level: eight table rows around the point, interpolated trilinearly along z, then y, then x. The Jacobian
-comes from the same rows, with the difference of two neighbours in place of their interpolation along one
-axis. Points are the last axis of every intermediate, so each operation runs over contiguous memory; one level
-at a time keeps them in cache.
+For each level, the eight table rows around a point are interpolated trilinearly along z, then y, then x. The
+Jacobian is computed from the same rows, with the difference of two neighbours instead of their interpolation
+along one axis. The points are the last axis of every intermediate tensor, so that each operation runs over
+contiguous memory; processing one level at a time keeps the tensors in the cache.
 
 Table rows are gathered and scattered by a pair of functions that are each other's derivative. The scatter
-runs the features in parallel but the points in order: on a CPU, reruns agree to the last bit.
+processes the features in parallel but the points in order, so that results on a CPU are bitwise reproducible.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ from neilfpp_method.kernels.grid import Encoded, GridSpec
 
 __all__ = ["encode"]
 
-PRIMES = (1, 2654435761 - 2**32, 805459861)  # of the spatial hash; the second is the int32 with the same bits
+PRIMES = (1, 2654435761 - 2**32, 805459861)
+"""Factors of the spatial hash. The second one is the int32 with the same bits as the published uint32."""
 
 
 def encode(x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpec, jacobian: bool) -> Encoded:
     """See `neilfpp_method.kernels.encode`."""
-    # Below float32 a coordinate could not tell the cells of a fine level apart.
+    # With less precision than float32, a coordinate could not distinguish the cells of a fine level.
     x01 = x01.to(torch.promote_types(x01.dtype, torch.float32))
     points = x01.t().clamp(0, 1).contiguous()
     inside = ((x01 >= 0) & (x01 <= 1)).t().to(table.dtype)
@@ -77,7 +78,7 @@ def _value_and_slopes(
 
 
 class _Gather(torch.autograd.Function):
-    """Table rows by number, features first."""
+    """Gather table rows by index; the features become the first axis."""
 
     @staticmethod
     def forward(
@@ -94,7 +95,7 @@ class _Gather(torch.autograd.Function):
 
 
 class _Scatter(torch.autograd.Function):
-    """The transpose of `_Gather`: values are added to their rows."""
+    """The transpose of `_Gather`: add values to their table rows."""
 
     @staticmethod
     def forward(

@@ -1,4 +1,4 @@
-"""Softplus units and their slope: compiled loops on a CPU, where torch makes ten passes over memory."""
+"""Softplus and its derivative by compiled loops on a CPU, where torch makes ten passes over memory."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from neilfpp_method.kernels.threads import for_each, shares
 __all__ = ["UnitSample", "softplus", "softplus_and_slope"]
 
 MIN_VALUES_PER_THREAD = 65_536
-"""Numbers that are worth waking a thread for."""
+"""Minimum work of a thread, in numbers; below it, starting the thread costs more than it saves."""
 
 
 @dataclass(frozen=True)
 class UnitSample:
-    """What hidden units make of z, and the derivative with respect to z."""
+    """The values of hidden units at z, and their derivatives with respect to z."""
 
     value: Float[Tensor, "*S"]
     slope: Float[Tensor, "*S"]
@@ -43,13 +43,14 @@ def softplus(z: Float[Tensor, "*S"], sharpness: float) -> Float[Tensor, "*S"]:
 
 
 def softplus_and_slope(z: Float[Tensor, "*S"], sharpness: float) -> UnitSample:
-    """Value and slope; both can be differentiated any number of times."""
+    """Softplus and its derivative; both can be differentiated any number of times."""
     if not _takes(z):
         return UnitSample(functional.softplus(z, beta=sharpness), torch.sigmoid(sharpness * z))
     return _differentiable(z, sharpness)
 
 
-@torch.compiler.disable  # a compiler cannot look into the loops, and need not
+# `torch.compile` cannot trace the loops.
+@torch.compiler.disable
 def _differentiable(z: Float[Tensor, "*S"], sharpness: float) -> UnitSample:
     return UnitSample(*_Softplus.apply(z, sharpness))
 
@@ -66,7 +67,8 @@ class _Softplus(torch.autograd.Function):
     @staticmethod
     def backward(ctx: FunctionCtx, to_value: Tensor, to_slope: Tensor) -> tuple[Tensor, None]:
         (slope,) = ctx.saved_tensors
-        if torch.is_grad_enabled():  # somebody differentiates the gradient
+        # Gradients are enabled if the gradient itself will be differentiated.
+        if torch.is_grad_enabled():
             return slope * (to_value + to_slope * ctx.sharpness * (1.0 - slope)), None
         gradient = torch.empty_like(slope)
         _run("pull_through_softplus", ctx.sharpness, slope, to_value, to_slope, gradient)
@@ -74,7 +76,7 @@ class _Softplus(torch.autograd.Function):
 
 
 def _takes(z: Tensor) -> bool:
-    """Whether the loops take these numbers; torch takes any."""
+    """Whether the loops support this tensor; torch supports any."""
     return z.device.type == "cpu" and z.dtype == torch.float32 and _loops() is not None
 
 

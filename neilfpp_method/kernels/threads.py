@@ -1,7 +1,7 @@
-"""Work shared between threads of this process, as many as torch uses.
+"""Divide work among threads of this process, as many as torch uses.
 
-Compiled loops that let go of the interpreter's lock need no more than Python's own threads. A threading layer
-of the compiler's would bring a second OpenMP beside torch's, or one that does not survive a fork.
+The compiled loops release the interpreter's lock, so Python threads are sufficient. The threading layers of
+the compiler would load a second OpenMP library next to that of torch, or would not survive a fork.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ __all__ = ["for_each", "shares"]
 
 
 def shares(count: int, least: int) -> list[tuple[int, int]]:
-    """`count` things in equal runs, (start, stop) each: one per thread, none shorter than `least`."""
+    """Divide `count` items into equal ranges (start, stop): at most one per thread, of `least` or more."""
     parts = max(1, min(torch.get_num_threads(), count // max(least, 1)))
     edges = [count * part // parts for part in range(parts + 1)]
     return list(itertools.pairwise(edges))
 
 
 def for_each(work: Callable[[int, int], object], runs: Sequence[tuple[int, int]]) -> None:
-    """`work(start, stop)` for every run, side by side; returns when all are done.
+    """Call `work(start, stop)` for every range in parallel, and return when all calls are finished.
 
     Raises:
-        Exception: what the first run that failed has raised.
+        Exception: that of the first range whose call has failed.
     """
     if len(runs) == 1:
         work(*runs[0])
@@ -41,5 +41,5 @@ def for_each(work: Callable[[int, int], object], runs: Sequence[tuple[int, int]]
 
 @lru_cache(maxsize=1)
 def _pool(process: int, threads: int) -> ThreadPoolExecutor:
-    """The threads beside the calling one. They do not live on in a forked process, which makes its own."""
+    """The threads besides the calling one. A forked process does not inherit them and makes its own."""
     return ThreadPoolExecutor(threads, thread_name_prefix=f"kernels-{process}")

@@ -12,10 +12,11 @@ from neilfpp_method.kernels.threads import for_each, shares
 __all__ = ["sphere_trace"]
 
 MIN_RAYS_PER_THREAD = 2048
-"""Rays that are worth waking a thread for."""
+"""Minimum work of a thread, in rays; below it, starting the thread costs more than it saves."""
 
 
-@torch.compiler.disable  # a compiler cannot look into the loops, and need not
+# `torch.compile` cannot trace the loops.
+@torch.compiler.disable
 def sphere_trace(
     grid: Float[Tensor, "R R R"],
     radius: float,
@@ -26,10 +27,20 @@ def sphere_trace(
     distance: Float[Tensor, " P"],
     hit: Bool[Tensor, " P"],
 ) -> None:
-    """Write how far each ray goes, and whether it comes closer to a surface than `least`, in `steps` steps.
+    """Trace rays in a sampled distance field until they come closer to a surface than `least`.
 
-    A step is as long as the distance allows, and no shorter than `least`. The grid has the distances at the
-    vertices z, y, x of the cube [−radius, radius]³, beyond which a ray ends. All are of one float type.
+    Each step has the length of the distance at its start, but at least `least`. A ray also ends after `steps`
+    steps or when it leaves the cube [−radius, radius]³. All floating-point tensors have the same type.
+
+    Args:
+        grid: distances at the vertices z, y, x of the cube.
+        radius: half the edge of the cube.
+        origins: origins of the rays.
+        directions: unit directions of the rays.
+        least: distance at which a surface counts as hit.
+        steps: maximum number of steps.
+        distance: receives the length of each ray.
+        hit: receives whether each ray has hit a surface.
     """
     vertices, start, towards = (tensor.contiguous().numpy() for tensor in (grid, origins, directions))
     written, least = (distance.numpy(), hit.numpy()), vertices.dtype.type(least)

@@ -1,1 +1,4 @@
-"""Light that is solved for: what surfaces send is linear in an environment map and in the lamps before it."""
+"""Fit an environment map and near lamps to observed surface points.
+
+The outgoing radiance of a surface is linear in the texels of the map and in the intensities of the lamps.
+"""

@@ -1,9 +1,10 @@
-"""Descent of a light fit, with a factor on the base colour of every point as an unknown beside the light.
+"""Gradient descent on a light, together with a factor on the base colour of every surface point.
 
-Surfaces have learned their base colour under the light so far: a lamp in the wrong place leaves its glow in
-it, which then holds the lamp there. So a fit keeps the mean base colour and asks of each point only that it
-is like its neighbours: surfaces are mostly made of few materials, and light changes slowly along them (Land
-and McCann 1971, "Lightness and Retinex Theory").
+The base colour was learned under the previous light. A lamp in the wrong place therefore leaves its glow in
+the base colour, and a fit with that base colour would put the lamp in the same place again. So a fit keeps
+only the mean base colour. At each point the base colour is free, under a prior that it resembles that of the
+neighbouring points: surfaces mostly consist of few materials, and light changes slowly along them (Land and
+McCann 1971, "Lightness and Retinex Theory").
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from neilfpp_method.lighting.objective import Objective, Target, nearest_points,
 __all__ = ["Unknown", "descend"]
 
 FINAL_RATE_SHARE = 0.05
-"""Rate of the last step over that of the first."""
+"""Learning rate of the last step as a share of that of the first."""
 
 
 @dataclass(frozen=True)
 class Unknown:
-    """Leaves of the graph, and their rate in the first step."""
+    """A leaf tensor that is optimised, and its learning rate in the first step."""
 
     value: Tensor
     rate: float
@@ -39,18 +40,20 @@ def descend(
     objective: Objective,
     loss_of: Callable[[Float[Tensor, "#N 3"]], Float[Tensor, ""]],
 ) -> Float[Tensor, ""]:
-    """Move the unknowns to where a loss is least, and with them factors on the base colour of the points.
+    """Minimise a loss over the unknowns and over factors ("gains") on the base colour of the points.
 
-    Every point has factors of its own; all share one per channel where the weight of evenness is 0. The mean
-    of their logarithms is 0: light and base colour share a scale, and surfaces have learned what there is to
-    know of it. Where cameras saw some of the light itself it is free.
+    Every point has a gain per channel; if the weight of evenness is 0, all points share it. The mean
+    logarithm of the gains is kept at 0, because the images do not determine the common scale of light and
+    base colour and the current base colour is the best estimate of it. If the cameras have seen part of the
+    light directly, that fixes the scale, and the mean is free.
 
     Args:
-        unknowns: what moves, in place.
-        gain_rate: rate of the logarithms of the factors.
-        steps: how many.
-        target, objective: whose base colour is to be even, and how much that weighs.
-        loss_of: all that speaks against the unknowns, from the factors.
+        unknowns: the tensors to optimise, in place.
+        gain_rate: learning rate of the logarithms of the gains.
+        steps: number of Adam steps.
+        target: the surface points; their base colour and positions define the evenness prior.
+        objective: its `config.evenness` is the weight of that prior.
+        loss_of: the other terms of the loss, as a function of the gains.
 
     Returns:
         The loss before the last step.
@@ -60,7 +63,7 @@ def descend(
     nearest = nearest_points(target.position) if weight > 0 else None
     groups = [{"params": [u.value], "lr": u.rate} for u in (*unknowns, Unknown(log_gain, gain_rate))]
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
-    falling = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL_RATE_SHARE ** (1 / steps))
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL_RATE_SHARE ** (1 / steps))
     with torch.enable_grad():
         for _ in range(steps):
             gain = (log_gain - log_gain.mean() if objective.sky is None else log_gain).exp()
@@ -70,5 +73,5 @@ def descend(
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
-            falling.step()
+            schedule.step()
     return loss.detach()

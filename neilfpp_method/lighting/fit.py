@@ -1,8 +1,8 @@
-"""Light is solved for: a map and lamps under which remembered points look as the images show them.
+"""Fit an environment map and lamps to the pixels of remembered surface points.
 
-With the transport of these points at hand (`lighting.transport`), a hundred steps on the light cost less than
-as many steps of training. They find lamps that stochastic descent, through few and noisy samples of every
-texel, spreads into a haze that the base colour then makes up for.
+Once the transport to these points is computed (`lighting.transport`), a hundred steps on the light cost less
+than a hundred training steps. Stochastic descent during training sees few and noisy samples of every texel:
+it blurs a lamp into a haze, and the base colour then compensates for the missing shadows. A fit does not.
 """
 
 from __future__ import annotations
@@ -20,39 +20,54 @@ from neilfpp_method.lighting.transport import Transport
 __all__ = ["MIN_POINTS", "Evidence", "Light", "compare", "evidence", "fit_light"]
 
 RATE = 0.1
-"""Of log radiance at the start of a fit; lamps and base colour move at these shares of it:"""
-ROOT_RATE, GAIN_RATE = 0.5, 0.1
-"""Rates of the roots of lamp contributions, and of log factors on base colour, over log radiance's."""
+"""Learning rate of log radiance in the first step of a fit."""
+ROOT_RATE = 0.5
+"""Learning rate of the square roots of the lamps' contributions, as a multiple of `RATE`."""
+GAIN_RATE = 0.1
+"""Learning rate of the logarithms of the factors on base colour, as a multiple of `RATE`."""
 MIN_REACH = 0.05
-"""A lamp that brings less than this share of the mean over all lamps, at equal intensity, is not sought:
-behind a wall any intensity fits.
+"""A lamp whose contribution at intensity 1 is below this share of the mean over all lamps gets no intensity:
+a lamp that hardly any point sees, such as one behind a wall, fits the images with any intensity.
 """
 MIN_GAIN = 0.01
-"""Relative error that lamps must save: those that explain less than a hundredth are not kept."""
+"""Smallest reduction of the mean relative error for which lamps are kept."""
 MIN_POINTS = 20
-"""Points kept back from which something is concluded."""
+"""Smallest number of held-back points from which a decision is made."""
 MIN_VISIBLE_SHARE = 0.05
-"""Share of points that must see a texel for images to set it; below, the smoothness prior alone does."""
+"""Share of the points that must see a texel for the images to determine it. Texels below this share are
+determined by the smoothness prior only.
+"""
 FIRST_SHARE = 0.1
-"""Of the light that typical points receive, what all lamps that are not yet lit start with together."""
+"""Initial contribution of all candidate lamps together, as a share of the light that a typical point
+receives.
+"""
 
 
 @dataclass(frozen=True)
 class Light:
-    """A map, log radiance of its texels, and the intensity of lamps."""
+    """The parameters of a map and M lamps.
+
+    Attributes:
+        log_radiance: logarithm of the radiance of each texel.
+        intensity: radiant intensity of each lamp.
+    """
 
     log_radiance: Float[Tensor, "3 H W"]
     intensity: Float[Tensor, "M 3"]
 
     def strength(self) -> Float[Tensor, "T 3"]:
-        """Of all sources: radiance of the texels row by row, then intensity of the lamps."""
+        """The strengths of all sources: radiance of the texels row by row, then intensity of the lamps."""
         return torch.cat((self.log_radiance.exp().flatten(1).t(), self.intensity))
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """How much lower the relative error of the second of two lights is at `points` that neither was fitted
-    to, and the standard error of that mean.
+    """Comparison of a light with lamps against one without, at held-back points that neither was fitted to.
+
+    Attributes:
+        gain: mean reduction of the relative error by the lamps.
+        deviation: standard error of that mean.
+        points: number of held-back points.
     """
 
     gain: float
@@ -60,10 +75,13 @@ class Evidence:
     points: int
 
     def favours(self, chosen: bool) -> bool:
-        """Whether to take the more complicated light; `chosen`: the one that surfaces learn under now.
+        """Whether the light with lamps should be used.
 
-        To be chosen it must gain more than chance brings about once in forty times, and enough to be worth
-        it; to stay, it may well do so.
+        Lamps are added if their gain is significant (two standard errors) and at least `MIN_GAIN`. They are
+        removed only if a gain of `MIN_GAIN` is ruled out at the same significance.
+
+        Args:
+            chosen: whether lamps are in use now.
         """
         if self.points < MIN_POINTS:
             return False
@@ -73,28 +91,33 @@ class Evidence:
 
 
 def evidence(gain: Float[Tensor, " N"]) -> Evidence:
-    """What the gains of points add up to; without any, nothing speaks for either light."""
+    """Mean and standard error of the gains of N points."""
     if not len(gain):
         return Evidence(0.0, 0.0, 0)
     return Evidence(gain.mean().item(), (gain.std(correction=0) / len(gain) ** 0.5).item(), len(gain))
 
 
-def fit_light(start: Light, carried: Transport, target: Target, objective: Objective) -> Light:
-    """The light that explains the points best, the smoothest and with the fewest lamps where they do not say.
+def fit_light(start: Light, transport: Transport, target: Target, objective: Objective) -> Light:
+    """Find the light that best explains the pixels of surface points.
 
-    Minimises the relative error, robustly; the total variation of the map's log radiance, so that lamps in it
-    may be sharp and what no point sees takes after its surroundings; how far the map is from what cameras saw
-    of it; the unevenness of base colour, which is free during the fit (`descent`); and the price of lamps and
-    of tint, which images hardly tell from that of the surfaces (`objective`).
+    The minimised sum (see `objective`) consists of
+
+    - a robust loss of the relative error of the pixels,
+    - the total variation of the map's log radiance, which permits sharp edges and gives a texel that no
+      point sees the radiance of its neighbours,
+    - the deviation of the map from what cameras saw of it directly,
+    - the unevenness of base colour, which is free during the fit (see `descent`),
+    - priors on the lamps and on the tint of the light, which the images hardly separate from the tint of
+      the surfaces.
 
     Args:
-        start: where the search starts.
-        carried: from the texels of the map, row by row, and then from the lamps.
-        target: what the points look like.
-        objective: what is minimised; its settings have rates and the number of steps, too.
+        start: initial value.
+        transport: from the texels of the map, row by row, followed by the lamps.
+        target: the points and their pixels.
+        objective: the terms and their weights; its settings also hold the number of steps.
 
     Returns:
-        `start` where the search leads to what is not finite, or there is no point.
+        The fitted light; `start` if there are no points or the result is not finite.
     """
     if not len(target.pixel):
         return start
@@ -103,44 +126,57 @@ def fit_light(start: Light, carried: Transport, target: Target, objective: Objec
     channels = start.log_radiance.clone()
     log_radiance = channels.mean(0, keepdim=True) if objective.monochrome else channels
     log_radiance.requires_grad_()
-    # In units of a lamp's mean contribution to a white surface, so that its unknowns have one size.
-    brought = carried.sources[0, :, texels:].mean(0)[:, None] / unit
-    reaches = brought > MIN_REACH * brought.mean()
-    first = FIRST_SHARE / max(1, len(brought))
-    root = (start.intensity * brought).clamp_min(first).sqrt().requires_grad_()
-    # Sources that reach no point take no part in the sum: half of the texels over a table.
-    reaching_any = torch.nonzero(carried.sources.amax((0, 1)))[:, 0]
-    carried = carried.of(reaching_any)
-    mean_transport = carried.sources[0].mean(0)
-    visible_share = (carried.sources[0] > 0).float().mean(0)
+    # The unknown of a lamp is its mean contribution to a white surface, in units of a typical pixel, so that
+    # one learning rate suits all lamps. Its square root is optimised, which keeps it non-negative.
+    reach = transport.sources[0, :, texels:].mean(0)[:, None] / unit
+    is_reachable = reach > MIN_REACH * reach.mean()
+    first = FIRST_SHARE / max(1, len(reach))
+    root = (start.intensity * reach).clamp_min(first).sqrt().requires_grad_()
+    # Sources that no point sees are left out of the sums: half of the texels if the scene is a table top.
+    reaching_any = torch.nonzero(transport.sources.amax((0, 1)))[:, 0]
+    transport = transport.select_sources(reaching_any)
+    mean_transport = transport.sources[0].mean(0)
+    visible_share = (transport.sources[0] > 0).float().mean(0)
     set_by_images = ((visible_share > MIN_VISIBLE_SHARE) | (reaching_any >= texels))[:, None]
 
     def light() -> Light:
         colored = log_radiance.expand_as(start.log_radiance)
-        return Light(colored, torch.where(reaches, root.square() / brought.clamp_min(1e-20), 0.0))
+        return Light(colored, torch.where(is_reachable, root.square() / reach.clamp_min(1e-20), 0.0))
 
     def loss_of(gain: Float[Tensor, "#N 3"]) -> Float[Tensor, ""]:
         strength = light().strength()[reaching_any]
         strength = torch.where(set_by_images, strength, strength.detach())
-        loss = objective.misfit(strength, carried, target, gain)
-        loss = loss + objective.unlikely(log_radiance.expand_as(start.log_radiance))
-        return loss + objective.price(unit * root.square().mean(-1), mean_transport @ strength)
+        loss = objective.misfit(strength, transport, target, gain)
+        loss = loss + objective.map_prior(log_radiance.expand_as(start.log_radiance))
+        return loss + objective.lamp_prior(unit * root.square().mean(-1), mean_transport @ strength)
 
     unknowns = (Unknown(log_radiance, RATE), Unknown(root, ROOT_RATE * RATE))
     descend(unknowns, GAIN_RATE * RATE, config.steps, target, objective, loss_of)
-    found = light()
-    found = Light(found.log_radiance.detach(), found.intensity.detach())
-    finite = found.log_radiance.isfinite().all() and found.intensity.isfinite().all()
-    return found if finite else start
+    fitted = light()
+    fitted = Light(fitted.log_radiance.detach(), fitted.intensity.detach())
+    finite = fitted.log_radiance.isfinite().all() and fitted.intensity.isfinite().all()
+    return fitted if finite else start
 
 
 @torch.no_grad()
 def compare(
-    lights: tuple[Light, Light], carried: tuple[Transport, Transport], target: Target, objective: Objective
+    lights: tuple[Light, Light],
+    transports: tuple[Transport, Transport],
+    target: Target,
+    objective: Objective,
 ) -> Float[Tensor, " N"]:
-    """How much lower the second of two lights makes the relative error, at points kept from both fits."""
-    one, other = (
+    """Relative error under the first light minus that under the second, at held-back points.
+
+    The relative error of a channel is clipped at 1, so that a few outliers do not dominate the mean.
+
+    Args:
+        lights: the two lights.
+        transports: the transport to the points, for each of the lights.
+        target: the held-back points and their pixels.
+        objective: defines the relative error.
+    """
+    first, second = (
         objective.relative_error(light.strength(), transport, target, 1.0).abs().clamp_max(1).mean(-1)
-        for light, transport in zip(lights, carried, strict=True)
+        for light, transport in zip(lights, transports, strict=True)
     )
-    return one - other
+    return first - second

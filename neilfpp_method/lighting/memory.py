@@ -1,4 +1,4 @@
-"""The surface points that light is fitted to: a share of every training step's."""
+"""A memory of surface points from recent training steps, to which the light is fitted."""
 
 from __future__ import annotations
 
@@ -13,16 +13,18 @@ from neilfpp_method.structures import Observed
 __all__ = ["SurfaceMemory"]
 
 FIRST_WAIT = 4
-"""Steps before the first fit, even if the memory is not full: until then the light is a guess."""
+"""Steps before the first fit even if the memory is not full yet: until then the light is only a guess."""
 
 
 class SurfaceMemory(nn.Module):
-    """The newest surface points of all images, and when to fit to them next: for the first time when the
-    memory is full, or after a few steps. It is part of a checkpoint.
+    """A ring buffer of surface points, and the schedule of the fits. Its state is part of a checkpoint.
+
+    The first fit is due when the buffer is full or after `FIRST_WAIT` steps, the following ones every
+    `every` steps.
 
     Args:
-        capacity: how many points are kept.
-        every: steps between two fits.
+        capacity: number of points in the buffer.
+        every: number of steps between two fits.
     """
 
     def __init__(self, capacity: int, every: int) -> None:
@@ -34,14 +36,18 @@ class SurfaceMemory(nn.Module):
 
     @property
     def due(self) -> bool:
-        """Whether it is time to fit: `every` steps after each fit, and soon for the first time."""
+        """Whether a fit is due."""
         if self.age is not None:
             return self.age >= self.every
         return self.points.full or (self.points.filled > 0 and self.waited >= FIRST_WAIT)
 
     @torch.no_grad()
     def remember(self, observed: Observed) -> None:
-        """Keep some rows, in the place of the oldest; before the first fit all of them."""
+        """Add the surface points of a step to the buffer, in place of the oldest.
+
+        Before the first fit all of them are added; after it as many as replace the whole buffer once
+        between two fits.
+        """
         self.waited += self.age is None
         share = len(observed) if self.age is None else math.ceil(self.points.capacity / self.every)
         rows = torch.cat((observed.position, observed.normal, observed.wo, observed.pixel), -1)
@@ -50,18 +56,18 @@ class SurfaceMemory(nn.Module):
             self.age += 1
 
     def wait(self) -> None:
-        """Let the first fit be due after `every` steps, as the light that there is needs none before."""
+        """Postpone the first fit by `every` steps, because the current light is already an estimate."""
         self.age = 0
 
     def recall(self) -> Observed:
-        """Everything that is remembered, for a fit that is done now."""
+        """All remembered points, for a fit; the count of steps to the next fit restarts."""
         self.age = 0
         return Observed(*self.points.kept().split(3, -1))
 
     def get_extra_state(self) -> dict[str, int | None]:
-        """Where the memory stands, for checkpoints."""
+        """The counters, for a checkpoint."""
         return {"age": self.age, "waited": self.waited}
 
     def set_extra_state(self, state: dict[str, int | None]) -> None:
-        """The inverse of `get_extra_state`."""
+        """Restore the counters from a checkpoint."""
         self.age, self.waited = state["age"], state["waited"]

@@ -1,8 +1,9 @@
-"""The objective of a light fit: errors of remembered points, and priors on light and base colour.
+"""The objective of a light fit: the error of remembered points, and priors on light and base colour.
 
-The priors are of ratios, so that none prefers a dimmer light and brighter surfaces: the total variation of
-the map's log radiance, differences of log base colour, lamps by their share of all light, and the tint. A
-price per amount of light would dim the light at every fit, as the base colour follows.
+Every prior depends only on ratios, so that none of them prefers a dimmer light with brighter surfaces: the
+total variation of the map's log radiance, differences of log base colour, the share of each lamp in all
+light, and the tint. A penalty on the absolute amount of light would dim the light a little at every fit,
+because the base colour then follows.
 """
 
 from __future__ import annotations
@@ -32,28 +33,41 @@ __all__ = [
 ]
 
 FLOOR = 0.1
-"""Errors are relative to the pixel plus this share of a typical one: dark pixels are mostly noise."""
+"""This share of a typical pixel is added to the denominator of a relative error, because dark pixels are
+mostly noise.
+"""
 OUTLIER = 0.1
-"""Relative errors beyond this count linearly, not squared: no light explains some of the points."""
+"""Relative error at which the loss changes from quadratic to linear. Some points are explained by no light,
+for example where the geometry is wrong.
+"""
 SKY = 1.0
-"""Weight of the difference between the map's log radiance and what cameras saw beyond the scene, per texel,
-against the relative error: that much is certain, and the scale of light and base colour hangs on it.
+"""Weight, relative to the data term, of the deviation of the map's log radiance from what cameras saw of it
+directly. The weight is high because this observation is reliable and fixes the common scale of light and
+base colour.
 """
 SPARSITY = 0.001
-"""Weight of the lamps, by the logarithm of their shares of all light, against the relative error."""
+"""Weight of the sparsity prior on lamps, relative to the data term."""
 QUADRATIC_BELOW = 1e-2
-"""Differences of logarithms below this count by their square, so that the gradient has no jump at 0."""
+"""Scale below which absolute differences of logarithms become quadratic, so that the gradient is continuous
+at 0.
+"""
 LINEAR_SHARE = 0.02
-"""Share of all light below which a lamp's price is linear; above it, logarithmic."""
+"""Share of all light below which the sparsity prior of a lamp is about linear; above, it is logarithmic."""
 NEIGHBOURS = 4
-"""Points whose base colour a point is compared with."""
+"""Number of neighbouring points with which the base colour of a point is compared."""
 DARK_FLOOR = 0.02
-"""Base colours are raised to this before their logarithms are compared."""
+"""Base colours are raised to at least this value before their logarithms are compared."""
 
 
 @dataclass(frozen=True)
 class Target(Indexable):
-    """What points look like: their material, constants, and their pixels in the response of the capture."""
+    """N surface points and what cameras recorded of them.
+
+    Attributes:
+        position: of the points, scene frame.
+        material: of the points; it is not differentiated.
+        pixel: their pixels, in the response of the capture.
+    """
 
     position: Float[Tensor, "N 3"]
     material: Material
@@ -65,16 +79,15 @@ class Target(Indexable):
 
 @dataclass(frozen=True)
 class Objective:
-    """What a light is to minimise.
+    """The terms that a light fit minimises.
 
     Attributes:
-        response: of the capture, "linear" or "srgb".
-        unit: what a pixel of typical brightness changes by per unit of log radiance (`response_slope`):
-            itself, where the response is linear. Errors are relative to that of the pixel and a share of
-            this.
-        config: the weights.
-        sky: what cameras saw of the light itself; none where they saw nothing of it.
-        monochrome: the map has one channel for all three colours.
+        response: response of the capture, "linear" or "srgb".
+        unit: change of a typical pixel per unit of log radiance (`response_slope`); for a linear response
+            this is the pixel value itself. The denominator of relative errors depends on it.
+        config: weights of the terms.
+        sky: what cameras saw of the map directly; None if they saw nothing of it.
+        monochrome: whether the map has one channel for all three colours.
     """
 
     response: str
@@ -86,78 +99,99 @@ class Objective:
     def relative_error(
         self,
         strength: Float[Tensor, "T 3"],
-        carried: Transport,
+        transport: Transport,
         target: Target,
         gain: Float[Tensor, "#N 3"] | float,
     ) -> Float[Tensor, "N 3"]:
-        """How far radiance is off, of itself: what the camera stores of the points, their base colour times
-        `gain`, against their pixels; a clipped one is a lower bound.
+        """The error of the rendered pixels relative to the recorded ones.
+
+        A clipped pixel is a lower bound: a render above it has no error (see `shading.color.residual`).
+
+        Args:
+            strength: strengths of the T sources.
+            transport: from the sources to the points.
+            target: the points and their pixels.
+            gain: factor on the base colour of the points.
         """
         material = target.material
-        tinted = Material((material.base_color * gain).clamp(0, 1), material.roughness, material.metallic)
-        off = residual(carried.outgoing(tinted, strength), target.pixel, self.response)
-        return off / error_unit(target.pixel, self.response, self.unit)
+        scaled = Material((material.base_color * gain).clamp(0, 1), material.roughness, material.metallic)
+        error = residual(transport.outgoing(scaled, strength), target.pixel, self.response)
+        return error / error_unit(target.pixel, self.response, self.unit)
 
     def misfit(
-        self, strength: Float[Tensor, "T 3"], carried: Transport, target: Target, gain: Float[Tensor, "#N 3"]
+        self,
+        strength: Float[Tensor, "T 3"],
+        transport: Transport,
+        target: Target,
+        gain: Float[Tensor, "#N 3"],
     ) -> Float[Tensor, ""]:
-        """The relative error in the mean: by its square where it is small, by its size where it is large."""
-        error = self.relative_error(strength, carried, target, gain)
+        """The data term: the mean Huber loss of the relative error. Arguments as in `relative_error`."""
+        error = self.relative_error(strength, transport, target, gain)
         return functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER)
 
-    def unlikely(self, log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, ""]:
-        """Priors on a map alone: smoothness, and agreement with what cameras saw of it."""
+    def map_prior(self, log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, ""]:
+        """Priors on the map: smoothness, and agreement with what cameras saw of it directly."""
         uneven = self.config.smoothness * total_variation(log_radiance)
         if self.sky is None or not log_radiance.numel():
             return uneven
         return uneven + SKY * self.sky.misfit(log_radiance)
 
-    def price(self, brought: Float[Tensor, " M"], all_light: Float[Tensor, " 3"]) -> Float[Tensor, ""]:
-        """Priors on lamps, by the light that each brings to the points, and on the tint of all light.
+    def lamp_prior(
+        self, contribution: Float[Tensor, " M"], all_light: Float[Tensor, " 3"]
+    ) -> Float[Tensor, ""]:
+        """Sparsity prior on the lamps, and the prior that all light together is close to white.
 
-        Σ ln(1 + share/s) over lamps is concave: one strong lamp is cheaper than two half as strong.
+        The sparsity prior Σ ln(1 + share / s) is concave in each share, so that one strong lamp costs less
+        than two lamps of half its strength.
+
+        Args:
+            contribution: mean light that each lamp brings to the points.
+            all_light: mean light that all sources bring to the points.
         """
-        share = brought / all_light.mean()
+        share = contribution / all_light.mean()
         lamps = SPARSITY * (share / LINEAR_SHARE).log1p().sum()
         return lamps + self.config.whiteness * tint(all_light)
 
 
 def error_unit(pixel: Float[Tensor, "*B 3"], response: str, typical: float) -> Float[Tensor, "*B 3"]:
-    """What a pixel may change by for a relative error of 1.
+    """The error of a pixel that counts as a relative error of 1.
 
     Args:
-        pixel: in the capture's response.
-        response: "linear" or "srgb".
-        typical: what a pixel of typical brightness changes by per unit of log radiance (`response_slope`).
+        pixel: pixel values, in the capture's response.
+        response: response of the capture, "linear" or "srgb".
+        typical: change of a typical pixel per unit of log radiance (`response_slope`).
     """
     return response_slope(pixel, response) + FLOOR * typical
 
 
 def total_variation(values: Float[Tensor, "C H W"]) -> Float[Tensor, ""]:
-    """Σ |difference of neighbours| per texel, of a map that is closed in azimuth."""
+    """Σ |difference of neighbouring texels| divided by the number of texels; the map wraps in azimuth."""
     across = torch.cat((values, values[..., :1]), -1).diff(dim=-1)
     down = values.diff(dim=1)
-    size = max(1, values[0].numel())
-    return sum(_size(step).sum() for step in (across, down)) / size
+    texels = max(1, values[0].numel())
+    return sum(_smooth_abs(difference).sum() for difference in (across, down)) / texels
 
 
 def nearest_points(position: Float[Tensor, "N 3"]) -> Int[Tensor, "N K"]:
-    """The nearest other points of each; K is `NEIGHBOURS`, less where there are fewer."""
-    apart = torch.cdist(position, position).fill_diagonal_(torch.inf)
-    return apart.topk(min(NEIGHBOURS, len(position) - 1), largest=False).indices
+    """Indices of the `NEIGHBOURS` nearest other points of each point (of all others if there are fewer)."""
+    distance = torch.cdist(position, position).fill_diagonal_(torch.inf)
+    return distance.topk(min(NEIGHBOURS, len(position) - 1), largest=False).indices
 
 
 def unevenness(base_color: Float[Tensor, "N 3"], nearest: Int[Tensor, "N K"]) -> Float[Tensor, ""]:
-    """Mean |difference of log base colour| between neighbours: sharp and gradual edges cost the same."""
+    """Mean |difference of log base colour| between neighbours.
+
+    The absolute value makes a sharp edge as cheap as a gradual change of the same total size.
+    """
     logarithm = base_color.clamp_min(DARK_FLOOR).log()
-    apart = logarithm[:, None] - logarithm[nearest]
-    return _size(apart).sum() / max(1, apart.numel())
+    difference = logarithm[:, None] - logarithm[nearest]
+    return _smooth_abs(difference).sum() / max(1, difference.numel())
 
 
-def _size(difference: Float[Tensor, ...]) -> Float[Tensor, ...]:
+def _smooth_abs(difference: Float[Tensor, ...]) -> Float[Tensor, ...]:
     return (difference.square() + QUADRATIC_BELOW**2).sqrt()
 
 
 def tint(light: Float[Tensor, " 3"]) -> Float[Tensor, ""]:
-    """How far light is from white: the variance of its logarithm over the channels."""
+    """Deviation of a colour from white: the variance of its logarithm over the channels."""
     return light.clamp_min(1e-20).log().var(correction=0)

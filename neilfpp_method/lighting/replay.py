@@ -1,4 +1,8 @@
-"""Surface points that are shaded again: while a surface stands still, no ray need be rendered twice."""
+"""A buffer of surface points that are shaded again in later steps, used while geometry is fixed.
+
+As long as the surface does not change, the hit of a ray does not change either, so rendering it once is
+enough.
+"""
 
 from __future__ import annotations
 
@@ -11,17 +15,18 @@ from neilfpp_method.structures import SurfacePixels
 __all__ = ["Replay"]
 
 KEPT_STEPS = 16
-"""Points are kept for the rays of so many steps."""
+"""Capacity of the buffer, in steps of rays."""
 WIDTHS = (3, 3, 3, 3, 1)
+"""Numbers per row: position, normal, `wo`, pixel, and image gradient."""
 
 
 class Replay(nn.Module):
-    """The newest surface points of a stage in which no surface moves. It is part of a checkpoint.
+    """The newest surface points of a stage with fixed geometry. Its state is part of a checkpoint.
 
     Args:
-        fresh: share of the points of a step that are new, once there are enough to draw from; 1: nothing is
-            kept.
-        rays: of a step.
+        fresh: share of the points of a step that are newly rendered, once the buffer is full; with 1 nothing
+            is stored.
+        rays: number of rays in a step.
     """
 
     def __init__(self, fresh: float, rays: int) -> None:
@@ -31,11 +36,15 @@ class Replay(nn.Module):
 
     @property
     def share(self) -> float:
-        """Of the rays of the next step, those that are to be rendered."""
+        """Share of the rays of the next step that must be rendered."""
         return self.fresh if self.ring.full else 1.0
 
     def beside_earlier(self, surface: SurfacePixels) -> SurfacePixels:
-        """The points of a step, constants, and as many of earlier steps as make them `share` of all."""
+        """The points of a step together with stored points of earlier steps, without gradients.
+
+        The new points make up `share` of the result, and are stored in turn. If `fresh` is 1, the result is
+        `surface` itself, with its gradients.
+        """
         if self.fresh == 1:
             return surface
         new = surface.detach()

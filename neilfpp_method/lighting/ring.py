@@ -1,4 +1,4 @@
-"""Rows of numbers that are remembered: the newest, in the place of the oldest."""
+"""A ring buffer of rows of numbers."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ __all__ = ["Ring"]
 
 
 class Ring(nn.Module):
-    """The newest rows, part of a checkpoint.
+    """A ring buffer that keeps the newest rows. Its state is part of a checkpoint.
 
     Args:
-        capacity: how many rows are kept.
-        width: numbers in a row.
+        capacity: maximum number of rows.
+        width: numbers per row.
     """
 
     def __init__(self, capacity: int, width: int) -> None:
@@ -25,17 +25,17 @@ class Ring(nn.Module):
 
     @property
     def capacity(self) -> int:
-        """How many rows are kept."""
+        """The maximum number of rows."""
         return len(self.rows)
 
     @property
     def full(self) -> bool:
-        """Whether what is kept next takes the place of something."""
+        """Whether the next row that is stored replaces the oldest one."""
         return self.filled == self.capacity
 
     @torch.no_grad()
     def keep(self, rows: Float[Tensor, "N W"]) -> None:
-        """Keep rows, the first ones where there are more than fit."""
+        """Store rows; if there are more than the capacity, only the first ones."""
         rows = rows[: self.capacity].to(self.rows.dtype)
         slots = torch.arange(self.next, self.next + len(rows), device=rows.device) % self.capacity
         self.rows[slots] = rows
@@ -43,18 +43,18 @@ class Ring(nn.Module):
         self.filled = min(self.filled + len(rows), self.capacity)
 
     def kept(self) -> Float[Tensor, "K W"]:
-        """Everything that is remembered, in no order."""
+        """All stored rows, in no particular order."""
         return self.rows[: self.filled]
 
     def draw(self, count: int) -> Float[Tensor, "K W"]:
-        """Some of it at random, each draw for itself; at most as many as are remembered."""
-        at = torch.randint(max(1, self.filled), (min(count, self.filled),), device=self.rows.device)
-        return self.rows[at]
+        """Draw stored rows at random with replacement, at most as many as are stored."""
+        numbers = torch.randint(max(1, self.filled), (min(count, self.filled),), device=self.rows.device)
+        return self.rows[numbers]
 
     def get_extra_state(self) -> dict[str, int]:
-        """Where the ring stands, for checkpoints."""
+        """The counters, for a checkpoint."""
         return {"filled": self.filled, "next": self.next}
 
     def set_extra_state(self, state: dict[str, int]) -> None:
-        """The inverse of `get_extra_state`."""
+        """Restore the counters from a checkpoint."""
         self.filled, self.next = state["filled"], state["next"]

@@ -1,9 +1,9 @@
-"""Refine found lamps: their places, axes and intensities by descent, and drop those that are not needed.
+"""Refine the positions, axes and intensities of lamps by gradient descent, and drop superfluous lamps.
 
-Candidates lie beside a lamp, never on it, so a fit finds a lamp in pieces: several candidates around it, too
-strong together. Their places are refined by descent, in turns with the choice of candidates: conditional
-gradients with moving atoms (Boyd, Schiebinger and Recht 2017, "The alternating descent conditional gradient
-method for sparse inverse problems").
+No candidate lies exactly on a lamp, so a fit represents a lamp by several candidates around it, which
+together are too strong. Choosing candidates and refining their places alternate from fit to fit: this is a
+conditional gradient method with moving atoms (Boyd, Schiebinger and Recht 2017, "The alternating descent
+conditional gradient method for sparse inverse problems").
 """
 
 from __future__ import annotations
@@ -28,20 +28,27 @@ from neilfpp_method.structures import Observed, SceneTracer
 __all__ = ["settle_lamps"]
 
 STEPS = 100
+"""Adam steps of one descent."""
 RATE = 0.02
-"""Scene units per step, at the start."""
+"""Initial learning rate of positions, in scene units."""
 AXIS_RATE = 0.06
-"""Per step, at the start, of axes and of logarithms of intensity."""
+"""Initial learning rate of axes and of the logarithms of intensity."""
 GAIN_RATE = 0.1
-"""Per step, at the start, of the logarithms of the factors on base colour."""
+"""Initial learning rate of the logarithms of the factors on base colour."""
 PANEL_GAIN = 0.01
-"""Share of the loss that a panel must save over a bulb: its axis alone lowers the loss a little."""
+"""A lamp is a panel rather than a bulb only if that lowers the loss by more than this share: the additional
+unknowns of the axis always lower it a little.
+"""
 FAINT_SHARE = 1e-3
-"""Share of the strongest channel to which darker ones are raised first: the logarithm needs a slope."""
+"""Intensities are raised to at least this share of the strongest one before their logarithm is taken: the
+logarithm of 0 cannot be optimised.
+"""
 
 
 @dataclass(frozen=True)
 class _Settled:
+    """Refined lamps and their loss; it is infinite if the descent failed."""
+
     lamps: FoundLamps
     loss: float
 
@@ -57,19 +64,25 @@ def settle_lamps(
     scene: SceneTracer | None,
     objective: Objective,
 ) -> FoundLamps:
-    """Lamps whose places, axes and intensities minimise the objective, and as few of them as do.
+    """Refine lamps and drop superfluous ones.
 
-    From the weakest to the strongest, a lamp is dropped where the others, its power given to its neighbour,
-    have a lower loss. Each lamp that is left is tried as a panel and as a bulb, as one at another place looks
-    much like the other.
+    First all lamps are refined together. Then each lamp, from the weakest to the strongest, is dropped if
+    the loss is lower without it, after its power is given to the nearest other lamp and the rest is refined
+    again. Finally each remaining lamp is tried as a panel and as a bulb, because a panel at one place looks
+    much like a bulb at another.
 
     Args:
-        found: lamps to start from, the strongest first.
-        radius: of each, scene units.
-        beside: all other light, with no sources of its own.
-        observed, target: the points, and what they look like.
-        lobe, scene: as of `from_texels`.
-        objective: what is minimised.
+        found: initial lamps, the strongest first.
+        radius: radius of every lamp, in scene units.
+        beside: transport of all other light, as constant radiance (it has no sources).
+        observed: the surface points.
+        target: their material and pixels.
+        lobe: as in `from_texels`.
+        scene: as in `from_texels`.
+        objective: the terms of the loss and their weights.
+
+    Returns:
+        The refined lamps; `found` if there are no points or the descent is not finite.
     """
     if not len(found.intensity) or not len(observed):
         return found
@@ -78,13 +91,13 @@ def settle_lamps(
         lamps: FoundLamps, sight: Bool[Tensor, "N M"], gain: Float[Tensor, "#N 3"]
     ) -> Float[Tensor, ""]:
         kernel = lamp_kernel(lamps.places, radius, sight, observed, target.material.roughness, lobe)
-        brought = kernel[0].mean(0)[:, None] * lamps.intensity
-        all_light = brought.sum(0) + beside.scene[0].mean(0)
+        contribution = kernel[0].mean(0)[:, None] * lamps.intensity
+        all_light = contribution.sum(0) + beside.scene[0].mean(0)
         misfit = objective.misfit(lamps.intensity, Transport(kernel, beside.scene), target, gain)
-        return misfit + objective.price(brought.mean(-1), all_light)
+        return misfit + objective.lamp_prior(contribution.mean(-1), all_light)
 
     def settle(lamps: FoundLamps) -> _Settled:
-        # A shadow's edge has no derivative here: what is hidden at the start stays hidden in this fit.
+        # Visibility is not differentiated: it is computed once per descent, at the initial positions.
         sight = in_sight(lamps.places, radius, observed.position, scene)
         return _descend(lamps, target, objective, lambda moved, gain: loss_of(moved, sight, gain))
 
@@ -105,15 +118,15 @@ def settle_lamps(
 
 
 def _of_other_kind(lamps: FoundLamps, number: int, points: Float[Tensor, "N 3"]) -> FoundLamps:
-    """All lamps as they are, but a panel that is a bulb, or a bulb that faces the points as a panel."""
+    """The same lamps with one panel made a bulb, or one bulb made a panel that faces the points."""
     position, axis = lamps.places.position[number], lamps.places.axis.clone()
-    towards = safe_normalize((points - position).mean(0, keepdim=True))[0]
-    axis[number] = torch.where(axis[number].any(), 0.0, towards)
+    to_points = safe_normalize((points - position).mean(0, keepdim=True))[0]
+    axis[number] = torch.where(axis[number].any(), 0.0, to_points)
     return FoundLamps(LampPlaces(lamps.places.position, axis), lamps.intensity)
 
 
 def _without(lamps: FoundLamps, number: int) -> FoundLamps:
-    """All lamps but one, whose power goes to the nearest other."""
+    """All lamps except one, whose intensity is added to that of the nearest other lamp."""
     others = torch.arange(len(lamps.intensity), device=lamps.intensity.device) != number
     places, intensity = lamps.places[others], lamps.intensity[others]
     nearest = (places.position - lamps.places.position[number]).norm(dim=-1).argmin()
@@ -127,15 +140,15 @@ def _descend(
     objective: Objective,
     loss_of: Callable[[FoundLamps, Float[Tensor, "#N 3"]], Float[Tensor, ""]],
 ) -> _Settled:
-    """The nearest minimum of a loss over place, axis and intensity; the start if that is not finite."""
-    bare = start.places.axis.square().sum(-1, keepdim=True) == 0
+    """Minimise a loss over position, axis and intensity; return `start` if the result is not finite."""
+    is_bulb = start.places.axis.square().sum(-1, keepdim=True) == 0
     position = start.places.position.clone().requires_grad_()
     axis = start.places.axis.clone().requires_grad_()
     log_intensity = start.intensity.clamp_min(FAINT_SHARE * start.intensity.max()).log().requires_grad_()
 
     def lamps() -> FoundLamps:
         return FoundLamps(
-            LampPlaces(position, safe_normalize(axis).masked_fill(bare, 0.0)), log_intensity.exp()
+            LampPlaces(position, safe_normalize(axis).masked_fill(is_bulb, 0.0)), log_intensity.exp()
         )
 
     unknowns = (Unknown(position, RATE), Unknown(axis, AXIS_RATE), Unknown(log_intensity, AXIS_RATE))

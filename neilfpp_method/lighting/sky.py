@@ -1,7 +1,8 @@
-"""What cameras saw of the light itself: pixels that show what lies beyond the scene.
+"""Direct observations of the environment map: pixels of rays that pass the scene and show what lies behind.
 
-A map has one radiance for a direction, from wherever one looks. What lies near is seen from every camera in
-another direction; its texels disagree with themselves, and count for less.
+The radiance of an environment map depends on the direction only. Things that are near appear in different
+directions from different cameras, so the pixels that fall into their texels disagree; such texels get a low
+weight.
 """
 
 from __future__ import annotations
@@ -19,48 +20,54 @@ from neilfpp_method.shading.color import luminance, srgb_to_linear
 __all__ = ["KnownSky", "SkySightings"]
 
 HALF_WEIGHT_SPREAD = 0.3
-"""Standard deviation of the radiance within a texel, over its mean, at which the texel counts for half."""
+"""Relative standard deviation of the luminance within a texel at which its weight is halved."""
 QUADRATIC_BELOW = 0.1
-"""Differences of logarithms below this count by their square."""
+"""Difference of log radiance at which the loss changes from quadratic to linear."""
 DARK_FLOOR = 1e-3
-"""Share of the mean radiance below which a texel counts as this dark where logarithms are compared."""
+"""Texels are raised to at least this share of the mean radiance before the logarithm is taken."""
 
 
 @dataclass(frozen=True)
 class KnownSky:
-    """Log radiance of map texels as cameras saw them, and its weight: 0 where none looked, at most 1."""
+    """The map as cameras saw it directly.
+
+    Attributes:
+        log_radiance: logarithm of the observed radiance of each texel.
+        weight: confidence in each texel, from 0 (never seen) to 1.
+    """
 
     log_radiance: Float[Tensor, "3 H W"]
     weight: Float[Tensor, "H W"]
 
     def misfit(self, log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, ""]:
-        """How far a map is from what was seen, in the mean over its texels."""
-        off = functional.smooth_l1_loss(
+        """Weighted Huber loss between a map and the observation, averaged over the texels."""
+        error = functional.smooth_l1_loss(
             log_radiance, self.log_radiance, beta=QUADRATIC_BELOW, reduction="none"
         )
-        return (self.weight * off.mean(0)).mean()
+        return (self.weight * error.mean(0)).mean()
 
 
 class SkySightings(nn.Module):
     """Sums over the pixels that fell into each texel of a map. They are part of a checkpoint.
 
     Args:
-        height: rows of the map; it has twice as many columns.
-        response: of the capture, "linear" or "srgb". A pixel of an LDR image that is clipped says too little:
-            its texel counts as unseen.
+        height: number of rows of the map; it has twice as many columns.
+        response: response of the capture, "linear" or "srgb". A texel into which a clipped pixel of an LDR
+            image fell counts as not seen, because its radiance is only bounded from below.
     """
 
     def __init__(self, height: int, response: str) -> None:
         super().__init__()
         self.response = response
         self.register_buffer("radiance", torch.zeros(3, height, 2 * height))
-        self.register_buffer("squares", torch.zeros(height, 2 * height))  # of luminance
+        # Sums of the squared luminance.
+        self.register_buffer("squares", torch.zeros(height, 2 * height))
         self.register_buffer("pixels", torch.zeros(height, 2 * height))
         self.register_buffer("clipped", torch.zeros(height, 2 * height))
 
     @torch.no_grad()
     def remember(self, directions: Float[Tensor, "N 3"], color: Float[Tensor, "N 3"]) -> None:
-        """Add pixels, as images hold them, whose rays pass the scene by."""
+        """Add the pixels of rays that pass the scene; `color` is in the response of the capture."""
         clipped = torch.zeros_like(color[:, 0])
         if self.response == "srgb":
             clipped, color = (color >= 1).any(-1).to(color.dtype), srgb_to_linear(color)
@@ -71,7 +78,7 @@ class SkySightings(nn.Module):
         self.clipped.view(-1).index_add_(0, texel, clipped)
 
     def known(self) -> KnownSky:
-        """What the texels are, as far as they were seen."""
+        """The observed map and its weights."""
         count = self.pixels.clamp_min(1)
         mean = self.radiance / count
         bright = luminance(mean.permute(1, 2, 0))

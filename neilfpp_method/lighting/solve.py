@@ -1,4 +1,4 @@
-"""The light of a scene from observations: the map, and lamps where points kept back support them."""
+"""Solve for the light of a scene: an environment map, and lamps if held-back points support them."""
 
 from __future__ import annotations
 
@@ -20,16 +20,18 @@ from neilfpp_method.structures import Material, Observed, SceneTracer
 __all__ = ["solve_light"]
 
 CANDIDATES = 256
-"""Places for lamps that one fit tries."""
+"""Number of candidate lamps in one fit."""
 FOLDS = 5
-"""Number of parts. One part is not fitted to, and decides between two lights; at first, each in turn."""
+"""Number of folds of the points. One fold is held back from the fits with and without lamps and decides
+between them; for the first decision every fold is held back in turn.
+"""
 BLOCKS_OF_FOLD = 6
-"""Blocks of neighbouring points that make a part. Neighbours share the errors of their material, and a lamp
-that makes up for those would be confirmed by a neighbour that was kept back; so a block is kept back
-whole.
+"""Number of blocks of neighbouring points in a fold. Neighbours share the errors of their material, so a
+lamp that compensates for such errors would also be confirmed by held-back neighbours of the fitted points.
+Blocks are therefore held back as a whole.
 """
 KNOWN_ROWS = 32
-"""Rows of a known map in fits of the lamps before it: such a fit traces every texel from every point."""
+"""Rows to which a known map is reduced when only lamps are fitted: every texel is traced from every point."""
 
 
 @torch.no_grad()
@@ -42,81 +44,87 @@ def solve_light(
     objective: Objective,
     config: MapLightConfig,
     first: bool,
-    benefit_of_doubt: bool = False,
+    lamps_if_undecided: bool = False,
 ) -> Evidence | None:
-    """Set the map, and lamps where allowed, to what explains the points. A known map stays.
+    """Set the map, and lamps if the settings allow them, to the values that best explain the points.
+
+    A known map is left unchanged.
 
     Args:
-        light: what is set; the search starts from what it is.
-        observed, material: surface points, and what they are made of.
-        lobe, scene: as of `from_texels`.
-        objective: what is minimised.
-        config: with "auto" the lamps must earn their place: the fit is done with and without, and they stay
-            where they lower the error at points kept back from both (`Evidence.favours`).
-        first: nothing has been decided yet.
-        benefit_of_doubt: lamps stay out only where it is sure that they are not worth it. Surfaces learn the
-            light that they are under: a lamp too many goes out at a later fit, as surfaces then show; a lamp
-            that is missing has left its glow on them, and no later fit asks for it.
+        light: the light to set; its current values are the initial values of the fit.
+        observed: the surface points.
+        material: their material.
+        lobe: as in `from_texels`.
+        scene: as in `from_texels`.
+        objective: the terms of the loss and their weights.
+        config: settings of the light. With kind "auto" the light is fitted with and without lamps, and the
+            lamps are used if they lower the error at points held back from both fits (`Evidence.favours`).
+        first: whether this is the first decision between the two.
+        lamps_if_undecided: use lamps even if their gain is not significant, unless it is significantly too
+            small. The error of a superfluous lamp can be undone: surfaces learn under it, and a later fit
+            removes it. A missing lamp cannot: its glow becomes base colour, and no later fit adds it.
 
     Returns:
-        What was measured for and against lamps; none where the settings had decided.
+        The comparison of the fits with and without lamps; None if the settings decide.
     """
     environment, lamps = light.light, light.lamps
     target = Target(observed.position, material, observed.pixel)
-    dark = environment.log_radiance.new_zeros(0, 3)
+    no_lamps = environment.log_radiance.new_zeros(0, 3)
+    # `unknown` are the texels to fit, as a view of the map, so that `copy_` sets them.
     if config.map is None:
-        # An even light is one source, and one texel that stands for all.
+        # An even light is a single source, which is stored in the first texel.
         even = environment.even
-        sought = environment.log_radiance[:, :1, :1] if even else environment.log_radiance
-        seen = environment.at_most(EVEN_ROWS) if even else environment
-        texels = from_texels(seen, observed, material.roughness, lobe, scene)
-        texels = texels.together() if even else texels
+        unknown = environment.log_radiance[:, :1, :1] if even else environment.log_radiance
+        traced = environment.at_most(EVEN_ROWS) if even else environment
+        from_map = from_texels(traced, observed, material.roughness, lobe, scene)
+        from_map = from_map.sum_sources() if even else from_map
     else:
-        sought = environment.log_radiance.new_zeros(3, 0, 0)
+        unknown = environment.log_radiance.new_zeros(3, 0, 0)
         known = environment.at_most(KNOWN_ROWS)
-        texels = from_texels(known, observed, material.roughness, lobe, scene)
-        texels = texels.lit(known.log_radiance.exp().flatten(1).t())
-    plain_start = Light(sought, dark)
+        from_map = from_texels(known, observed, material.roughness, lobe, scene)
+        from_map = from_map.with_strength(known.log_radiance.exp().flatten(1).t())
+    map_only = Light(unknown, no_lamps)
     if config.kind == "distant":
-        sought.copy_(fit_light(plain_start, texels, target, objective).log_radiance)
+        unknown.copy_(fit_light(map_only, from_map, target, objective).log_radiance)
         return None
 
     places = propose(lamps, observed.position, CANDIDATES)
-    near = from_lamps(places, lamps.radius, observed, material.roughness, lobe, scene)
-    both = texels.beside(near)
-    intensity = dark.new_zeros(len(places.position), 3)
+    from_candidates = from_lamps(places, lamps.radius, observed, material.roughness, lobe, scene)
+    from_both = from_map.concatenate(from_candidates)
+    intensity = no_lamps.new_zeros(len(places.position), 3)
     intensity[: lamps.lit] = lamps.intensity[: lamps.lit]
-    start = Light(sought, intensity)
+    start = Light(unknown, intensity)
     if config.kind != "auto":
-        found, measured = fit_light(start, both, target, objective), None
+        found, measured = fit_light(start, from_both, target, objective), None
     else:
-        # Surfaces then learn under the first choice and confirm it, so it is made on all parts in turn.
+        # Surfaces learn under the light that is chosen first and then confirm it, so the first decision uses
+        # all folds.
         fold = _folds(observed.position)
         gains = []
         for number in range(FOLDS if first else 1):
-            kept_back, fitted = fold == number, fold != number
-            plain = fit_light(plain_start, texels[fitted], target[fitted], objective)
-            found = fit_light(start, both[fitted], target[fitted], objective)
-            carried = (texels[kept_back], both[kept_back])
-            gains.append(compare((plain, found), carried, target[kept_back], objective))
+            held_back, fitted = fold == number, fold != number
+            plain = fit_light(map_only, from_map[fitted], target[fitted], objective)
+            found = fit_light(start, from_both[fitted], target[fitted], objective)
+            transports = (from_map[held_back], from_both[held_back])
+            gains.append(compare((plain, found), transports, target[held_back], objective))
         measured = evidence(torch.cat(gains))
-        if not measured.favours(chosen=benefit_of_doubt or lamps.lit > 0):
-            sought.copy_(plain.log_radiance)
-            lamps.place(dark, dark)
+        if not measured.favours(chosen=lamps_if_undecided or lamps.lit > 0):
+            unknown.copy_(plain.log_radiance)
+            lamps.place(no_lamps, no_lamps)
             return measured
-    sought.copy_(found.log_radiance)
-    lit = merge(places, found.intensity, near.sources[0].mean(0), len(lamps.position))
-    beside = texels.lit(sought.exp().flatten(1).t())
-    lit = settle_lamps(lit, lamps.radius, beside, observed, target, lobe, scene, objective)
-    # The map was found beside temporary lamps: light between the two may now belong to the other.
-    near = from_lamps(lit.places, lamps.radius, observed, material.roughness, lobe, scene)
-    found = fit_light(Light(sought, lit.intensity), texels.beside(near), target, objective)
-    sought.copy_(found.log_radiance)
-    lamps.place(lit.places.position, found.intensity, lit.places.axis)
+    unknown.copy_(found.log_radiance)
+    merged = merge(places, found.intensity, from_candidates.sources[0].mean(0), len(lamps.position))
+    map_light = from_map.with_strength(unknown.exp().flatten(1).t())
+    merged = settle_lamps(merged, lamps.radius, map_light, observed, target, lobe, scene, objective)
+    # The map was fitted together with the candidates, so it is fitted again with the refined lamps.
+    from_merged = from_lamps(merged.places, lamps.radius, observed, material.roughness, lobe, scene)
+    found = fit_light(Light(unknown, merged.intensity), from_map.concatenate(from_merged), target, objective)
+    unknown.copy_(found.log_radiance)
+    lamps.place(merged.places.position, found.intensity, merged.places.axis)
     return measured
 
 
 def _folds(position: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
-    """Each point's part number: that of its block, about the nearest of some randomly drawn points."""
-    drawn = torch.randperm(len(position), device=position.device)[: BLOCKS_OF_FOLD * FOLDS]
-    return torch.cdist(position, position[drawn]).argmin(1) % FOLDS
+    """The fold of each point. Points with the same nearest random centre form a block of a fold."""
+    centres = torch.randperm(len(position), device=position.device)[: BLOCKS_OF_FOLD * FOLDS]
+    return torch.cdist(position, position[centres]).argmin(1) % FOLDS

@@ -1,11 +1,11 @@
-"""The light solver: it remembers what training steps showed, and solves for the light behind it.
+"""The light solver remembers surface points of training steps and periodically fits the light to them.
 
     solver = model.light_solver()
     step = model.step(batch, stage)
     solver.observe(step)
     evidence = solver.solve(model.brdf, model.scene)
 
-A light that is free at every point is learned by gradients; `NothingToSolve` stands in its place.
+The free light field is learned by gradient descent instead; its solver, `NothingToSolve`, does nothing.
 """
 
 from __future__ import annotations
@@ -32,84 +32,92 @@ __all__ = ["LightSolver", "MapSolver", "NothingToSolve", "make_light_solver"]
 
 @runtime_checkable
 class LightSolver(Protocol):
-    """What a training loop calls after every step; a module, as checkpoints hold what it remembers."""
+    """The interface that a training loop calls after every step.
+
+    Implementations are modules, because the remembered points are part of a checkpoint.
+    """
 
     @property
     def due(self) -> bool:
-        """Whether `solve` would solve now."""
+        """Whether `solve` would run a fit now."""
         ...
 
     @property
     def points(self) -> int:
-        """How many surface points are remembered."""
+        """Number of remembered surface points."""
         ...
 
     def observe(self, step: StepResult) -> None:
-        """Remember what a training step showed of the surface and of the light beyond it."""
+        """Remember the surface points of a training step, and its pixels that show the light directly."""
         ...
 
     def use(self, config: FreeLightConfig | MapLightConfig, lobe: Lobe | None) -> None:
-        """Solve with these settings, and for surfaces of this lobe, from now on; what is remembered stays."""
+        """Use other settings and another specular lobe from now on; the remembered points are kept."""
         ...
 
     @property
     def seeks_start(self) -> bool:
-        """Whether a map is sought, and nothing is known of it yet."""
+        """Whether the solver fits a map and neither a fit nor an observed point exists yet."""
         ...
 
     def start(self, observed: Observed, material: Material, scene: SceneTracer | None) -> Evidence | None:
-        """Seek lamps before the map that has been set; without any it stays as it is. Surfaces learn under it
-        for a while before the first `solve`.
+        """Look for lamps in addition to an initial map that has been set; if none is found, keep that map.
+
+        The first `solve` is then due one interval of fits later, so that surfaces first learn under this
+        light.
 
         Args:
-            observed, material: surface points, and what they are made of.
-            scene: as of `solve`.
+            observed: surface points.
+            material: their material.
+            scene: as in `solve`.
 
         Returns:
-            As of `solve`.
+            As in `solve`.
         """
         ...
 
     def solve(self, brdf: BrdfField, scene: SceneTracer | None) -> Evidence | None:
-        """Set the light to what explains the remembered points, when it is time.
+        """If a fit is due, set the light to the one that best explains the remembered points.
 
         Args:
-            brdf: says what the remembered points are made of.
-            scene: stands between the points and the light, and shines on them; none where nothing is traced.
+            brdf: gives the material of the points.
+            scene: traces rays from the points through the scene, which blocks light and emits its own
+                radiance; None without traced visibility.
 
         Returns:
-            What the points that were kept back say of lamps; none where nothing was solved, or the settings
-            had decided.
+            The comparison of a light with lamps and one without at held-back points; None if no fit was due
+            or the settings decide about lamps.
         """
         ...
 
 
 class NothingToSolve(nn.Module):
-    """The solver of a light that is learned by gradients, or known."""
+    """The solver of a light that is learned by gradient descent, or completely known: it does nothing."""
 
     due, points, seeks_start = False, 0, False
 
     def start(self, observed: Observed, material: Material, scene: SceneTracer | None) -> None:
-        """Nothing is solved for."""
+        """Do nothing."""
 
     def observe(self, step: StepResult) -> None:
-        """Nothing is remembered."""
+        """Do nothing."""
 
     def use(self, config: FreeLightConfig | MapLightConfig, lobe: Lobe | None) -> None:
-        """Nothing depends on the settings."""
+        """Do nothing."""
 
     def solve(self, brdf: BrdfField, scene: SceneTracer | None) -> None:
-        """Nothing is solved for."""
+        """Do nothing."""
 
 
 class MapSolver(nn.Module):
-    """Solves for an environment map and the lamps before it.
+    """The solver of an environment map and near lamps.
 
     Args:
-        config: of the light.
-        facts, units: of the scene.
-        light: the map and the lamps that are set; they stay those of the model.
-        lobe: of the specular reflection; none for Lambertian surfaces.
+        config: settings of the light.
+        facts: facts of the scene: the response, and the kind of background.
+        units: units of radiance in which errors are measured.
+        light: the map and the lamps of the model, which the solver changes in place.
+        lobe: the specular lobe; None for Lambertian surfaces.
     """
 
     def __init__(
@@ -124,23 +132,24 @@ class MapSolver(nn.Module):
         self.config, self.response, self.unit = config, facts.response, units.physical
         self.light, self.lobe = light, lobe
         self.memory = SurfaceMemory(config.fit.points, config.fit.every)
-        # Only a background that is no backdrop shows the light, and only an unknown map must match it.
+        # The light is only visible behind the scene if the background is open, and a known map needs no
+        # observation.
         sightings = config.map is None and facts.background == "inverted_sphere"
         rows = light.light.log_radiance.shape[1]
         self.sky = SkySightings(rows, facts.response) if sightings else None
 
     @property
     def due(self) -> bool:
-        """Whether `solve` would solve now."""
+        """See `LightSolver.due`."""
         return self.memory.due and not _is_given(self.config)
 
     @property
     def points(self) -> int:
-        """How many surface points are remembered."""
+        """See `LightSolver.points`."""
         return self.memory.points.filled
 
     def observe(self, step: StepResult) -> None:
-        """As of `LightSolver`."""
+        """See `LightSolver.observe`."""
         if not len(step.surface_rows) and not len(step.beyond_rows):
             return
         self.memory.remember(step.surface)
@@ -149,29 +158,29 @@ class MapSolver(nn.Module):
 
     @property
     def seeks_start(self) -> bool:
-        """As of `LightSolver`."""
-        sought = self.config.map is None and not self.light.light.even
-        return sought and self.memory.age is None and self.points == 0
+        """See `LightSolver.seeks_start`."""
+        fits_map = self.config.map is None and not self.light.light.even
+        return fits_map and self.memory.age is None and self.points == 0
 
     @torch.no_grad()
     def start(self, observed: Observed, material: Material, scene: SceneTracer | None) -> Evidence | None:
-        """As of `LightSolver`."""
+        """See `LightSolver.start`."""
         self.memory.wait()
         if self.config.kind == "distant":
             return None
-        before = self.light.light.log_radiance.clone()
-        measured = self._solve(observed, material, scene, first=True, benefit_of_doubt=True)
+        before, rows = self.light.light.log_radiance.clone(), slice(self.config.fit.points)
+        measured = self._solve(observed[rows], material[rows], scene, first=True, lamps_if_undecided=True)
         if not self.light.lamps.lit:
             self.light.light.log_radiance.copy_(before)
         return measured
 
     def use(self, config: MapLightConfig, lobe: Lobe | None) -> None:
-        """As of `LightSolver`."""
+        """See `LightSolver.use`."""
         self.config, self.lobe = config, lobe
 
     @torch.no_grad()
     def solve(self, brdf: BrdfField, scene: SceneTracer | None) -> Evidence | None:
-        """As of `LightSolver`."""
+        """See `LightSolver.solve`."""
         if not self.due:
             return None
         first, observed = self.memory.age is None, self.memory.recall()
@@ -183,7 +192,7 @@ class MapSolver(nn.Module):
         material: Material,
         scene: SceneTracer | None,
         first: bool,
-        benefit_of_doubt: bool = False,
+        lamps_if_undecided: bool = False,
     ) -> Evidence | None:
         sky = None if self.sky is None else self.sky.known()
         environment = self.light.light
@@ -194,7 +203,7 @@ class MapSolver(nn.Module):
             None if environment.even else sky,
             self.config.monochrome,
         )
-        found = solve_light(
+        measured = solve_light(
             self.light,
             observed,
             material,
@@ -203,11 +212,11 @@ class MapSolver(nn.Module):
             objective,
             self.config,
             first,
-            benefit_of_doubt,
+            lamps_if_undecided,
         )
         if environment.even:
             environment.log_radiance.copy_(environment.log_radiance[:, :1, :1].clone())
-        return found
+        return measured
 
 
 def make_light_solver(
@@ -217,12 +226,12 @@ def make_light_solver(
     light: LightModel,
     lobe: Lobe | None,
 ) -> MapSolver | NothingToSolve:
-    """The solver that a light needs; arguments as of `MapSolver`."""
+    """Make the solver for a light; the arguments are those of `MapSolver`."""
     if isinstance(config, FreeLightConfig) or _is_given(config):
         return NothingToSolve()
     return MapSolver(config, facts, units, light, lobe)
 
 
 def _is_given(config: MapLightConfig) -> bool:
-    """Whether the map is known and nothing is sought before it."""
+    """Whether the map is known and no lamps are fitted."""
     return config.map is not None and config.kind == "distant"

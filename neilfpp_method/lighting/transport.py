@@ -1,12 +1,13 @@
-"""Light transport to a surface and on to its viewer as matrices: radiance is linear in the light.
+"""Light transport from sources via surface points to their viewers, as matrices.
 
-With geometry and roughness fixed, a map of T texels of radiance E and M lamps of intensity I,
+With geometry and roughness fixed, outgoing radiance is linear in the light. For a map with T texels of
+radiance E and M lamps of intensity I,
 
     L_o = k_d (D E + D' I + d) + F0 (F E + F' I + f) + (G E + G' I + g)
     k_d = (1 − m) b,   F0 = 0.04 (1 − m) + b m
 
-D, F, G hold cosine, visibility, solid angle, and the diffuse, the facing and the grazing part of the BRDF; d,
-f, g are what the scene's own surfaces add.
+The matrices D, F and G contain the cosine, the visibility, the solid angle, and the diffuse, facing and
+grazing part of the BRDF. The vectors d, f and g are the light that arrives from other surfaces of the scene.
 """
 
 from __future__ import annotations
@@ -28,46 +29,53 @@ from neilfpp_method.structures import Material, Observed, SceneLight, SceneTrace
 __all__ = ["Transport", "from_lamps", "from_texels", "from_texels_at", "in_sight", "lamp_kernel"]
 
 PAIRS_AT_ONCE = 2**18
-"""Pairs of a point and a direction that are traced together: what bounds the memory."""
+"""Maximum number of pairs of a point and a direction that are traced at once; it bounds memory."""
 
 
 @dataclass(frozen=True)
 class Transport:
-    """How light leaves N points towards their viewers: the diffuse, the facing and the grazing part, in this
-    order; K is 3, or 1 for Lambertian surfaces.
+    """Transport from T sources via N points to their viewers.
 
-    `sources` is per unit of each of T sources, `scene` what the scene's own surfaces send through the points.
+    The first dimension of both tensors is the part of the BRDF: diffuse, facing and grazing (K = 3), or only
+    diffuse for Lambertian surfaces (K = 1).
+
+    Attributes:
+        sources: outgoing radiance per unit of strength of each source.
+        scene: outgoing radiance due to light that other surfaces of the scene send to the points.
     """
 
     sources: Float[Tensor, "K N T"]
     scene: Float[Tensor, "K N 3"]
 
     def __getitem__(self, points: Tensor | slice) -> Transport:
-        """The same for some of the points."""
+        """The transport via some of the points."""
         return Transport(self.sources[:, points], self.scene[:, points])
 
-    def of(self, sources: Int[Tensor, " U"]) -> Transport:
-        """From some of the sources."""
+    def select_sources(self, sources: Int[Tensor, " U"]) -> Transport:
+        """The transport from some of the sources."""
         return Transport(self.sources[..., sources], self.scene)
 
-    def together(self) -> Transport:
-        """One source: all of them, where they are equally strong."""
+    def sum_sources(self) -> Transport:
+        """The transport from a single source that stands for all of them at equal strength."""
         return Transport(self.sources.sum(-1, keepdim=True), self.scene)
 
-    def beside(self, other: Transport) -> Transport:
-        """Both sets of sources."""
+    def concatenate(self, other: Transport) -> Transport:
+        """The transport from the sources of both."""
         return Transport(torch.cat((self.sources, other.sources), -1), self.scene + other.scene)
 
-    def lit(self, strength: Float[Tensor, "T 3"]) -> Transport:
-        """No sources: these, of a strength that is known, count as the scene's."""
+    def with_strength(self, strength: Float[Tensor, "T 3"]) -> Transport:
+        """A transport without sources, whose `scene` includes these sources at a known strength."""
         return Transport(self.sources[..., :0], self.scene + self.sources @ strength)
 
     def arriving(self, strength: Float[Tensor, "T 3"]) -> Float[Tensor, "K N 3"]:
-        """The sum over all sources of this strength and the scene, before any color of the material."""
+        """Sum over the sources at this strength, plus the scene, before it is multiplied by base colors."""
         return _SumOverSources.apply(self.sources, strength) + self.scene
 
     def outgoing(self, material: Material, strength: Float[Tensor, "T 3"]) -> Float[Tensor, "N 3"]:
-        """L_o under sources of this strength, with the colours of `material` (roughness is fixed)."""
+        """L_o for sources of this strength.
+
+        Only base colour and metallic of `material` are read; the roughness is part of the transport.
+        """
         diffuse, *reflected = self.arriving(strength)
         color = diffuse_reflectance(material, bool(reflected)) * diffuse
         if reflected:
@@ -77,10 +85,11 @@ class Transport:
 
 
 class _SumOverSources(torch.autograd.Function):
-    """sources @ strength: K N T, T 3 → K N 3.
+    """sources @ strength: (K, N, T) @ (T, 3) → (K, N, 3).
 
-    Autograd's own slope in the strength reads the sources across their order in memory, which takes longer
-    than along it; a fit does little else.
+    The backward pass of autograd for `strength` multiplies by the transposed sources and reads them against
+    their order in memory. The pass below reads them in order, which is faster, and a fit spends most of its
+    time here.
     """
 
     @staticmethod
@@ -89,13 +98,14 @@ class _SumOverSources(torch.autograd.Function):
         return sources @ strength
 
     @staticmethod
-    def backward(ctx, slope: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:
         sources, strength = ctx.saved_tensors
-        of_sources = slope @ strength.t() if ctx.needs_input_grad[0] else None
-        of_strength = (
-            (slope.flatten(0, 1).t() @ sources.flatten(0, 1)).t() if ctx.needs_input_grad[1] else None
-        )
-        return of_sources, of_strength
+        grad_sources = grad_strength = None
+        if ctx.needs_input_grad[0]:
+            grad_sources = grad @ strength.t()
+        if ctx.needs_input_grad[1]:
+            grad_strength = (grad.flatten(0, 1).t() @ sources.flatten(0, 1)).t()
+        return grad_sources, grad_strength
 
 
 @torch.no_grad()
@@ -106,20 +116,23 @@ def from_texels(
     lobe: Lobe | None,
     scene: SceneTracer | None,
 ) -> Transport:
-    """From the texels of a map, per unit of radiance; one direction per point and texel is traced.
+    """The transport from the texels of a map, per unit of radiance.
+
+    One random direction per point and texel is traced.
 
     Args:
-        environment: whose texels are meant; its radiance plays no part.
-        observed: surface points; unit normals and directions to the viewer.
-        roughness: at the points.
-        lobe: of the specular reflection; none for Lambertian surfaces.
-        scene: stands between the points and the map, and shines on them; none where inter-reflection is off.
+        environment: the map; only its shape is used, not its radiance.
+        observed: the surface points, with unit normals and directions to the viewer.
+        roughness: roughness at the points.
+        lobe: the specular lobe; None for Lambertian surfaces.
+        scene: traces rays from the points through the scene, which blocks light from the map and emits its
+            own radiance; None if inter-reflection is off.
     """
     texels = environment.log_radiance[0].numel()
     parts = []
     for part, rough in _chunks(observed, roughness, texels):
         rays = _texel_rays(environment, part, scene)
-        parts.append(rays.carried(_kernel(part, rough, rays.wi, rays.weight, lobe)))
+        parts.append(rays.transport(_kernel(part, rough, rays.wi, rays.weight, lobe)))
     return _joined(parts)
 
 
@@ -131,16 +144,17 @@ def from_texels_at(
     lobe: Lobe,
     scene: SceneTracer | None,
 ) -> Transport:
-    """As `from_texels`, at several roughnesses; directions are traced once; half-precision `sources`.
+    """The transport from the texels of a map at several roughnesses, with directions traced only once.
 
-    Layer 0 is diffuse, layers 1 + 2k and 2 + 2k the facing and grazing parts at roughness number k.
+    Layer 0 of the result is the diffuse part; layers 1 + 2k and 2 + 2k are the facing and grazing parts at
+    roughness number k. `sources` has half precision. Other arguments as in `from_texels`.
     """
     texels = environment.log_radiance[0].numel()
     parts = []
     for part, rough in _chunks(observed, observed.position[:, :1], texels):
         rays = _texel_rays(environment, part, scene)
         kernels = [_kernel(part, torch.full_like(rough, r), rays.wi, rays.weight, lobe) for r in roughnesses]
-        layers = [rays.carried(kernel if k == 0 else kernel[1:]) for k, kernel in enumerate(kernels)]
+        layers = [rays.transport(kernel if k == 0 else kernel[1:]) for k, kernel in enumerate(kernels)]
         parts.append(
             Transport(torch.cat([x.sources.half() for x in layers]), torch.cat([x.scene for x in layers]))
         )
@@ -149,8 +163,14 @@ def from_texels_at(
 
 @dataclass(frozen=True)
 class _TexelRays:
-    """For N points a direction in each texel above the horizon, its number among T texels, cosine times solid
-    angle, and what stands there of the scene.
+    """For each of N points one direction in each texel above its horizon.
+
+    Attributes:
+        wi: the directions.
+        number: index of the texel.
+        weight: cosine times solid angle of the texel.
+        texels: number of texels of the map.
+        met: what the rays hit in the scene; None without a scene.
     """
 
     wi: Float[Tensor, "N S 3"]
@@ -159,8 +179,8 @@ class _TexelRays:
     texels: int
     met: SceneLight | None
 
-    def carried(self, kernel: Float[Tensor, "K N S"]) -> Transport:
-        """What leaves the points through a kernel."""
+    def transport(self, kernel: Float[Tensor, "K N S"]) -> Transport:
+        """The transport through a kernel, which is the BRDF times `weight`."""
         sent = kernel.new_zeros(*kernel.shape[:2], 3)
         if self.met is not None:
             sent = torch.einsum("kns,nsc->knc", kernel, self.met.radiance.to(kernel.dtype))
@@ -173,7 +193,8 @@ def _texel_rays(environment: EnvironmentLight, observed: Observed, scene: SceneT
     drawn = environment.texel_directions(observed.position)
     texels = len(drawn.solid_angle)
     weight = dot(drawn.wi, observed.normal).clamp_min(0) * drawn.solid_angle
-    # The map is symmetric about its centre: half of its texels are above any horizon, grazing ones aside.
+    # The texels are symmetric about the origin, so half of them lie above any horizon (up to those that the
+    # horizon cuts).
     weight, number = weight.topk(texels // 2, dim=1)
     wi = drawn.wi.gather(1, number[..., None].expand(-1, -1, 3))
     met = None if scene is None else scene(observed.position, wi)
@@ -195,7 +216,16 @@ def from_lamps(
     lobe: Lobe | None,
     scene: SceneTracer | None,
 ) -> Transport:
-    """From small lamps, per unit intensity, tracing to their middles. Arguments as of `from_texels`."""
+    """The transport from small lamps, per unit of intensity; shadow rays go to their centres.
+
+    Args:
+        lamps: positions and axes of the lamps.
+        radius: radius of every lamp, in scene units.
+        observed: as in `from_texels`, like the remaining arguments.
+        roughness: as in `from_texels`.
+        lobe: as in `from_texels`.
+        scene: as in `from_texels`; it blocks light, but its own radiance is not added.
+    """
     sources = []
     for part, rough in _chunks(observed, roughness, len(lamps.position)):
         sight = in_sight(lamps, radius, part.position, scene)
@@ -208,7 +238,7 @@ def from_lamps(
 def in_sight(
     lamps: LampPlaces, radius: float, x: Float[Tensor, "N 3"], scene: SceneTracer | None
 ) -> Bool[Tensor, "N M"]:
-    """Whether the middle of a lamp is to be observed from a point."""
+    """Whether the centre of a lamp is visible from a point."""
     rays = rays_towards(x, lamps.position, lamps.axis, radius)
     if scene is None:
         return torch.ones_like(rays.distance, dtype=torch.bool)
@@ -223,7 +253,10 @@ def lamp_kernel(
     roughness: Float[Tensor, "N 1"],
     lobe: Lobe | None,
 ) -> Float[Tensor, "K N M"]:
-    """`sources` of a transport from lamps; differentiable in place and axis, but not in visibility."""
+    """The `sources` of a transport from lamps, differentiable in their positions and axes.
+
+    The visibility `sight` is a constant; see `in_sight`.
+    """
     rays = rays_towards(observed.position, lamps.position, lamps.axis, radius)
     weight = sight * rays.emission * dot(rays.wi, observed.normal).clamp_min(0) / rays.distance.square()
     return _kernel(observed, roughness, rays.wi, weight, lobe)
@@ -236,7 +269,7 @@ def _kernel(
     weight: Float[Tensor, "N S"],
     lobe: Lobe | None,
 ) -> Float[Tensor, "K N S"]:
-    """The parts of the BRDF times a weight that holds cosine and solid angle."""
+    """The parts of the BRDF times `weight`, which contains the cosine and the solid angle."""
     if lobe is None:
         return weight[None] / math.pi
     terms = specular_terms(roughness, observed.normal, observed.wo, wi, lobe)
@@ -246,6 +279,7 @@ def _kernel(
 def _chunks(
     observed: Observed, roughness: Float[Tensor, "N 1"], sources: int
 ) -> list[tuple[Observed, Tensor]]:
+    """Split points into chunks of at most `PAIRS_AT_ONCE` pairs of a point and a source."""
     rows = max(1, PAIRS_AT_ONCE // max(1, sources))
     spans = [slice(start, start + rows) for start in range(0, max(1, len(observed)), rows)]
     return [(observed[span], roughness[span]) for span in spans]

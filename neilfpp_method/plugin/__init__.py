@@ -1,8 +1,7 @@
-"""The method inside nerfstudio: `ns-train neilfpp --data CAPTURE`, and every `ns-*` command that follows it.
+"""The nerfstudio plugin: `ns-train neilfpp --data CAPTURE` and the other `ns-*` commands.
 
-Nerfstudio loads the specifications below in every command that it has. They are made when it asks for them,
-and one that cannot be made is reported and left out: a broken installation of this package costs its own
-methods, no others.
+Every nerfstudio command loads the specifications below. They are created on access, and one that cannot be
+created is reported and left out, so that a broken installation of this package does not affect other methods.
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'neilfpp_method.plugin' has no attribute '{name}'")
     try:
         return getattr(import_module(_SPECIFICATIONS[name]), name)
-    except Exception as error:  # whatever a dependency may raise
+    except Exception as error:
+        # The import of a dependency can raise anything.
         print(f"neilfpp-method: {name} is not available in nerfstudio ({error!r})", file=sys.stderr)
         return None

@@ -1,4 +1,4 @@
-"""Pixels for nerfstudio's own data manager: float images, and per pixel its ray and loss inputs."""
+"""Float images for nerfstudio's data manager, with the ray and the loss inputs of each pixel."""
 
 from __future__ import annotations
 
@@ -36,19 +36,21 @@ __all__ = [
 PIXELS = "neilfpp_pixels"
 """Key of a dataset's metadata under which the model finds the `PixelDataset`."""
 
-# Not under the name `mask`: nerfstudio draws no pixel outside of that, and L_vol needs those as well.
 FACTS = {"object_mask": "mask", "mask_known": "mask_known", "image_gradient": "image_gradient"}
+"""Keys of a nerfstudio batch and the attributes of `PixelBatch` that they hold. The mask is not called `mask`
+because nerfstudio would then draw no pixels outside of it, which L_vol needs.
+"""
 VALID = "valid"
-"""Key of a batch of pixels under which they say whether they count."""
+"""Key of a nerfstudio batch for whether a pixel is valid."""
 NEAR = "near_object"
-"""Key of a batch of pixels under which they say whether they are on the object or near it."""
+"""Key of a nerfstudio batch for whether a pixel is on the object or near it."""
 
 
 class CaptureDataset(InputDataset):
-    """Images as the files hold them: linear radiance without an upper bound, or display values in [0, 1].
+    """Images as stored in the files: unbounded linear radiance, or display values in [0, 1].
 
     Raises:
-        UserError: the views differ in size, or are to be scaled.
+        UserError: if the views differ in size, or nerfstudio is to scale them.
     """
 
     exclude_batch_keys_from_device: ClassVar = [
@@ -72,11 +74,11 @@ class CaptureDataset(InputDataset):
         self.metadata[PIXELS] = self.pixels
 
     def get_image_float32(self, image_idx: int) -> Float[Tensor, "H W 3"]:
-        """The image as its file holds it."""
+        """The image as stored in its file."""
         return self._image(image_idx, self.pixels.view(image_idx, gradients=False).color)
 
     def get_metadata(self, data: dict[str, Any]) -> dict[str, Tensor]:
-        """What the losses ask of each pixel, and which can be drawn, (H, W, 1)."""
+        """Loss inputs of each pixel, and which pixels can be drawn, (H, W, 1) each."""
         i = data["image_idx"]
         pixels = self.pixels.view(i)
         facts = {key: self._image(i, getattr(pixels, name)) for key, name in FACTS.items()}
@@ -91,16 +93,16 @@ class CaptureDataset(InputDataset):
 
 
 def pixel_batch(origins: Tensor, directions: Tensor, batch: dict[str, Any]) -> PixelBatch:
-    """Nerfstudio's rays and its batch of pixels as ours; both in the scene frame."""
+    """Convert nerfstudio's rays and batch of pixels to a `PixelBatch`; both are in the scene frame."""
     facts = {name: batch[key].to(origins.device)[:, 0] for key, name in FACTS.items()}
     color, view = batch["image"].to(origins.device), batch["indices"][:, 0].to(origins.device)
     return PixelBatch(origins=origins, directions=directions, color=color, view=view, **facts)
 
 
 class CapturePixelSampler(PixelSampler):
-    """Draws what `PixelDataset.sample` would (`data.drawing`), by the same random numbers.
+    """Draws the same pixels as `PixelDataset.sample` (`data.drawing`) with the same random numbers.
 
-    A step then learns from the same pixels as the same step of the standalone loop, with masks or without.
+    A step thus trains on the same pixels as the corresponding step of the standalone loop.
     """
 
     _valid: Tensor | None = None
@@ -110,9 +112,10 @@ class CapturePixelSampler(PixelSampler):
         self, batch: dict[str, Any], num_rays_per_batch: int, keep_full_image: bool = False
     ) -> dict[str, Tensor]:
         """Pixels of a batch of images, and their `indices`: view, row, column."""
-        del keep_full_image  # no model of ours looks at whole images in training
+        # Training never reads whole images.
+        del keep_full_image
         _, height, width, _ = batch["image"].shape
-        # Nerfstudio has shuffled the images when it loaded them.
+        # Nerfstudio shuffles the images when it loads them.
         order = batch["image_idx"].cpu().argsort()
         if self._valid is not batch[VALID]:
             bits = VALID_BIT * batch[VALID].cpu()[order] + NEAR_BIT * batch[NEAR].cpu()[order]
@@ -130,10 +133,10 @@ class CapturePixelSampler(PixelSampler):
 
 
 class CaptureRayGenerator(RayGenerator):
-    """Rays of the capture's cameras, to the bit those that the standalone loop learns from.
+    """Rays of the capture's cameras, bitwise equal to those of the standalone loop.
 
-    Nerfstudio's own differ by rounding, where a lens bends them by a little more, and training is chaotic:
-    two runs that part by a rounding error end about as far apart as two seeds do.
+    Nerfstudio's own rays differ by rounding errors, and by slightly more with lens distortion. Training is
+    chaotic: two runs that differ by a rounding error end about as far apart as two runs with different seeds.
     """
 
     def __init__(self, dataset: CaptureDataset, device: torch.device | str) -> None:
@@ -158,13 +161,13 @@ class CaptureDataManagerConfig(VanillaDataManagerConfig):
     pixel_sampler: PixelSamplerConfig = field(
         default_factory=lambda: PixelSamplerConfig(_target=CapturePixelSampler)
     )
-    """Who draws the pixels of a step."""
+    """The sampler of the pixels of a step."""
 
 
 class CaptureDataManager(VanillaDataManager[CaptureDataset]):
     """Nerfstudio's data manager with float images."""
 
     def setup_train(self) -> None:
-        """Nerfstudio's, with our rays."""
+        """Set up as nerfstudio does, but with `CaptureRayGenerator`."""
         super().setup_train()
         self.train_ray_generator = CaptureRayGenerator(self.train_dataset, self.device)

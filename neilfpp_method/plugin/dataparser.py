@@ -1,6 +1,6 @@
-"""`neilfpp-data`: every capture that `neilfpp train` reads, HDR included, for nerfstudio's data managers.
+"""The dataparser `neilfpp-data`, which reads every capture that `neilfpp train` reads, including HDR images.
 
-Nerfstudio's frame is then the scene frame (unit sphere). Data managers import this module.
+Nerfstudio's frame is then the scene frame, in which the object lies in the unit sphere.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ class CaptureParserConfig(DataParserConfig):
     data: Path = Path()
     """Folder of the capture."""
     format: Optional[str] = None  # noqa: UP045  (tyro reads it at run time on every Python)
-    """The capture's format (see docs/captures.md); none: told from what is in the folder."""
+    """Format of the capture (see docs/captures.md); default: recognised from the files."""
     test_every: Optional[int] = None  # noqa: UP045  (tyro reads it at run time on every Python)
-    """Hold out every k-th view; none: as the capture says, else every 8th."""
+    """Hold out every k-th view; default: the capture's split, or every 8th view."""
     response: Literal["auto", "linear", "srgb"] = "auto"
-    """Whether pixels are linear radiance or display values; auto: as captured, else floats are linear."""
+    """What the pixels hold: linear radiance or sRGB; auto: as the capture or the kind of files says."""
 
 
 @dataclass
@@ -55,7 +55,7 @@ class CaptureParser(DataParser):
     def _generate_dataparser_outputs(self, split: str = "train", **_) -> DataparserOutputs:
         chosen = self.config
         capture = load_capture(chosen.data, chosen.format, chosen.test_every, response=chosen.response)
-        # Nerfstudio needs a view to evaluate; where none is held out it gets a training view.
+        # Nerfstudio needs at least one evaluation view; if none is held out it gets a training view.
         views = capture.train_views if split == "train" else capture.test_views or capture.train_views[:1]
         frame = capture.normalisation
         transform = torch.eye(4)[:3]
@@ -93,10 +93,10 @@ def _is_fisheye(camera: Camera) -> bool:
 
 
 def _distortion(camera: Camera) -> list[float]:
-    """A lens as nerfstudio's k1, k2, k3, k4, p1, p2.
+    """Distortion coefficients in nerfstudio's order k1, k2, k3, k4, p1, p2.
 
     Raises:
-        UserError: nerfstudio has no such lens.
+        UserError: if nerfstudio does not support the lens model.
     """
     known = nerfstudio_coefficients(camera)
     if known is None:
@@ -107,10 +107,10 @@ def _distortion(camera: Camera) -> list[float]:
 
 
 def capture_of(outputs: DataparserOutputs) -> Capture:
-    """The capture behind a dataparser's outputs: `neilfpp-data`'s, or one made of another's outputs.
+    """The capture of a dataparser's outputs: that of `neilfpp-data`, or one made from other outputs.
 
     Raises:
-        UserError: a camera has no image plane: it is a panorama, or orthographic.
+        UserError: if a camera is neither perspective nor fisheye, or if HDR and LDR images are mixed.
     """
     if CAPTURE in outputs.metadata:
         return outputs.metadata[CAPTURE]

@@ -1,4 +1,4 @@
-"""A method of nerfstudio as our host: `--pipeline.model.host neus`."""
+"""Use a nerfstudio method as the host: `--pipeline.model.host neus`."""
 
 from __future__ import annotations
 
@@ -15,33 +15,35 @@ from neilfpp_method.errors import UserError
 
 __all__ = ["ForeignModel", "build_foreign"]
 
-# What a host needs: normals, and one colour for one place and direction, whichever image looks at it.
 WANTED = {
     "predict_normals": True,
     "use_appearance_embedding": False,
     "camera_optimizer": CameraOptimizerConfig(mode="off"),
 }
+"""Options that a host needs: normals, and a colour that depends on position and direction but not on the
+image.
+"""
 
 
 @dataclass(frozen=True)
 class ForeignModel:
-    """A nerfstudio model, and the rate at which its own method trains it."""
+    """A nerfstudio model, and the learning rate with which its own method trains it."""
 
     model: Model
     rate: float
 
 
 def build_foreign(name: str, arguments: Mapping[str, Any]) -> ForeignModel:
-    """The model of the method `name`, untrained.
+    """Build the untrained model of a nerfstudio method.
 
     Args:
-        name: as in `ns-train`.
-        arguments: what nerfstudio builds its models from: scene box, number of images, device, …
+        name: name of the method in `ns-train`.
+        arguments: arguments of nerfstudio's model constructor: scene box, number of images, device, …
 
     Raises:
-        UserError: there is no such method, or it does not render rays.
+        UserError: if there is no such method, or if it does not render rays.
     """
-    # Nerfstudio's table of methods holds this plugin; it can be imported only once the plugin is.
+    # Nerfstudio's table of methods contains this plugin, so it can only be imported after the plugin.
     from nerfstudio.configs.method_configs import method_configs
 
     rays = {key: method for key, method in method_configs.items() if _takes_rays(method)}

@@ -18,7 +18,7 @@ __all__ = ["neilfpp", "neilfpp_mesh"]
 
 
 def trainer(name: str, settings: NeilfConfig) -> TrainerConfig:
-    """Nerfstudio's trainer with the numbers of the settings."""
+    """The configuration of nerfstudio's trainer that corresponds to settings of this package."""
     loop = settings.train
     return TrainerConfig(
         method_name=name,
@@ -33,7 +33,7 @@ def trainer(name: str, settings: NeilfConfig) -> TrainerConfig:
             ),
             model=NeilfMethodConfig(neilf=settings, eval_num_rays_per_chunk=loop.eval_chunk),
         ),
-        # The rates are those of `pipeline.model.neilf.optimizer`, set at each step.
+        # Learning rates come from `pipeline.model.neilf.optimizer` and are set in each step.
         optimizers={
             field: {"optimizer": FieldAdamConfig(name=field), "scheduler": None}
             for field in sorted(GEOMETRY | MATERIAL)

@@ -51,10 +51,10 @@ __all__ = ["FieldAdamConfig", "NeilfMethod", "NeilfMethodConfig"]
 
 @dataclass
 class FieldAdamConfig(OptimizerConfig):
-    """The optimiser of one field; at each step its rate is set as the standalone loop sets it."""
+    """The optimizer of one field. Its learning rate is set in each step, as in the standalone loop."""
 
     name: str = ""
-    """The field."""
+    """Name of the field."""
 
     def setup(self, params: list[nn.Parameter]) -> torch.optim.Optimizer:
         """Adam, as in `train.optimizer.make_optimizer`."""
@@ -67,21 +67,21 @@ class NeilfMethodConfig(ModelConfig):
 
     _target: type = field(default_factory=lambda: NeilfMethod)
     enable_collider: bool = False
-    """Unused: hosts bound their rays themselves."""
+    """Unused, because hosts limit their rays themselves."""
     host: Optional[str] = None  # noqa: UP045  (tyro reads it at run time)
-    """A nerfstudio method that renders rays as the host (neus, nerfacto, …); none: the host of `neilf`. It
-    trains at its own rate and with its own regularisers.
+    """A nerfstudio method that renders rays (neus, nerfacto, …), to use as the host; default: the host of
+    `neilf`. It is trained with its own learning rate and regularisers.
     """
     host_losses: float = 1.0
-    """Weight of `host`'s regularisers; 0: none of them, and our L_Eik where it is a surface model."""
+    """Weight of the regularisers of `host`. With 0 they are replaced by L_Eik if it is a surface model."""
     neilf: NeilfConfig = field(default_factory=lambda: preset("fast"))
-    """The settings of the method. Of `train` only the seed and the steps of the stages count here."""
+    """The settings of the method. Of `train`, only the seed and the steps of the stages are used."""
 
 
 class NeilfMethod(Model):
-    """The model, its outputs by name, and the three stages through nerfstudio's callbacks.
+    """The method as a nerfstudio model, which runs the three stages through nerfstudio's callbacks.
 
-    `rgb` and `rgb_volume` are in the response of the capture, as its pixels are: linear where it is HDR.
+    The outputs `rgb` and `rgb_volume` are in the response of the capture: linear for HDR captures.
     """
 
     config: NeilfMethodConfig
@@ -93,7 +93,8 @@ class NeilfMethod(Model):
         pixels: PixelDataset | None = self.kwargs["metadata"].get(PIXELS)
         if pixels is None:
             raise UserError(
-                "the data manager is not ours", "leave --pipeline.datamanager as `ns-train neilfpp` sets it"
+                "the data manager is not that of neilfpp",
+                "leave --pipeline.datamanager as `ns-train neilfpp` sets it",
             )
         settings = self.config.neilf
         self.proxy: SurfaceProxy | None = None
@@ -118,8 +119,8 @@ class NeilfMethod(Model):
             self.neilf.observers.append(lambda batch, hits: whole.show_proxy(batch.rays, hits))
             if self.proxy is not None:
                 CONSOLE.log(
-                    f"{self.config.host} traces no rays cheaply: a proxy of its surface, gathered from the "
-                    "training rays, traces shadows and light between surfaces"
+                    f"{self.config.host} cannot trace rays cheaply: shadows and inter-reflection are traced "
+                    "on a proxy of its surface that is built from the training rays"
                 )
         self.pixels = pixels
         self.light_solver = self.neilf.light_solver()
@@ -134,7 +135,7 @@ class NeilfMethod(Model):
 
     @property
     def stage(self) -> Stage:
-        """The stage of the step in progress, or of the last one; before training the first."""
+        """The stage of the current or last step; the first stage before training."""
         return stage_at(self.step, self.config.neilf.train).stage
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -146,18 +147,19 @@ class NeilfMethod(Model):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Ours, and those of a host that comes from nerfstudio.
+        """The callbacks of this method, and those of a nerfstudio host.
 
         Raises:
-            UserError: training on several devices; the losses are computed where nerfstudio's wrapper does
-                not look. Or an environment map that is known cannot be read.
+            UserError: if the known environment map cannot be read, or if there are several devices: the
+                losses are computed outside of the method that nerfstudio's data-parallel wrapper handles.
         """
         trainer, optimizers = training_callback_attributes.trainer, training_callback_attributes.optimizers
         if trainer.world_size > 1:
             raise UserError(
                 "several devices under nerfstudio", "use `neilfpp train --devices N`, or one device"
             )
-        if self.step < 0:  # no checkpoint was loaded, which would hold the map
+        # A loaded checkpoint already contains the map.
+        if self.step < 0:
             show_known_light(self.neilf)
         theirs = (
             self.neilf.host.inner.model.get_training_callbacks(training_callback_attributes)
@@ -168,7 +170,7 @@ class NeilfMethod(Model):
             self.guard.watch(optimizer)
         obstacle = no_record(trainer, self.config.host)
         if obstacle:
-            CONSOLE.log(f"no run folder for neilfpp's own commands: {obstacle}")
+            CONSOLE.log(f"no run folder for the neilfpp commands: {obstacle}")
         else:
             self.record = RunRecord.of(trainer, self.config.neilf, self.neilf.facts)
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
@@ -195,18 +197,18 @@ class NeilfMethod(Model):
         seed_step(settings.seed, step)
 
     def _start_light(self, step: int) -> None:
-        """Find the light that a material is learned under first, as the standalone loop does."""
+        """Set the initial light before material is trained, as in the standalone loop."""
         settings = self.config.neilf
         seed_step(settings.train.seed, -4 - step)
         plan, pixels = Plan.begin(Asked("as-set"), settings), self.pixels.on(self.device)
-        _, found = look_at_light(plan, self.neilf, pixels, step)
-        if found is not None:
-            CONSOLE.log(found.in_words())
-            start_with(self.neilf, found)
-            self.light_solver.start(found.observed, found.material, self.neilf.scene)
+        _, first = look_at_light(plan, self.neilf, pixels, step)
+        if first is not None:
+            CONSOLE.log(first.in_words())
+            start_with(self.neilf, first)
+            self.light_solver.start(first.observed, first.material, self.neilf.scene)
 
     def _solve_light(self, step: int) -> None:
-        """After the optimiser, as the standalone loop does."""
+        """Fit the light after the optimizer step if that is due, as in the standalone loop."""
         if self.computed is None:
             return
         self.light_solver.observe(self.computed)
@@ -217,7 +219,7 @@ class NeilfMethod(Model):
         self.computed = None
 
     def _look_and_save(self, trainer: Trainer, step: int) -> None:
-        """At the end of a stage see whether all is well; there, and where nerfstudio saves, keep the run."""
+        """Check the health at the end of a stage; write the run folder then and when nerfstudio saves."""
         done = step + 1
         position = stage_at(step, self.config.neilf.train)
         ends = position.step + 1 == position.length
@@ -227,19 +229,20 @@ class NeilfMethod(Model):
             CONSOLE.log(f"health after {position.stage.value}: {Health.of(self.watch.findings.values())}")
             if self.proxy is not None and self.proxy.report() is not None:
                 CONSOLE.log(str(self.proxy.report()))
-        saves = step > 0 and step % trainer.config.steps_per_save == 0  # as nerfstudio has it
+        # The condition under which nerfstudio saves.
+        saves = step > 0 and step % trainer.config.steps_per_save == 0
         if ends or saves or done == trainer._start_step + trainer.config.max_num_iterations:
             write_findings(trainer.base_dir, self.watch)
             if self.record is not None:
                 self.record.save(self.neilf, self.light_solver, self.watch, trainer, done)
 
     def _end_after_last(self, trainer: Trainer, step: int) -> None:
-        """Nerfstudio counts iterations from where it resumes; the stages end where they end."""
+        """Stop after the last stage: nerfstudio counts iterations from the step at which it resumes."""
         if step + 1 >= sum(stage_steps(self.config.neilf.train).values()):
             trainer.stop_training = True
 
     def update_to_step(self, step: int) -> None:
-        """The step of a checkpoint that has been loaded."""
+        """Set the step after a checkpoint has been loaded."""
         self.step = step
 
     # ------------------------------------------------------------------------------------------------- losses
@@ -247,7 +250,7 @@ class NeilfMethod(Model):
     def get_loss_dict(
         self, outputs: dict[str, Tensor], batch: dict[str, Any], metrics_dict: dict[str, Tensor] | None = None
     ) -> dict[str, Tensor]:
-        """The weighted losses of the stage; in evaluation the mean absolute difference from the image."""
+        """The weighted losses of the stage; in evaluation mode the mean absolute error of the image."""
         if not self.training:
             return {"rgb": (outputs["rgb"] - batch["image"].to(self.device)).abs().mean()}
         pixels = pixel_batch(outputs["origins"], outputs["directions"], batch)
@@ -262,12 +265,12 @@ class NeilfMethod(Model):
         total = weigh(terms, weights)
         self.guard.begin_step(total.terms, self.step)
         if metrics_dict is not None:
-            # Known only now, and logged after this: the terms before their weights.
+            # Nerfstudio logs the metrics after this call, so the unweighted terms can be added here.
             metrics_dict |= total.terms | self._light_found()
         return {name: weigh({name: term}, weights).loss for name, term in terms.items()}
 
     def _light_found(self) -> dict[str, Tensor]:
-        """The last fit's evidence for and against lamps, where the settings leave that open."""
+        """The evidence for lamps of the last fit, unless the settings decide about lamps."""
         if self.evidence is None:
             return {}
         return {
@@ -278,11 +281,11 @@ class NeilfMethod(Model):
     # ------------------------------------------------------------------------------------------------ outputs
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
-        """In evaluation every map; in training the rays: the losses decide what is rendered."""
+        """All maps in evaluation mode; in training only the rays, since the losses render what they need."""
         rays = RayBatch(ray_bundle.origins, ray_bundle.directions)
         if self.training:
             return {"origins": rays.origins, "directions": rays.directions}
-        # Before the stage that moves it, the material is what it starts as, and says nothing of the scene.
+        # Before material is trained, its initial values are not shown.
         maps = self.neilf.maps(rays, with_material=self._has_material())
         response = self.neilf.facts.response
         return {
@@ -302,17 +305,16 @@ class NeilfMethod(Model):
 
     @torch.no_grad()
     def _incident_light(self, rays: RayBatch, maps: Maps) -> Float[Tensor, "N 3"]:
-        """Irradiance over π at surface hits: the mean incident radiance, weighted by cosine."""
+        """Irradiance divided by π at the hits: the cosine-weighted mean of the incident radiance."""
         light = torch.zeros_like(maps.rgb)
-        rows = torch.nonzero(maps.roughness[:, 0])[
-            :, 0
-        ]  # what is no hit, or has no material yet, holds zeros
+        # Roughness is 0 for rays without a hit, and for all rays before material is trained.
+        rows = torch.nonzero(maps.roughness[:, 0])[:, 0]
         if not len(rows):
             return light
         normal, wo = maps.normal[rows], -rays.directions[rows]
         position = rays.origins[rows] + maps.depth[rows] * rays.directions[rows]
         count = self.config.neilf.shading.train_samples
-        # The density of a cosine sampler cancels the cosine: what is left is a plain mean.
+        # The pdf of the cosine sampler cancels the cosine, so the estimate is a plain mean.
         drawn = sample_directions(
             "cosine", normal, wo, maps.roughness[rows], count, self.neilf.lobe, stochastic=False
         )
@@ -322,15 +324,15 @@ class NeilfMethod(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """PSNR and SSIM of display values over the object, as `neilfpp eval`, and all maps."""
+        """PSNR and SSIM of display values on the object, as in `neilfpp eval`, and pictures of all maps."""
         truth, rgb, volume = (self._display(image.to(self.device)) for image in _images(batch, outputs))
-        # Where nothing is known of the object, what is rendered of it chooses the pixels.
-        shown = (
+        # Without a mask, the rendered opacity selects the pixels of the object.
+        on_object = (
             batch["object_mask"].cpu() > 0.5
             if batch["mask_known"].any()
             else outputs["accumulation"].cpu() > 0.5
         )
-        mask = (shown & batch[VALID].cpu())[..., 0].numpy()
+        mask = (on_object & batch[VALID].cpu())[..., 0].numpy()
         arrays = {"": rgb, "volume_": volume}
         figures = {
             f"{name}{kind}": measure(image.cpu().numpy(), truth.cpu().numpy(), mask)

@@ -1,5 +1,6 @@
-"""A run of `ns-train` as a run folder, `neilfpp` beside its `config.yml`: what `neilfpp export`, `eval`,
-`relight`, `report`, `render`, `view` and `train --resume` read.
+"""Write a training of `ns-train` as a run folder, `neilfpp` next to nerfstudio's `config.yml`.
+
+The commands `neilfpp export`, `eval`, `relight`, `report`, `render`, `view` and `train --resume` read it.
 """
 
 from __future__ import annotations
@@ -24,23 +25,23 @@ __all__ = ["RunRecord", "no_record"]
 
 
 def no_record(trainer: Trainer, host: str | None) -> str | None:
-    """Why a training cannot be kept as a run folder, a clause; none: it can."""
+    """The reason why a training cannot be written as a run folder; None if it can."""
     if host is not None:
-        return f"the host {host} is nerfstudio's own: use the ns-* commands, ns-export among them"
+        return f"the host {host} belongs to nerfstudio: use the ns-* commands, for example ns-export"
     if not isinstance(trainer.config.pipeline.datamanager.dataparser, CaptureParserConfig):
-        return "its images come from another dataparser than neilfpp-data: use the ns-* commands"
+        return "the images come from another dataparser than neilfpp-data: use the ns-* commands"
     return None
 
 
 @dataclass(frozen=True)
 class RunRecord:
-    """Writes the folder, its description with the first checkpoint.
+    """Writes a run folder; its description is written together with the first checkpoint.
 
     Attributes:
-        path: the folder.
-        config: the settings as they are trained, with as many rays as nerfstudio's data manager draws.
-        source: how the capture is read again.
-        facts: what the images decided.
+        path: the run folder.
+        config: the settings, with the number of rays of nerfstudio's data manager.
+        source: the location of the capture and how it is read.
+        facts: facts measured in the images.
     """
 
     path: Path
@@ -50,7 +51,7 @@ class RunRecord:
 
     @staticmethod
     def of(trainer: Trainer, settings: NeilfConfig, facts: SceneFacts) -> RunRecord:
-        """The folder beside the configuration of a trainer."""
+        """The record of a trainer, next to its `config.yml`."""
         pixels = trainer.config.pipeline.datamanager
         parser = pixels.dataparser
         train = dataclasses.replace(settings.train, rays=pixels.train_num_rays_per_batch)
@@ -62,11 +63,12 @@ class RunRecord:
     def save(
         self, model: NeilfModel, light_solver: nn.Module, watch: Watch, trainer: Trainer, steps: int
     ) -> None:
-        """The state after `steps` steps, with that of nerfstudio's optimisers as one, as `neilfpp train` has
-        it.
+        """Write the state after `steps` steps.
+
+        The states of nerfstudio's optimizers are merged into that of a single one, as in `neilfpp train`.
 
         Raises:
-            UserError: the folder cannot be written.
+            UserError: if the folder cannot be written.
         """
         if not (self.path / "config.json").is_file():
             create_run(self.path, self.config, self.source, self.facts)

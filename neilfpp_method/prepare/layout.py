@@ -19,6 +19,7 @@ from neilfpp_method.data.formats.write_transforms import write_transforms
 from neilfpp_method.data.point_cloud import WorldPoints, read_oriented_ply, write_oriented_ply
 from neilfpp_method.data.scene_box import SceneBox, find_box
 from neilfpp_method.data.views import CaptureFiles, View
+from neilfpp_method.errors import UserError
 from neilfpp_method.inspection.findings import inspect_capture, problems, to_leave_out
 from neilfpp_method.prepare.dense_cloud import dense_cloud
 from neilfpp_method.prepare.options import Prepare
@@ -85,7 +86,7 @@ def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
         work / "capture",
         step,
         test_every=options.test_every,
-        dense=options.dense,
+        cloud=options.cloud,
         also=options.also,
         auto=options.auto,
     )
@@ -123,19 +124,30 @@ def _cloud(
     source: Source, prepared: Capture, options: Prepare, after: Step, open_bar: Bars
 ) -> tuple[WorldPoints, str]:
     """The oriented points, and where they come from, in words."""
-    if options.dense:
-        step = begin(options.out / WORK / "dense", after, views=[view.name for view in prepared.views])
-        path = step.folder / CLOUD
-        if step.result is None:
-            write_oriented_ply(path, dense_cloud(prepared, step.folder, open_bar))
-            step.complete({})
-        return read_oriented_ply(path), "dense: plane-sweep stereo"
+    if options.cloud == "dense" or (options.cloud == "auto" and source.posed.cloud is None):
+        try:
+            return _dense(prepared, options, after, open_bar), "dense: plane-sweep stereo"
+        except UserError as error:
+            if options.cloud == "dense":
+                raise
+            no_dense = f"; no dense ones, as {error.problem}"
+    else:
+        no_dense = ""
     if source.posed.cloud is not None:
         return without_outliers(read_oriented_ply(source.posed.cloud)), "given with the capture"
     if source.points is not None:
-        return oriented(source.points), "sparse: structure from motion"
-    empty = WorldPoints(np.empty((0, 3)), np.empty((0, 3)))
-    return empty, "none: the poses came without points; --dense computes a cloud"
+        return oriented(source.points), f"sparse: structure from motion{no_dense}"
+    return WorldPoints(np.empty((0, 3)), np.empty((0, 3))), f"none: the poses came without points{no_dense}"
+
+
+def _dense(prepared: Capture, options: Prepare, after: Step, open_bar: Bars) -> WorldPoints:
+    """The dense cloud; it is computed once and read again when the command is repeated."""
+    step = begin(options.out / WORK / "dense", after, views=[view.name for view in prepared.views])
+    path = step.folder / CLOUD
+    if step.result is None:
+        write_oriented_ply(path, dense_cloud(prepared, step.folder, open_bar))
+        step.complete({})
+    return read_oriented_ply(path)
 
 
 def _publish(

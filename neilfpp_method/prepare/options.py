@@ -38,8 +38,11 @@ class Prepare:
     """Merging of exposure brackets into linear images; auto: if all photographs belong to brackets."""
     undistort: bool = False
     """Resample images to pinhole cameras; otherwise images are unchanged and cameras keep their lens."""
-    dense: bool = False
-    """Compute a dense oriented point cloud by plane-sweep stereo; otherwise the sparse points are used."""
+    cloud: Literal["auto", "dense", "sparse"] = "auto"
+    """The oriented points that training keeps the surface to. dense: computed from all images by plane-sweep
+    stereo, on the CPU. sparse: the points of structure from motion, or of the capture. auto: the points of a
+    capture that has some with normals, otherwise dense, and sparse if stereo finds no surface.
+    """
     test_every: int | None = None
     """Hold out every k-th view for testing, 0: none; default: the split of the capture, or every 8th view."""
     auto: bool = False

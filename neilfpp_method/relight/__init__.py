@@ -1,1 +1,1 @@
-"""A finished run under other light, path-traced on the surface and material that it has found."""
+"""Render a finished run under other light, by path tracing on its surface with its material."""

@@ -1,4 +1,4 @@
-"""What is looked at: the views of a capture in any size, or a circle of cameras about the scene."""
+"""Cameras to render: the views of a capture in any size, or a circle of cameras around the scene."""
 
 from __future__ import annotations
 
@@ -19,15 +19,24 @@ from neilfpp_method.structures import RayBatch
 __all__ = ["MAX_WIDTH", "Shot", "chosen_views", "rays_through", "resized", "turntable", "view_shots"]
 
 MAX_WIDTH = 800
-"""Pixels: photographs are larger than anybody wants to wait for, so this is where the default size ends."""
+"""Largest default width, pixels, because a path-traced image of the size of a photograph takes long."""
 MAX_SIDE = 8192
-"""Pixels of a picture's side: larger ones do not fit into memory together with what a denoiser needs."""
+"""Largest width and height, pixels. Larger images and the inputs of a denoiser do not fit into memory."""
+MAX_FRAMES = 9999
+"""Largest number of frames of a turntable, for which names have four digits."""
+POLE_MARGIN = 2e-3
+"""Least angle between a turntable camera and the vertical, radians, at which "up" is still well defined."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A picture to take: its name, which is a plain file name, the camera in the scene frame, and the
-    capture's view that it shows, if it shows one in full size."""
+    """An image to render.
+
+    Attributes:
+        name: name of the image, valid as a file name.
+        camera: the camera, scene frame.
+        view: the view of the capture with the same camera and size; None if there is none.
+    """
 
     name: str
     camera: Camera
@@ -51,60 +60,73 @@ def chosen_views(capture: Capture, words: Sequence[str]) -> list[View]:
 
 
 def view_shots(capture: Capture, views: Sequence[View], scale: float | None, width: int | None) -> list[Shot]:
-    """Views of a capture; neither a scale nor a width: their own size, up to `MAX_WIDTH`.
+    """Build shots of views of a capture.
+
+    Args:
+        capture: the capture.
+        views: the views.
+        scale: size relative to the views.
+        width: width, pixels. If neither is given, views keep their size, up to a width of `MAX_WIDTH`.
 
     Raises:
-        UserError: there are no views, or a size that is not possible.
+        UserError: there are no views, or the size is impossible.
     """
     if not views:
         raise UserError(f"{capture.root}: no such views", "choose --views train or turntable")
     shots = []
     for view in views:
         camera = capture.normalisation.camera(view.camera)
-        sized = resized(camera, _factor(camera, scale, width))
-        same = (sized.width, sized.height) == (camera.width, camera.height)
-        shots.append(Shot(view.name, sized, view if same else None))
+        shot_camera = resized(camera, _factor(camera, scale, width))
+        same_size = (shot_camera.width, shot_camera.height) == (camera.width, camera.height)
+        shots.append(Shot(view.name, shot_camera, view if same_size else None))
     return shots
 
 
 def turntable(capture: Capture, frames: int, scale: float | None, width: int | None) -> list[Shot]:
-    """Cameras on a circle about the scene's +z, facing its centre; height, distance, lens as captured.
+    """Build shots from a circle around the scene's +z axis that look at its centre.
 
-    Distance and elevation are the medians of the capture's cameras; the lens is that of the view whose
-    distance is nearest to the median, straightened.
+    Distance and elevation are the medians over the capture's cameras. Focal length and size are those of the
+    view whose distance is nearest to the median, without lens distortion.
+
+    Args:
+        capture: the capture.
+        frames: number of cameras.
+        scale: size relative to the view.
+        width: width, pixels. If neither is given, the size is that of the view, up to `MAX_WIDTH`.
 
     Raises:
-        UserError: fewer than 2 or more than 9999 frames, or a size that is not possible.
+        UserError: the number of frames is not within 2 … 9999, or the size is impossible.
     """
-    if not 2 <= frames <= 9999:
-        raise UserError(f"a turntable of {frames} frames", "give 2 to 9999 with --frames")
+    if not 2 <= frames <= MAX_FRAMES:
+        raise UserError(f"a turntable cannot have {frames} frames", f"give 2 to {MAX_FRAMES} with --frames")
     cameras = [capture.normalisation.camera(view.camera) for view in capture.views]
     eyes = np.stack([camera.c2w[:, 3] for camera in cameras])
     distances = np.linalg.norm(eyes, axis=-1).clip(1e-6)
     distance = float(np.median(distances))
     elevation = float(np.median(np.arcsin((eyes[:, 2] / distances).clip(-1, 1))))
-    # Straight from above there is no up; a tenth of a degree is enough for one.
-    elevation = float(np.clip(elevation, -math.pi / 2 + 2e-3, math.pi / 2 - 2e-3))
-    like = cameras[int(np.abs(distances - distance).argmin())]
-    like = replace(like, lens=None, cx=like.width / 2, cy=like.height / 2)
-    like = resized(like, _factor(like, scale, width))
+    # Seen from exactly above, "up" is undefined.
+    elevation = float(np.clip(elevation, -math.pi / 2 + POLE_MARGIN, math.pi / 2 - POLE_MARGIN))
+    camera = cameras[int(np.abs(distances - distance).argmin())]
+    camera = replace(camera, lens=None, cx=camera.width / 2, cy=camera.height / 2)
+    camera = resized(camera, _factor(camera, scale, width))
     azimuths = 2 * math.pi * np.arange(frames) / frames
     return [
-        Shot(f"turn_{k:04d}", replace(like, w2c=_looking_in(distance, elevation, azimuth)))
+        Shot(f"turn_{k:04d}", replace(camera, w2c=_looking_at_origin(distance, elevation, azimuth)))
         for k, azimuth in enumerate(azimuths)
     ]
 
 
 def resized(camera: Camera, factor: float) -> Camera:
-    """The same picture in another size; a lens bends the unit plane and stays.
+    """Return the camera with another image size. A lens distorts the unit plane and does not change.
 
     Raises:
-        UserError: the size is below 1 or above 8192 pixels a side.
+        UserError: width or height is not within 1 … 8192 pixels.
     """
     width, height = round(camera.width * factor), round(camera.height * factor)
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise UserError(
-            f"a picture of {width}×{height} pixels", f"choose --scale or --width for 1 to {MAX_SIDE} a side"
+            f"an image cannot have {width}×{height} pixels",
+            f"choose --scale or --width for 1 to {MAX_SIDE} pixels per side",
         )
     x, y = width / camera.width, height / camera.height
     sizes = {"fx": camera.fx * x, "cx": camera.cx * x, "fy": camera.fy * y, "cy": camera.cy * y}
@@ -112,20 +134,28 @@ def resized(camera: Camera, factor: float) -> Camera:
 
 
 def rays_through(camera: Camera, points: Float[Tensor, "N 2"]) -> tuple[RayBatch, Bool[Tensor, " N"]]:
-    """Rays through image points (column + ½ at a pixel's centre), in the frame of the pose, and which of them
-    there are: a lens may show nothing at a point."""
+    """Build rays through points of the image of a camera.
+
+    Args:
+        camera: the camera.
+        points: image points (x, y), pixels; the centre of a pixel is at column + ½, row + ½.
+
+    Returns:
+        The rays, in the frame of the camera's pose, and a mask of the valid ones. A ray is invalid if the
+        lens shows nothing at its point.
+    """
     plane = (points.double().cpu().numpy() - camera.intrinsics[2:]) / camera.intrinsics[:2]
     if camera.lens is not None:
         plane = camera.lens.straighten(plane)
-    shown = np.isfinite(plane).all(axis=1)
-    local = np.concatenate([np.where(shown[:, None], plane, 0.0), np.ones((len(plane), 1))], axis=1)
+    valid = np.isfinite(plane).all(axis=1)
+    local = np.concatenate([np.where(valid[:, None], plane, 0.0), np.ones((len(plane), 1))], axis=1)
     pose = camera.c2w
     directions = (local / np.linalg.norm(local, axis=1, keepdims=True)) @ pose[:, :3].T
     origins = np.broadcast_to(pose[:, 3], directions.shape)
     rays = RayBatch(
         *(torch.from_numpy(part.astype(np.float32)).to(points.device) for part in (origins, directions))
     )
-    return rays, torch.from_numpy(shown).to(points.device)
+    return rays, torch.from_numpy(valid).to(points.device)
 
 
 def _factor(camera: Camera, scale: float | None, width: int | None) -> float:
@@ -136,8 +166,8 @@ def _factor(camera: Camera, scale: float | None, width: int | None) -> float:
     return min(1.0, MAX_WIDTH / camera.width)
 
 
-def _looking_in(distance: float, elevation: float, azimuth: float) -> Float64[np.ndarray, "4 4"]:
-    """World to camera from a place on a sphere about the origin, upright."""
+def _looking_at_origin(distance: float, elevation: float, azimuth: float) -> Float64[np.ndarray, "4 4"]:
+    """World-to-camera matrix of an upright camera on a sphere around the origin that looks at the origin."""
     outward = np.array(
         [
             math.cos(azimuth) * math.cos(elevation),

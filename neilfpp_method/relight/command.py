@@ -1,10 +1,12 @@
-"""`neilfpp relight`: the views of a run under other light, as files.
+"""`neilfpp relight`: render views of a run under other light to files.
 
-RUN/relit/<map>/<view>.exr    linear radiance and alpha, premultiplied
-RUN/relit/<map>/<view>.png    the same as a display shows it
-RUN/relit/<map>/<view>.json   how it was made; written last: a view that has it is done
-RUN/relit/<map>/turntable.mp4
-RUN/relit/<map>/metrics.json  where true images are given
+Files:
+
+    RUN/relit/<map>/<view>.exr      linear radiance and alpha, premultiplied
+    RUN/relit/<map>/<view>.png      the same for display
+    RUN/relit/<map>/<view>.json     settings of the image; written last, so it marks a finished image
+    RUN/relit/<map>/turntable.mp4   with --views turntable
+    RUN/relit/<map>/metrics.json    with --truth
 """
 
 from __future__ import annotations
@@ -25,8 +27,8 @@ from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.relight.cameras import Shot, chosen_views, rays_through, turntable, view_shots
 from neilfpp_method.relight.comparison import compare, find_truth, read_truth
 from neilfpp_method.relight.denoise import check_denoiser, denoised
-from neilfpp_method.relight.edits import edited, parse_edits, scene_box
-from neilfpp_method.relight.film import Budget, Picture, take_picture
+from neilfpp_method.relight.edits import parse_edits, scene_box, with_edits
+from neilfpp_method.relight.film import Budget, Picture, render_picture
 from neilfpp_method.relight.lamp_edits import edited_lamps, parse_lamp_edits
 from neilfpp_method.relight.lamplight import Lamplight, lamps_of_run
 from neilfpp_method.relight.maps import Layout, check_map, map_names, read_map
@@ -35,24 +37,28 @@ from neilfpp_method.relight.path_tracer import Scene
 from neilfpp_method.relight.picture_folder import PictureFolder
 from neilfpp_method.relight.recovered import check_material, surface_of_run
 from neilfpp_method.relight.sky import Sky, sky_of_run
-from neilfpp_method.relight.stencil import painted, read_stencils
+from neilfpp_method.relight.stencil import masked_limit, read_stencils
 from neilfpp_method.train.device import pick_device
-from neilfpp_method.train.run import Run, check_folder, load_run, write_json
+from neilfpp_method.train.output import check_folder
+from neilfpp_method.train.run import Run, load_run, write_json
 
 __all__ = ["Request", "relight"]
 
 OWN = "own"
-"""The name of the light that a run has found."""
+"""Name of the run's estimated light in paths and records."""
 TURNTABLE = "turntable"
 """The word for a circle of cameras in place of views."""
 SAMPLES = 64
-"""Per pixel, where neither samples nor seconds are asked for."""
+"""Default number of samples per pixel, if neither --spp nor --seconds is given."""
+MAX_BOUNCES = 64
+"""Largest number of bounces. After that many, a path carries less than a thousandth of its radiance."""
 FORMAT = 1
+"""Version of the format of the records."""
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for; the fields are those of `commands.relight.Relight`, which says what they mean."""
+    """Options of the command; `commands.relight.Relight` documents the fields."""
 
     run: Path
     env: tuple[Path, ...]
@@ -86,15 +92,18 @@ def relight(
     say: Callable[[str], None] = lambda text: None,
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> Path:
-    """Render what is asked for, and return the folder. Views that are there, made the same way, are skipped.
+    """Render the requested views. Images that exist and have the same settings are skipped.
 
     Args:
-        request: what.
-        say: takes lines for the person who waits.
-        on_progress: told the share that is done.
+        request: options of the command.
+        say: receives messages for the user, line by line.
+        on_progress: called with the fraction of the work that is done.
+
+    Returns:
+        The folder that contains the images.
 
     Raises:
-        UserError: something that was asked for cannot be; nothing is written then.
+        UserError: an option is invalid, or the run lacks what it needs. In these cases nothing is written.
     """
     _check(request)
     run = load_run(request.run, pick_device(request.device), request.checkpoint)
@@ -113,8 +122,8 @@ def relight(
     }
     if any(missing.values()):
         surface = surface_of_run(run, request.resolution)
-        limits = ([box.holds] if box else []) + ([painted(stencils, surface)] if stencils else [])
-        materials = edited(run.model.materials, parse_edits(request.edits), limits)
+        limits = ([box.contains] if box else []) + ([masked_limit(stencils, surface)] if stencils else [])
+        materials = with_edits(run.model.materials, parse_edits(request.edits), limits)
         scenes = {name: Scene(surface, materials, run.model.lobe, sky, lamps) for name, sky in lights.items()}
         _render(request, scenes, folders, missing, on_progress)
     for k, folder in enumerate(folders.values()):
@@ -125,50 +134,51 @@ def relight(
     return out
 
 
-# ------------------------------------------------------------------------------------------ what is asked for
+# ---------------------------------------------------------------------------------------------------- options
 
 
 def _check(request: Request) -> None:
-    """What the words of the request alone can tell."""
+    """Check everything that does not need the run."""
     positive = {
         "--spp": request.spp,
         "--seconds": request.seconds,
         "--scale": request.scale,
         "--width": request.width,
-    }
-    for option, value in {
-        **positive,
         "--bounces": request.bounces,
         "--resolution": request.resolution,
-    }.items():
+    }
+    for option, value in positive.items():
         if value is not None and not (0 < value < float("inf")):
             raise UserError(f"{option} is {value}", "give a positive number")
-    if request.bounces > 64:
+    if request.bounces > MAX_BOUNCES:
         raise UserError(
-            f"--bounces is {request.bounces}", "give 64 or fewer: what is left is a share below 1e-3"
+            f"--bounces is {request.bounces}",
+            f"give at most {MAX_BOUNCES}, after which less than a thousandth of the light is left",
         )
     if not all(np.isfinite(value) for value in (request.rotate, request.exposure)):
-        raise UserError("--rotate and --exposure are not finite", "give degrees and stops")
+        raise UserError("--rotate or --exposure is not finite", "give degrees and stops")
     if request.scale is not None and request.width is not None:
-        raise UserError("--scale and --width both say how large", "give one of them")
+        raise UserError("--scale and --width both set the size of views", "give only one of them")
     for option, given in (("--box", request.box is not None), ("--mask", bool(request.mask))):
         if given and not request.edits:
             raise UserError(
-                f"{option} without --set limits nothing", "say what changes within it, as --set roughness=0.2"
+                f"{option} without --set has no effect",
+                "give the change of the material, for example --set roughness=0.2",
             )
     if request.lamp_edits and request.lamps == "drop":
-        raise UserError("--lamp moves what --lamps drop leaves out", "give one of them")
+        raise UserError("--lamp changes lamps, but --lamps drop removes all of them", "give only one of both")
     if TURNTABLE in request.views and len(request.views) > 1:
         raise UserError("--views turntable is a circle, and no other views go with it", "give one of them")
     if request.truth:
         if TURNTABLE in request.views or request.scale is not None or request.width is not None:
             raise UserError(
-                "true images are of views in full size", "leave --views turntable, --scale and --width out"
+                "true images can only be compared with views in full size",
+                "leave --views turntable, --scale and --width out",
             )
         if len(request.truth) != max(1, len(request.env)):
             raise UserError(
                 f"{len(request.truth)} folders of true images for {len(request.env)} maps",
-                "give one for each map",
+                "give one folder for each map",
             )
     if request.denoise:
         check_denoiser()
@@ -188,32 +198,31 @@ def _shots(request: Request, run: Run) -> list[Shot]:
 
 
 def _lights(request: Request, run: Run, say: Callable[[str], None]) -> dict[str, Sky]:
-    """The maps by name, on the device of the run; without any the light of the run."""
+    """The environment maps by name, on the device of the run; the run's own light if no map is given."""
     device = next(run.model.parameters()).device
     if not request.env:
         if not isinstance(run.model.light, EnvironmentLight):
             raise UserError(
-                f"{run.path}: the light of this run is no environment map", "name a map with --env MAP.exr"
+                f"{run.path}: the light of this run is no environment map", "give a map with --env MAP.exr"
             )
         sky = sky_of_run(run.model.light)
-        start = sky.start - np.radians(request.rotate)
-        return {
-            OWN: dataclasses.replace(sky, radiance=sky.radiance * 2.0**request.exposure, start=float(start))
-        }
+        start = float(sky.start - np.radians(request.rotate))
+        radiance = sky.radiance * 2.0**request.exposure
+        return {OWN: dataclasses.replace(sky, radiance=radiance, start=start)}
     lights = {}
     for name, path in zip(map_names(request.env), request.env, strict=True):
-        read = read_map(path, request.env_layout, request.rotate, request.exposure)
-        if read.negative:
-            texels = "texel is" if read.negative == 1 else "texels are"
-            say(f"{path}: {read.negative} {texels} slightly negative; replaced by 0")
-        lights[name] = dataclasses.replace(read.sky, radiance=read.sky.radiance.to(device))
+        light_map = read_map(path, request.env_layout, request.rotate, request.exposure)
+        if light_map.negative:
+            texels = "texel is" if light_map.negative == 1 else "texels are"
+            say(f"{path}: {light_map.negative} {texels} slightly negative; set to 0")
+        lights[name] = dataclasses.replace(light_map.sky, radiance=light_map.sky.radiance.to(device))
     return lights
 
 
 def _settings(request: Request, run: Run, name: str) -> dict[str, Any]:
-    """Everything that decides what a picture shows, as JSON has it."""
+    """All settings that affect an image, as values for JSON."""
     path = dict(zip(map_names(request.env), request.env, strict=True)).get(name)
-    described = {
+    settings = {
         "format": FORMAT,
         "map": OWN if path is None else path.name,
         "map_sha256": None if path is None else hashlib.sha256(path.read_bytes()).hexdigest(),
@@ -225,14 +234,14 @@ def _settings(request: Request, run: Run, name: str) -> dict[str, Any]:
         "box": None if request.box is None else list(request.box),
         "mask": [[path.name, hashlib.sha256(path.read_bytes()).hexdigest()] for path in request.mask],
     }
-    kept = ("rotate", "exposure", "spp", "seconds", "bounces", "background", "denoise", "resolution")
-    return described | {key: getattr(request, key) for key in kept}
+    copied = ("rotate", "exposure", "spp", "seconds", "bounces", "background", "denoise", "resolution")
+    return settings | {key: getattr(request, key) for key in copied}
 
 
 def _with_lamps(request: Request) -> bool:
-    """Whether lamps shine: those under the run's own light, and those that somebody has asked for."""
-    asked = request.lamps == "keep" or bool(request.lamp_edits)
-    return asked or (request.lamps == "auto" and not request.env)
+    """Whether the run's lamps are lit: if requested, and by default under the run's own light."""
+    requested = request.lamps == "keep" or bool(request.lamp_edits)
+    return requested or (request.lamps == "auto" and not request.env)
 
 
 def _lamps(request: Request, run: Run) -> Lamplight | None:
@@ -242,7 +251,7 @@ def _lamps(request: Request, run: Run) -> Lamplight | None:
     return edited_lamps(lamps_of_run(run.model.lamps), edits, run.capture.normalisation)
 
 
-# ------------------------------------------------------------------------------------------------------ doing
+# -------------------------------------------------------------------------------------------------- rendering
 
 
 def _render(
@@ -260,39 +269,36 @@ def _render(
             on_progress((done + share) / len(work))
 
         begun = time.monotonic()
-        # By name: what a view shows does not depend on which others are rendered.
+        # The seed depends on the name only, so that an image does not depend on which others are rendered.
         seed = int.from_bytes(hashlib.sha256(shot.name.encode()).digest()[:4], "big")
-        picture = take_picture(scene, shot.camera, budget, request.bounces, seed, report)
+        picture = render_picture(scene, shot.camera, budget, request.bounces, seed, report)
         if request.denoise:
             picture = denoised(picture)
         if request.background == "map":
-            picture = _before_sky(picture, scene.sky, shot)
+            picture = _over_sky(picture, scene.sky, shot)
         folder.write(shot, picture, time.monotonic() - begun)
         report(1.0)
 
 
-def _before_sky(picture: Picture, sky: Sky, shot: Shot) -> Picture:
-    """The picture with the map behind it."""
+def _over_sky(picture: Picture, sky: Sky, shot: Shot) -> Picture:
+    """Composite the image over the environment map."""
     height, width = picture.alpha.shape[:2]
     pixel = torch.arange(height * width, device=picture.alpha.device)
-    rays, shown = rays_through(shot.camera, torch.stack((pixel % width, pixel // width), -1) + 0.5)
-    behind = (sky.look(rays.directions) * shown[:, None]).view(height, width, 3)
-    opaque = torch.ones_like(picture.alpha)
-    return dataclasses.replace(
-        picture, radiance=picture.radiance + (1 - picture.alpha) * behind, alpha=opaque
-    )
+    rays, valid = rays_through(shot.camera, torch.stack((pixel % width, pixel // width), -1) + 0.5)
+    background = (sky.lookup(rays.directions) * valid[:, None]).view(height, width, 3)
+    radiance = picture.radiance + (1 - picture.alpha) * background
+    return dataclasses.replace(picture, radiance=radiance, alpha=torch.ones_like(picture.alpha))
 
 
 def _measure(run: Run, folder: PictureFolder, shots: Sequence[Shot], truth: Mapping[str, Path]) -> str:
-    """Compare with true images, write metrics.json, and say the main figures."""
+    """Compare with true images, write metrics.json, and return one line with the main figures."""
     true = [read_truth(run.capture, shot.view, truth[shot.name]) for shot in shots]
     relit = [folder.read(shot) for shot in shots]
-    found = compare([image.radiance for image in relit], [image.alpha for image in relit], true)
-    described = {"views": found.views, "scale": list(found.scale), "mask_source": found.mask_source}
-    write_json(folder.path / "metrics.json", {**found.figures, **described, "settings": folder.settings})
-    figures = (found.figures[f"{name}_scaled"] for name in ("relight_psnr", "baseline_psnr"))
-    scaled, baseline = (f"{figure:.2f} dB" for figure in figures)
-    plain = f"PSNR {found.figures['relight_psnr']:.2f} dB"
-    return (
-        f"{folder.path.name}: {plain}, scale aligned {scaled} (the training image of each view: {baseline})"
+    result = compare([image.radiance for image in relit], [image.alpha for image in relit], true)
+    details = {"views": result.views, "scale": list(result.scale), "mask_source": result.mask_source}
+    write_json(folder.path / "metrics.json", {**result.figures, **details, "settings": folder.settings})
+    psnr, scaled, baseline = (
+        f"{result.figures[name]:.2f} dB"
+        for name in ("relight_psnr", "relight_psnr_scaled", "baseline_psnr_scaled")
     )
+    return f"{folder.path.name}: PSNR {psnr}, after scaling {scaled} (photograph of each view: {baseline})"

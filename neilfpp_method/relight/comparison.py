@@ -1,11 +1,13 @@
-"""A relit run against true images of the same views under the same light.
+"""Compare relit views with true images of the same views under the same light.
 
-relight_psnr, relight_ssim    both tone-mapped as a display shows them, masked, mean over views
-relight_psnr_linear           the same on linear radiance, peak 1
-*_scaled                      with one factor per channel for all views, by least squares on linear
-                              radiance: base colour and light share a factor that images do not tell
-*_frame                       the same over the whole frame, the background counted as free of error
-baseline_*                    the capture's own image of the view, taken for the relit one
+Figures:
+
+    relight_psnr, relight_ssim    both tone-mapped, over masked pixels, mean over views
+    relight_psnr_linear           the same on linear radiance, peak 1
+    *_scaled                      after one least-squares factor per channel for all views, on linear
+                                  radiance: images determine base colour and light only up to this factor
+    *_frame                       the same over the whole frame, the background counted as free of error
+    baseline_*                    the same figures for the photograph of the view, not the relit image
 """
 
 from __future__ import annotations
@@ -26,12 +28,20 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.shading.color import srgb_to_linear, tone_map
 
-__all__ = ["Compared", "TrueImage", "compare", "find_truth", "read_truth"]
+__all__ = ["Comparison", "TrueImage", "compare", "find_truth", "read_truth"]
 
 
 @dataclass(frozen=True)
 class TrueImage:
-    """The true image of a view, linear; its counted pixels and their origin; the capture's image."""
+    """The true image of a view.
+
+    Attributes:
+        name: name of the view.
+        image: the true image, linear.
+        mask: pixels that count; None if the opacity of the relit image decides.
+        mask_source: where the mask comes from.
+        photograph: the capture's image of the view, linear.
+    """
 
     name: str
     image: Float[np.ndarray, "H W 3"]
@@ -41,8 +51,15 @@ class TrueImage:
 
 
 @dataclass(frozen=True)
-class Compared:
-    """Figures by name, PSNR of each view, the factors, and what decided which pixels count."""
+class Comparison:
+    """The result of a comparison.
+
+    Attributes:
+        figures: figures by name.
+        views: scaled PSNR of each view by name.
+        scale: the factor per channel.
+        mask_source: where the masks come from.
+    """
 
     figures: Mapping[str, float]
     views: Mapping[str, float]
@@ -51,12 +68,12 @@ class Compared:
 
 
 def find_truth(folder: Path, views: Sequence[View]) -> dict[str, Path]:
-    """The file of each view, `<folder>/<view>.exr` or another image of that name; headers are looked at.
+    """Find the true image of each view, `<folder>/<view>.exr` or another type of image, and check its size.
 
     Raises:
-        UserError: a view has none, or one of another size.
+        UserError: a view has no true image, or one of a different size.
     """
-    found = {}
+    paths = {}
     for view in views:
         files = [path for suffix in IMAGE_SUFFIXES if (path := folder / f"{view.name}{suffix}").is_file()]
         if not files:
@@ -66,14 +83,14 @@ def find_truth(folder: Path, views: Sequence[View]) -> dict[str, Path]:
         header = image_header(files[0])
         if (header.width, header.height) != (view.camera.width, view.camera.height):
             wanted = f"{view.camera.width}×{view.camera.height}"
-            size = f"{header.width}×{header.height} pixels where the view has {wanted}"
+            size = f"{header.width}×{header.height} pixels, but the view has {wanted}"
             raise UserError(f"{files[0]}: {size}", "render the true image again in the size of the view")
-        found[view.name] = files[0]
-    return found
+        paths[view.name] = files[0]
+    return paths
 
 
 def read_truth(capture: Capture, view: View, path: Path) -> TrueImage:
-    """A true image and its counted pixels: by alpha, else by true depth, else by the view's mask.
+    """Read a true image, with a mask from its alpha, or else from true depth, or else from the view's mask.
 
     Raises:
         UserError: an image cannot be read, or has values that are not finite.
@@ -100,14 +117,19 @@ def compare(
     relit: Sequence[Float[np.ndarray, "H W 3"]],
     opacity: Sequence[Float[np.ndarray, "H W"]],
     truth: Sequence[TrueImage],
-) -> Compared:
-    """Figures of relit views, linear radiance over black, each against the true image of the same view.
+) -> Comparison:
+    """Compute the figures of relit views against the true images.
+
+    Args:
+        relit: linear radiance of each view, over black.
+        opacity: opacity of each view.
+        truth: the true image of each view.
 
     Raises:
-        UserError: no pixel counts.
+        UserError: all masks are empty.
     """
     pairs = zip(opacity, truth, strict=True)
-    masks = [seen > 0.5 if true.mask is None else true.mask for seen, true in pairs]
+    masks = [alpha > 0.5 if true.mask is None else true.mask for alpha, true in pairs]
     if not any(mask.any() for mask in masks):
         raise UserError(
             "no pixel of the true images shows a surface", "give images of the views, with their masks"
@@ -116,7 +138,7 @@ def compare(
     figures, views, scale = _figures("relight", relit, images, masks, names)
     baseline, _, _ = _figures("baseline", [true.photograph for true in truth], images, masks, names)
     sources = sorted({true.mask_source for true in truth})
-    return Compared(figures | baseline, views, scale, ", ".join(sources))
+    return Comparison(figures | baseline, views, scale, ", ".join(sources))
 
 
 def _figures(
@@ -126,7 +148,7 @@ def _figures(
     masks: Sequence[np.ndarray],
     names: Sequence[str],
 ) -> tuple[dict[str, float], dict[str, float], tuple[float, ...]]:
-    """Means over the views that have pixels, the scaled PSNR of each, and the factors."""
+    """Figures averaged over the views with a non-empty mask, scaled PSNR of each view, and the factors."""
     pooled = [
         np.concatenate([image[mask] for image, mask in zip(side, masks, strict=True)])
         for side in (estimates, images)
@@ -137,24 +159,22 @@ def _figures(
     for name, estimate, image, mask in zip(names, estimates, images, masks, strict=True):
         if not mask.any():
             continue
-        shown = _shown(image)
+        displayed_truth = _tone_mapped(image)
         for suffix, linear in {"": estimate, "_scaled": estimate * scale}.items():
+            displayed = _tone_mapped(linear)
             values = {
-                "psnr": metrics.psnr(_shown(linear), shown, mask),
+                "psnr": metrics.psnr(displayed, displayed_truth, mask),
                 "psnr_linear": metrics.psnr(linear, image, mask),
-                "psnr_frame": metrics.psnr_frame(_shown(linear), shown, mask),
+                "psnr_frame": metrics.psnr_frame(displayed, displayed_truth, mask),
             }
             if min(mask.shape) >= metrics.SSIM_WINDOW:
-                values["ssim"] = metrics.ssim(_shown(linear), shown, mask)
+                values["ssim"] = metrics.ssim(displayed, displayed_truth, mask)
             for key, value in values.items():
                 scores.setdefault(f"{title}_{key}{suffix}", []).append(value)
             if suffix:
                 views[name] = values["psnr"]
-    return (
-        {key: float(np.mean(values)) for key, values in scores.items()},
-        views,
-        tuple(float(s) for s in scale),
-    )
+    figures = {key: float(np.mean(values)) for key, values in scores.items()}
+    return figures, views, tuple(float(s) for s in scale)
 
 
 def _linear(pixels: Float[np.ndarray, "H W C"], linear: bool) -> Float[np.ndarray, "H W 3"]:
@@ -162,5 +182,5 @@ def _linear(pixels: Float[np.ndarray, "H W C"], linear: bool) -> Float[np.ndarra
     return np.repeat(values, 3, axis=-1) if values.shape[-1] == 1 else values
 
 
-def _shown(linear: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
+def _tone_mapped(linear: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
     return tone_map(torch.from_numpy(np.ascontiguousarray(linear, np.float32))).numpy()

@@ -1,4 +1,4 @@
-"""Open Image Denoise (Áfra, Intel), if `pyoidn` is installed: less noise for a little blur."""
+"""Denoise path-traced images with Intel Open Image Denoise (Áfra), if `pyoidn` is installed."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ __all__ = ["check_denoiser", "denoised"]
 
 
 def check_denoiser() -> None:
-    """That there is a denoiser.
+    """Check that the denoiser is installed.
 
     Raises:
-        UserError: there is none.
+        UserError: it is not.
     """
     _library()
 
 
 def denoised(picture: Picture) -> Picture:
-    """The picture with its radiance denoised, helped by reflectance and normal; alpha stays.
+    """Denoise the radiance of an image, guided by its reflectance and normals. Alpha does not change.
 
     Raises:
-        UserError: there is no denoiser here, or it fails.
+        UserError: the denoiser is not installed, or it fails.
     """
     oidn = _library()
     color, albedo, normal = (

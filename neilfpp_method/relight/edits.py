@@ -1,4 +1,4 @@
-"""A material that a person changes before it is relit: `roughness=0.2`, everywhere or within limits."""
+"""User-defined changes of the material before relighting, such as `roughness=0.2`."""
 
 from __future__ import annotations
 
@@ -13,18 +13,20 @@ from neilfpp_method.data.views import Normalisation
 from neilfpp_method.errors import UserError
 from neilfpp_method.structures import Material
 
-__all__ = ["Box", "Edit", "Limit", "Materials", "edited", "parse_edits", "scene_box"]
+__all__ = ["Box", "Edit", "Limit", "Materials", "parse_edits", "scene_box", "with_edits"]
 
 Materials = Callable[[Float[Tensor, "N 3"]], Material]
+"""The material at points of the scene frame."""
 Limit = Callable[[Float[Tensor, "N 3"]], Bool[Tensor, "N 1"]]
-"""At which points of the surface an edit counts."""
+"""Whether points of the surface are inside of the region that edits apply to."""
 
 CHANNELS = {"base_color": 3, "roughness": 1, "metallic": 1}
+"""Names of the material's parameters, and their numbers of channels."""
 
 
 @dataclass(frozen=True)
 class Edit:
-    """One parameter of the material, and what it becomes."""
+    """A parameter of the material and its new value: one number, or one per channel."""
 
     name: str
     value: tuple[float, ...]
@@ -32,46 +34,46 @@ class Edit:
 
 @dataclass(frozen=True)
 class Box:
-    """A box along the axes of the scene frame."""
+    """An axis-aligned box in the scene frame."""
 
     low: Float[Tensor, " 3"]
     high: Float[Tensor, " 3"]
 
-    def holds(self, x: Float[Tensor, "N 3"]) -> Bool[Tensor, "N 1"]:
-        """Which points lie in it."""
+    def contains(self, x: Float[Tensor, "N 3"]) -> Bool[Tensor, "N 1"]:
+        """Whether points lie in the box."""
         return ((x >= self.low.to(x)) & (x <= self.high.to(x))).all(-1, keepdim=True)
 
 
 def parse_edits(texts: Sequence[str]) -> list[Edit]:
-    """Edits as written: a name, `=`, and one number in [0, 1], or three with commas for a linear colour.
+    """Parse edits of the form name=value, with a number in [0, 1], or r,g,b for a linear colour.
 
     Raises:
-        UserError: no such parameter, or no such value.
+        UserError: there is no such parameter, or the value is invalid.
     """
     return [_parse(text) for text in texts]
 
 
 def scene_box(corners: Sequence[float], normalisation: Normalisation) -> Box:
-    """A box from two opposite corners in the capture's world frame, x y z x y z.
+    """Build a box from two opposite corners x y z x y z in the world frame.
 
     Raises:
-        UserError: it has no inside.
+        UserError: the box is empty, or a coordinate is not finite.
     """
     ends = torch.tensor(corners, dtype=torch.float64).view(2, 3)
     low, high = ends.amin(0), ends.amax(0)
     if not ends.isfinite().all() or (low == high).any():
         raise UserError(
-            "--box has no inside", "give two opposite corners, x y z x y z, in the capture's world frame"
+            "--box has no inside", "give two opposite corners, x y z x y z, in the world frame of the capture"
         )
     return Box(normalisation.to_scene(low).float(), normalisation.to_scene(high).float())
 
 
-def edited(materials: Materials, edits: Sequence[Edit], limits: Sequence[Limit] = ()) -> Materials:
-    """The materials with edits, the last of each parameter counting; where every limit holds."""
+def with_edits(materials: Materials, edits: Sequence[Edit], limits: Sequence[Limit] = ()) -> Materials:
+    """Apply edits at the points that are inside of all limits; a later edit of a parameter wins."""
     if not edits:
         return materials
 
-    def changed(x: Float[Tensor, "N 3"]) -> Material:
+    def edited(x: Float[Tensor, "N 3"]) -> Material:
         material = materials(x)
         within = torch.ones_like(x[:, :1], dtype=torch.bool)
         for limit in limits:
@@ -82,7 +84,7 @@ def edited(materials: Materials, edits: Sequence[Edit], limits: Sequence[Limit] 
             values[edit.name] = torch.where(within, old.new_tensor(edit.value).expand_as(old), old)
         return replace(material, **values)
 
-    return changed
+    return edited
 
 
 def _parse(text: str) -> Edit:
@@ -90,13 +92,13 @@ def _parse(text: str) -> Edit:
     name = name.strip()
     if not equals or name not in CHANNELS:
         raise UserError(
-            f"--set {text}: no such parameter", f"write one of {', '.join(CHANNELS)}, then = and a number"
+            f"--set {text}: no such parameter", f"give NAME=NUMBER with one of {', '.join(CHANNELS)}"
         )
     try:
         value = tuple(float(number) for number in numbers.split(","))
     except ValueError:
         value = ()
     if len(value) not in {1, CHANNELS[name]} or not all(0 <= number <= 1 for number in value):
-        many = " or three of them, by commas" if CHANNELS[name] == 3 else ""
-        raise UserError(f"--set {text}: not a value of {name}", f"give a number in 0 … 1{many}")
+        three = " or three of them, separated by commas" if CHANNELS[name] == 3 else ""
+        raise UserError(f"--set {text}: not a value of {name}", f"give a number in 0 … 1{three}")
     return Edit(name, value)

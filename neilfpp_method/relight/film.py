@@ -1,4 +1,4 @@
-"""From paths to a picture: samples are added pass by pass, until there are enough or the time is over."""
+"""Render an image by path tracing: accumulate samples until their number or the time limit is reached."""
 
 from __future__ import annotations
 
@@ -15,20 +15,24 @@ from neilfpp_method.relight.cameras import rays_through
 from neilfpp_method.relight.path_tracer import DIMENSIONS, Scene, trace_paths
 from neilfpp_method.relight.sequence import Numbers, Sequence
 
-__all__ = ["Budget", "Picture", "take_picture"]
+__all__ = ["Budget", "Picture", "render_picture"]
 
 PATHS_AT_ONCE = 2**16
-"""Bounds the memory, some 100 MB; fewer are slower, more are not faster."""
-ENOUGH = 2**20
-"""Samples of a pixel where only the time bounds them."""
-PLACE_IN_PIXEL = 2
-"""Dimensions of the sequence that come first."""
+"""Number of paths per batch. It bounds the memory to about 100 MB; fewer are slower, more are not faster."""
+MAX_SAMPLES = 2**20
+"""Largest number of samples per pixel if only a time limit is given."""
+PIXEL_DIMENSIONS = 2
+"""Number of leading dimensions of the sequence that give the position within a pixel."""
 
 
 @dataclass(frozen=True)
 class Budget:
-    """When a picture is done: after so many samples per pixel, or at the end of the pass in which the seconds
-    are over; whichever comes first. Each pixel has one sample at least."""
+    """Limits of the work on an image; rendering stops at whichever is reached first, after at least one pass.
+
+    Attributes:
+        samples: number of samples per pixel; None for no limit.
+        seconds: time after which no new pass begins; None for no limit.
+    """
 
     samples: int | None
     seconds: float | None = None
@@ -36,8 +40,15 @@ class Budget:
 
 @dataclass(frozen=True)
 class Picture:
-    """Linear radiance, premultiplied: 0 where no surface is; the share of a pixel that a surface covers;
-    reflectance and normal for a denoiser; and how many samples each pixel had."""
+    """A rendered image.
+
+    Attributes:
+        radiance: linear radiance, premultiplied by alpha.
+        alpha: fraction of a pixel that the surface covers.
+        albedo: reflectance, for a denoiser.
+        normal: normals, for a denoiser.
+        samples: number of samples per pixel.
+    """
 
     radiance: Float[Tensor, "H W 3"]
     alpha: Float[Tensor, "H W 1"]
@@ -46,7 +57,7 @@ class Picture:
     samples: int
 
 
-def take_picture(
+def render_picture(
     scene: Scene,
     camera: Camera,
     budget: Budget,
@@ -55,35 +66,41 @@ def take_picture(
     on_progress: Callable[[float], None] = lambda share: None,
     clock: Callable[[], float] = time.monotonic,
 ) -> Picture:
-    """A picture by path tracing, a box filter of one pixel.
+    """Render an image by path tracing, with a box filter of one pixel.
 
     Args:
-        scene: what there is; its device is where paths are traced.
-        camera: in the scene frame.
-        budget: of this picture.
-        bounces: see `trace_paths`.
-        seed: the same seed and number of samples give the same picture.
-        on_progress: told the share of the picture that is done.
-        clock: seconds.
+        scene: the scene; paths are traced on its device.
+        camera: the camera, scene frame.
+        budget: limits of samples and time.
+        bounces: largest number of surface vertices of a path (`trace_paths`).
+        seed: the same seed and number of samples give the same image.
+        on_progress: called with the fraction of the work that is done.
+        clock: returns the time in seconds.
+
+    Example::
+
+        surface, sky = surface_of_run(run, resolution=256), sky_of_run(run.model.light)
+        scene = Scene(surface, run.model.materials, run.model.lobe, sky)
+        picture = render_picture(scene, camera, Budget(samples=64), bounces=4)
     """
     device = scene.sky.radiance.device
     pixels, begun = camera.width * camera.height, clock()
-    most = budget.samples or ENOUGH
-    sequence = Sequence(PLACE_IN_PIXEL + bounces * DIMENSIONS, seed)
+    max_samples = budget.samples or MAX_SAMPLES
+    sequence = Sequence(PIXEL_DIMENSIONS + bounces * DIMENSIONS, seed)
     sums = torch.zeros(pixels, 10, dtype=torch.float64, device=device)
     done = 0
-    while done < most:
-        passed = clock() - begun
-        if done and budget.seconds is not None and passed >= budget.seconds:
+    while done < max_samples:
+        elapsed = clock() - begun
+        if done and budget.seconds is not None and elapsed >= budget.seconds:
             break
-        block = min(max(1, PATHS_AT_ONCE // pixels), most - done)
+        block = min(max(1, PATHS_AT_ONCE // pixels), max_samples - done)
         numbers = sequence.next(block, pixels, device)
         for paths in torch.arange(block * pixels, device=device).split(PATHS_AT_ONCE):
             part = numbers.of(paths)
             sums.index_add_(0, part.pixel, _samples(scene, camera, part, bounces))
-            share = (done + (paths[-1].item() + 1) / pixels) / most
-            spent = 0.0 if budget.seconds is None else (clock() - begun) / budget.seconds
-            on_progress(min(1.0, max(share, spent)))
+            of_samples = (done + (paths[-1].item() + 1) / pixels) / max_samples
+            of_time = 0.0 if budget.seconds is None else (clock() - begun) / budget.seconds
+            on_progress(min(1.0, max(of_samples, of_time)))
         done += block
     mean = (sums / done).float().view(camera.height, camera.width, 10)
     radiance, alpha, albedo, normal = mean.split([3, 1, 3, 3], dim=-1)
@@ -91,9 +108,10 @@ def take_picture(
 
 
 def _samples(scene: Scene, camera: Camera, numbers: Numbers, bounces: int) -> Float[Tensor, "N 10"]:
+    """Radiance, alpha, albedo and normal of one sample for each path."""
     paths = torch.arange(len(numbers.pixel), device=numbers.pixel.device)
     corner = torch.stack((numbers.pixel % camera.width, numbers.pixel // camera.width), -1)
-    rays, shown = rays_through(camera, corner + numbers.at(paths, 0, PLACE_IN_PIXEL))
-    traced = trace_paths(scene, rays, numbers, bounces, PLACE_IN_PIXEL)
+    rays, valid = rays_through(camera, corner + numbers.at(paths, 0, PIXEL_DIMENSIONS))
+    traced = trace_paths(scene, rays, numbers, bounces, PIXEL_DIMENSIONS)
     values = torch.cat((traced.radiance, traced.alpha[:, None], traced.albedo, traced.normal), -1)
-    return (values * shown[:, None]).double()
+    return (values * valid[:, None]).double()

@@ -1,4 +1,4 @@
-"""Lamps that a person moves or leaves out: `0=1.2,0,0.8` or `1=off`, by their numbers in `lamps.json`."""
+"""User-defined changes of lamps by index: `0=1.2,0,0.8` moves a lamp, `1=off` removes it."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ OFF = "off"
 
 @dataclass(frozen=True)
 class LampEdit:
-    """A lamp by its number, and its new place in the capture's world; none: it is left out."""
+    """The index of a lamp, and its new position in the world frame; None removes the lamp."""
 
     number: int
     position: tuple[float, float, float] | None
 
 
 def parse_lamp_edits(texts: Sequence[str]) -> list[LampEdit]:
-    """Edits as a person writes them: a number from 0 on, `=`, and a place x,y,z or `off`.
+    """Parse edits of the form INDEX=x,y,z or INDEX=off; indices start at 0.
 
     Raises:
-        UserError: not of that form, or one lamp twice.
+        UserError: an edit has another form, or a lamp is given twice.
 
     Example:
         >>> parse_lamp_edits(["0=1,0.5,2", "2=off"])
@@ -39,19 +39,25 @@ def parse_lamp_edits(texts: Sequence[str]) -> list[LampEdit]:
     numbers = [edit.number for edit in edits]
     for number in numbers:
         if numbers.count(number) > 1:
-            raise UserError(f"--lamp {number} is given twice", "give each lamp one place")
+            raise UserError(f"--lamp {number} is given twice", "give each lamp only once")
     return edits
 
 
 def edited_lamps(
     lamps: Lamplight | None, edits: Sequence[LampEdit], normalisation: Normalisation
 ) -> Lamplight | None:
-    """The lamps of a run with some moved, and without those that are left out; none where none is left.
+    """Move or remove lamps. The axis of a panel does not change.
 
-    A panel keeps the way it faces.
+    Args:
+        lamps: the lamps of the run, or None.
+        edits: the changes.
+        normalisation: transformation from the world frame to the scene frame.
+
+    Returns:
+        The remaining lamps, or None if there are none.
 
     Raises:
-        UserError: the run has no lamp of a number.
+        UserError: the run has no lamp of an index.
     """
     count = 0 if lamps is None else len(lamps.position)
     for edit in edits:
@@ -59,7 +65,7 @@ def edited_lamps(
             has = f"{count}, numbered from 0" if count else "none"
             raise UserError(
                 f"--lamp {edit.number}: the run has no such lamp; it has {has}",
-                "see lamps.json of `neilfpp export RUN --what light`",
+                "`neilfpp export RUN --what light` lists them in lamps.json",
             )
     if lamps is None or not edits:
         return lamps
@@ -68,24 +74,24 @@ def edited_lamps(
         if edit.position is None:
             kept[edit.number] = False
         else:
-            place = torch.tensor(edit.position, dtype=torch.float64)
-            position[edit.number] = normalisation.to_scene(place).to(position)
+            world_position = torch.tensor(edit.position, dtype=torch.float64)
+            position[edit.number] = normalisation.to_scene(world_position).to(position)
     if not kept.any():
         return None
     return Lamplight(position[kept], lamps.axis[kept], lamps.radiance[kept], lamps.radius)
 
 
 def _parse(text: str) -> LampEdit:
-    number, equals, place = (part.strip() for part in text.partition("="))
+    number, equals, value = (part.strip() for part in text.partition("="))
     try:
         if not (equals and number.isdecimal()):
             raise ValueError
-        if place == OFF:
+        if value == OFF:
             return LampEdit(int(number), None)
-        x, y, z = (float(coordinate) for coordinate in place.split(","))
+        x, y, z = (float(coordinate) for coordinate in value.split(","))
         if not all(math.isfinite(coordinate) for coordinate in (x, y, z)):
             raise ValueError
     except ValueError:
-        remedy = "write its number, = and x,y,z in the capture's world, or off: --lamp 0=1,0.5,2 --lamp 1=off"
+        remedy = "give INDEX=x,y,z (world frame) or INDEX=off, for example --lamp 0=1,0.5,2 --lamp 1=off"
         raise UserError(f"--lamp {text}: not an edit of a lamp", remedy) from None
     return LampEdit(int(number), (x, y, z))

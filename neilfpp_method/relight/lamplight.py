@@ -1,4 +1,4 @@
-"""Lamps for path tracing: spheres that are sampled by the solid angle they cover (`fields.lamps`)."""
+"""Lamps for path tracing: spheres that are sampled by the solid angle that they subtend (`fields.lamps`)."""
 
 from __future__ import annotations
 
@@ -16,14 +16,21 @@ from neilfpp_method.shading.frame import local_frame, safe_normalize
 __all__ = ["LampSample", "Lamplight", "lamps_of_run"]
 
 EVEN_SHARE = 0.05
-"""Share of the lamps' probability without regard to axes: an axis is asked at a lamp's middle only."""
+"""Part of a lamp's selection probability that does not depend on its axis. The emission along the axis is
+evaluated at the centre of the lamp only, so it can be 0 although part of the lamp is visible.
+"""
 
 
 @dataclass(frozen=True)
 class LampSample:
-    """Unit directions towards a lamp each, their density per steradian (with the choice of the lamp), the
-    distance of the lamp's surface, and the radiance that arrives where nothing is in the way. A density of 0:
-    nothing was drawn."""
+    """Sampled directions towards lamps.
+
+    Attributes:
+        wi: unit directions.
+        pdf: density per steradian, including the choice of the lamp; 0 if the sample is invalid.
+        distance: distance to the surface of the lamp.
+        radiance: radiance that arrives if the lamp is not occluded.
+    """
 
     wi: Float[Tensor, "N 3"]
     pdf: Float[Tensor, " N"]
@@ -33,7 +40,15 @@ class LampSample:
 
 @dataclass(frozen=True)
 class Lamplight:
-    """K spheres of one radius. `radiance` is that on the `axis`; one of zeros: the same in all directions."""
+    """K spheres of equal radius that emit light.
+
+    Attributes:
+        position: centres, scene frame.
+        axis: unit axes of panels, whose emission falls with the cosine to the axis; zero for bulbs, which
+            emit equally in all directions.
+        radiance: radiance along the axis.
+        radius: radius, scene units.
+    """
 
     position: Float[Tensor, "K 3"]
     axis: Float[Tensor, "K 3"]
@@ -41,30 +56,39 @@ class Lamplight:
     radius: float
 
     def sample(self, x: Float[Tensor, "N 3"], u: Float[Tensor, "N 3"]) -> LampSample:
-        """A direction within one lamp's cone, for numbers in [0, 1); lamps drawn by contribution."""
-        chosen = self._shares(x)
-        lamp = torch.searchsorted(chosen.cumsum(-1), u[:, 2:].contiguous()).clamp_max(len(self.position) - 1)
+        """Sample a lamp in proportion to its approximate contribution, and a direction within its cone.
+
+        Args:
+            x: points to illuminate, scene frame.
+            u: random numbers in [0, 1).
+        """
+        probability = self._probabilities(x)
+        last = len(self.position) - 1
+        lamp = torch.searchsorted(probability.cumsum(-1), u[:, 2:].contiguous()).clamp_max(last)
         offset = self.position[lamp[:, 0]] - x
-        below_one = self._one_less_cosine(offset)
-        cosine = 1 - u[:, 0] * below_one
+        one_minus_cosine = self._one_minus_cosine(offset)
+        cosine = 1 - u[:, 0] * one_minus_cosine
         sine = ((1 - cosine) * (1 + cosine)).clamp_min(0).sqrt()
         azimuth = 2 * math.pi * u[:, 1]
         local = torch.stack((sine * azimuth.cos(), sine * azimuth.sin(), cosine), -1)
         wi = safe_normalize((local[:, :, None] * local_frame(safe_normalize(offset))).sum(1))
-        pdf = chosen.gather(1, lamp)[:, 0] * _density(below_one)
-        distance, radiance = self._met(x, wi, lamp[:, 0])
-        # A direction at the rim that rounding has moved off the sphere brings nothing.
+        pdf = probability.gather(1, lamp)[:, 0] * _cone_pdf(one_minus_cosine)
+        distance, radiance = self._intersect(x, wi, lamp[:, 0])
+        # Rounding can move a direction at the rim off the sphere; such a sample is invalid.
         return LampSample(wi, torch.where(distance.isfinite(), pdf, 0.0), distance, radiance)
 
     def pdf(self, x: Float[Tensor, "N 3"], lamp: int) -> Float[Tensor, " N"]:
-        """Density of `sample` at directions that meet one of the lamps, per steradian, for this lamp."""
-        return self._shares(x)[:, lamp] * _density(self._one_less_cosine(self.position[lamp] - x))
+        """Density of `sample`, per steradian, at directions that hit a given lamp."""
+        cone = _cone_pdf(self._one_minus_cosine(self.position[lamp] - x))
+        return self._probabilities(x)[:, lamp] * cone
 
-    def meet(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N 3"], lamp: int) -> tuple[Tensor, Tensor]:
-        """Distance (N,) at which directions meet a lamp, else infinite, and radiance (N, 3) from it."""
-        return self._met(x, wi, torch.full_like(x[:, 0], lamp, dtype=torch.int64))
+    def intersect(
+        self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N 3"], lamp: int
+    ) -> tuple[Tensor, Tensor]:
+        """Distance (N,) at which rays hit a lamp, infinite if they miss it, and radiance (N, 3) from it."""
+        return self._intersect(x, wi, torch.full_like(x[:, 0], lamp, dtype=torch.int64))
 
-    def _met(
+    def _intersect(
         self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N 3"], lamp: Int[Tensor, " N"]
     ) -> tuple[Tensor, Tensor]:
         offset = self.position[lamp] - x
@@ -76,27 +100,31 @@ class Lamplight:
         return distance, (hit * self._emission(wi, lamp))[:, None] * self.radiance[lamp]
 
     def _emission(self, wi: Float[Tensor, "*B 3"], lamp: Int[Tensor, "*L"]) -> Float[Tensor, "*B"]:
+        """Emission of lamps towards the origin of rays, relative to that along the axis."""
         axis = self.axis[lamp]
-        bare = axis.square().sum(-1) == 0
-        return torch.where(bare, 1.0, (-(wi * axis).sum(-1)).clamp_min(0))
+        is_bulb = axis.square().sum(-1) == 0
+        return torch.where(is_bulb, 1.0, (-(wi * axis).sum(-1)).clamp_min(0))
 
-    def _shares(self, x: Float[Tensor, "N 3"]) -> Float[Tensor, "N K"]:
-        """The probability of each lamp at each point; all alike within a lamp's radius."""
+    def _probabilities(self, x: Float[Tensor, "N 3"]) -> Float[Tensor, "N K"]:
+        """Selection probability of each lamp at each point.
+
+        It is proportional to luminance over squared distance, where a distance counts as at least the radius.
+        """
         offset = self.position - x[:, None]
-        every = torch.arange(len(self.position), device=x.device)
-        sent = EVEN_SHARE + (1 - EVEN_SHARE) * self._emission(safe_normalize(offset), every)
-        weight = luminance(self.radiance) * sent / offset.square().sum(-1).clamp_min(self.radius**2)
+        lamps = torch.arange(len(self.position), device=x.device)
+        emission = EVEN_SHARE + (1 - EVEN_SHARE) * self._emission(safe_normalize(offset), lamps)
+        weight = luminance(self.radiance) * emission / offset.square().sum(-1).clamp_min(self.radius**2)
         return weight / weight.sum(-1, keepdim=True)
 
-    def _one_less_cosine(self, offset: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-        """1 − cos of the cone's half angle, with its digits also for a lamp far away; 0 within the lamp."""
+    def _one_minus_cosine(self, offset: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+        """1 − cos of the cone's half angle, accurate also for distant lamps; 0 inside of a lamp."""
         squared = offset.square().sum(-1)
         sine_squared = torch.where(squared > self.radius**2, self.radius**2 / squared, 0.0)
         return sine_squared / (1 + (1 - sine_squared).clamp_min(0).sqrt())
 
 
 def lamps_of_run(lamps: Lamps | None) -> Lamplight | None:
-    """The lamps that a run has lit; none where none is, or none sends light."""
+    """The lit lamps of a run; None if there are none, or none emits light."""
     if lamps is None or not lamps.lit or not lamps.radiance().any():
         return None
     lit = slice(lamps.lit)
@@ -105,7 +133,7 @@ def lamps_of_run(lamps: Lamps | None) -> Lamplight | None:
     )
 
 
-def _density(one_less_cosine: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """Of directions spread evenly over a cone; 0 where there is none."""
-    inside = one_less_cosine <= 0
-    return torch.where(inside, 0.0, 1 / (2 * math.pi * torch.where(inside, 1.0, one_less_cosine)))
+def _cone_pdf(one_minus_cosine: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    """Density of uniform directions in a cone, per steradian; 0 if the cone is empty."""
+    empty = one_minus_cosine <= 0
+    return torch.where(empty, 0.0, 1 / (2 * math.pi * torch.where(empty, 1.0, one_minus_cosine)))

@@ -1,4 +1,4 @@
-"""Pictures as an MP4: H.264 by imageio-ffmpeg where that is installed, else MPEG-4 by OpenCV."""
+"""Write images as an MP4 video: H.264 with imageio-ffmpeg if it is installed, else MPEG-4 with OpenCV."""
 
 from __future__ import annotations
 
@@ -16,21 +16,24 @@ __all__ = ["write_movie"]
 
 FRAMES_PER_SECOND = 24
 CODEC = "mp4v"
+"""OpenCV's code of MPEG-4."""
+QUALITY = 8
+"""Quality of H.264 in imageio-ffmpeg, out of 10."""
 
 
 def write_movie(path: Path, pictures: Sequence[Path]) -> None:
-    """Write PNG files of one size as a film, over black.
+    """Write PNG files of equal size as a video, composited over black.
 
-    Sides are cut to even numbers of pixels, as the encoders need.
+    Width and height are cropped to even numbers, which the encoders require.
 
     Raises:
-        UserError: a picture cannot be read, no encoder is here, or the film cannot be written.
+        UserError: an image cannot be read, there is no encoder, or the video cannot be written.
     """
     with replacing(path) as temporary:
         (_by_ffmpeg if _has_ffmpeg() else _by_opencv)(temporary, pictures)
         if not temporary.is_file() or not temporary.stat().st_size:
             raise UserError(
-                f"{path}: no MP4 encoder here", "install imageio-ffmpeg, or make a film of the PNG files"
+                f"{path}: no MP4 encoder found", "install imageio-ffmpeg, or encode the PNG files otherwise"
             )
 
 
@@ -49,7 +52,8 @@ def _has_ffmpeg() -> bool:
         return False
     try:
         return bool(imageio_ffmpeg.get_ffmpeg_exe())
-    except RuntimeError:  # the package is there, and no program
+    # The package is installed, but not the program.
+    except RuntimeError:
         return False
 
 
@@ -61,7 +65,7 @@ def _by_ffmpeg(path: Path, pictures: Sequence[Path]) -> None:
         if writer is None:
             size = (frame.shape[1], frame.shape[0])
             writer = imageio_ffmpeg.write_frames(
-                str(path), size, fps=FRAMES_PER_SECOND, quality=8, macro_block_size=2
+                str(path), size, fps=FRAMES_PER_SECOND, quality=QUALITY, macro_block_size=2
             )
             writer.send(None)
         writer.send(frame)

@@ -1,9 +1,9 @@
-"""Light along paths from the camera to the lights (Kajiya 1986), all paths of a block side by side.
+"""Path tracing from the camera (Kajiya 1986), vectorised over a batch of paths.
 
-At every vertex the light is asked in two ways, and both are weighed by the power heuristic (Veach 1997,
-§9.2): a direction drawn by the light (the map, and one lamp), and the direction in which the path goes on,
-where it meets a light. Paths of little throughput end by chance (Russian roulette), and those that live on
-make up for them: nothing is cut off but what lies beyond `bounces`.
+At every vertex, direct light is estimated with two techniques, which are combined by the power heuristic
+(Veach 1997, §9.2): light sampling (one direction of the map, and one of a lamp), and BRDF sampling (the
+direction in which the path continues, if it hits a light). Paths of low throughput are terminated by Russian
+roulette, which keeps the estimate unbiased up to `bounces`.
 """
 
 from __future__ import annotations
@@ -16,33 +16,35 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from neilfpp_method.relight.lamplight import Lamplight
-from neilfpp_method.relight.scattering import Vertices, scatter, scattered, scattering_pdf, vertices
+from neilfpp_method.relight.scattering import Vertices, brdf_cosine, scatter, scattering_pdf, vertices
 from neilfpp_method.relight.sequence import Numbers
 from neilfpp_method.relight.sky import Sky
-from neilfpp_method.relight.surface import OFFSET, Crossings, Surface
+from neilfpp_method.relight.surface import OFFSET, Intersections, Surface
 from neilfpp_method.shading.brdf import Lobe, diffuse_reflectance, normal_reflectance
 from neilfpp_method.structures import Material, RayBatch
 
 __all__ = ["DIMENSIONS", "Scene", "Traced", "power_heuristic", "trace_paths"]
 
 DIMENSIONS = 9
-"""Numbers per vertex: three for the next direction, two for the map, three for a lamp, one roulette."""
+"""Random numbers per vertex: three for the next direction, two for the map, three for a lamp, one for
+roulette.
+"""
 ROULETTE_FROM = 3
-"""Vertices of a path before it may end by chance: the first ones carry most of the light."""
+"""Number of vertices before Russian roulette begins, because the first ones carry most of the light."""
 MAX_SURVIVAL = 0.95
-"""The largest probability of going on: a path between white walls ends, too."""
+"""Largest probability of survival, so that paths between white surfaces are terminated as well."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """All that light meets.
+    """The scene of the path tracer. Cameras see neither lamps nor sky.
 
     Attributes:
-        surface: where paths bounce, scene frame.
-        materials: of points on it.
-        lobe: of the BRDF; none: a Lambertian surface.
-        sky: light from far away.
-        lamps: light from close by. Cameras see neither lamps nor sky.
+        surface: the surface, scene frame.
+        materials: the material at points of the surface.
+        lobe: specular lobe of the BRDF; None for a Lambertian surface.
+        sky: distant light.
+        lamps: lamps near the scene, or None.
     """
 
     surface: Surface
@@ -54,8 +56,14 @@ class Scene:
 
 @dataclass(frozen=True)
 class Traced:
-    """What N camera rays see: radiance from the surface (0 where they meet nothing), 1 or 0 for meeting it,
-    and what a denoiser is helped by: reflectance and normal of the surface that is met first."""
+    """Results for N camera rays.
+
+    Attributes:
+        radiance: radiance from the surface; 0 if the ray misses it.
+        alpha: 1 if the ray hits the surface, else 0.
+        albedo: reflectance at the first hit, for a denoiser.
+        normal: normal at the first hit, for a denoiser.
+    """
 
     radiance: Float[Tensor, "N 3"]
     alpha: Float[Tensor, " N"]
@@ -64,8 +72,13 @@ class Traced:
 
 
 def power_heuristic(own: Float[Tensor, " N"], other: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """Weight of a direction drawn by one of two techniques, own² / (own² + other²); 0 where `own` is."""
-    # By the quotient: the squared density of a smooth lobe exceeds float32's precision, not its range.
+    """Weight of a sample from one of two techniques, own² / (own² + other²); 0 if `own` is 0.
+
+    Args:
+        own: density of the technique that produced the sample.
+        other: density of the other technique.
+    """
+    # Computed from the quotient, because the squared density of a narrow lobe loses precision in float32.
     ratio = other / torch.where(own > 0, own, 1.0)
     return torch.where(own > 0, 1 / (1 + ratio.square()), 0.0)
 
@@ -74,27 +87,29 @@ def power_heuristic(own: Float[Tensor, " N"], other: Float[Tensor, " N"]) -> Flo
 def trace_paths(
     scene: Scene, rays: RayBatch, numbers: Numbers, bounces: int, first_dimension: int = 0
 ) -> Traced:
-    """The light that arrives along camera rays; its mean over samples is unbiased up to `bounces`.
+    """Estimate the radiance along camera rays with one path each.
+
+    The mean over samples is unbiased for paths of up to `bounces` surface vertices.
 
     Args:
-        scene: what there is.
-        rays: unit directions; row k is path k of `numbers`.
-        numbers: dimensions from `first_dimension` on are used, `DIMENSIONS` for each bounce.
-        bounces: vertices on the surface, at most; 1 is direct light alone.
+        scene: the scene.
+        rays: camera rays with unit directions; row k is path k of `numbers`.
+        numbers: random numbers; dimensions from `first_dimension` on are used, `DIMENSIONS` per vertex.
+        bounces: largest number of surface vertices of a path; 1 gives direct light only.
+        first_dimension: first dimension of `numbers` that may be used.
     """
     radiance, albedo, normal = (torch.zeros_like(rays.origins) for _ in range(3))
     alpha = torch.zeros_like(rays.origins[:, 0])
     throughput = torch.ones_like(rays.origins)
     paths = torch.arange(len(rays), device=alpha.device)
-    met, directions = scene.surface.cross(rays.origins, rays.directions), rays.directions
-    alpha[met.rows] = 1.0
+    hits, directions = scene.surface.intersect(rays.origins, rays.directions), rays.directions
+    alpha[hits.rows] = 1.0
     for bounce in range(bounces):
-        seen = torch.nonzero(met.outside)[:, 0]
-        met = met[seen]
-        paths, throughput, directions = paths[met.rows], throughput[met.rows], directions[met.rows]
+        hits = hits[torch.nonzero(hits.outside)[:, 0]]
+        paths, throughput, directions = paths[hits.rows], throughput[hits.rows], directions[hits.rows]
         if not len(paths):
             break
-        at = _vertices(scene, met, -directions)
+        at = _vertices(scene, hits, -directions)
         if bounce == 0:
             normal[paths] = at.normal
             albedo[paths] = _reflectance(at, scene.lobe)
@@ -106,24 +121,24 @@ def trace_paths(
 
         directions = scatter(at, u[:, :3], scene.lobe)
         pdf = scattering_pdf(at, directions, scene.lobe)
-        factor = scattered(at, directions, scene.lobe) / pdf.clamp_min(torch.finfo(pdf.dtype).tiny)[:, None]
-        throughput = throughput * factor
+        smallest = torch.finfo(pdf.dtype).tiny
+        throughput = throughput * brdf_cosine(at, directions, scene.lobe) / pdf.clamp_min(smallest)[:, None]
         alive = torch.nonzero(throughput.amax(-1) > 0)[:, 0]
         paths, throughput, directions, pdf, u = (t[alive] for t in (paths, throughput, directions, pdf, u))
         at = at[alive]
         origins = at.position + OFFSET * at.flat
-        met = scene.surface.cross(origins, directions)
-        radiance[paths] += throughput * _met_light(scene, at, origins, directions, pdf, met)
+        hits = scene.surface.intersect(origins, directions)
+        radiance[paths] += throughput * _from_hit_lights(scene, origins, directions, pdf, hits)
 
         if bounce + 1 >= ROULETTE_FROM:
-            life = throughput.amax(-1).clamp_max(MAX_SURVIVAL)
-            throughput = throughput / life[:, None]
-            met = met[torch.nonzero((u[:, 8] < life)[met.rows])[:, 0]]
+            survival = throughput.amax(-1).clamp_max(MAX_SURVIVAL)
+            throughput = throughput / survival[:, None]
+            hits = hits[torch.nonzero((u[:, 8] < survival)[hits.rows])[:, 0]]
     return Traced(radiance, alpha, albedo, normal)
 
 
-def _vertices(scene: Scene, met: Crossings, wo: Float[Tensor, "N 3"]) -> Vertices:
-    return vertices(met.position, met.normal, met.flat, wo, scene.materials(met.position), scene.lobe)
+def _vertices(scene: Scene, hits: Intersections, wo: Float[Tensor, "N 3"]) -> Vertices:
+    return vertices(hits.position, hits.normal, hits.flat, wo, scene.materials(hits.position), scene.lobe)
 
 
 def _reflectance(at: Vertices, lobe: Lobe | None) -> Float[Tensor, "N 3"]:
@@ -131,63 +146,62 @@ def _reflectance(at: Vertices, lobe: Lobe | None) -> Float[Tensor, "N 3"]:
     return (diffuse if lobe is None else diffuse + normal_reflectance(at.material)).clamp(0, 1)
 
 
-# ------------------------------------------------------------------------------------ directions by the light
+# --------------------------------------------------------------------------------------------- light sampling
 
 
 def _from_sky(scene: Scene, at: Vertices, u: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
-    """Light of the map along a direction that the map has drawn."""
-    drawn = scene.sky.sample(u)
-    value, rows = _scattering(scene, at, drawn.wi)
-    wi, pdf, at = drawn.wi[rows], drawn.pdf[rows], at[rows]
-    clear = ~scene.surface.blocked(at.position + OFFSET * at.flat, wi)
-    weight = power_heuristic(pdf, scattering_pdf(at, wi, scene.lobe)) * clear / pdf
-    light = value * scene.sky.look(wi) * weight[:, None]
-    return torch.zeros_like(drawn.wi).index_put((rows,), light)
+    """Reflected light of the map, from one direction sampled in proportion to the map."""
+    sample = scene.sky.sample(u)
+    value, rows = _scattering(scene, at, sample.wi)
+    wi, pdf, at = sample.wi[rows], sample.pdf[rows], at[rows]
+    unoccluded = ~scene.surface.blocked(at.position + OFFSET * at.flat, wi)
+    weight = power_heuristic(pdf, scattering_pdf(at, wi, scene.lobe)) * unoccluded / pdf
+    light = value * scene.sky.lookup(wi) * weight[:, None]
+    return torch.zeros_like(sample.wi).index_put((rows,), light)
 
 
 def _from_lamps(
     scene: Scene, lamps: Lamplight, at: Vertices, u: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N 3"]:
-    """Light of a lamp along a direction towards it."""
+    """Reflected light of the lamps, from one direction towards one of them."""
     origins = at.position + OFFSET * at.flat
-    drawn = lamps.sample(origins, u)
-    value, rows = _scattering(scene, at, drawn.wi)
-    rows_kept = drawn.pdf[rows] > 0
-    rows, value = rows[rows_kept], value[rows_kept]
-    wi, pdf, at = drawn.wi[rows], drawn.pdf[rows], at[rows]
-    clear = ~scene.surface.blocked(origins[rows], wi, drawn.distance[rows])
-    weight = power_heuristic(pdf, scattering_pdf(at, wi, scene.lobe)) * clear / pdf
-    light = value * drawn.radiance[rows] * weight[:, None]
-    return torch.zeros_like(drawn.wi).index_put((rows,), light)
+    sample = lamps.sample(origins, u)
+    value, rows = _scattering(scene, at, sample.wi)
+    valid = sample.pdf[rows] > 0
+    rows, value = rows[valid], value[valid]
+    wi, pdf, at = sample.wi[rows], sample.pdf[rows], at[rows]
+    unoccluded = ~scene.surface.blocked(origins[rows], wi, sample.distance[rows])
+    weight = power_heuristic(pdf, scattering_pdf(at, wi, scene.lobe)) * unoccluded / pdf
+    light = value * sample.radiance[rows] * weight[:, None]
+    return torch.zeros_like(sample.wi).index_put((rows,), light)
 
 
 def _scattering(
     scene: Scene, at: Vertices, wi: Float[Tensor, "N 3"]
 ) -> tuple[Float[Tensor, "K 3"], Int[Tensor, " K"]]:
-    """f · cosine where it is not zero, and at which rows that is: only there a ray is worth its cost."""
-    value = scattered(at, wi, scene.lobe)
+    """f · cosine at the rows where it is not zero, and these rows; other rows need no shadow ray."""
+    value = brdf_cosine(at, wi, scene.lobe)
     rows = torch.nonzero(value.amax(-1) > 0)[:, 0]
     return value[rows], rows
 
 
-# ---------------------------------------------------------------------------------- directions by the surface
+# ---------------------------------------------------------------------------------------------- BRDF sampling
 
 
-def _met_light(
+def _from_hit_lights(
     scene: Scene,
-    at: Vertices,
     origins: Float[Tensor, "N 3"],
     wi: Float[Tensor, "N 3"],
     pdf: Float[Tensor, " N"],
-    met: Crossings,
+    hits: Intersections,
 ) -> Float[Tensor, "N 3"]:
-    """Light that the directions in which paths go on meet by themselves."""
-    nearest = torch.full_like(pdf, torch.inf).index_put((met.rows,), met.distance)
-    free = nearest.isinf()
-    light = scene.sky.look(wi) * (free * power_heuristic(pdf, scene.sky.pdf(wi)))[:, None]
+    """Weighted radiance of the map and the lamps that the next segments of the paths hit."""
+    nearest = torch.full_like(pdf, torch.inf).index_put((hits.rows,), hits.distance)
+    unoccluded = nearest.isinf()
+    light = scene.sky.lookup(wi) * (unoccluded * power_heuristic(pdf, scene.sky.pdf(wi)))[:, None]
     lamps = scene.lamps
     for lamp in range(0 if lamps is None else len(lamps.position)):
-        distance, radiance = lamps.meet(origins, wi, lamp)
+        distance, radiance = lamps.intersect(origins, wi, lamp)
         rows = torch.nonzero(distance < nearest)[:, 0]
         weight = power_heuristic(pdf[rows], lamps.pdf(origins[rows], lamp))
         light = light.index_add(0, rows, radiance[rows] * weight[:, None])

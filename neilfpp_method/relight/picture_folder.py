@@ -1,4 +1,4 @@
-"""The pictures of one light on disk: what is there, what it was made with, and never half of it."""
+"""A folder of rendered images with records of their settings, so that interrupted work can be continued."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["PictureFolder", "StoredPicture"]
 
 @dataclass(frozen=True)
 class StoredPicture:
-    """Linear radiance, premultiplied, and alpha."""
+    """Linear radiance, premultiplied by alpha, and alpha."""
 
     radiance: Float[np.ndarray, "H W 3"]
     alpha: Float[np.ndarray, "H W"]
@@ -32,68 +32,68 @@ class StoredPicture:
 
 @dataclass(frozen=True)
 class PictureFolder:
-    """A folder of pictures that are made with the same `settings`, as JSON has them.
+    """A folder of images that are rendered with the same settings.
 
-    Each is an EXR, a PNG and a JSON record, which is written last: without it the picture is unfinished.
+    Each image is an EXR, a PNG and a JSON record with its settings. The record is written last; an image
+    without a record is unfinished.
     """
 
     path: Path
     settings: Mapping[str, Any]
 
     def has(self, shot: Shot) -> bool:
-        """Whether a picture is there.
+        """Whether a finished image exists.
 
         Raises:
-            UserError: there is one that was made in another way.
+            UserError: an image exists that was rendered with different settings.
         """
         record = self._file(shot, ".json")
         if not record.is_file():
             return False
-        made = read_json(record)
-        for key, value in self._made_with(shot).items():
-            if made.get(key) != value:
-                same = (
+        stored = read_json(record)
+        for key, value in self._record(shot).items():
+            if stored.get(key) != value:
+                other = (
                     "another map of this name"
                     if key == "map_sha256"
-                    else f"{key} {made.get(key)}, not {value}"
+                    else f"{key} {stored.get(key)}, not {value}"
                 )
-                raise UserError(
-                    f"{record}: was made with {same}", "choose another --out, or render again with --force"
-                )
+                problem = f"{record}: the image was rendered with {other}"
+                raise UserError(problem, "choose another --out, or render again with --force")
         return all(self._file(shot, suffix).is_file() for suffix in (".exr", ".png"))
 
     def write(self, shot: Shot, picture: Picture, seconds: float) -> None:
-        """Put a picture in place of what was there.
+        """Write an image, replacing an existing one. `seconds` is the time it took, for the record.
 
         Raises:
-            UserError: it cannot be written.
+            UserError: a file cannot be written.
         """
         record = self._file(shot, ".json")
         record.unlink(missing_ok=True)
         rgba = torch.cat((picture.radiance, picture.alpha), -1).cpu()
         write_exr(self._file(shot, ".exr"), {"RGBA": rgba.numpy()})
         write_png(self.png(shot), _displayed(rgba))
-        write_json(record, {**self._made_with(shot), "samples": picture.samples, "took": round(seconds, 2)})
+        write_json(record, {**self._record(shot), "samples": picture.samples, "took": round(seconds, 2)})
 
     def read(self, shot: Shot) -> StoredPicture:
-        """A picture that was written, as it is in the EXR."""
+        """Read an image from its EXR."""
         file = read_image(self._file(shot, ".exr"))
         opaque = np.ones(file.pixels.shape[:2], np.float32)
         return StoredPicture(file.pixels, opaque if file.alpha is None else file.alpha)
 
     def png(self, shot: Shot) -> Path:
-        """Where the picture is that people look at."""
+        """Path of the PNG of an image."""
         return self._file(shot, ".png")
 
     def _file(self, shot: Shot, suffix: str) -> Path:
         return self.path / f"{shot.name}{suffix}"
 
-    def _made_with(self, shot: Shot) -> dict[str, Any]:
+    def _record(self, shot: Shot) -> dict[str, Any]:
         return {**self.settings, "width": shot.camera.width, "height": shot.camera.height}
 
 
 def _displayed(rgba: Float[Tensor, "H W 4"]) -> UInt8[np.ndarray, "H W 4"]:
-    """8-bit sRGB with alpha, which PNG has not premultiplied."""
+    """Convert to 8-bit sRGB with straight alpha, as PNG requires."""
     color, alpha = rgba.split([3, 1], dim=-1)
     straight = torch.where(alpha > 0, color / alpha.clamp_min(1e-6), 0.0)
     return (torch.cat((tone_map(straight), alpha), -1) * 255).round().byte().numpy()

@@ -1,4 +1,4 @@
-"""The scene of a finished run as the path tracer takes it: its surface, its material, its lamps."""
+"""The surface of a finished run for the path tracer."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from neilfpp_method.train.run import Run
 __all__ = ["check_material", "surface_of_run"]
 
 NORMALS_AT_ONCE = 2**14
-"""Points whose neighbourhood is asked together: bounds the memory."""
+"""Number of points per call of the host's normal smoothing, which bounds the memory."""
 
 
 def check_material(run: Run) -> None:
-    """That there is a material to relight.
+    """Check that the run has a material.
 
     Raises:
-        UserError: no stage has moved the material yet.
+        UserError: no stage has estimated the material yet.
     """
     if not run.has_material:
-        raise UserError(f"{run.path}: there is no material at step {run.step}", "train the next stage")
+        raise UserError(f"{run.path}: the run has no material at step {run.step}", "train the next stage")
 
 
 @torch.no_grad()
 def surface_of_run(run: Run, resolution: int) -> Surface:
-    """The given mesh, or the one that `neilfpp export --what mesh` extracts from the distance field.
+    """Return the mesh the run was given, or the one that `neilfpp export --what mesh` extracts.
 
-    Surfaces are shaded with the normals of training: the host's, smoothed where it smooths.
+    Shading normals are those of training: the host's normals, smoothed if the host smooths them.
 
     Args:
         run: the trained run.
-        resolution: cells along an edge of the scene's cube, where a mesh is extracted.
+        resolution: number of cells along an edge of the scene's cube when a mesh is extracted.
 
     Raises:
         UserError: the run has no surface.

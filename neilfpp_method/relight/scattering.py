@@ -1,7 +1,8 @@
-"""Where paths go on at a surface: the package's BRDF (METHOD §1), and directions in proportion to it.
+"""Scattering at surface vertices: the package's BRDF, and directions sampled in approximate proportion to it.
 
-A direction comes from the specular lobe with the probability `share`, else in proportion to the cosine; its
-density is that of the mixture, so every direction of the BRDF can be drawn and weights stay bounded.
+A direction is sampled from the specular lobe with probability `share`, and otherwise in proportion to the
+cosine. Its density is that of the mixture, so every direction of the BRDF can be sampled and weights are
+bounded.
 """
 
 from __future__ import annotations
@@ -18,16 +19,28 @@ from neilfpp_method.shading.frame import local_frame
 from neilfpp_method.shading.sampling import pdf_cosine, pdf_specular_lobe
 from neilfpp_method.structures import Indexable, Material
 
-__all__ = ["Vertices", "scatter", "scattered", "scattering_pdf", "vertices"]
+__all__ = ["Vertices", "brdf_cosine", "scatter", "scattering_pdf", "vertices"]
 
 MIN_SHARE = 0.1
-"""Of either technique: an error in the lobe's share costs at most ten times the variance."""
+"""Least probability of each technique. It bounds the increase of the variance by a bad estimate of `share` to
+a factor of ten.
+"""
 
 
 @dataclass(frozen=True)
 class Vertices(Indexable):
-    """Points of paths: unit `normal` and `wo` away from the surface, the triangle's own normal `flat`, what
-    the surface is made of there, and the probability that the next direction comes from the specular lobe."""
+    """Surface vertices of N paths.
+
+    Attributes:
+        position: positions, scene frame.
+        normal: unit shading normals.
+        flat: unit normals of the triangles.
+        wo: unit directions to the previous vertices.
+        base_color: base colour, linear.
+        roughness: roughness.
+        metallic: metallic.
+        share: probability that the next direction is sampled from the specular lobe.
+    """
 
     position: Float[Tensor, "N 3"]
     normal: Float[Tensor, "N 3"]
@@ -51,7 +64,7 @@ def vertices(
     material: Material,
     lobe: Lobe | None,
 ) -> Vertices:
-    """Points of paths; `share`: what the lobe sends of constant light over what both parts send, about."""
+    """Build vertices. `share` approximates the lobe's part of the reflectance under constant light."""
     if lobe is None:
         share = torch.zeros_like(position[:, 0])
     else:
@@ -66,17 +79,21 @@ def vertices(
 
 
 def scatter(at: Vertices, u: Float[Tensor, "N 3"], lobe: Lobe | None) -> Float[Tensor, "N 3"]:
-    """Unit directions for numbers in [0, 1); some lie below the horizon, where nothing is scattered to."""
+    """Sample unit directions from random numbers in [0, 1).
+
+    Directions below the horizon can occur; the BRDF is zero there.
+    """
     from_lobe = u[:, 2] < at.share
-    height, turn = (1 - u[:, 0]).sqrt(), u[:, 1]
+    cosine = (1 - u[:, 0]).sqrt()
     if lobe is not None:
-        height = torch.where(from_lobe, lobe.sample_cos_h(u[:, :1], at.roughness)[:, 0], height)
-    sine = ((1 - height) * (1 + height)).clamp_min(0).sqrt()
-    azimuth = 2 * math.pi * turn
-    local = torch.stack((sine * azimuth.cos(), sine * azimuth.sin(), height), -1)
-    drawn = (local[:, :, None] * local_frame(at.normal)).sum(1)
-    mirrored = 2 * (drawn * at.wo).sum(-1, keepdim=True) * drawn - at.wo
-    return torch.where(from_lobe[:, None], mirrored, drawn)
+        cosine = torch.where(from_lobe, lobe.sample_cos_h(u[:, :1], at.roughness)[:, 0], cosine)
+    sine = ((1 - cosine) * (1 + cosine)).clamp_min(0).sqrt()
+    azimuth = 2 * math.pi * u[:, 1]
+    local = torch.stack((sine * azimuth.cos(), sine * azimuth.sin(), cosine), -1)
+    # A direction if it is sampled by the cosine, a half vector if it is sampled from the lobe.
+    vector = (local[:, :, None] * local_frame(at.normal)).sum(1)
+    mirrored = 2 * (vector * at.wo).sum(-1, keepdim=True) * vector - at.wo
+    return torch.where(from_lobe[:, None], mirrored, vector)
 
 
 def scattering_pdf(at: Vertices, wi: Float[Tensor, "N 3"], lobe: Lobe | None) -> Float[Tensor, " N"]:
@@ -87,9 +104,9 @@ def scattering_pdf(at: Vertices, wi: Float[Tensor, "N 3"], lobe: Lobe | None) ->
     return pdf + at.share * pdf_specular_lobe(wi[:, None], at.normal, at.wo, at.roughness, lobe)[:, 0]
 
 
-def scattered(at: Vertices, wi: Float[Tensor, "N 3"], lobe: Lobe | None) -> Float[Tensor, "N 3"]:
-    """f(wo, wi) times the cosine of wi; zero below the horizon, that of the triangle included."""
-    # A Lambertian surface asks for no lobe, and `evaluate` looks at none.
+def brdf_cosine(at: Vertices, wi: Float[Tensor, "N 3"], lobe: Lobe | None) -> Float[Tensor, "N 3"]:
+    """f(wo, wi) times the cosine of wi; zero below the horizon of the shading normal or of the triangle."""
+    # For a Lambertian surface `evaluate` does not use the lobe.
     value = evaluate(at.material, at.normal, at.wo, wi[:, None], lobe or GGX, specular=lobe is not None)
     cosine = (wi * at.normal).sum(-1, keepdim=True).clamp_min(0)
     above = (wi * at.flat).sum(-1, keepdim=True) > 0

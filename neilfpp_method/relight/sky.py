@@ -1,6 +1,6 @@
-"""Distant light for path tracing: a latitude-longitude map, and directions in proportion to it.
+"""Distant light for path tracing: a latitude-longitude map that can be evaluated and sampled.
 
-Two layouts of rows and any azimuth of the first column: a map is used as it is, never resampled.
+Two layouts of rows and any azimuth of the first column are supported, so that maps need not be resampled.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from neilfpp_method.shading.color import luminance
 __all__ = ["Sky", "SkySample", "sky_of_run"]
 
 MEAN_OF_CELL = (1 / 8, 3 / 4)
-"""Bilinear radiance has this mean in a texel: shares of each neighbour and of itself, per axis."""
+"""Weights of each neighbour and of the texel itself, per axis, in the mean of bilinear radiance."""
 
 
 @dataclass(frozen=True)
 class SkySample:
-    """Unit directions towards the light, and their density per steradian of the sphere."""
+    """Unit directions towards the light, and their density per steradian."""
 
     wi: Float[Tensor, "N 3"]
     pdf: Float[Tensor, " N"]
@@ -33,14 +33,14 @@ class SkySample:
 
 @dataclass(frozen=True)
 class Sky:
-    """An environment map about +z, bilinear between its texels; linear RGB ≥ 0, not black.
+    """An environment map around +z with bilinear interpolation; linear RGB, not negative, not black.
 
-    Column i has the azimuth φ = start + 2π(i + ½)/W and the direction (sin φ sin θ, cos φ sin θ, cos θ).
+    Column i has the azimuth φ = start + 2π(i + ½)/W; directions are (sin φ sin θ, cos φ sin θ, cos θ).
 
     Attributes:
-        radiance: the texels, rows from +z down.
-        rows_at_poles: the first and the last row are the poles, θ = πj/(H − 1), as in this package's files;
-            else rows lie at θ = π(j + ½)/H, as most programs have them.
+        radiance: texels; the first row is at +z.
+        rows_at_poles: if True, row j has θ = πj/(H − 1), as in this package's files, so the first and last
+            row are the poles; if False, it has θ = π(j + ½)/H, as in most programs.
         start: azimuth of the left edge of column 0, radians.
 
     Example:
@@ -53,22 +53,22 @@ class Sky:
     rows_at_poles: bool
     start: float
 
-    def look(self, wi: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """Radiance that arrives from unit directions."""
+    def lookup(self, wi: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """Radiance that arrives from unit directions, by bilinear interpolation."""
         height, width = self.radiance.shape[:2]
-        column, row = self._place(wi)
-        at = torch.stack((2 * (column + 1) / (width + 1) - 1, 2 * row / (height - 1) - 1), -1)
-        found = functional.grid_sample(
-            self._closed, at[None, None], padding_mode="border", align_corners=True
+        column, row = self._to_texels(wi)
+        grid = torch.stack((2 * (column + 1) / (width + 1) - 1, 2 * row / (height - 1) - 1), -1)
+        values = functional.grid_sample(
+            self._closed, grid[None, None], padding_mode="border", align_corners=True
         )
-        return found[0, :, 0].T
+        return values[0, :, 0].T
 
     def sample(self, u: Float[Tensor, "N 2"]) -> SkySample:
-        """Directions for numbers in [0, 1), in proportion to luminance and solid angle of texels."""
+        """Sample directions from random numbers in [0, 1), in proportion to luminance times solid angle."""
         height, width = self.radiance.shape[:2]
         by_row, by_texel = self._cumulated
         u = u.double()
-        # First the row, then the column within it: an even spread of u stays one.
+        # The row first, then the column within it, which preserves the stratification of u.
         row, down = _invert(by_row, u[:, 0] * by_row[-1], 0, height)
         before = torch.where(row > 0, by_texel[(row * width - 1).clamp_min(0)], 0.0)
         mass = by_texel[row * width + width - 1] - before
@@ -80,24 +80,24 @@ class Sky:
         return SkySample(wi, self.pdf(wi))
 
     def pdf(self, wi: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-        """Density of `sample` at unit directions, per steradian of the sphere; constant on a texel."""
+        """Density of `sample` at unit directions, per steradian; constant over a texel."""
         height, width = self.radiance.shape[:2]
-        column, row = self._place(wi)
+        column, row = self._to_texels(wi)
         row = (row + 0.5).long().clamp(0, height - 1)
         return self._density[row * width + (column + 0.5).floor().long() % width]
 
-    def _place(self, wi: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
-        """Where directions lie, in texels: column in [−½, W − ½), row in [−½, H − ½]."""
+    def _to_texels(self, wi: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
+        """Texel coordinates of directions: column in [−½, W − ½), row in [−½, H − ½]."""
         height, width = self.radiance.shape[:2]
-        turn = (torch.atan2(wi[:, 0], wi[:, 1]) - self.start) / (2 * math.pi)
-        # Not acos, which has no digits left near the poles.
-        share = torch.atan2(wi[:, :2].norm(dim=-1), wi[:, 2]) / math.pi
-        row = share * (height - 1) if self.rows_at_poles else share * height - 0.5
-        return (turn - turn.floor()) * width - 0.5, row
+        turns = (torch.atan2(wi[:, 0], wi[:, 1]) - self.start) / (2 * math.pi)
+        # acos would be inaccurate near the poles.
+        theta = torch.atan2(wi[:, :2].norm(dim=-1), wi[:, 2]) / math.pi
+        row = theta * (height - 1) if self.rows_at_poles else theta * height - 0.5
+        return (turns - turns.floor()) * width - 0.5, row
 
     @cached_property
     def _closed(self) -> Float[Tensor, "1 3 H C"]:
-        """The map with one column more on each side, which closes it in azimuth."""
+        """The map with one more column on each side, so that interpolation wraps around in azimuth."""
         planes = self.radiance.permute(2, 0, 1)
         return torch.cat((planes[..., -1:], planes, planes[..., :1]), -1)[None].contiguous()
 
@@ -111,7 +111,7 @@ class Sky:
 
     @cached_property
     def _mass(self) -> Float[Tensor, "H W"]:
-        """What texels bring: mean luminance of bilinear radiance times solid angle; float64."""
+        """Mean luminance of bilinear radiance over each texel, times its solid angle; float64."""
         mean = luminance(self.radiance.double())
         mean = MEAN_OF_CELL[0] * (mean.roll(1, 1) + mean.roll(-1, 1)) + MEAN_OF_CELL[1] * mean
         above, below = torch.cat((mean[:1], mean[:-1])), torch.cat((mean[1:], mean[-1:]))
@@ -124,7 +124,7 @@ class Sky:
 
     @cached_property
     def _cumulated(self) -> tuple[Float[Tensor, " H"], Float[Tensor, " T"]]:
-        """Cumulated masses of rows and texels in float64: float32 cannot sum eight million texels."""
+        """Cumulated masses of rows and texels; float64, because float32 cannot sum eight million texels."""
         texels = self._mass.reshape(-1).cumsum(0)
         return texels[self.radiance.shape[1] - 1 :: self.radiance.shape[1]].contiguous(), texels
 
@@ -134,7 +134,7 @@ class Sky:
 
 
 def sky_of_run(light: EnvironmentLight) -> Sky:
-    """The environment map that a run has found, as it is."""
+    """The estimated environment map of a run, without resampling."""
     return Sky(light.log_radiance.detach().exp().permute(1, 2, 0).contiguous(), rows_at_poles=True, start=0.0)
 
 
@@ -144,9 +144,9 @@ def _invert(
     first: Int[Tensor, " N"] | int,
     end: Int[Tensor, " N"] | int,
 ) -> tuple[Int[Tensor, " N"], Float[Tensor, " N"]]:
-    """Which of the entries first … end − 1 a cumulated value falls into, and how far, in [0, 1)."""
-    found = torch.searchsorted(cumulated, value, right=True)
-    found = torch.minimum(torch.maximum(found, torch.as_tensor(first)), torch.as_tensor(end) - 1)
-    before = torch.where(found > 0, cumulated[(found - 1).clamp_min(0)], 0.0)
-    share = (value - before) / (cumulated[found] - before).clamp_min(torch.finfo(torch.float64).tiny)
-    return found, share.clamp(0, 1)
+    """Find the entry among first … end − 1 that contains a cumulated value, and the position within it."""
+    index = torch.searchsorted(cumulated, value, right=True)
+    index = torch.minimum(torch.maximum(index, torch.as_tensor(first)), torch.as_tensor(end) - 1)
+    before = torch.where(index > 0, cumulated[(index - 1).clamp_min(0)], 0.0)
+    position = (value - before) / (cumulated[index] - before).clamp_min(torch.finfo(torch.float64).tiny)
+    return index, position.clamp(0, 1)

@@ -1,4 +1,4 @@
-"""Masks that a person paints over a view, to say where an edit counts: they lie on what the view sees."""
+"""Masks painted over a view, which limit edits of the material to the surface behind white pixels."""
 
 from __future__ import annotations
 
@@ -19,71 +19,72 @@ from neilfpp_method.relight.cameras import resized
 from neilfpp_method.relight.edits import Limit
 from neilfpp_method.relight.surface import Surface
 
-__all__ = ["Stencil", "painted", "read_stencils"]
+__all__ = ["Stencil", "masked_limit", "read_stencils"]
 
 NEAR = 2e-3
-"""Scene units that a point may lie behind what its view meets first, and be taken for it."""
+"""A point is visible if it is at most this distance behind the first hit of its ray, scene units."""
 WHITE = 0.5
-"""From this share of white on a pixel is painted."""
+"""Value from which a pixel counts as white."""
 
 
 @dataclass(frozen=True)
 class Stencil:
-    """A camera in the scene frame, in the size of the mask, and which of its pixels are painted."""
+    """A camera in the scene frame with the size of a mask, and the white pixels of the mask."""
 
     camera: Camera
     white: Bool[Tensor, "H W"]
 
     def covers(self, x: Float[Tensor, "N 3"], surface: Surface) -> Bool[Tensor, "N 1"]:
-        """Which points the camera sees through a painted pixel, with nothing of the surface in between."""
-        shown = project(self.camera, x)
-        column, row = shown.pixel.nan_to_num(-1.0, -1.0, -1.0).floor().long().unbind(-1)
+        """Whether the camera sees points through a white pixel, without occlusion by the surface."""
+        projected = project(self.camera, x)
+        column, row = projected.pixel.nan_to_num(-1.0, -1.0, -1.0).floor().long().unbind(-1)
         height, width = self.white.shape
-        inside = (shown.depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        inside = (projected.depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
         covered = torch.zeros_like(inside)
         rows = torch.nonzero(inside)[:, 0]
         rows = rows[self.white.to(x.device)[row[rows], column[rows]]]
         eye = torch.as_tensor(self.camera.c2w[:, 3], dtype=x.dtype, device=x.device)
         offset = x[rows] - eye
         distance = offset.norm(dim=-1)
-        hidden = surface.blocked(eye.expand_as(offset), offset / distance[:, None], distance - NEAR)
-        covered[rows] = ~hidden
+        occluded = surface.blocked(eye.expand_as(offset), offset / distance[:, None], distance - NEAR)
+        covered[rows] = ~occluded
         return covered[:, None]
 
 
 def read_stencils(paths: Sequence[Path], capture: Capture) -> list[Stencil]:
-    """Masks by files; the name of a file, without its suffix, is that of the view that it is painted over.
+    """Read masks. The name of a file, without its suffix, is the name of the view that it was painted over.
 
-    White counts, black does not; where there is transparency, what is transparent does not either.
+    Edits apply at white pixels, but not at transparent ones.
 
     Raises:
-        UserError: no such file, no view of the name, another shape than the view's, or nothing is white.
+        UserError: there is no such file or view, the aspect ratio differs from the view's, or no pixel is
+            white.
     """
     return [_read(path, capture) for path in paths]
 
 
-def painted(stencils: Sequence[Stencil], surface: Surface) -> Limit:
-    """Whether one of the masks covers a point of a surface."""
+def masked_limit(stencils: Sequence[Stencil], surface: Surface) -> Limit:
+    """Return a limit that contains the points of a surface that at least one of the masks covers."""
 
-    def holds(x: Float[Tensor, "N 3"]) -> Bool[Tensor, "N 1"]:
+    def limit(x: Float[Tensor, "N 3"]) -> Bool[Tensor, "N 1"]:
         covered = [stencil.covers(x, surface) for stencil in stencils]
         return torch.stack(covered).any(0)
 
-    return holds
+    return limit
 
 
 def _read(path: Path, capture: Capture) -> Stencil:
     view = next((view for view in capture.views if view.name == path.stem), None)
     if view is None:
-        remedy = f"name the file as the view it is painted over, as {capture.views[0].name}{path.suffix}"
+        remedy = f"name the file as the view, for example {capture.views[0].name}{path.suffix}"
         raise UserError(f"{path}: the capture has no view '{path.stem}'", remedy)
     header, camera = image_header(path), view.camera
     factor = header.width / camera.width
     if not math.isclose(header.height, camera.height * factor, abs_tol=1.0):
         raise UserError(
-            f"{path}: a mask of {header.width}×{header.height} pixels over a view of "
+            f"{path}: the mask has {header.width}×{header.height} pixels, but the view has "
             f"{camera.width}×{camera.height}",
-            "paint it over the whole view, in any size of the same shape",
+            "paint it over the whole view, in any size with the same aspect ratio",
         )
     camera = resized(capture.normalisation.camera(camera), factor)
     file = read_image(path)
@@ -91,8 +92,11 @@ def _read(path: Path, capture: Capture) -> Stencil:
     if file.alpha is not None:
         value = value * torch.from_numpy(file.alpha)
     white = torch.zeros(camera.height, camera.width, dtype=torch.bool)
-    rows = min(camera.height, len(value))  # rounding may make one more or less
+    # Due to rounding, the heights of camera and mask may differ by one row.
+    rows = min(camera.height, len(value))
     white[:rows] = value[:rows] >= WHITE
     if not white.any():
-        raise UserError(f"{path}: nothing in the mask is white", "paint white where the material changes")
+        raise UserError(
+            f"{path}: no pixel of the mask is white", "paint the pixels white at which the material changes"
+        )
     return Stencil(camera, white)

@@ -1,4 +1,4 @@
-"""The surface that paths bounce on: triangles with normals at their corners, and what rays meet first."""
+"""The surface of the path tracer: triangles with corner normals, and ray intersection."""
 
 from __future__ import annotations
 
@@ -12,20 +12,27 @@ from neilfpp_method.hosts.mesh_tracing import build_tree, embree_tracer, meet, t
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import Indexable
 
-__all__ = ["OFFSET", "Crossings", "Surface"]
+__all__ = ["OFFSET", "Intersections", "Surface"]
 
 OFFSET = 1e-4
-"""Height above a triangle at which rays leave, scene units: above rounding (1e-6), below relief."""
+"""Height above a triangle at which rays start, scene units. It is larger than rounding errors (1e-6) and
+smaller than details of the surface.
+"""
 TINY = 1e-18
-"""Length under which a sum of edge products has no direction."""
+"""Length of the cross product of two edges below which a triangle has no normal."""
 
 
 @dataclass(frozen=True)
-class Crossings(Indexable):
-    """The rays that meet the surface: which they are, where, and the surface there.
+class Intersections(Indexable):
+    """First hits of the K rays that hit the surface.
 
-    `normal` is for shading, interpolated where that faces the ray; `flat` is the triangle's own; `outside` is
-    false where a ray comes from within.
+    Attributes:
+        rows: indices of the rays.
+        distance: distance along the ray, scene units.
+        position: position of the hit, scene frame.
+        normal: unit shading normal: the interpolated normal if it faces the ray, else `flat`.
+        flat: unit normal of the triangle.
+        outside: whether the ray hits the outside of the triangle.
     """
 
     rows: Int[Tensor, " K"]
@@ -37,13 +44,13 @@ class Crossings(Indexable):
 
 
 class Surface:
-    """Triangles in the scene frame, wound outwards: from within they stop rays and send nothing.
+    """Triangles in the scene frame, oriented outwards. Their inside absorbs rays and reflects no light.
+
+    First hits are found by Embree on a CPU, if it is installed, and else by a bounding volume hierarchy.
 
     Args:
-        triangles: their corners.
-        corner_normals: unit normals for shading at the corners; none: flat ones.
-
-    Embree finds first hits on a CPU, a tree of boxes anywhere else.
+        triangles: corners of the triangles.
+        corner_normals: unit shading normals at the corners; None for the normals of the triangles.
     """
 
     def __init__(
@@ -58,18 +65,19 @@ class Surface:
         tracer = embree_tracer(triangles) if triangles.device.type == "cpu" else None
         self._first_hits = tracer or tree_tracer(build_tree(triangles))
 
-    def cross(self, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> Crossings:
-        """Where rays of unit directions meet the surface first."""
+    def intersect(self, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> Intersections:
+        """Find the first hits of rays with unit directions."""
         numbers = self._first_hits(origins, directions)
         rows = torch.nonzero(numbers >= 0)[:, 0]
         numbers, origins, directions = numbers[rows], origins[rows], directions[rows]
-        meeting = meet(origins, directions, self.triangles[numbers])
+        hit = meet(origins, directions, self.triangles[numbers])
         flat = self.outward[numbers]
-        weights = meeting.weights.nan_to_num(1 / 3)[..., None]  # a ray along its triangle
+        # Barycentric weights are NaN if a ray lies in the plane of its triangle.
+        weights = hit.weights.nan_to_num(1 / 3)[..., None]
         smooth = safe_normalize((weights * self.corner_normals[numbers]).sum(1))
         faces_viewer = (smooth * directions).sum(-1, keepdim=True) < 0
-        distance = meeting.distance.nan_to_num(0.0, 0.0, 0.0)
-        return Crossings(
+        distance = hit.distance.nan_to_num(0.0, 0.0, 0.0)
+        return Intersections(
             rows=rows,
             distance=distance,
             position=origins + distance[:, None] * directions,
@@ -84,7 +92,7 @@ class Surface:
         directions: Float[Tensor, "N 3"],
         before: Float[Tensor, " N"] | None = None,
     ) -> Bool[Tensor, " N"]:
-        """Whether rays meet the surface at all, or nearer than a distance."""
+        """Whether rays hit the surface; if `before` is given, whether they hit it at a smaller distance."""
         numbers = self._first_hits(origins, directions)
         hit = numbers >= 0
         if before is None:

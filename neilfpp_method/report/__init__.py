@@ -1,5 +1,6 @@
-"""What a run came to, on one page that needs no network (docs/report.md).
+"""The report of a run: one HTML file that loads nothing from outside (docs/report.md).
 
-`files` reads what lies in the run's folder, `views`, `surface` and `light` make pictures from its model;
-`pictures` and `tables` put them into HTML, `page` frames it, and `write` does it all.
+`files` and `measured` read the run's folder; `views`, `surface` and `light` render its model; `pictures`,
+`tables` and `curves` produce HTML with the elements of `markup`; `page` combines the sections; `write` is the
+entry point.
 """

@@ -1,6 +1,4 @@
-"""What time bought: held-back quality over the seconds of a run, and what the seconds went to, as inline
-SVG.
-"""
+"""Charts of training time as inline SVG: held-back quality over time, and the time of each kind of work."""
 
 from __future__ import annotations
 
@@ -14,11 +12,17 @@ from neilfpp_method.train.quality import Look
 __all__ = ["quality_curve", "work_bars"]
 
 WIDTH, HEIGHT = 640.0, 260.0
+"""Size of a chart, pixels. The height of `work_bars` depends on the number of stages."""
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 96.0, 14.0, 40.0
+"""Margins around the plot, pixels, for the labels."""
 BAR, GAP = 22.0, 14.0
+"""Height of a bar and distance between bars, pixels."""
+STAGE_WIDTH, SECONDS_WIDTH = 110.0, 60.0
+"""Space for the name of a stage left of its bar, and for its seconds right of it, pixels."""
 LABEL_HEIGHT = 14.0
-"""Vertical distance of labels that would overlap."""
+"""Smallest vertical distance between two labels, pixels."""
 TICKS = 5
+"""Approximate number of intervals between axis labels."""
 COLORS = (
     "#4477aa",
     "#228833",
@@ -32,14 +36,15 @@ COLORS = (
     "#99ddff",
     "#777777",
 )
-"""One for each kind of work, in the order of `WORK`; told apart by most people with a colour vision of their
-own, and named by the legend.
+"""Colours of the kinds of work, in the order of `WORK`, chosen so that readers with colour blindness can
+distinguish most of them; the legend names them.
 """
 
 
 def quality_curve(looks: Sequence[Look]) -> Html | None:
-    """PSNR of R and of the rendering equation at held-back pixels over the seconds of the run; none: there
-    was no look.
+    """Draw the PSNR of R and of the rendering equation at held-back pixels over the seconds of the run.
+
+    Returns None if there was no measurement during training.
     """
     if not looks:
         return None
@@ -49,61 +54,69 @@ def quality_curve(looks: Sequence[Look]) -> Html | None:
     x_ticks, y_ticks = _ticks(0.0, looks[-1].seconds), _ticks(min(values), max(values))
     right, low, high = max(x_ticks[-1], looks[-1].seconds), y_ticks[0], y_ticks[-1]
 
-    def place(seconds: float, value: float) -> tuple[float, float]:
+    def to_pixels(seconds: float, value: float) -> tuple[float, float]:
         across, up = seconds / max(right, 1e-9), (value - low) / (high - low)
         return LEFT + across * (WIDTH - LEFT - RIGHT), TOP + (1 - up) * (HEIGHT - TOP - BOTTOM)
 
-    grid = [_text(place(x, low)[0], HEIGHT - BOTTOM + 18, f"{x:g}", "middle") for x in x_ticks]
+    grid = [_text(to_pixels(x, low)[0], HEIGHT - BOTTOM + 18, f"{x:g}", "middle") for x in x_ticks]
     for y in y_ticks:
-        height = place(0.0, y)[1]
+        height = to_pixels(0.0, y)[1]
         grid.append(_line(LEFT, height, WIDTH - RIGHT, height))
         grid.append(_text(LEFT - 6, height + 4, f"{y:g}", "end"))
     lines, labels = [], []
     for name, points, color in (("R", radiance, COLORS[0]), ("PBR", physical, COLORS[3])):
         if points:
-            shown = [place(*point) for point in points]
-            lines.append(_curve(shown, color))
-            labels.append((shown[-1], f"{name} {points[-1][1]:.1f} dB"))
+            pixels = [to_pixels(*point) for point in points]
+            x, y = pixels[-1]
+            lines.append(_curve(pixels, color))
+            labels.append((x + 8, y + 4, f"{name} {points[-1][1]:.1f} dB"))
     previous = -math.inf
-    for (x, y), text in sorted(labels, key=lambda label: label[0][1]):
-        previous = max(y + 4, previous + LABEL_HEIGHT)
-        lines.append(_text(x + 8, previous, text, "start"))
+    for x, y, text in sorted(labels, key=lambda label: label[1]):
+        previous = max(y, previous + LABEL_HEIGHT)
+        lines.append(_text(x, previous, text, "start"))
     caption = _text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 4, "seconds of the run", "middle")
     return _svg(HEIGHT, "PSNR of held-back pixels over seconds", *grid, *lines, caption)
 
 
 def work_bars(work: Mapping[str, Mapping[str, float]], titles: Mapping[str, str]) -> Html | None:
-    """A bar for each stage, as long as it took, divided by kind of work; none: nothing was recorded."""
+    """Draw a bar for each stage, divided by kind of work; its length is proportional to the stage's time.
+
+    Args:
+        work: seconds by stage and kind of work.
+        titles: titles of the stages.
+
+    Returns:
+        The chart with its legend, or None if no time was recorded.
+    """
     sums = {stage: sum(parts.values()) for stage, parts in work.items()}
     longest = max(sums.values(), default=0.0)
     if longest <= 0.0:
         return None
-    left, bars, seen = 110.0, [], set()
+    bars, drawn = [], set()
     for number, (stage, parts) in enumerate(work.items()):
-        top, x = TOP + number * (BAR + GAP), left
-        bars.append(_text(left - 8, top + 15, titles.get(stage, stage), "end"))
+        top, x = TOP + number * (BAR + GAP), STAGE_WIDTH
+        bars.append(_text(x - 8, top + 15, titles.get(stage, stage), "end"))
         for kind, color in zip(WORK, COLORS, strict=True):
-            width = (WIDTH - left - 60) * parts.get(kind, 0.0) / longest
+            width = (WIDTH - STAGE_WIDTH - SECONDS_WIDTH) * parts.get(kind, 0.0) / longest
             if width > 0:
-                told = element("title", f"{kind.replace('_', ' ')}: {parts[kind]:.1f} s")
+                tooltip = element("title", f"{kind.replace('_', ' ')}: {parts[kind]:.1f} s")
                 box = {"x": f"{x:.1f}", "y": top, "width": f"{width:.1f}", "height": BAR, "fill": color}
-                bars.append(element("rect", told, **box))
-                seen.add(kind)
+                bars.append(element("rect", tooltip, **box))
+                drawn.add(kind)
             x += width
         bars.append(_text(x + 6, top + 15, f"{sums[stage]:.0f} s", "start"))
     height = TOP + len(work) * (BAR + GAP)
     legend = (
         element("span", element("span", "■ ", style=f"color: {color}"), f"{kind.replace('_', ' ')}  ")
         for kind, color in zip(WORK, COLORS, strict=True)
-        if kind in seen
+        if kind in drawn
     )
-    return joined(
-        _svg(height, "Seconds of each stage by kind of work", *bars), element("p", *legend, class_="pale")
-    )
+    chart = _svg(height, "Seconds of each stage by kind of work", *bars)
+    return joined(chart, element("p", *legend, class_="pale"))
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Round numbers from at most the lowest value to at least the highest, some five of them.
+    """About `TICKS` round numbers, from at most `low` to at least `high`.
 
     >>> _ticks(18.2, 26.9)
     [18.0, 20.0, 22.0, 24.0, 26.0, 28.0]

@@ -1,4 +1,4 @@
-"""Pictures inside a page: encoded small, as data addresses."""
+"""Images as compressed data URLs, which a page contains instead of loading files."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from PIL import Image
 
-__all__ = ["data_address", "encoded"]
+__all__ = ["data_url", "encoded"]
 
 QUALITY = 88
-"""Of WebP, out of 100: no step is seen in a smooth map at this quality."""
+"""Quality of WebP, out of 100. At this value smooth maps show no visible steps."""
 
 
-def encoded(picture: UInt8[np.ndarray, "H W 3"], shown: Bool[np.ndarray, "H W"] | None = None) -> str:
-    """A picture as a data address, transparent where `shown` is False, for light and dark pages."""
-    if shown is not None and not shown.all():
-        alpha = np.where(shown, 255, 0).astype(np.uint8)[..., None]
+def encoded(picture: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None = None) -> str:
+    """Encode an image as a data URL; pixels outside of the mask are transparent, for light and dark pages."""
+    if mask is not None and not mask.all():
+        alpha = np.where(mask, 255, 0).astype(np.uint8)[..., None]
         picture = np.concatenate([picture, alpha], axis=-1)
     file = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(picture)).save(file, "WEBP", quality=QUALITY, method=4)
-    return data_address(file.getvalue(), "image/webp")
+    return data_url(file.getvalue(), "image/webp")
 
 
-def data_address(data: bytes, kind: str) -> str:
-    """Bytes as a `data:` address of a media type."""
+def data_url(data: bytes, kind: str) -> str:
+    """Encode bytes of a media type as a `data:` URL."""
     return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"

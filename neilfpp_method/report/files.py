@@ -1,4 +1,4 @@
-"""A run's folder besides its model: progress, figures, times, findings, effects and settings."""
+"""Read the files of a run other than its model: settings, figures, times, findings and effects."""
 
 from __future__ import annotations
 
@@ -26,29 +26,29 @@ Read = TypeVar("Read")
 
 @dataclass(frozen=True)
 class Changed:
-    """A setting that is not that of the preset; `usual` is none where the preset does not have it."""
+    """A setting that differs from the preset; `preset_value` is None if the preset has no such setting."""
 
     name: str
     value: str
-    usual: str | None
+    preset_value: str | None
 
 
 @dataclass(frozen=True)
 class Files:
-    """What the files of a run say.
+    """The contents of a run's files.
 
     Attributes:
         path: the run's folder.
-        config: its settings.
-        steps: of the whole training.
-        findings: of its health; none: it has no record.
-        measured: figures by protocol; empty where `neilfpp eval` was not called.
-        timing: seconds of each stage.
-        work: seconds of each stage by kind of work.
-        looks: at held-back pixels, on the way.
-        effects: a row per effect, as `effects.json` has them.
-        machine: versions and hardware.
-        notes: what could not be read.
+        config: the settings of the run.
+        steps: number of steps of the whole training.
+        findings: findings of the health checks; None if the run has no record of them.
+        measured: figures by protocol; empty if the run was not evaluated.
+        timing: seconds by stage.
+        work: seconds by stage and kind of work.
+        looks: measurements at held-back pixels during training.
+        effects: one row per effect, from `effects.json`.
+        machine: hardware and package versions, from `environment.json`.
+        notes: one message per file that could not be read.
     """
 
     path: Path
@@ -65,7 +65,7 @@ class Files:
 
 
 def read_files(path: Path) -> Files:
-    """The files of a run. A damaged one besides its settings is left out, and a note says so.
+    """Read the files of a run. A damaged file is skipped and noted, unless it holds the settings.
 
     Raises:
         UserError: there is no run, or its settings cannot be read.
@@ -73,36 +73,36 @@ def read_files(path: Path) -> Files:
     config = read_description(path).config
     notes: list[str] = []
 
-    def tried(read: Callable[[], Read], else_: Read) -> Read:
+    def read_or(read: Callable[[], Read], default: Read) -> Read:
         try:
             return read()
         except UserError as error:
             notes.append(str(error))
-            return else_
+            return default
 
-    def optional(name: str) -> dict[str, Any]:
-        return tried(lambda: read_json(path / name), {}) if (path / name).is_file() else {}
+    def optional_json(name: str) -> dict[str, Any]:
+        return read_or(lambda: read_json(path / name), {}) if (path / name).is_file() else {}
 
     measured, damaged = read_measured(path)
     notes += damaged
-    rows = optional("effects.json").get("effects")
+    rows = optional_json("effects.json").get("effects")
     return Files(
         path=path,
         config=config,
         steps=sum(stage_steps(config.train).values()),
-        findings=tried(lambda: read_findings(path), None),
+        findings=read_or(lambda: read_findings(path), None),
         measured=measured,
-        timing=numbers(optional("timing.json")),
-        work=tried(lambda: read_work(path), {}),
-        looks=tried(lambda: read_looks(path), []),
+        timing=numbers(optional_json("timing.json")),
+        work=read_or(lambda: read_work(path), {}),
+        looks=read_or(lambda: read_looks(path), []),
         effects=[row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else [],
-        machine=optional("environment.json"),
+        machine=optional_json("environment.json"),
         notes=notes,
     )
 
 
 def changed_settings(config: NeilfConfig) -> list[Changed] | None:
-    """The settings that are not those of the preset; none where the preset is not known."""
+    """List the settings that differ from the run's preset; None if this version does not know the preset."""
     name = config.preset.removesuffix("-mesh")
     if name in PRESETS:
         base = PRESETS[name]()
@@ -112,25 +112,24 @@ def changed_settings(config: NeilfConfig) -> list[Changed] | None:
         return None
     base = fixed_geometry(base) if isinstance(config.host, MeshConfig) else base
     base = free_light(base) if config.light.kind == "free" and base.light.kind != "free" else base
-    own, usual = flat_settings(to_dict(config)), flat_settings(to_dict(base))
+    own, preset = flat_settings(to_dict(config)), flat_settings(to_dict(base))
     return [
-        Changed(key, str(value), None if key not in usual else str(usual[key]))
+        Changed(key, str(value), str(preset[key]) if key in preset else None)
         for key, value in own.items()
-        if key not in usual or usual[key] != value
+        if key not in preset or preset[key] != value
     ]
 
 
-def flat_settings(values: Mapping[str, Any], where: str = "") -> dict[str, Any]:
-    """Nested settings by their dotted names.
+def flat_settings(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Flatten nested settings to dotted names.
 
     >>> flat_settings({"train": {"rays": 77}})
     {'train.rays': 77}
     """
-    found: dict[str, Any] = {}
+    flat: dict[str, Any] = {}
     for name, value in values.items():
-        found |= (
-            flat_settings(value, f"{where}{name}.")
-            if isinstance(value, Mapping)
-            else {f"{where}{name}": value}
-        )
-    return found
+        if isinstance(value, Mapping):
+            flat |= flat_settings(value, f"{prefix}{name}.")
+        else:
+            flat[f"{prefix}{name}"] = value
+    return flat

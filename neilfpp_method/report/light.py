@@ -1,4 +1,4 @@
-"""The light of a run for its page: the map as a picture, and its lamps."""
+"""The light of a run for its report: the environment map as an image, and the lamps."""
 
 from __future__ import annotations
 
@@ -15,20 +15,24 @@ from neilfpp_method.train.run import Run
 __all__ = ["lamps_of", "picture_of_map"]
 
 MIN_HEIGHT = 192
-"""Pixels of the picture: each texel is so large that it is seen."""
+"""Least height of the image, pixels. Texels are enlarged until it is reached, so that they are visible."""
 
 
 def picture_of_map(run: Run) -> tuple[str, float] | None:
-    """The environment map as a data address, +z at the top, and its exposure; none without a map."""
+    """Return the environment map as a data URL, +z at the top, and its exposure.
+
+    Returns None if the run's light is no environment map, or no stage has estimated the light yet.
+    """
     light = run.model.light
     if not run.has_material or not isinstance(light, EnvironmentLight):
         return None
     radiance = light.log_radiance.detach().exp().permute(1, 2, 0).cpu().numpy()
     exposure = auto_exposure(radiance.reshape(-1, 3))
-    times = max(1, -(-MIN_HEIGHT // len(radiance)))
-    return encoded(np.kron(display_color(radiance, exposure), np.ones((times, times, 1), np.uint8))), exposure
+    factor = max(1, -(-MIN_HEIGHT // len(radiance)))
+    enlarged = np.kron(display_color(radiance, exposure), np.ones((factor, factor, 1), np.uint8))
+    return encoded(enlarged), exposure
 
 
 def lamps_of(run: Run) -> list[dict[str, Any]]:
-    """The lamps as `lamps.json` has them; none before a stage has moved the light."""
+    """The lamps in the format of `lamps.json`; empty if no stage has estimated the light yet."""
     return lamps_in_world(run) if run.has_material else []

@@ -1,4 +1,4 @@
-"""HTML that is put together from Python values: text is escaped unless it was made here."""
+"""Build HTML from Python values. Text is escaped unless it is an `Html` made by this module."""
 
 from __future__ import annotations
 
@@ -9,21 +9,22 @@ from typing import Any
 __all__ = ["Html", "cell", "data_block", "element", "joined", "table", "with_code"]
 
 VOID = frozenset({"br", "hr", "img", "input", "link", "meta"})
-"""Elements that hold nothing and have no end."""
+"""Elements without content and end tag."""
 
 
 class Html(str):
-    """Text that is HTML already; every other string is escaped where it is put into an element."""
+    """Text that is HTML. Any other string is escaped when it is put into an element."""
 
 
 def element(name: str, /, *children: str | None, **attributes: str | int | float | bool | None) -> Html:
-    """An element.
+    """Build an element.
 
     Args:
-        name: of the element.
-        children: `Html` as it is, other text escaped; none is left out.
-        attributes: their values are escaped. True stands alone, False and none are left out. An underscore at
-            the end goes, as in `class_`; other underscores become dashes.
+        name: tag name.
+        children: content. `Html` is inserted unchanged, other text is escaped, None is skipped.
+        attributes: attributes, whose values are escaped. True gives an attribute without value; False and
+            None are skipped. A trailing underscore is removed, as in `class_`; other underscores become
+            hyphens.
 
     >>> element("p", "a < b", class_="note", hidden=True)
     '<p class="note" hidden>a &lt; b</p>'
@@ -35,19 +36,19 @@ def element(name: str, /, *children: str | None, **attributes: str | int | float
 
 
 def joined(*parts: str | None) -> Html:
-    """Parts one after the other, escaped where they are no HTML yet."""
+    """Concatenate parts. `Html` is kept unchanged, other text is escaped, None is skipped."""
     return Html(
         "".join(part if isinstance(part, Html) else escape(part) for part in parts if part is not None)
     )
 
 
 def table(head: tuple[str, ...], *rows: Html, class_: str | None = None) -> Html:
-    """A table that scrolls sideways where it is wider than the page.
+    """Build a table that scrolls horizontally if it is wider than the page.
 
     Args:
-        head: the columns' titles; without any the table has no head.
+        head: titles of the columns; if empty, the table has no head.
         rows: `tr` elements.
-        class_: of the table.
+        class_: class of the table.
     """
     titles = element("tr", *(element("th", title, scope="col") for title in head))
     inside = (element("thead", titles) if head else None, element("tbody", *rows))
@@ -65,12 +66,15 @@ def with_code(text: str) -> Html:
 
 
 def cell(text: str) -> Html:
-    """A cell of a table whose text may be long."""
+    """Build a table cell for text that may be long."""
     return element("td", text, class_="long")
 
 
 def data_block(name: str, value: Any) -> Html:
-    """A value that scripts of the page read as JSON, by element identifier; it cannot end the block."""
+    """Embed a value as JSON, which scripts of the page read by element identifier.
+
+    `<` is escaped, so that no text in the value can end the block.
+    """
     text = json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     return Html(f'<script type="application/json" id="{escape(name)}">{text}</script>')
 

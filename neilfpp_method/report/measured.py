@@ -1,4 +1,4 @@
-"""Figures that lie in a run's folder: those of `neilfpp eval`, and of published protocols in `eval/`."""
+"""Read the figures in a run's folder: those of `neilfpp eval`, and of published protocols in `eval/`."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ class Measured:
     """Figures under one protocol.
 
     Attributes:
-        protocol: its name, as `neilfpp eval --protocol` has it.
-        said: what else is to be known of them, in words, by name.
-        figures: by name.
-        views: the names of the views that were measured; none: the file does not say.
-        size: width and height of the widest of them, pixels.
+        protocol: the name that `neilfpp eval --protocol` takes.
+        description: how the figures were measured, as texts by name.
+        figures: figures by name.
+        views: names of the measured views; None if the file does not contain them.
+        size: width and height of the widest view, pixels; None if the file does not contain it.
         outdated: whether the figures are older than the checkpoint.
     """
 
     protocol: str
-    said: Mapping[str, str]
+    description: Mapping[str, str]
     figures: Mapping[str, float]
     views: tuple[str, ...] | None
     size: tuple[int, int] | None
@@ -39,19 +39,22 @@ class Measured:
 
     @property
     def extent(self) -> str:
-        """The views and their size, in words; empty where that is not known."""
+        """Number of views and their size for display; empty if they are not known."""
         if self.views is None or self.size is None:
             return ""
-        many = f"{len(self.views)} views" if len(self.views) != 1 else "one view"
-        return f"{many} of {self.size[0]}×{self.size[1]} pixels"
+        views = f"{len(self.views)} views" if len(self.views) != 1 else "one view"
+        return f"{views} of {self.size[0]}×{self.size[1]} pixels"
 
 
 def read_measured(path: Path) -> tuple[dict[str, Measured], list[str]]:
-    """The figures of a run by protocol, this project's own first, and a note on each file that is damaged.
+    """Read the figures of a run by protocol, this project's own first.
 
-    A protocol that was not measured is not there, and neither is one that this version does not know.
+    Protocols that were not measured, or that this version does not know, are left out.
+
+    Returns:
+        The figures by name of the protocol, and one message per file that could not be read.
     """
-    found: dict[str, Measured] = {}
+    measurements: dict[str, Measured] = {}
     notes: list[str] = []
     for name in (OWN, *PROTOCOLS):
         file = path / "metrics.json" if name == OWN else path / "eval" / f"{name}.json"
@@ -62,40 +65,42 @@ def read_measured(path: Path) -> tuple[dict[str, Measured], list[str]]:
         except UserError as error:
             notes.append(str(error))
             continue
-        found |= {name: measured} if measured.figures else {}
-    return found, notes
+        if measured.figures:
+            measurements[name] = measured
+    return measurements, notes
 
 
 def numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    """The numbers among values, truth values left out."""
+    """Keep the values that are numbers; booleans are dropped."""
     return {
         key: float(v) for key, v in values.items() if isinstance(v, int | float) and not isinstance(v, bool)
     }
 
 
 def _own(file: Path) -> Measured:
-    beside = file.with_name(f"{file.stem}-protocol.json")
-    described = read_json(beside) if beside.is_file() else {}
-    said = {name: text for name, text in described.items() if isinstance(text, str)}
-    return _measured(OWN, file, said, read_json(file), described.get("measured"))
+    protocol_file = file.with_name(f"{file.stem}-protocol.json")
+    protocol = read_json(protocol_file) if protocol_file.is_file() else {}
+    description = {name: text for name, text in protocol.items() if isinstance(text, str)}
+    return _measured(OWN, file, description, read_json(file), protocol.get("measured"))
 
 
 def _published(name: str, file: Path) -> Measured:
     stored = read_json(file)
-    said = {key: stored[key] for key in ("source", "left_out") if isinstance(stored.get(key), str)}
+    description = {key: stored[key] for key in ("source", "left_out") if isinstance(stored.get(key), str)}
     figures = stored.get("figures")
-    return _measured(name, file, said, figures if isinstance(figures, dict) else {}, stored.get("measured"))
+    figures = figures if isinstance(figures, dict) else {}
+    return _measured(name, file, description, figures, stored.get("measured"))
 
 
 def _measured(
-    name: str, file: Path, said: Mapping[str, str], figures: Mapping[str, Any], what: Any
+    name: str, file: Path, description: Mapping[str, str], figures: Mapping[str, Any], measured: Any
 ) -> Measured:
-    what = what if isinstance(what, dict) else {}
-    views, size = what.get("view_names"), (what.get("width"), what.get("height"))
+    measured = measured if isinstance(measured, dict) else {}
+    views, size = measured.get("view_names"), (measured.get("width"), measured.get("height"))
     checkpoint = file.parent / ("" if name == OWN else "..") / "checkpoints" / "last.pt"
     return Measured(
         protocol=name,
-        said=said,
+        description=description,
         figures=numbers(figures),
         views=tuple(map(str, views)) if isinstance(views, list) and views else None,
         size=size if all(isinstance(side, int) for side in size) else None,

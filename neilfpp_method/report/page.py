@@ -1,4 +1,4 @@
-"""The frame of a page: one file of HTML that loads nothing, in which no script runs but its own two."""
+"""The complete HTML page: it loads nothing, and its security policy admits only its own two scripts."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ __all__ = ["page"]
 
 
 def page(title: str, subtitle: str, sections: Sequence[tuple[str, str, Html]]) -> str:
-    """The whole page.
+    """Build the page.
 
     Args:
-        title: of the run.
-        subtitle: a line below it.
-        sections: identifier, heading and content of each.
+        title: title of the page.
+        subtitle: line below the title.
+        sections: identifier, heading and content of each section.
     """
     static = resources.files("neilfpp_method.report") / "static"
     style = (static / "page.css").read_text("utf-8")
     scripts = [(static / name).read_text("utf-8") for name in ("compare.js", "viewer.js")]
-    # No address is loaded, and no script runs but those two, whatever a name in a file may hold.
+    # The policy forbids to load anything and to run any other script, even if escaping failed somewhere.
     hashes = " ".join(f"'sha256-{_sha256(script)}'" for script in scripts)
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {hashes}"
     head = element(

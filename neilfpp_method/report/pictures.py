@@ -1,4 +1,4 @@
-"""The parts of a page that show pictures: views with a slider, the surface to turn, the light."""
+"""Sections of a report with images: views with a slider, the surface in a 3D viewer, and the light."""
 
 from __future__ import annotations
 
@@ -6,17 +6,22 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from neilfpp_method.report.markup import Html, cell, data_block, element, joined, table
-from neilfpp_method.report.views import LightPicture, Shown
+from neilfpp_method.report.views import LightPicture, ReportViews
 
 __all__ = ["light_section", "surface_section", "views_section"]
 
 
-def views_section(shown: Shown, held_out: bool) -> Html:
-    """Every map with a slider; without scripts, all estimates."""
-    names = list(shown.names)
+def views_section(views: ReportViews, held_out: bool) -> Html:
+    """Build the section with all maps and a slider; without scripts it shows the estimates only.
+
+    Args:
+        views: the rendered views.
+        held_out: whether the views were held out of training.
+    """
+    names = list(views.names)
     block = {
         "names": names,
-        "photographs": list(shown.photographs),
+        "photographs": list(views.photographs),
         "layers": [
             {
                 "title": layer.title,
@@ -24,14 +29,14 @@ def views_section(shown: Shown, held_out: bool) -> Html:
                 "largest": layer.largest,
                 "cells": [{"truth": cell.truth, "error": cell.error} for cell in layer.cells],
             }
-            for layer in shown.layers
+            for layer in views.layers
         ],
     }
-    first = shown.layers[0]
-    width = f"min(100%, calc(68vh * {shown.width / shown.height:.4f}))"
+    first = views.layers[0]
+    width = f"min(100%, calc(68vh * {views.width / views.height:.4f}))"
     stage = element(
         "div",
-        element("img", class_="before", src=shown.photographs[0], alt=f"Photograph, view {names[0]}"),
+        element("img", class_="before", src=views.photographs[0], alt=f"Photograph, view {names[0]}"),
         element(
             "img",
             class_="after",
@@ -40,74 +45,77 @@ def views_section(shown: Shown, held_out: bool) -> Html:
         ),
         element("span", "photograph", class_="tag left"),
         element("span", "estimate", class_="tag right"),
-        element(
-            "input", type="range", min=0, max=100, value=50, aria_label="Border between the two pictures"
-        ),
+        element("input", type="range", min=0, max=100, value=50, aria_label="Border between the two images"),
         class_="stage",
-        style=f"width: {width}; aspect-ratio: {shown.width} / {shown.height}",
+        style=f"width: {width}; aspect-ratio: {views.width} / {views.height}",
     )
     strips = (
         element(
             "div",
-            *(_thumbnail(layer.title, layer.cells[i].estimate, name) for layer in shown.layers),
+            *(_thumbnail(layer.title, layer.cells[i].estimate, name) for layer in views.layers),
             class_="strip",
             data_view=i,
         )
         for i, name in enumerate(names)
     )
     note = (
-        "Views that were not trained on."
+        "These views were held out of training."
         if held_out
-        else "No view is held out: these are views that were trained on."
+        else "No view is held out: training used the views shown here."
     )
     return joined(
         element("p", note, class_="pale"),
         _choices("view", "View", names),
-        _choices("layer", "Map", [layer.title for layer in shown.layers]),
-        _choices("beside", "Beside", ["truth", "photograph", "error"], values=True),
+        _choices("layer", "Map", [layer.title for layer in views.layers]),
+        _choices("beside", "Compare with", ["truth", "photograph", "error"], values=True),
         element("figure", stage, element("figcaption", id="views-caption", aria_live="polite")),
         *strips,
-        element("noscript", element("p", "Without scripts this page shows the estimates alone.")),
+        element("noscript", element("p", "Without JavaScript this page shows only the estimates.")),
         data_block("views-data", block),
     )
 
 
 def surface_section(packed: Mapping[str, Any] | None, reason: str) -> Html:
-    """The surface in a viewer; none: why there is none."""
+    """Build the section with the surface in a viewer, or the reason why there is no surface.
+
+    Args:
+        packed: the surface from `packed_surface`, or None.
+        reason: why there is no surface.
+    """
     if packed is None:
         return element("p", f"There is no surface to show: {reason}.")
     layers = ["Preview", "Base colour", "Roughness", "Metallic", "Normal"]
-    chosen = (
+    choices = (
         [(str(i), name) for i, name in enumerate(layers)]
         if "color" in packed
         else [("5", "Shape"), ("4", "Normal")]
     )
     return joined(
-        _radios("surface-layer", "Layer", chosen),
+        _radios("surface-layer", "Layer", choices),
         element(
             "canvas",
             id="surface-canvas",
             tabindex=0,
             role="img",
-            aria_label="The surface of the run. Arrow keys turn it, plus and minus change the distance.",
+            aria_label="The surface of the run. Arrow keys rotate it; plus and minus change the distance.",
         ),
         element(
             "p",
-            element("button", "Stop turning", type="button", id="surface-pause"),
+            element("button", "Stop rotation", type="button", id="surface-pause"),
             " ",
             element("button", "Reset", type="button", id="surface-reset"),
         ),
         element(
             "p",
-            "Without scripts there is nothing to turn.",
-            id="surface-said",
+            "The viewer needs JavaScript.",
+            id="surface-status",
             class_="pale",
             aria_live="polite",
         ),
         element(
             "p",
-            "Only what a training camera saw is shown. The preview is lit from the camera, not by the light "
-            "of the run.",
+            "Only parts of the surface that a training camera sees are shown. The preview is lit from the "
+            "camera, not by the light of the run.",
             class_="pale",
         ),
         data_block("surface-data", packed),
@@ -115,28 +123,30 @@ def surface_section(packed: Mapping[str, Any] | None, reason: str) -> Html:
 
 
 def light_section(
-    words: str,
+    description: str,
     picture: tuple[str, float] | None,
     lamps: Sequence[Mapping[str, Any]],
     points: Sequence[LightPicture],
 ) -> Html:
-    """The light in words, the map, the lamps, and what arrives at points."""
-    parts = [element("p", words[:1].upper() + words[1:] + ".")]
+    """Build the section about the light.
+
+    Args:
+        description: a phrase that describes the light.
+        picture: the environment map as a data URL and its exposure, or None.
+        lamps: the lamps in the format of `lamps.json`.
+        points: images of the incident light at surface points.
+    """
+    parts = [element("p", description[:1].upper() + description[1:] + ".")]
     if picture is not None:
         caption = (
             f"The environment map: +z at the top, the azimuth from left to right, exposure {picture[1]:.2g}."
         )
-        image = element(
-            "img", class_="map", src=picture[0], alt="The environment map, all directions unrolled"
-        )
+        alt = "The environment map in latitude-longitude projection"
+        image = element("img", class_="map", src=picture[0], alt=alt)
         parts.append(element("figure", image, element("figcaption", caption)))
     if lamps:
-        parts.append(
-            table(
-                ("lamp", "place in the world", "radius", "intensity (R, G, B)"),
-                *map(_lamp, range(len(lamps)), lamps),
-            )
-        )
+        head = ("lamp", "position (world frame)", "radius", "intensity (R, G, B)")
+        parts.append(table(head, *map(_lamp, range(len(lamps)), lamps)))
     if points:
         figures = (
             element(
@@ -150,8 +160,8 @@ def light_section(
         parts.append(
             element(
                 "p",
-                "Places are in the scene frame, where the object has radius 1. Grey is below the surface; "
-                "rings are about lamps.",
+                "Positions are in the scene frame, in which the object has radius 1. Directions below the "
+                "surface are grey; rings mark the directions to lamps.",
                 class_="pale",
             )
         )
@@ -170,10 +180,10 @@ def _lamp(number: int, lamp: Mapping[str, Any]) -> Html:
     return element("tr", element("th", swatch, f" {number + 1}", scope="row"), *map(cell, values))
 
 
-def _thumbnail(title: str, address: str, view: str) -> Html:
+def _thumbnail(title: str, url: str, view: str) -> Html:
     return element(
         "figure",
-        element("img", src=address, alt=f"{title}, estimate, view {view}"),
+        element("img", src=url, alt=f"{title}, estimate, view {view}"),
         element("figcaption", title),
     )
 

@@ -1,4 +1,4 @@
-"""The parts of a page that say what there is in words and figures."""
+"""Sections of a report with text and tables."""
 
 from __future__ import annotations
 
@@ -32,83 +32,90 @@ STAGE_TITLES = {
 
 READING = {
     "Truth, estimate, error.": (
-        "Dark errors are small. Where the capture has no truth of a map, the photograph stands beside it."
+        "In images of the error, dark means small. If the capture has no truth for a map, the photograph is "
+        "shown instead."
     ),
     "Base colour and light share a factor.": (
-        "Twice the light on half the base colour gives the same images, in each channel. Unless the scene "
-        "holds something of known colour, that factor is free. So base colour is shown as estimated and, "
-        "where the truth is known, with the best factor per channel, and the light with the inverse of it. "
-        "Neither alone tells enough."
+        "In each channel, twice the light on half the base colour gives the same images, so images cannot "
+        "determine this factor unless the scene contains an object of known colour. Base colour is therefore "
+        "shown as estimated and, if the truth is known, also after the best factor per channel; the light is "
+        "also shown after the inverse of that factor. Consider both versions."
     ),
     "Roughness and metallic need highlights.": (
-        "Where a surface shows none, the priors decide: rough, and no metal."
+        "On a surface without visible highlights the priors decide, which prefer rough non-metals."
     ),
-    "Light is known where it matters.": (
-        "It is estimated above surfaces that the images show. Where the surface is rough, only its broad "
-        "shape leaves a trace in the images."
+    "The light is estimated only where it has an effect.": (
+        "Light can be estimated above surfaces that the images show. Above rough surfaces, the images "
+        "determine only its low frequencies."
     ),
     "Figures.": (
-        "They are means over the test views, of the pixels that show the object. PSNR grows by 6 dB when "
-        "the error halves. The whole frame counts the background as free of error, as some published tables "
-        "do, and is higher by its share. What needs no method is a constant for roughness and metallic, and "
-        "the mean image for base colour."
+        "Figures are averaged over the pixels of the object in each test view, and then over the test views. "
+        "PSNR increases by 6 dB when the error halves. A figure over the whole frame counts the background "
+        "as free of error, as some published tables do, and is therefore higher. The naive baseline is a "
+        "constant for roughness and metallic, and the mean observed colour for base colour."
     ),
     "Display values clip.": (
-        "8-bit captures lose what is brighter than white; light and metallic then come out low."
+        "8-bit images contain no values brighter than white, so light and metallic are underestimated."
     ),
 }
+"""Heading and text of each paragraph of `reading_section`."""
 
 
 def health_section(findings: Sequence[Finding] | None, notes: Sequence[str]) -> Html:
-    """The verdict with what was found, its cause and its remedy, and what else is to be known first."""
-    said = [element("p", note, class_="note") for note in notes]
+    """Build the section with the verdict, notes, and the findings with causes and remedies.
+
+    Args:
+        findings: findings of the health checks; None if the run has no record of them.
+        notes: remarks that the reader should see first.
+    """
+    paragraphs = [element("p", note, class_="note") for note in notes]
     if findings is None:
-        return joined(*said, element("p", "This run has no record of its health."))
+        return joined(*paragraphs, element("p", "This run has no record of its health."))
     verdict = verdict_of(findings)
-    said.insert(0, element("p", element("b", verdict.capitalize(), class_=verdict)))
+    paragraphs.insert(0, element("p", element("b", verdict.capitalize(), class_=verdict)))
     if not findings:
-        said.insert(1, element("p", "None of the cases in docs/health.md was found."))
-        return joined(*said)
+        paragraphs.insert(1, element("p", "None of the problems in docs/health.md was found."))
+        return joined(*paragraphs)
     rows = (
         element("tr", element("th", f.what, scope="row"), *map(cell, (f.cause, f.remedy, f"step {f.step}")))
         for f in findings
     )
-    return joined(*said, table(("what was found", "likely cause", "remedy", "when"), *rows))
+    return joined(*paragraphs, table(("finding", "likely cause", "remedy", "when"), *rows))
 
 
-def figures_section(metrics: Mapping[str, float], said: str) -> Html:
-    """A row per figure; `x_frame` and `baseline_x` stand in the row of `x`."""
+def figures_section(metrics: Mapping[str, float], description: str) -> Html:
+    """Build a table with a row per figure; `x_frame` and `baseline_x` are columns in the row of `x`.
+
+    Args:
+        metrics: figures by name.
+        description: how they were measured, or why there are none.
+    """
     if not metrics:
-        return element("p", said)
-    beside = {name: (f"{name}_frame", f"baseline_{name}") for name in metrics}
-    companions = {companion for pair in beside.values() for companion in pair}
-    titles = ("whole frame", "without a method")
-    filled = [k for k in range(len(titles)) if any(pair[k] in metrics for pair in beside.values())]
+        return element("p", description)
+    companions = {name: (f"{name}_frame", f"baseline_{name}") for name in metrics}
+    titles = ("whole frame", "naive baseline")
+    filled = [k for k in range(len(titles)) if any(pair[k] in metrics for pair in companions.values())]
+    in_other_rows = {companion for pair in companions.values() for companion in pair}
     rows = []
     for name in metrics:
-        if name in companions:
+        if name in in_other_rows:
             continue
         entry = explain(name)
-        keys = (name, *(beside[name][k] for k in filled))
+        keys = (name, *(companions[name][k] for k in filled))
         value, *others = (entry.format(metrics[key]) if key in metrics else "–" for key in keys)
-        arrow = {"higher": "↑", "lower": "↓"}.get(entry.better)
-        beside_value = (" ", element("span", arrow, title=f"{entry.better} is better")) if arrow else ()
+        symbol = {"higher": "↑", "lower": "↓"}.get(entry.better)
+        arrow = (" ", element("span", symbol, title=f"{entry.better} is better")) if symbol else ()
         rows.append(
             element(
                 "tr",
                 element("th", entry.title, element("br"), element("code", name), scope="row"),
-                element(
-                    "td",
-                    element("b", value),
-                    *beside_value,
-                    class_="number",
-                ),
+                element("td", element("b", value), *arrow, class_="number"),
                 *(element("td", other, class_="number") for other in others),
                 element("td", entry.meaning),
             )
         )
-    names = ("figure", "this run", *(titles[k] for k in filled), "what it says")
-    return joined(element("p", with_code(said), class_="pale"), table(names, *rows))
+    names = ("figure", "this run", *(titles[k] for k in filled), "meaning")
+    return joined(element("p", with_code(description), class_="pale"), table(names, *rows))
 
 
 def time_section(
@@ -117,7 +124,14 @@ def time_section(
     looks: Sequence[Look],
     previews: Sequence[tuple[str, str]],
 ) -> Html:
-    """Seconds of each stage, what they went to, what they bought, and a picture at the end of each."""
+    """Build the section with the time of each stage by kind of work, quality over time, and previews.
+
+    Args:
+        timing: seconds by stage.
+        work: seconds by stage and kind of work; if not empty, it replaces `timing`.
+        looks: measurements at held-back pixels during training.
+        previews: stage and data URL of the image at the end of each stage.
+    """
     stages = {stage: sum(parts.values()) for stage, parts in work.items()} or dict(timing)
     if not stages:
         return element("p", "No stage has been timed.")
@@ -127,17 +141,15 @@ def time_section(
             "tr",
             element("th", STAGE_TITLES.get(stage, stage), scope="row"),
             element("td", _duration(seconds), class_="number"),
-            element(
-                "td", element("i", style=f"width: {100 * seconds / max(total, 1e-9):.1f}%"), class_="bar"
-            ),
-            element("td", _most(work.get(stage, {})), class_="pale"),
+            element("td", _bar(seconds / max(total, 1e-9)), class_="bar"),
+            element("td", _largest_parts(work.get(stage, {})), class_="pale"),
         )
         for stage, seconds in stages.items()
     ]
     rows.append(
         element(
             "tr",
-            element("th", "Together", scope="row"),
+            element("th", "Total", scope="row"),
             element("td", element("b", _duration(total)), class_="number"),
             *(2 * [element("td")]),
         )
@@ -145,26 +157,27 @@ def time_section(
     pictures = (
         element(
             "figure",
-            element("img", class_="map", src=address, alt=f"Preview at the end of {stage}"),
+            element("img", class_="map", src=url, alt=f"Preview at the end of {stage}"),
             element(
                 "figcaption",
                 f"End of {STAGE_TITLES.get(stage, stage)}: photograph, R, normal, then PBR, base colour, "
                 "roughness, metallic",
             ),
         )
-        for stage, address in previews
+        for stage, url in previews
     )
-    times = table(("stage", "time", "", "most of it"), *rows)
+    times = table(("stage", "time", "", "largest parts"), *rows)
     curve = quality_curve(looks)
-    said = (
-        "Quality on the way, at small patches of training views that no step learns from:" if curve else None
-    )
-    return joined(
-        times, work_bars(work, STAGE_TITLES), said and element("p", said, class_="pale"), curve, *pictures
-    )
+    caption = "Quality during training at held-back pixels, small patches of training views:"
+    caption = element("p", caption, class_="pale") if curve else None
+    return joined(times, work_bars(work, STAGE_TITLES), caption, curve, *pictures)
 
 
-def _most(parts: Mapping[str, float]) -> str:
+def _bar(share: float) -> Html:
+    return element("i", style=f"width: {100 * share:.1f}%")
+
+
+def _largest_parts(parts: Mapping[str, float]) -> str:
     total = sum(parts.values())
     largest = sorted(parts.items(), key=lambda part: -part[1])[:3]
     return ", ".join(
@@ -173,9 +186,9 @@ def _most(parts: Mapping[str, float]) -> str:
 
 
 def effects_section(rows: Sequence[Mapping[str, Any]]) -> Html:
-    """The plan of effects; nothing where the run has none."""
+    """Build the table of effects from the rows of `effects.json`."""
     if not rows:
-        return element("p", "This run has no plan of effects: its settings decide.")
+        return element("p", "This run has no plan of effects; its settings determine what is simulated.")
     names = ("title", "decision", "reason", "cost", "risk")
     lines = (
         element(
@@ -185,23 +198,23 @@ def effects_section(rows: Sequence[Mapping[str, Any]]) -> Html:
         )
         for row in rows
     )
-    return table(("effect", "decision", "why", "cost when on", "left out by mistake"), *lines)
+    return table(("effect", "decision", "reason", "cost if on", "risk if left out"), *lines)
 
 
 def settings_section(preset: str, changed: Sequence[Changed] | None) -> Html:
-    """The settings that are not those of the preset."""
+    """Build the table of settings that differ from the preset; None if the preset is not known."""
     if changed is None:
         return element(
-            "p", f"The preset {preset} is not known to this version; config.json has every setting."
+            "p", f"This version does not know the preset {preset}; config.json contains all settings."
         )
     if not changed:
-        return element("p", f"Every setting is that of the preset {preset}.")
+        return element("p", f"All settings are those of the preset {preset}.")
     rows = (
         element(
             "tr",
             element("th", element("code", c.name), scope="row"),
             cell(c.value),
-            cell("–" if c.usual is None else c.usual),
+            cell("–" if c.preset_value is None else c.preset_value),
         )
         for c in changed
     )
@@ -209,12 +222,12 @@ def settings_section(preset: str, changed: Sequence[Changed] | None) -> Html:
 
 
 def reading_section() -> Html:
-    """How to read what is shown."""
+    """Build the section that explains how to interpret the report."""
     return element("ul", *(element("li", element("b", head), f" {text}") for head, text in READING.items()))
 
 
 def facts_section(facts: Mapping[str, str]) -> Html:
-    """What made the run."""
+    """Build a table of facts by name."""
     rows = (
         element("tr", element("th", name, scope="row"), element("td", text, class_="long"))
         for name, text in facts.items()

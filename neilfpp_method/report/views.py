@@ -1,4 +1,4 @@
-"""Views of a run for its page: every map, beside its truth or, where none is known, beside the photograph."""
+"""Render views of a run for reports and comparisons: all maps, beside the truth if it is known."""
 
 from __future__ import annotations
 
@@ -10,33 +10,36 @@ from jaxtyping import Float
 
 from neilfpp_method.data.scaling import at_scale, file_size
 from neilfpp_method.evaluate.confidence import gather_evidence, with_deviation
-from neilfpp_method.evaluate.panels import ComparedMap, albedo_scale, compared_maps, light_sections
-from neilfpp_method.evaluate.protocols import image_metrics, material_metrics, normal_metrics
+from neilfpp_method.evaluate.light_panels import light_sections
+from neilfpp_method.evaluate.map_metrics import image_metrics, material_metrics, normal_metrics
+from neilfpp_method.evaluate.panels import ComparedMap, albedo_scale, compared_maps
+from neilfpp_method.evaluate.pictures import Section
 from neilfpp_method.evaluate.views import RenderedView, known_test_views, render_view
 from neilfpp_method.report.encoded import encoded
 from neilfpp_method.train.run import Run
 
 __all__ = [
     "Cell",
+    "ComparedViews",
     "Layer",
     "LightPicture",
-    "Looked",
-    "Shown",
+    "ReportViews",
+    "compare_views",
+    "encode_views",
     "evenly_spread",
-    "look_at_views",
-    "show_views",
-    "shown_run",
+    "run_for_display",
     "title_of",
 ]
 
 TITLES = {"rgb": "Image, rendering equation", "rgb_volume": "Image, volume rendering"}
+"""Titles of maps whose own title is ambiguous, by name."""
 CONFIDENCE_STEP = 2
-"""One pixel in so many by so many is asked how far off it may be."""
+"""Expected errors are computed for every n-th pixel of every n-th row, to save time."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A map of a view as data addresses of pictures; truth and error are none where no truth is known."""
+    """One map of one view as data URLs; truth and error are None if no truth is known."""
 
     estimate: str
     truth: str | None
@@ -45,7 +48,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Layer:
-    """A map over all views; `largest` is the error that its pictures show brightest, with its unit."""
+    """One map of all views; `largest` is the error at the bright end of the colour scale, with its unit."""
 
     title: str
     note: str
@@ -55,7 +58,13 @@ class Layer:
 
 @dataclass(frozen=True)
 class LightPicture:
-    """All directions of the light at a point, unrolled; `title` says where, `column` which."""
+    """Incident light at a surface point as a latitude-longitude image, encoded as a data URL.
+
+    Attributes:
+        title: the point.
+        column: "truth", "estimate" or "estimate, scaled".
+        picture: the data URL.
+    """
 
     title: str
     column: str
@@ -63,8 +72,18 @@ class LightPicture:
 
 
 @dataclass(frozen=True)
-class Shown:
-    """Views by name with photographs and layers, the light at points, and figures of these views."""
+class ReportViews:
+    """The views of a report.
+
+    Attributes:
+        names: names of the views.
+        photographs: the photographs as data URLs.
+        width: width of a view, pixels.
+        height: height of a view, pixels.
+        layers: all maps.
+        light: incident light at surface points.
+        figures: metrics of these views by name.
+    """
 
     names: tuple[str, ...]
     photographs: tuple[str, ...]
@@ -76,15 +95,15 @@ class Shown:
 
 
 @dataclass(frozen=True)
-class Looked:
-    """The views that are held out as they were rendered, and all that is known of them.
+class ComparedViews:
+    """The held-out views as rendered, compared with the truth.
 
     Attributes:
-        rendered: the views, in order.
-        scale: what fits the base colour to the truth, per channel; none where no truth is known.
-        maps: every map beside its truth, ready to be shown.
-        figures: of these views alone, as the protocol neilfpp measures them.
-        mask_source: what decided which pixels count.
+        rendered: the rendered views, in order.
+        scale: factor per channel that fits the base colour to the truth; None if no truth is known.
+        maps: all maps beside the truth, as 8-bit images.
+        figures: metrics of these views by name, under the protocol neilfpp.
+        mask_source: source of the masks (`evaluate.views.mask_source`).
     """
 
     rendered: tuple[RenderedView, ...]
@@ -95,7 +114,7 @@ class Looked:
 
 
 def evenly_spread(names: Sequence[str], count: int) -> tuple[str, ...]:
-    """So many of the names, spread over all of them.
+    """Choose `count` of the names at even distances, or all if there are fewer.
 
     >>> evenly_spread("abcde", 3)
     ('a', 'c', 'e')
@@ -104,25 +123,30 @@ def evenly_spread(names: Sequence[str], count: int) -> tuple[str, ...]:
     return tuple(names[row] for row in rows)
 
 
-def shown_run(run: Run, views: int, size: int) -> Run:
-    """The run with so many views held out, spread over those that are, or over the training views where none
-    is; no side of a view is longer than `size` pixels, or than it was in training.
+def run_for_display(run: Run, views: int, size: int) -> Run:
+    """Return the run with a few small views held out, for display.
+
+    Args:
+        run: the run.
+        views: number of views, chosen at even distances from its test views, or from its training views if
+            none is held out.
+        size: longest side of a view, pixels; views do not become larger than in training.
     """
-    chosen = run.capture.test_views or run.capture.train_views
-    names = evenly_spread([view.name for view in chosen], views)
+    candidates = run.capture.test_views or run.capture.train_views
+    names = evenly_spread([view.name for view in candidates], views)
     longest = max(max(file_size(view)) for view in run.capture.views)
     trained = max(max(view.camera.width, view.camera.height) for view in run.capture.views)
     capture = at_scale(run.capture, min(size, trained) / longest)
     return replace(run, capture=replace(capture, test=frozenset(names)))
 
 
-def look_at_views(run: Run, confidence: bool, on_progress: Callable[[float], None]) -> Looked:
-    """Render the views that are held out, and set them beside all that is known of them.
+def compare_views(run: Run, confidence: bool, on_progress: Callable[[float], None]) -> ComparedViews:
+    """Render the held-out views and compare them with the truth.
 
     Args:
-        run: as `shown_run` makes it.
-        confidence: add how far off the material may be.
-        on_progress: told the share that is done.
+        run: a run from `run_for_display`.
+        confidence: also compute the expected errors of the material.
+        on_progress: called with the fraction of the work that is done.
     """
     held_out = run.capture.test_views
     rendered = []
@@ -138,20 +162,18 @@ def look_at_views(run: Run, confidence: bool, on_progress: Callable[[float], Non
         evidence = gather_evidence(run)
         rendered = [with_deviation(run, evidence, view, CONFIDENCE_STEP) for view in rendered]
     maps = tuple(compared_maps(run, rendered, known, scale))
-    return Looked(tuple(rendered), scale, maps, figures, held.mask_source)
+    return ComparedViews(tuple(rendered), scale, maps, figures, held.mask_source)
 
 
-def title_of(shown: ComparedMap) -> str:
-    """The title of a map that tells it from every other map of a run."""
-    aligned = f"{shown.title}, scaled" if shown.note.startswith("scaled") else shown.title
-    return TITLES.get(shown.name, aligned)
+def title_of(compared: ComparedMap) -> str:
+    """A title of a map that is unique among the maps of a run."""
+    title = f"{compared.title}, scaled" if compared.note.startswith("scaled") else compared.title
+    return TITLES.get(compared.name, title)
 
 
-def show_views(run: Run, confidence: bool, on_progress: Callable[[float], None]) -> Shown:
-    """Render the views that are held out, and show all that is known of them; arguments as of
-    `look_at_views`.
-    """
-    looked = look_at_views(run, confidence, on_progress)
+def encode_views(run: Run, confidence: bool, on_progress: Callable[[float], None]) -> ReportViews:
+    """Render the held-out views and encode them for a page. Arguments are those of `compare_views`."""
+    compared = compare_views(run, confidence, on_progress)
     layers = tuple(
         Layer(
             title_of(m),
@@ -166,21 +188,21 @@ def show_views(run: Run, confidence: bool, on_progress: Callable[[float], None])
                 for c in m.comparisons
             ),
         )
-        for m in looked.maps
+        for m in compared.maps
     )
-    photographs = tuple(encoded(c.truth) for c in looked.maps[0].comparisons)
+    photographs = tuple(encoded(c.truth) for c in compared.maps[0].comparisons)
     camera = run.capture.test_views[0].camera
-    light = _light(light_sections(run, looked.rendered, looked.scale)) if run.has_material else ()
-    names = tuple(view.name for view in looked.rendered)
-    return Shown(names, photographs, camera.width, camera.height, layers, light, looked.figures)
+    light = _light(light_sections(run, compared.rendered, compared.scale)) if run.has_material else ()
+    names = tuple(view.name for view in compared.rendered)
+    return ReportViews(names, photographs, camera.width, camera.height, layers, light, compared.figures)
 
 
-def _light(sections: Sequence) -> tuple[LightPicture, ...]:
-    found = []
+def _light(sections: Sequence[Section]) -> tuple[LightPicture, ...]:
+    images = []
     for section in sections:
         columns = [(group.title, column) for group in section.groups for column in group.columns]
         pictures = section.rows[0].pictures
-        found += [
+        images += [
             LightPicture(*c, encoded(p)) for c, p in zip(columns, pictures, strict=True) if p is not None
         ]
-    return tuple(found)
+    return tuple(images)

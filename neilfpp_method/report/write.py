@@ -1,4 +1,4 @@
-"""`report.html` of a run: one file that holds all that it shows."""
+"""Write the report of a run, `report.html`: one self-contained file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from neilfpp_method.report.markup import Html, element, joined
 from neilfpp_method.report.measured import OWN, Measured
 from neilfpp_method.report.page import page
 from neilfpp_method.report.surface import packed_surface
-from neilfpp_method.report.views import Shown, show_views, shown_run
+from neilfpp_method.report.views import ReportViews, encode_views, run_for_display
 from neilfpp_method.schedule import Stage
 from neilfpp_method.train.light_record import in_words, read_fits
 from neilfpp_method.train.run import Run, load_run
@@ -26,24 +26,37 @@ from neilfpp_method.train.run import Run, load_run
 __all__ = ["REPORT", "ReportOptions", "write_report"]
 
 REPORT = "report.html"
-VIEWS_SHARE = 0.85
-"""Of the work that rendering the views is."""
+RENDERING = 0.85
+"""Fraction of the progress that rendering the views takes."""
+MAX_VIEWS = 64
+"""Largest number of views; more would make a page that browsers open slowly."""
+MIN_SIZE, MAX_SIZE = 16, 2048
+"""Smallest and largest longest side of a view, pixels."""
 
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """How much a page shows: views, longest side of a picture in pixels, and expected errors or not."""
+    """What a report contains.
+
+    Attributes:
+        views: number of views.
+        size: longest side of a view, pixels.
+        confidence: whether expected errors of the material are included.
+    """
 
     views: int = 2
     size: int = 320
     confidence: bool = False
 
     def check(self) -> None:
-        """Raises a `UserError` where a number is out of range."""
-        if not 1 <= self.views <= 64:
-            raise UserError(f"a page of {self.views} views", "give 1 to 64 with --views")
-        if not 16 <= self.size <= 2048:
-            raise UserError(f"pictures of {self.size} pixels", "give 16 to 2048 with --size")
+        """Raise a `UserError` if a number is out of range."""
+        if not 1 <= self.views <= MAX_VIEWS:
+            raise UserError(f"a report cannot have {self.views} views", f"give 1 to {MAX_VIEWS} with --views")
+        if not MIN_SIZE <= self.size <= MAX_SIZE:
+            raise UserError(
+                f"views in a report cannot have {self.size} pixels",
+                f"give {MIN_SIZE} to {MAX_SIZE} with --size",
+            )
 
 
 def write_report(
@@ -53,18 +66,21 @@ def write_report(
     device: str = "cpu",
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> Path:
-    """Write the page of a run, whole or not at all.
+    """Write the report of a run atomically.
 
     Args:
-        path: the run's folder; a run that was stopped before its first checkpoint has a page of what is
-            there.
-        out: the file.
-        options: how much it shows.
-        device: where to render.
-        on_progress: told the share that is done.
+        path: the run's folder. A run that was stopped before its first checkpoint gets a report without
+            images.
+        out: the file to write.
+        options: what the report contains.
+        device: device on which views are rendered.
+        on_progress: called with the fraction of the work that is done.
+
+    Returns:
+        `out`.
 
     Raises:
-        UserError: no run there, its capture has moved, an option out of range, or a file that cannot be
+        UserError: there is no run, its capture was moved, an option is out of range, or the file cannot be
             written.
     """
     options.check()
@@ -78,127 +94,121 @@ def write_report(
 
 
 def _with_model(run: Run, files: Files, options: ReportOptions, on_progress: Callable[[float], None]) -> str:
-    small = shown_run(run, options.views, options.size)
-    shown = show_views(small, options.confidence, lambda share: on_progress(VIEWS_SHARE * share))
+    small = run_for_display(run, options.views, options.size)
+    views = encode_views(small, options.confidence, lambda share: on_progress(RENDERING * share))
     try:
         surface, reason = packed_surface(small), ""
     except UserError as error:
         surface, reason = None, error.problem
     notes = list(files.notes)
     if run.step < files.steps:
-        go_on = f"neilfpp train --out {run.path} --resume"
-        notes.insert(
-            0, f"Training was stopped after step {run.step} of {files.steps}; it goes on with: {go_on}"
-        )
+        stopped = f"Training was stopped after step {run.step} of {files.steps}."
+        notes.insert(0, f"{stopped} {_how_to_continue(run.path)}")
     if not run.has_material:
-        notes.append("No stage has moved the material and the light yet, so there is geometry alone.")
+        notes.append("No stage has estimated material and light yet; only the geometry is shown.")
     if not run.capture.hdr:
         notes.append(
-            "The photographs are display values (LDR): what is brighter than white is lost, and light and "
-            "metallic come out low."
+            "The photographs contain display values (LDR): values brighter than white are clipped, so light "
+            "and metallic are underestimated."
         )
     if not run.capture.test_views:
         notes.append(
-            "No view is held out for testing: nothing here says how new views look. Train with --test-every "
-            "8 to know."
+            "No view is held out for testing, so the quality of new views is not measured. To measure it, "
+            "train with --test-every 8."
         )
-    words = (
+    light = (
         in_words(run.config.light, read_fits(run.path, run.step))
         if run.has_material
         else "no light has been estimated yet"
     )
     sections = [
         ("health", "Health", tables.health_section(files.findings, notes)),
-        ("views", "Views", pictures.views_section(shown, bool(run.capture.test_views))),
+        ("views", "Views", pictures.views_section(views, bool(run.capture.test_views))),
         ("surface", "Surface", pictures.surface_section(surface, reason)),
-        ("light", "Light", pictures.light_section(words, picture_of_map(run), lamps_of(run), shown.light)),
-        ("figures", "Figures", _figures(run, files, shown)),
+        ("light", "Light", pictures.light_section(light, picture_of_map(run), lamps_of(run), views.light)),
+        ("figures", "Figures", _figures(run, files, views)),
         *_from_files(files),
         ("reading", "How to read this", tables.reading_section()),
-        ("facts", "What made it", tables.facts_section({"Capture": run.capture.summary, **_facts(files)})),
+        ("facts", "Setup", tables.facts_section({"Capture": run.capture.summary, **_facts(files)})),
     ]
     title = f"{run.capture.root.resolve().name}, {run.config.preset}"
     return page(title, f"step {run.step} of {files.steps}", sections)
 
 
 def _without_model(files: Files) -> str:
-    go_on = f"neilfpp train --out {files.path} --resume"
-    note = f"Training was stopped before its first checkpoint: nothing to show yet. It goes on with: {go_on}"
+    note = f"Training was stopped before its first checkpoint. {_how_to_continue(files.path)}"
     sections = [
         ("health", "Health", tables.health_section(files.findings, [note, *files.notes])),
         *_from_files(files),
-        ("facts", "What made it", tables.facts_section(_facts(files))),
+        ("facts", "Setup", tables.facts_section(_facts(files))),
     ]
     return page(f"{files.path.resolve().name}, {files.config.preset}", f"step 0 of {files.steps}", sections)
 
 
+def _how_to_continue(path: Path) -> str:
+    return f"To continue: neilfpp train --out {path} --resume"
+
+
 def _from_files(files: Files) -> list[tuple[str, str, Html]]:
+    settings = tables.settings_section(files.config.preset, changed_settings(files.config))
     return [
         ("time", "Time", tables.time_section(files.timing, files.work, files.looks, _previews(files.path))),
         ("effects", "Effects", tables.effects_section(files.effects)),
-        (
-            "settings",
-            "Settings",
-            tables.settings_section(files.config.preset, changed_settings(files.config)),
-        ),
+        ("settings", "Settings", settings),
     ]
 
 
-def _figures(run: Run, files: Files, shown: Shown) -> Html:
-    """Figures by protocol, each with how they came about; without any those of the views that are shown."""
+def _figures(run: Run, files: Files, views: ReportViews) -> Html:
+    """Tables of figures, one per protocol; if none was measured, the figures of the views in the report."""
     if files.measured:
-        tables_of = (
+        sections = (
             joined(
                 element("h3", f"Protocol {measured.protocol}"),
-                tables.figures_section(measured.figures, _told(measured)),
+                tables.figures_section(measured.figures, _description(measured)),
             )
             for measured in files.measured.values()
         )
-        return joined(*tables_of)
+        return joined(*sections)
     if not run.capture.test_views:
-        return tables.figures_section({}, "Nothing was measured: no view is held out.")
-    size = f"{len(shown.names)} views shown here, of {shown.width}×{shown.height} pixels"
-    said = (
-        f"Of the {size}, not yet the figures of the protocol neilfpp: `neilfpp eval {run.path}` measures "
-        "those."
+        return tables.figures_section({}, "Nothing was measured, because no view is held out.")
+    description = (
+        f"These figures are of the {len(views.names)} views in this report, at {views.width}×{views.height} "
+        f"pixels. They are not the figures of the protocol neilfpp, which `neilfpp eval {run.path}` measures."
     )
-    return tables.figures_section(shown.figures, said)
+    return tables.figures_section(views.figures, description)
 
 
-def _told(measured: Measured) -> str:
-    """How figures came about, in words."""
+def _description(measured: Measured) -> str:
+    """How figures were measured, in one or two sentences."""
     option = "" if measured.protocol == OWN else f" --protocol {measured.protocol}"
     parts = [measured.extent] if measured.extent else []
-    parts += [f"{name.replace('_', ' ')}: {text}" for name, text in measured.said.items()]
-    late = " They are older than the checkpoint that is shown here." if measured.outdated else ""
-    return (
-        f"By `neilfpp eval{option}`: {'; '.join(parts)}.{late}"
-        if parts
-        else f"By `neilfpp eval{option}`.{late}"
-    )
+    parts += [f"{name.replace('_', ' ')}: {text}" for name, text in measured.description.items()]
+    details = f": {'; '.join(parts)}" if parts else ""
+    outdated = " The figures are older than the checkpoint of this report." if measured.outdated else ""
+    return f"Measured by `neilfpp eval{option}`{details}.{outdated}"
 
 
 def _previews(path: Path) -> list[tuple[str, str]]:
-    """The pictures at the ends of stages, as data addresses."""
-    found = []
+    """Stage and data URL of the preview images that exist."""
+    previews = []
     for stage in Stage:
         file = path / "previews" / f"{stage.value}.png"
         if file.is_file():
-            found.append((stage.value, encoded((read_image(file).pixels * 255).round().astype(np.uint8))))
-    return found
+            previews.append((stage.value, encoded((read_image(file).pixels * 255).round().astype(np.uint8))))
+    return previews
 
 
 def _facts(files: Files) -> dict[str, str]:
-    """Settings and machine, in words."""
+    """Settings and hardware for display, by title."""
     shading, machine = files.config.shading, files.machine
     facts = {
         "Preset": files.config.preset,
         "Shading": (
-            f"{shading.lobe} lobe, {shading.sampler} sampler, {shading.train_samples} directions a point in "
-            f"training and {shading.eval_samples} here"
+            f"{shading.lobe} lobe, {shading.sampler} sampler; directions per point: "
+            f"{shading.train_samples} in training, {shading.eval_samples} in this report"
         ),
         "Inter-reflection": files.config.inter_reflection.mode,
-        "Rays a step": str(files.config.train.rays),
+        "Rays per step": str(files.config.train.rays),
     }
     if machine:
         facts["Processor"] = (
@@ -206,6 +216,6 @@ def _facts(files: Files) -> dict[str, str]:
         )
         facts["GPU"] = ", ".join(map(str, machine.get("gpus") or [])) or "none"
         packages = machine.get("packages")
-        named = packages.items() if isinstance(packages, dict) else ()
-        facts["Versions"] = ", ".join(f"{name} {version}" for name, version in named)
+        versions = packages.items() if isinstance(packages, dict) else ()
+        facts["Versions"] = ", ".join(f"{name} {version}" for name, version in versions)
     return facts

@@ -1,4 +1,5 @@
-"""The presets: the published settings (`docs/paper.md`), and settings for a laptop's CPU.
+"""The presets: the published settings (`docs/paper.md`), `fast` for a laptop's CPU, and
+`balanced` and `best`, which take longer.
 
 Each preset is a mapping of the settings in which it differs from another one.
 """
@@ -182,8 +183,61 @@ def fast() -> NeilfConfig:
     return changed(NeilfConfig(), FAST)
 
 
+# Beside fast.
+BALANCED: Mapping[str, Any] = {
+    "preset": "balanced",
+    "encoding.log2_entries": 17,
+    "encoding.sdf_log2_entries": 19,
+    "encoding.max_resolution": 512,
+    "volume.samples": 48,
+    "shading.train_samples": 64,
+    "shading.eval_samples": 256,
+    "light.fit.points": 2048,
+    "light.fit.every": 250,
+    "train.sdf_steps": 4_000,
+    "train.material_steps": 3_000,
+    "train.joint_steps": 400,
+    "train.rays": 1024,
+}
+
+
+def balanced() -> NeilfConfig:
+    """`fast` with more steps, more rays and directions, and finer grids.
+
+    Method and learning rates are the same. docs/budget.md has the time that it takes.
+    """
+    return changed(fast(), BALANCED)
+
+
+# Beside balanced.
+BEST: Mapping[str, Any] = {
+    "preset": "best",
+    "encoding.levels": 10,
+    "encoding.log2_entries": 18,
+    "encoding.sdf_log2_entries": 20,
+    "encoding.max_resolution": 1024,
+    "radiance.width": 128,
+    "brdf.width": 128,
+    "volume.samples": 64,
+    "shading.train_samples": 128,
+    "light.fit.every": 500,
+    "light.fit.steps": 200,
+    "train.sdf_steps": 10_000,
+    "train.material_steps": 8_000,
+    "train.joint_steps": 2_000,
+    "train.rays": 2048,
+}
+
+
+def best() -> NeilfConfig:
+    """`balanced` with more of each again, for a GPU or a night of computation (docs/budget.md)."""
+    return changed(balanced(), BEST)
+
+
 PRESETS: Mapping[str, Callable[[], NeilfConfig]] = {
     "fast": fast,
+    "balanced": balanced,
+    "best": best,
     "paper-mlp": paper_mlp,
     "paper-ngp": paper_ngp,
     "paper-ngp-hdr": paper_ngp_hdr,

@@ -1,7 +1,7 @@
 """The rendering equation (METHOD §1): stateless mathematics, no parameters.
 
-`frame` holds directions at a surface point, `brdf` the material, `sampling` the directions and their
-densities, `rendering_equation` the estimator that joins them, `color` what a pixel is of radiance.
+`frame` has local frames and cosines, `brdf` the BRDF, `sampling` incident directions and their densities,
+`rendering_equation` the estimator, `color` the response of cameras, and `albedo` the directional albedo.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Directional albedo: what a surface sends to a viewer of light that is 1 from everywhere."""
+"""Directional albedo: radiance of a surface towards a viewer under a radiance of 1 from all directions."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from neilfpp_method.structures import PDF_FLOOR, Material
 __all__ = ["directional_albedo", "initial_albedo"]
 
 SIZE = 32
-"""Entries along either axis, roughness and cosine of the viewer."""
+"""Entries of the table along each axis: roughness, and cosine of the viewer."""
 DIRECTIONS = 512
-"""Of the sum for an entry."""
+"""Number of incident directions from which an entry is computed."""
 
 
 def directional_albedo(
@@ -29,21 +29,21 @@ def directional_albedo(
 
         ρ = (1 − m) b + F0 A(r, n·wo) + B(r, n·wo)
 
-    A and B are the integrals of the two terms of the lobe (`specular_terms`): one table for each, bilinear
-    between its entries; the split of Karis 2013 (Real Shading in Unreal Engine 4). `n`, `wo` are unit and
-    constants; the gradient goes to the material.
+    A and B are the integrals of the two terms of the lobe (`specular_terms`), each from a table with bilinear
+    interpolation: the split of Karis 2013 (Real Shading in Unreal Engine 4). `n` and `wo` are unit vectors
+    without gradient; the gradient flows to the material.
     """
     table = _lobe_integrals(lobe, n.device, n.dtype)
     cosine = (n * wo).sum(-1, keepdim=True).detach()
-    # The places of `grid_sample` have the last axis first, and go from −1 to 1.
+    # Coordinates of `grid_sample` are in [−1, 1], the last axis first.
     place = torch.cat((cosine, material.roughness.to(n.dtype)), -1) * 2 - 1
-    found = functional.grid_sample(table, place[None, :, None], padding_mode="border", align_corners=False)
-    facing, grazing = found[0, :, :, 0].unsqueeze(-1)
+    sampled = functional.grid_sample(table, place[None, :, None], padding_mode="border", align_corners=False)
+    facing, grazing = sampled[0, :, :, 0].unsqueeze(-1)
     return diffuse_reflectance(material) + normal_reflectance(material) * facing + grazing
 
 
 def initial_albedo(base_color: float, metallic: float, lobe: Lobe | None) -> float:
-    """Directional albedo along the normal of grey material, roughness 0.5; no `lobe`: Lambertian."""
+    """Directional albedo along the normal, for roughness 0.5 and grey; Lambertian if `lobe` is None."""
     if lobe is None:
         return base_color
     material = Material(torch.full((1, 3), base_color), torch.full((1, 1), 0.5), torch.full((1, 1), metallic))
@@ -54,7 +54,7 @@ def initial_albedo(base_color: float, metallic: float, lobe: Lobe | None) -> flo
 @lru_cache
 @torch.no_grad()
 def _lobe_integrals(lobe: Lobe, device: torch.device, dtype: torch.dtype) -> Float[Tensor, "1 2 R C"]:
-    """A and B at middles of parts of roughness and viewer cosine; once per device and type."""
+    """A and B at the centers of the cells of roughness and viewer cosine; cached per device and dtype."""
     middle = (torch.arange(SIZE) + 0.5) / SIZE
     roughness, cosine = torch.cartesian_prod(middle, middle)[:, :, None].unbind(1)
     up = torch.tensor([0.0, 0.0, 1.0]).expand(len(cosine), 3)

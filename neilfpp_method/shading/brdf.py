@@ -3,8 +3,8 @@
     f_d = (1 − m)/π · b
     f_s = D(n·h) · F(wo·h) · V(n·wi, n·wo),  V = G / (4 (n·wi)(n·wo))
 
-V is always taken in the form in which the cosines have cancelled: it has no 0/0 at grazing angles. All is
-computed, and returned, in at least float32.
+V is always computed in the form in which the cosines have cancelled, without 0/0 at grazing angles. All
+results are in at least float32.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ __all__ = [
 class Lobe:
     """A microfacet lobe: functions of cosines (N, S) and roughness (N, 1), each (N, S).
 
-    A lobe keeps r ≥ `roughness_floor`: smoother surfaces shade as that one, without gradient to r.
+    Roughness below `roughness_floor` counts as that floor, without a gradient.
     """
 
     distribution: Callable[[Tensor, Tensor], Tensor]
@@ -177,7 +177,7 @@ class BrdfValue:
 
 @dataclass(frozen=True)
 class SpecularTerms:
-    """f_s = F0 · `facing` + `grazing`: a scalar pair per direction, without the surface's colour F0."""
+    """f_s = F0 · `facing` + `grazing`: a scalar pair per direction, without the surface's color F0."""
 
     facing: Float[Tensor, "N S"]
     grazing: Float[Tensor, "N S"]

@@ -1,4 +1,4 @@
-"""What a pixel is of radiance: the sRGB curve, clipping, luminance (METHOD §6)."""
+"""Responses of cameras: the sRGB curve, clipping, and luminance (METHOD §6)."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ __all__ = [
 ]
 
 KNEE = 0.04045
-"""The pixel at which the sRGB curve goes over from a line to a power."""
+"""Display value at which the sRGB curve changes from a linear function to a power."""
 CLIPPED = 0.99
-"""Display values from here on may be cut off: they say only that radiance is at least so much. The encoders
-of cameras leave clipped areas two or three of 255 levels below white.
+"""Display value from which a pixel may be clipped, so that it is only a lower bound on the radiance. Cameras
+encode clipped areas up to two or three of 255 levels below white.
 """
 
 
 def linear_to_srgb(color: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """The sRGB curve (IEC 61966-2-1): 12.92 c up to 0.0031308, then 1.055 c^(1/2.4) − 0.055.
 
-    Nothing is clipped: the linear part extends below 0, the power above 1, gradients are finite.
+    Values are not clipped: the linear part extends below 0 and the power above 1. Gradients are finite.
     """
     knee = 0.0031308
     return torch.where(color <= knee, 12.92 * color, 1.055 * color.clamp_min(knee).pow(1 / 2.4) - 0.055)
@@ -43,15 +43,15 @@ def srgb_to_linear(color: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 
 
 def tone_map(color: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Linear radiance as an 8-bit display would show it: clipped to [0, 1], then the sRGB curve."""
+    """Display values of linear radiance: clipped to [0, 1], then sRGB-encoded."""
     return linear_to_srgb(color.clamp(0, 1))
 
 
 def apply_response(color: Float[Tensor, "*shape"], response: str) -> Float[Tensor, "*shape"]:
-    """What the camera stores of linear radiance: the same (HDR), or clipped and sRGB-encoded (LDR).
+    """Pixel values of linear radiance: unchanged ("linear", HDR), or clipped and sRGB-encoded ("srgb", LDR).
 
     Raises:
-        UserError: the response is neither; "auto" must be settled by the capture first.
+        UserError: the response is neither; "auto" must be resolved by the capture first.
     """
     if response == "linear":
         return color
@@ -63,11 +63,10 @@ def apply_response(color: Float[Tensor, "*shape"], response: str) -> Float[Tenso
 def residual(
     radiance: Float[Tensor, "*shape"], pixel: Float[Tensor, "*shape"], response: str
 ) -> Float[Tensor, "*shape"]:
-    """What the camera would store of a radiance, were its range endless, less what it stored.
+    """Difference between the pixel value of a radiance, encoded without clipping, and the pixel.
 
-    A display value that may be clipped is a lower bound: there the residual of a brighter radiance is 0, and
-    so is its gradient. Elsewhere radiance beyond the camera's range is off by how far it lies beyond, and has
-    a gradient that leads back.
+    A pixel that may be clipped (≥ `CLIPPED`, srgb) is a lower bound: for a brighter radiance the residual and
+    its gradient are 0. For other pixels radiance beyond the camera's range has a residual and a gradient.
 
     Example:
         >>> residual(torch.tensor([4.0, 1.0]), torch.tensor([1.0, 0.5]), "srgb")
@@ -82,13 +81,13 @@ def residual(
 def at_common_exposure(
     pixel: Float[Tensor, "*shape"], gain: Float[Tensor, "#*shape"], response: str
 ) -> Float[Tensor, "*shape"]:
-    """What a camera of gain 1 would have stored, were its range endless, in place of one of another gain.
+    """Convert pixels of a camera with some gain to those of a camera with gain 1, without clipping.
 
-    A display value that may be clipped stays one, whatever the gain: it remains a lower bound.
+    A pixel that may be clipped still counts as clipped after the conversion, so it remains a lower bound.
 
     Args:
-        pixel: in the capture's response.
-        gain: what the camera multiplied radiance by.
+        pixel: pixel values in the capture's response.
+        gain: factor by which the camera multiplied radiance.
         response: "linear" or "srgb".
     """
     if response == "linear":
@@ -98,9 +97,10 @@ def at_common_exposure(
 
 
 def response_slope(pixel: Float[Tensor, "*shape"], response: str) -> Float[Tensor, "*shape"]:
-    """What a pixel changes by per unit of the logarithm of radiance, dp / d ln c: an error over this is one
-    of radiance, relative, whatever the camera stores. The pixel itself (HDR); along the power of the sRGB
-    curve (p + 0.055) / 2.4.
+    """Derivative of a pixel value with respect to log radiance, dp / d ln c.
+
+    An error of a pixel divided by it is a relative error of radiance, for every response. It is p for a
+    linear pixel p, and (p + 0.055) / 2.4 on the power part of the sRGB curve.
     """
     if response == "linear":
         return pixel

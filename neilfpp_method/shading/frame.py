@@ -10,15 +10,15 @@ __all__ = ["at_least_float32", "dot", "local_frame", "safe_normalize"]
 
 
 def at_least_float32(tensor: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Half precision becomes float32: the 8 bits of a bfloat16 cannot hold a cosine near 1."""
+    """Convert half precision to float32: the 8 bits of a bfloat16 cannot represent a cosine near 1."""
     return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
 
 
 def dot(directions: Float[Tensor, "#N S 3"], vector: Float[Tensor, "N 3"]) -> Float[Tensor, "N S"]:
     """The inner product of each direction with the vector of its point, in at least float32.
 
-    Directions that all points share are (1, S, 3). Written out: it needs no (N, S, 3) product, and neither
-    autocast nor TF32 may round it as they round a matmul.
+    Directions that all points share have shape (1, S, 3). The sum is written out because it then needs no
+    (N, S, 3) product, and because autocast and TF32 would round a matmul.
     """
     a, b = at_least_float32(directions), at_least_float32(vector).unsqueeze(1)
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
@@ -36,9 +36,9 @@ def safe_normalize(v: Float[Tensor, "*batch 3"], eps: float = 1e-6) -> Float[Ten
 def local_frame(n: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3 3"]:
     """A right-handed orthonormal frame with rows tangent, bitangent, normal; n must be unit.
 
-    t = (1 − a x², −a x y, −x), b = (−a x y, 1 − a y², −y) with a = 1/(1 + z) (Frisvad 2012), continuous
-    except at n = −z, where some frame must break. For z < 0 the same a is written (1 − z)/(x² + y²): it keeps
-    its digits near −z.
+    t = (1 − a x², −a x y, −x), b = (−a x y, 1 − a y², −y) with a = 1/(1 + z) (Frisvad 2012). It is continuous
+    except at n = −z; no frame is continuous everywhere. For z < 0 the equal expression a = (1 − z)/(x² + y²)
+    is used, which is accurate near −z.
     """
     x, y, z = n.unbind(-1)
     eps = torch.finfo(n.dtype).eps

@@ -22,12 +22,16 @@ def shade(
     incident: Incident,
     lobe: Lobe | None,
 ) -> Shading:
-    """L_o(wo) ≈ Σ weight f(wo, wi) L(wi) max(n·wi, 0), in at least float32.
+    """Outgoing radiance L_o(wo) ≈ Σ weight f(wo, wi) L(wi) max(n·wi, 0), in at least float32.
 
-    The colour of a surface does not depend on the direction, so it leaves the sum: three scalar weights per
-    direction stand for f, and of tensors (N, S, 3) autograd keeps the directions and the radiance alone. `n`,
-    `wo` are unit and point away from the surface. Without a `lobe` the surface is Lambertian and nothing
-    specular is computed.
+    The colors of the BRDF do not depend on wi and are factored out of the sum: f has three scalar weights per
+    direction, and the only tensors of shape (N, S, 3) that autograd stores are directions and radiance.
+
+    Args:
+        material: material of the points.
+        n, wo: unit normals and unit directions to the viewer, away from the surface.
+        incident: incident radiance with directions and weights.
+        lobe: specular lobe; None: the surface is Lambertian.
     """
     radiance = at_least_float32(incident.radiance)
     weight = dot(incident.wi, n).clamp_min(0) * incident.weight
@@ -46,5 +50,5 @@ def shade(
 
 
 def _integrate(weight: Float[Tensor, "N S"], radiance: Float[Tensor, "#N S 3"]) -> Float[Tensor, "N 3"]:
-    """Σ weight · radiance over the directions; as a matmul, autocast would do it in half precision."""
+    """Σ weight · radiance over the directions; not a matmul, which autocast would do in half precision."""
     return (weight.unsqueeze(-1) * radiance).sum(1)

@@ -1,14 +1,14 @@
-"""Incident directions and the densities that drew them.
+"""Samplers of incident directions, with their densities.
 
 Every sampler integrates the same integral: the mean over S of f(wi)/pdf(wi) estimates ∫ f dwi over the
 hemisphere about n. A `Technique` maps a lattice of the unit square to directions; techniques differ in the
-density, and `combine` joins several by the balance heuristic. With `stochastic` each point's lattice is
-turned at random and each sample moves evenly within its stratum, so that the expectation is exact; without it
-the lattice lies at the midpoints, the same at every call.
+density, and `combine` combines several by the balance heuristic. With `stochastic` each point's lattice is
+rotated at random and each sample is uniform in its stratum, so that the estimate is unbiased. Without it the
+samples are at the midpoints of the strata, the same at every call.
 
-Directions and densities are constants, without gradient. The estimator's gradient is then the mean of
-(∂f)/pdf, which estimates ∂∫f without bias: with f·cos zero at the horizon, the moving edge of the hemisphere
-adds nothing.
+Directions and densities have no gradient. The estimator's gradient is then the mean of (∂f)/pdf, which
+estimates ∂∫f without bias: f·cos is zero at the horizon, so the moving boundary of the hemisphere contributes
+nothing.
 """
 
 from __future__ import annotations
@@ -43,16 +43,18 @@ GOLDEN_TURN = (3 - math.sqrt(5)) / 2
 """The golden angle as a share of a full turn."""
 
 LOBE_SHARE, LIGHT_SHARE = 0.25, 0.5
-"""Shares of mis directions where a light can be sampled; cosine has the rest (docs/performance.md)."""
+"""Shares of the directions of "mis" for lobe and light, if the light can be sampled; cosine has the rest
+(docs/performance.md).
+"""
 
 
 @dataclass(frozen=True)
 class Technique:
-    """One way to draw directions at N points.
+    """A way to sample directions at N points.
 
     Attributes:
-        draw: `draw(count, stochastic)` gives (N, count, 3) unit directions.
-        pdf: the density (N, S) of any directions (N, S, 3), per steradian.
+        draw: `draw(count, stochastic)` returns (N, count, 3) unit directions.
+        pdf: returns the density (N, S) of any directions (N, S, 3), per steradian.
     """
 
     draw: Callable[[int, bool], Float[Tensor, "N S 3"]]
@@ -108,7 +110,7 @@ def pdf_specular_lobe(
     roughness: Float[Tensor, "N 1"],
     lobe: Lobe,
 ) -> Float[Tensor, "N S"]:
-    """p(h)/(4 |wo·h|) over the whole sphere; of ±h, that which lies in the hemisphere about n was drawn."""
+    """p(h)/(4 |wo·h|) on the whole sphere; of ±h, the one in the hemisphere about n is the sampled one."""
     cos = cosines(n, wo, wi)
     return lobe.pdf_h(cos.h.abs(), roughness) / (4 * cos.d)
 
@@ -122,14 +124,14 @@ def fibonacci(n: Float[Tensor, "N 3"]) -> Technique:
 
 
 def cosine(n: Float[Tensor, "N 3"]) -> Technique:
-    """Directions in proportion to n·wi: no variance on a Lambertian surface under constant light."""
+    """Density proportional to n·wi: no variance for a Lambertian surface under constant light."""
     return _hemisphere(n, lambda u: (1 - u).sqrt(), pdf_cosine)
 
 
 def _hemisphere(
     n: Float[Tensor, "N 3"], height: Callable[[Tensor], Tensor], pdf: Callable[[Tensor, Tensor], Tensor]
 ) -> Technique:
-    """Directions about n whose cosine is `height` of a uniform number, at an even azimuth."""
+    """Directions about n whose cosine is `height` of a uniform number, with a uniform azimuth."""
     n = at_least_float32(n)
 
     def draw(count: int, stochastic: bool) -> Float[Tensor, "N S 3"]:
@@ -142,7 +144,7 @@ def _hemisphere(
 def specular_lobe(
     n: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"], roughness: Float[Tensor, "N 1"], lobe: Lobe
 ) -> Technique:
-    """Mirror directions of wo about half vectors that the lobe draws; some fall below the horizon."""
+    """Mirror directions of wo about half vectors sampled from the lobe; some are below the horizon."""
     n, wo = at_least_float32(n), at_least_float32(wo)
 
     def draw(count: int, stochastic: bool) -> Float[Tensor, "N S 3"]:
@@ -158,9 +160,9 @@ def specular_lobe(
 
 @torch.no_grad()
 def combine(techniques: Sequence[tuple[Technique, int]], stochastic: bool) -> IncidentSamples:
-    """So many directions from each technique, joined by the balance heuristic (Veach 1997, §9.2).
+    """Sample `count` directions of each technique, combined by the balance heuristic (Veach 1997, §9.2).
 
-    The density is that of the rounded directions: a lobe then cancels exactly against the integrand's.
+    The density is that of the rounded directions: a lobe cancels exactly against the integrand's.
     """
     techniques = [(technique, count) for technique, count in techniques if count]
     wi = torch.cat([technique.draw(count, stochastic) for technique, count in techniques], 1)
@@ -169,7 +171,7 @@ def combine(techniques: Sequence[tuple[Technique, int]], stochastic: bool) -> In
 
 
 def sphere_lattice(count: int, like: Tensor) -> Float[Tensor, "S 3"]:
-    """`count` even directions over the whole sphere, of `like`'s device and type (float32 at least)."""
+    """`count` evenly spread directions of the sphere, on the device of `like`, in at least float32."""
     up = at_least_float32(like).new_tensor([[0.0, 0.0, 1.0]])
     lattice = _lattice(up, count, stochastic=False)
     return _about(up, 1 - 2 * lattice.u, lattice.v)[0]
@@ -185,10 +187,11 @@ def sample_directions(
     stochastic: bool,
     light: Technique | None = None,
 ) -> IncidentSamples:
-    """`count` incident directions per point, in at least float32, by fibonacci, cosine, lobe, mis or no_lobe.
+    """Sample `count` incident directions per point, in at least float32.
 
-    mis: half cosine and half lobe or, with a `light` that can be sampled, cosine, lobe and light.
-    no_lobe: half cosine and half light, or the cosine alone.
+    The kinds are "fibonacci", "cosine", "lobe", "mis" and "no_lobe". "mis" is half cosine and half lobe; with
+    a `light` it is cosine, lobe and light. "no_lobe" is half cosine and half light; only cosine if `light` is
+    None.
 
     Raises:
         UserError: there is no such sampler.

@@ -1,1 +1,1 @@
-"""Where time goes: code says what it is doing, and a ledger that listens adds up the seconds."""
+"""Measure time by kind of work: code marks its work, and a ledger that listens adds up the seconds."""

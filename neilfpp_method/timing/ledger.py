@@ -1,16 +1,17 @@
-"""A ledger of seconds, by stage and by kind of work.
+"""A ledger of seconds by stage and by kind of work.
 
-Code that computes says which kind of work begins, and nothing else; without a ledger that costs a comparison:
+Code that computes marks the kind of its work. Without a ledger that costs a single comparison:
 
     with doing("tracing"):
         hits = host.scene_light(x, wi)
 
-A ledger that listens gives every moment to one kind: within `doing("tracing")` that of "shading" stands
-still. So its seconds add up to the time since it was made, and what no code has named is "rest".
+A ledger attributes every moment to exactly one kind: within `doing("tracing")` the clock of an enclosing
+"shading" stands still. So its seconds add up to the time since it was made; work that no code has marked is
+"rest".
 
-On a GPU the clock of the host shows when work was asked for, not when it was done. A ledger that is given
-`synchronise` waits for the device whenever the kind of work changes, but only in one of `EVERY` steps; the
-time of the other steps of a stage is shared out as that of those that were told apart.
+On a GPU the host clock shows when work is submitted, not when it is done. With `synchronise`, the ledger
+waits for the device whenever the kind of work changes, but only in one of `EVERY` steps (a sampled step). The
+time of the other steps of a stage is divided in the proportions of the sampled ones.
 """
 
 from __future__ import annotations
@@ -35,29 +36,38 @@ Work = Literal[
     "saving",
     "rest",
 ]
-"""Drawing pixels · rays of cameras through the host · losses on geometry and material alone · rays that leave
-surfaces · material, light and the rendering equation · the backward pass of all of these · the descent and
-its bookkeeping · solving for maps and lamps · pictures and figures on the way · checkpoints · what else there
-is.
+"""The kinds of work.
+
+- data: drawing pixels;
+- rendering: camera rays through the host;
+- regularisers: losses that depend only on geometry or material;
+- tracing: rays that leave surfaces;
+- shading: material, light and the rendering equation;
+- gradients: the backward pass of all of these;
+- optimiser: the optimizer step and its bookkeeping;
+- light_fits: fits of the map and the lamps;
+- looks: previews and measurements during training;
+- saving: checkpoints;
+- rest: everything else.
 """
 WORK: tuple[Work, ...] = get_args(Work)
+"""All kinds of work."""
 PREPARATION = "preparation"
-"""The stage before the first: images are read, the model is made."""
+"""Name of the time before the first stage, in which images are read and the model is built."""
 EVERY = 200
-"""On a GPU, one step in so many is told apart. A step that waits at each change of work takes at most about
-twice as long, so this costs at most half a per cent; an estimate, as no GPU was measured.
+"""On a GPU, one in this many steps is sampled. A sampled step takes at most about twice as long, so this
+costs at most half a per cent (an estimate; it has not been measured on a GPU).
 """
 FIRST = 10
-"""On a GPU, the step of a stage that is told apart first: those before it compile and allocate."""
+"""On a GPU, the first sampled step of a stage. The steps before it compile and allocate."""
 
 
 class Ledger:
-    """Seconds by stage and by work; begins to count when it is made.
+    """Counts seconds by stage and by kind of work, from its construction on.
 
     Args:
-        synchronise: waits until a device has done what it was asked; none: work is done when its call
-            returns.
-        now: a clock, seconds.
+        synchronise: waits until the device has finished its work; None if calls are synchronous.
+        now: a clock, in seconds.
     """
 
     def __init__(
@@ -66,16 +76,16 @@ class Ledger:
         now: Callable[[], float] = time.perf_counter,
     ) -> None:
         self._seconds: dict[str, dict[str, float]] = {}
-        self._untold: dict[str, float] = {}
-        self._told: dict[str, dict[str, float]] = {}
+        self._unsampled: dict[str, float] = {}
+        self._sampled: dict[str, dict[str, float]] = {}
         self._synchronise, self._now = synchronise, now
         self._stage, self._work = PREPARATION, "rest"
         self._in_step = self._apart = False
-        self._tells = synchronise is None
+        self._samples = synchronise is None
         self._since = now()
 
     def add(self, seconds: Mapping[str, Mapping[str, float]]) -> None:
-        """What was counted before, in a training that is continued."""
+        """Add the seconds of earlier sessions of a run that is continued."""
         for stage, parts in seconds.items():
             counted = self._seconds.setdefault(stage, {})
             for work, passed in parts.items():
@@ -85,71 +95,74 @@ class Ledger:
     def total(self) -> float:
         """All seconds so far."""
         self._count()
-        return sum(sum(parts.values()) for parts in self._seconds.values()) + sum(self._untold.values())
+        return sum(sum(parts.values()) for parts in self._seconds.values()) + sum(self._unsampled.values())
 
     def seconds(self) -> dict[str, dict[str, float]]:
-        """Seconds by stage and by work so far; kinds that took no time are absent."""
+        """Seconds by stage and by kind of work so far; kinds that took no time are absent."""
         self._count()
-        counted = {stage: dict(self._seconds.get(stage, {})) for stage in {**self._seconds, **self._untold}}
-        for stage, untold in self._untold.items():
-            told = self._told.get(stage) or {"rest": 1.0}
-            for work, part in told.items():
-                counted[stage][work] = counted[stage].get(work, 0.0) + untold * part / sum(told.values())
+        counted = {
+            stage: dict(self._seconds.get(stage, {})) for stage in {**self._seconds, **self._unsampled}
+        }
+        for stage, unsampled in self._unsampled.items():
+            sampled = self._sampled.get(stage) or {"rest": 1.0}
+            total = sum(sampled.values())
+            for work, part in sampled.items():
+                counted[stage][work] = counted[stage].get(work, 0.0) + unsampled * part / total
         return counted
 
     def enter(self, stage: str) -> None:
-        """From now on all time is of this stage."""
+        """Begin a stage."""
         self._count()
         self._stage = stage
 
     @contextmanager
     def step(self, number: int) -> Iterator[None]:
-        """A step of the stage, by its number in it."""
+        """Mark a training step, by its number in the stage."""
         self._count()
         self._in_step = True
-        self._tells = self._synchronise is None or number % EVERY == FIRST
+        self._samples = self._synchronise is None or number % EVERY == FIRST
         self._wait()
         try:
             yield
         finally:
             self._wait()
             self._count()
-            self._in_step, self._tells = False, self._synchronise is None
+            self._in_step, self._samples = False, self._synchronise is None
 
     def begin(self, work: Work, apart: bool) -> tuple[Work, bool]:
-        """Work of another kind begins. Returns what was done before, to go back to."""
+        """Begin another kind of work; see `doing`. Returns the previous kind, for `back_to`."""
         before = self._work, self._apart
         if not self._apart:
-            if apart or self._tells:
+            if apart or self._samples:
                 self._wait(always=apart)
                 self._count()
             self._work, self._apart = work, apart
         return before
 
     def back_to(self, before: tuple[Work, bool]) -> None:
-        """Work of the kind that `begin` returned goes on."""
+        """Return to the kind of work that `begin` returned."""
         if before == (self._work, self._apart):
             return
-        if self._apart or self._tells:
+        if self._apart or self._samples:
             self._wait(always=self._apart)
             self._count()
         self._work, self._apart = before
 
     def _wait(self, always: bool = False) -> None:
-        if self._synchronise is not None and (always or self._tells):
+        if self._synchronise is not None and (always or self._samples):
             self._synchronise()
 
     def _count(self) -> None:
-        """What has passed since the last time goes to what was done."""
+        """Attribute the time since the last call to the current kind of work."""
         now = self._now()
         passed, self._since = now - self._since, now
-        if self._in_step and not self._apart and not self._tells:
-            self._untold[self._stage] = self._untold.get(self._stage, 0.0) + passed
+        if self._in_step and not self._apart and not self._samples:
+            self._unsampled[self._stage] = self._unsampled.get(self._stage, 0.0) + passed
             return
-        kept = [self._seconds]
+        targets = [self._seconds]
         if self._in_step and not self._apart and self._synchronise is not None:
-            kept.append(self._told)
-        for seconds in kept:
+            targets.append(self._sampled)
+        for seconds in targets:
             parts = seconds.setdefault(self._stage, {})
             parts[self._work] = parts.get(self._work, 0.0) + passed
 
@@ -159,7 +172,7 @@ _ledger: Ledger | None = None
 
 @contextmanager
 def listening(ledger: Ledger) -> Iterator[Ledger]:
-    """The ledger that is told of all work within; one at a time in a process."""
+    """Make a ledger record all work in the context. Only one ledger of a process records at a time."""
     global _ledger
     before, _ledger = _ledger, ledger
     try:
@@ -169,12 +182,12 @@ def listening(ledger: Ledger) -> Iterator[Ledger]:
 
 
 class doing(ContextDecorator):
-    """Tells the listening ledger, if any, what kind of work is done within. Also a decorator.
+    """Mark the kind of work in a context, or in a decorated function, for the ledger that listens, if any.
 
     Args:
-        work: the kind.
-        apart: nothing within is told apart, as in a fit of the light that traces rays of its own; and the
-            device is always waited for, as this is rare and no part of every step.
+        work: the kind of work.
+        apart: whether marks within the context are ignored, as in a fit of the light that traces rays. The
+            ledger then always waits for the device, since such work is rare and not part of every step.
     """
 
     def __init__(self, work: Work, apart: bool = False) -> None:

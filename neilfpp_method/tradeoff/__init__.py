@@ -1,1 +1,1 @@
-"""What accuracy costs in time: one run for each budget, measured, put beside each other."""
+"""Measure accuracy against training time, with a run for each of several time budgets."""

@@ -1,4 +1,4 @@
-"""`neilfpp tradeoff`: train for each budget, measure, and write the frontier."""
+"""`neilfpp tradeoff`: train with each time budget, evaluate, and write the frontier."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.tradeoff.files import write_tradeoff
 from neilfpp_method.tradeoff.frontier import FIGURES, Point, frontier
 from neilfpp_method.tradeoff.rows import Row, measured, rows_of, run_row
-from neilfpp_method.train.run import check_folder, read_description
+from neilfpp_method.train.output import check_folder
+from neilfpp_method.train.run import read_description
 
 __all__ = ["run_tradeoff"]
 
@@ -29,46 +30,51 @@ def run_tradeoff(
     console: Console,
     at_end: Callable[[Path], None] | None = None,
 ) -> list[Point]:
-    """Run every row that has not come to its end, one after the other, and write the frontier into `out`.
+    """Train and evaluate all runs that are not finished, one after the other, and write the frontier.
 
-    The files are written anew after each row. A budget that is too small for this machine is said, left out,
-    and tried again by the next call.
+    The files are written again after each run. A budget that is too small for this machine is reported,
+    skipped, and tried again by the next call.
 
     Args:
-        data: the capture.
-        out: the folder of the runs and of the frontier.
-        config: the settings of all rows; seeds count on from theirs.
-        budgets: seconds.
-        seeds: runs of each budget.
-        device: where to compute.
-        console: where to speak.
-        at_end: called with the folder of a run that has been trained.
+        data: folder of the capture.
+        out: folder for the runs and the frontier.
+        config: the settings of all runs; the seeds start at that of the settings.
+        budgets: the time budgets, in seconds.
+        seeds: number of runs per budget.
+        device: name of the device.
+        console: where progress is printed.
+        at_end: called with the folder of each run that has been trained.
+
+    Returns:
+        The points of the frontier.
 
     Raises:
-        UserError: bad input, rows of another capture or other settings in `out`, or no row came to its end.
-        Stopped: a person asked for it; the next call goes on.
+        UserError: if the input is unusable, if `out` contains runs of another capture or with other
+            settings, or if no run could be finished.
+        Stopped: if the user stops the command; the next call continues it.
     """
     rows = rows_of(data, out, config, budgets, seeds, device)
-    load_capture(data)  # what is wrong with it is told before anything is written
+    # Errors in the capture are raised before anything is written.
+    load_capture(data)
     check_folder(out)
     for row in rows:
         _check_same(row)
     refused = ""
     for number, row in enumerate(rows, start=1):
-        console.print(f"row {number} of {len(rows)}: {row.name}", soft_wrap=True)
+        console.print(f"run {number} of {len(rows)}: {row.name}", soft_wrap=True)
         try:
             run_row(row, console, at_end)
         except UserError as error:
             if (row.out / "config.json").is_file():
                 raise
             refused = str(error)
-            console.print(f"left out: {refused}", style="yellow", soft_wrap=True)
+            console.print(f"skipped: {refused}", style="yellow", soft_wrap=True)
             continue
-        runs = [found for found in map(measured, rows) if found is not None]
+        runs = [result for result in map(measured, rows) if result is not None]
         write_tradeoff(out, f"{data.resolve().name}, {config.preset}", runs)
-    runs = [found for found in map(measured, rows) if found is not None]
+    runs = [result for result in map(measured, rows) if result is not None]
     if not runs:
-        raise UserError(f"{out}: no row could be run", refused)
+        raise UserError(f"{out}: no run could be made", refused)
     points = frontier(runs)
     for line in table(points):
         console.print(line, soft_wrap=True)
@@ -77,7 +83,7 @@ def run_tradeoff(
 
 
 def _check_same(row: Row) -> None:
-    """That a run which is there already is the one that this row would make."""
+    """Raise a `UserError` if the folder of a row contains another run than the row describes."""
     if not (row.out / "config.json").is_file():
         return
     described = read_description(row.out)
@@ -87,13 +93,13 @@ def _check_same(row: Row) -> None:
 
 
 def table(points: Sequence[Point]) -> list[str]:
-    """The frontier for a terminal: a line for each budget, and below it what each minute brought."""
+    """The frontier for the terminal: a line per budget, followed by the change of each metric per minute."""
     names = [name for name in FIGURES if points and name in points[0].figures]
     lines = ["budget      took   " + "  ".join(f"{FIGURES[name].title:>20}" for name in names)]
     for point in points:
-        told = "  ".join(f"{_with_deviation(point, name):>20}" for name in names)
+        values = "  ".join(f"{_with_deviation(point, name):>20}" for name in names)
         mark = "  dominated" if point.dominated else ""
-        lines.append(f"{in_words(point.budget):8} {point.seconds:6.1f} s  {told}{mark}")
+        lines.append(f"{in_words(point.budget):8} {point.seconds:6.1f} s  {values}{mark}")
         if point.per_minute:
             gained = "  ".join(f"{point.per_minute[name]:+18.2f}/m" for name in names)
             lines.append(f"{'':19}{gained}")

@@ -1,4 +1,4 @@
-"""The frontier as a picture: a panel for each figure, accuracy over minutes, every point labelled; SVG."""
+"""Draw the frontier as SVG: a panel for each metric, which shows accuracy over time with labelled points."""
 
 from __future__ import annotations
 
@@ -12,14 +12,23 @@ from neilfpp_method.tradeoff.frontier import FIGURES, Point
 __all__ = ["draw_frontier"]
 
 COLUMNS = 3
+"""Number of panels side by side."""
 WIDTH, HEIGHT, HEAD = 330.0, 230.0, 44.0
+"""Width and height of a panel, and height of the heading, in pixels."""
 LEFT, RIGHT, TOP, BOTTOM = 48.0, 40.0, 34.0, 38.0
+"""Margins of a panel around its plot, in pixels."""
 INK, PALE, LINE, GRAY = "#1c1e22", "#5c626b", "#4477aa", "#aaaaaa"
+"""Colours of text, of secondary text, of the curve, and of the labels of dominated points."""
 
 
 def draw_frontier(title: str, points: Sequence[Point]) -> str:
-    """The picture as text. Time is logarithmic; a bar through a point is a standard deviation over seeds to
-    either side; dominated points are hollow.
+    """Draw the frontier.
+
+    The time axis is logarithmic. Error bars are one standard deviation over the seeds to either side.
+    Dominated points are hollow.
+
+    Returns:
+        The SVG document.
     """
     names = [name for name in FIGURES if points and name in points[0].figures]
     rows = max(1, math.ceil(len(names) / COLUMNS))
@@ -58,15 +67,17 @@ def _panel(name: str, points: Sequence[Point]) -> list[Html]:
     for value in (min(ends), max(ends)):
         drawn.append(_text(LEFT - 6, place(points[0].seconds, value)[1] + 4, f"{value:.1f}", PALE, "end"))
     drawn.append(
-        _text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 8, "time that runs took, logarithmic", PALE, "middle")
+        _text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 8, "time of the runs (logarithmic)", PALE, "middle")
     )
     line = [place(point.seconds, point.figures[name]) for point in points]
     path = " ".join(f"{x:.1f},{y:.1f}" for x, y in line)
     drawn.append(element("polyline", points=path, fill="none", stroke=LINE, stroke_width=2))
     for point, (x, y) in zip(points, line, strict=True):
-        off = point.deviations.get(name)
-        if off is not None:
-            ends_of_bar = (place(point.seconds, point.figures[name] + sign * off)[1] for sign in (-1, 1))
+        deviation = point.deviations.get(name)
+        if deviation is not None:
+            ends_of_bar = (
+                place(point.seconds, point.figures[name] + sign * deviation)[1] for sign in (-1, 1)
+            )
             bottom, top = (f"{end:.1f}" for end in ends_of_bar)
             bar = {"x1": f"{x:.1f}", "x2": f"{x:.1f}", "y1": bottom, "y2": top}
             drawn.append(element("line", **bar, stroke=LINE))

@@ -1,6 +1,4 @@
-"""A frontier on disk: `tradeoff.csv` with a line for each run, `tradeoff.json` with runs and points, and
-`tradeoff.svg`.
-"""
+"""Write a frontier as `tradeoff.csv` (a line per run), `tradeoff.json` (runs and points), `tradeoff.svg`."""
 
 from __future__ import annotations
 
@@ -20,10 +18,11 @@ from neilfpp_method.train.run import environment
 __all__ = ["write_tradeoff"]
 
 FORMAT = 1
+"""Version of the layout of `tradeoff.json`."""
 
 
 def write_tradeoff(out: Path, title: str, runs: Sequence[Measured]) -> None:
-    """Write the three files; each whole or not at all."""
+    """Write the three files, each atomically."""
     points = frontier(runs)
     names = [name for name in FIGURES if any(name in run.figures for run in runs)]
     dominated = {point.budget: point.dominated for point in points}

@@ -1,5 +1,6 @@
-"""The frontier of accuracy over time, from the figures of runs: means over seeds, what each minute brought,
-and which budgets are dominated. Numbers in, numbers out.
+"""Compute the frontier of accuracy over time from the metrics of runs.
+
+For each budget these are means over the seeds, changes per minute, and whether another budget dominates it.
 """
 
 from __future__ import annotations
@@ -24,22 +25,22 @@ FIGURES: Mapping[str, _Figure] = {
     "metallic_psnr": _Figure("metallic", "dB", True),
     "normal_mae_deg": _Figure("normals", "degrees", False),
     "pbr_psnr": _Figure("novel view", "dB", True),
-    "held_back_psnr": _Figure("pixels held back", "dB", True),
+    "held_back_psnr": _Figure("held-back pixels", "dB", True),
 }
-"""Those of `neilfpp eval` where the capture's truth allows them; the last is of training views
-(`train.quality`) and always there.
+"""Metrics of `neilfpp eval`, as far as the capture has the truth for them. The last one is measured at
+held-back pixels of training views (`train.quality`) and always present.
 """
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A run that came to its end.
+    """The result of a finished run.
 
     Attributes:
-        budget: seconds that it was given.
-        seed: of its random numbers.
-        seconds: that it took.
-        figures: by name, as in `FIGURES`.
+        budget: its time budget, in seconds.
+        seed: its seed.
+        seconds: time that it took.
+        figures: its metrics by name, as in `FIGURES`.
     """
 
     budget: float
@@ -50,17 +51,18 @@ class Measured:
 
 @dataclass(frozen=True)
 class Point:
-    """What a budget came to.
+    """The result of a budget.
 
     Attributes:
-        budget: seconds.
-        seconds: that its runs took, mean.
-        runs: how many.
-        figures: means over its runs, of figures that all runs have.
-        deviations: standard deviations over its runs; empty where there is one.
-        per_minute: what each figure changed by from the budget before, per minute of time that runs took;
-            empty for the first.
-        dominated: a budget whose runs took no longer is as good in every figure, and better in one.
+        budget: the time budget, in seconds.
+        seconds: mean time that its runs took.
+        runs: number of its runs.
+        figures: means over its runs, for metrics that all runs have.
+        deviations: standard deviations over its runs; empty if there is only one run.
+        per_minute: change of each metric from the next smaller budget, per minute of additional time; empty
+            for the smallest budget.
+        dominated: whether another budget whose runs took no longer is at least as good in every metric and
+            better in one.
     """
 
     budget: float

@@ -1,4 +1,4 @@
-"""The runs of a tradeoff: each a run folder that `neilfpp train --resume` continues as any other."""
+"""The runs of a tradeoff. Each is an ordinary run folder, which `neilfpp train --resume` can continue."""
 
 from __future__ import annotations
 
@@ -25,19 +25,20 @@ from neilfpp_method.train.run import load_run
 __all__ = ["Row", "measured", "rows_of", "run_row"]
 
 METRICS = "metrics.json"
+"""File of a run with its metrics on test views."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A run to make: everything that a process elsewhere needs to know.
+    """Description of a run to make.
 
     Attributes:
-        data: the capture.
-        out: the run's folder.
-        config: the settings, their seed included.
-        effects: as `--effects`.
-        budget: seconds.
-        device: where to compute.
+        data: folder of the capture.
+        out: the run folder.
+        config: the settings, including the seed.
+        effects: value of `--effects`.
+        budget: time budget, in seconds.
+        device: name of the device.
     """
 
     data: Path
@@ -49,20 +50,20 @@ class Row:
 
     @property
     def name(self) -> str:
-        """As the figure has it."""
+        """Name of the run: that of its folder."""
         return self.out.name
 
 
 def rows_of(
     data: Path, out: Path, config: NeilfConfig, budgets: Sequence[float], seeds: int, device: str
 ) -> list[Row]:
-    """A row for each budget and seed, `OUT/10m-seed0` and so on, by budget.
+    """A row for each budget and seed, in order of budget, with folders `OUT/10m-seed0` and so on.
 
     Raises:
-        UserError: no budget, one that is given twice, or no seed.
+        UserError: if there is no budget, a budget occurs twice, or `seeds` is less than 1.
     """
     if not budgets or len(set(budgets)) != len(budgets):
-        raise UserError("the budgets are none, or one is given twice", "name each once, as 1m,3m,10m")
+        raise UserError("--budgets is empty or contains a budget twice", "give each once, as 1m,3m,10m")
     if seeds < 1:
         raise UserError(f"--seeds is {seeds}", "set it to 1 or more")
     effects = "as-set" if config.preset.startswith("paper-") else "auto"
@@ -75,25 +76,25 @@ def rows_of(
 
 
 def run_row(row: Row, console: Console, at_end: Callable[[Path], None] | None = None) -> None:
-    """Train a row, or the rest of it, and measure it; what is there already is left as it is.
+    """Train and evaluate a run, or only the parts that are missing.
 
     Raises:
-        UserError: among others, the budget is too small for this machine.
+        UserError: for example if the budget is too small for this machine.
     """
-    there = (row.out / "config.json").is_file()
-    plan = read_budget(row.out) if there else None
+    exists = (row.out / "config.json").is_file()
+    plan = read_budget(row.out) if exists else None
     if plan is None or plan.took is None:
         run_training(
-            data=None if there else row.data,
+            data=None if exists else row.data,
             out=row.out,
-            config=None if there else row.config,
-            resume=there,
+            config=None if exists else row.config,
+            resume=exists,
             test_every=None,
             response="auto",
             device=row.device,
             devices=1,
             console=console,
-            effects=None if there else read_asked(row.effects),
+            effects=None if exists else read_asked(row.effects),
             budget=row.budget,
             at_end=at_end,
         )
@@ -104,10 +105,10 @@ def run_row(row: Row, console: Console, at_end: Callable[[Path], None] | None = 
 
 
 def measured(row: Row) -> Measured | None:
-    """What a row came to; none: it has not come to its end.
+    """The result of a run; None if it is not finished.
 
     Raises:
-        UserError: a file of the run is damaged.
+        UserError: if a file of the run is damaged.
     """
     plan = read_budget(row.out)
     if plan is None or plan.took is None:

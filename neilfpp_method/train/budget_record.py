@@ -1,9 +1,7 @@
-"""The plan of a run with a budget, in `RUN/plan.json`: what the trial measured, what was planned, and every
-time that the clock changed it.
+"""The plan of a run with a time budget, stored in `RUN/plan.json`.
 
-format; budget, seconds; size; costs; places_looked_at; took, seconds, at the end
-revisions, in order, of which the first is the plan that the training began with: seconds of the run, step,
-and steps of each stage
+It holds the costs that the trial measured, the planned steps, and every revision of them. The keys of the
+file are `format` and the attributes of `BudgetPlan`.
 """
 
 from __future__ import annotations
@@ -24,12 +22,19 @@ __all__ = ["FILE", "BudgetPlan", "Revision", "read_budget", "write_budget"]
 
 FILE = "plan.json"
 FORMAT = 1
+"""Version of the file's layout."""
 STAGES = tuple(stage.value for stage in Stage)
 
 
 @dataclass(frozen=True)
 class Revision:
-    """Steps of each stage, as planned after `step` steps and `seconds` of the run."""
+    """Planned numbers of steps.
+
+    Attributes:
+        seconds: time of the run at which they were planned.
+        step: number of steps trained by then.
+        steps: planned steps of each stage.
+    """
 
     seconds: float
     step: int
@@ -38,40 +43,47 @@ class Revision:
 
 @dataclass
 class BudgetPlan:
-    """The plan of a run.
+    """The plan of a run with a time budget.
 
     Attributes:
-        budget: seconds of all.
-        size: of a step (`budget.sizes`).
-        costs: as the trial measured them.
-        places_looked_at: whether evidence of places decides about materials and light, where that is open.
-        revisions: in order; the last one counts.
-        took: seconds of the whole command, report included; none: it has not come to its end.
+        budget: time of the whole command, in seconds.
+        size: size of a step (`budget.sizes`).
+        costs: costs that the trial measured.
+        places_looked_at: whether there is time to measure evidence at places (`effects.material`), which
+            decides open effects of material and light.
+        light_pixels: maximum number of pixels for the search of the initial light; 0 for no search; None for
+            the number without a budget.
+        revisions: all plans in order, from the one before training; the last one holds.
+        took: time of the whole command including the report, in seconds; None until it has ended.
     """
 
     budget: float
     size: Literal["small", "usual", "large"]
     costs: Costs
     places_looked_at: bool
+    light_pixels: int | None = None
     revisions: list[Revision] = field(default_factory=list)
     took: float | None = None
 
     @property
     def steps(self) -> Mapping[str, int]:
-        """Of each stage, as planned last."""
+        """Steps of each stage in the last plan."""
         return self.revisions[-1].steps
 
 
 def write_budget(run: Path, plan: BudgetPlan) -> None:
-    """The plan so far."""
+    """Write the plan into the run folder."""
     write_json(run / FILE, {"format": FORMAT, **dataclasses.asdict(plan)})
 
 
 def read_budget(run: Path) -> BudgetPlan | None:
-    """The plan of a run; none: it has no budget.
+    """Read the plan of a run.
+
+    Returns:
+        The plan; None if the run has no budget.
 
     Raises:
-        UserError: the file is damaged or of another version.
+        UserError: if the file is damaged or of another version.
     """
     path = run / FILE
     if not path.is_file():
@@ -93,6 +105,7 @@ def read_budget(run: Path) -> BudgetPlan | None:
 def _plan(stored: Mapping[str, Any], where: str) -> BudgetPlan:
     stages = {name: from_dict(StageCost, cost, where) for name, cost in stored["costs"]["stages"].items()}
     plain = {name: stored[name] for name in ("budget", "size", "places_looked_at", "took")}
+    plain["light_pixels"] = stored.get("light_pixels")
     revisions = [
         Revision(float(entry["seconds"]), entry["step"], dict(entry["steps"]))
         for entry in stored["revisions"]
@@ -101,16 +114,18 @@ def _plan(stored: Mapping[str, Any], where: str) -> BudgetPlan:
 
 
 def _sensible(plan: BudgetPlan) -> bool:
+    """Whether all times and counts are finite and not negative, and all revisions have the same stages."""
     costs = plan.costs.stages.values()
     seconds = [plan.budget, plan.costs.reserve, *(n for c in costs for n in (c.step, c.fit, c.once))]
     seconds += [revision.seconds for revision in plan.revisions] + [plan.took or 0.0]
     counts = [
         *(cost.steps for cost in costs),
+        plan.light_pixels or 0,
         *(n for r in plan.revisions for n in (r.step, *r.steps.values())),
     ]
-    same = all(list(revision.steps) == list(plan.costs.stages) for revision in plan.revisions)
+    same_stages = all(list(revision.steps) == list(plan.costs.stages) for revision in plan.revisions)
     return (
-        same
+        same_stages
         and set(plan.costs.stages) <= set(STAGES)
         and all(is_finite_number(n) and n >= 0 for n in seconds)
         and all(isinstance(n, int) and n >= 0 for n in counts)

@@ -1,4 +1,4 @@
-"""A training for a time: tried out and planned before it begins, and what came of it."""
+"""Plan a training for a time budget, and report the outcome."""
 
 from __future__ import annotations
 
@@ -26,10 +26,18 @@ from neilfpp_method.train.work_record import waiting
 
 __all__ = ["close_budget", "outcome", "plan_budget", "planned_effects", "planned_settings"]
 
-TRIAL_SHARE, MAX_TRIAL = 0.03, 10.0
-"""Of the budget, and seconds, that the steps of a trial may take, about."""
+TRIAL_SHARE = 0.03
+"""Share of the budget that the steps of a trial may take."""
+MAX_TRIAL = 10.0
+"""Maximum time that the steps of a trial may take, in seconds."""
 PLACES_SHARE = 0.1
-"""Of the budget that looks at places may take; else materials and light are as the settings have them."""
+"""Share of the budget that measurements at places may take. If they take more they are left out, and the
+effects that they would decide stay as in the settings.
+"""
+LIGHT_SHARE = 0.2
+"""Share of the budget that the search for the initial light may take; it uses as many places as fit."""
+LONG_TAILS = "long-tails"
+"""The effect that is decided together with the initial light."""
 
 
 def plan_budget(
@@ -43,24 +51,25 @@ def plan_budget(
     report: bool,
     say: Callable[[str], object],
 ) -> BudgetPlan:
-    """Try out what a training costs, and plan one for the time.
+    """Measure the costs of a training in a trial, and plan its steps for a time budget.
 
     Args:
-        budget: seconds of all that `ledger` counts.
-        capture: whose views are as large as their files.
-        config: the settings; the steps of its stages are proportions.
-        asked: which effects are simulated.
-        device, devices: where to compute, and how many processes shall.
-        ledger: what has passed so far is part of the budget.
-        report: whether the run will end with its page.
-        say: tells a person the plan.
+        budget: time of the whole command, in seconds.
+        capture: the capture, with views of the size of their files.
+        config: the settings; the steps of its stages are used as proportions.
+        asked: the value of `--effects`.
+        device: the device of the training.
+        devices: number of processes of the training, which must be 1.
+        ledger: the clock; time that has already passed is part of the budget.
+        report: whether the command ends by writing the report.
+        say: prints a line for the user.
 
     Raises:
-        UserError: the budget is too small, and the smallest that makes sense is named; or several processes
-            are asked for.
+        UserError: if the budget is too small (the message names the smallest usable budget), or if there is
+            more than one process.
     """
     if devices > 1:
-        raise UserError("--budget plans for one process", "leave --devices out")
+        raise UserError("--budget plans for one process", "leave --devices and --nodes out")
     wait = waiting(device) or (lambda: None)
     trials: dict[Size, Trial] = {}
 
@@ -68,66 +77,69 @@ def plan_budget(
         if size not in trials:
             limit = min(TRIAL_SHARE * budget, MAX_TRIAL)
             changed = sized(config, size)
-            places = PLACES_SHARE * budget
-            trials[size] = try_out(capture, changed, asked, device, limit, places, report, wait)
+            places, light = PLACES_SHARE * budget, LIGHT_SHARE * budget
+            trials[size] = try_out(capture, changed, asked, device, limit, places, light, report, wait)
         return share_for(trials[size].costs, budget, ledger.total)
 
     size: Size = "usual"
-    tried = next_size(share("usual"))
-    if tried == "small" or (tried == "large" and share("large") >= 1.0):
-        size = tried
-    found, trial = share(size), trials[size]
-    if found < MIN_SHARE:
+    candidate = next_size(share("usual"))
+    if candidate == "small" or (candidate == "large" and share("large") >= 1.0):
+        size = candidate
+    affordable, trial = share(size), trials[size]
+    if affordable < MIN_SHARE:
         needed = smallest_budget(trial.costs, ledger.total)
         raise UserError(
-            f"a budget of {in_words(budget)} is too small: {in_words(ledger.total)} of it are over, and "
-            f"{in_words(trial.costs.once)} go to what does not depend on the number of steps",
-            f"the smallest that makes sense on this machine, as it is now, is --budget {in_words(needed)}",
+            f"a budget of {in_words(budget)} is too small: {in_words(ledger.total)} of it have passed, and "
+            f"{in_words(trial.costs.once)} are needed for work that does not depend on the number of steps",
+            f"the smallest usable budget on this machine at its present load is --budget {in_words(needed)}",
         )
-    plan = BudgetPlan(budget, size, trial.costs, trial.places > 0.0)
-    plan.revisions.append(Revision(ledger.total, 0, steps_for(trial.costs, found)))
+    plan = BudgetPlan(budget, size, trial.costs, trial.places > 0.0, trial.light_pixels)
+    plan.revisions.append(Revision(ledger.total, 0, steps_for(trial.costs, affordable)))
     say(_in_words(plan))
     return plan
 
 
 def planned_settings(plan: BudgetPlan, config: NeilfConfig) -> NeilfConfig:
-    """The settings of the run."""
+    """The settings with the planned size and number of steps."""
     config = sized(config, plan.size)
     return replace(config, train=with_steps(config.train, plan.steps))
 
 
 def planned_effects(plan: BudgetPlan, effects: Plan) -> None:
-    """What the budget decides of the effects: whether there is time to look at places."""
-    reason = f"evidence would take more than {PLACES_SHARE:.0%} of the budget"
+    """Leave the effects that are measured at places as in the settings if there is no time to measure."""
+    reason = f"not measured: that would take more than {PLACES_SHARE:.0%} of the budget"
     for name in JUDGED:
         if effects.is_open(name) and not plan.places_looked_at:
             effects.decisions.append(Decision(0, name, effects.is_on(name), "settings", reason))
+    if effects.is_open(LONG_TAILS) and plan.light_pixels == 0:
+        reason = f"evidence would take more than {LIGHT_SHARE:.0%} of the budget"
+        effects.decisions.append(Decision(0, LONG_TAILS, effects.is_on(LONG_TAILS), "settings", reason))
 
 
 def _in_words(plan: BudgetPlan) -> str:
-    """For people, before the training."""
+    """One line for the console, before the training."""
     steps = ", ".join(f"{stage.replace('_', ' ')} {count}" for stage, count in plan.steps.items())
     return (
-        f"budget {in_words(plan.budget)}: steps planned: {steps}; steps of {plan.size} size; "
-        f"{in_words(plan.costs.once)} go to looks, pictures and the report. How accurate it will be is not "
-        "known before"
+        f"budget {in_words(plan.budget)}: planned steps: {steps}; step size: {plan.size}; "
+        f"{in_words(plan.costs.once)} for measurements, previews and the report. The accuracy of the result "
+        "cannot be predicted"
     )
 
 
 def close_budget(run: Path, plan: BudgetPlan, seconds: float) -> None:
-    """Note what a run took that has come to its end."""
+    """Record the time that a finished run has taken."""
     plan.took = seconds
     write_budget(run, plan)
 
 
 def outcome(plan: BudgetPlan, looks: Sequence[Look]) -> str:
-    """For people, at the very end: how close the clock came, and what came of it."""
+    """One line for the console at the end: time taken against the budget, steps, and accuracy."""
     seconds = plan.took or 0.0
-    off = f"{100.0 * (seconds / plan.budget - 1.0):+.1f} %".replace("-", "\N{MINUS SIGN}")
+    deviation = f"{100.0 * (seconds / plan.budget - 1.0):+.1f} %".replace("-", "\N{MINUS SIGN}")
     steps = ", ".join(f"{stage.replace('_', ' ')} {count}" for stage, count in plan.steps.items())
-    text = f"budget: {seconds:.1f} s of {plan.budget:.0f} s ({off}); steps: {steps}"
+    text = f"budget: {seconds:.1f} s of {plan.budget:.0f} s ({deviation}); steps: {steps}"
     if looks:
         last = looks[-1]
         physical = "" if last.physical is None else f", PBR {last.physical:.1f} dB"
-        text += f"; pixels held back: R {last.radiance:.1f} dB{physical}"
+        text += f"; PSNR of held-back pixels: R {last.radiance:.1f} dB{physical}"
     return text

@@ -1,7 +1,8 @@
-"""`neilfpp train`: from a capture's folder to a finished run."""
+"""`neilfpp train`: train a run from a capture."""
 
 from __future__ import annotations
 
+import os
 import shlex
 import shutil
 import signal
@@ -58,6 +59,7 @@ from neilfpp_method.train.lock import alone_in
 from neilfpp_method.train.loop import Training, train
 from neilfpp_method.train.memory import check_training_memory
 from neilfpp_method.train.optimizer import seed_step
+from neilfpp_method.train.output import default_folder
 from neilfpp_method.train.pace import Pace
 from neilfpp_method.train.preview import write_preview
 from neilfpp_method.train.progress import Reporter, reporting
@@ -69,7 +71,6 @@ from neilfpp_method.train.run import (
     Description,
     check_free,
     create_run,
-    default_folder,
     load_checkpoint,
     read_description,
 )
@@ -90,6 +91,7 @@ def run_training(
     device: str,
     devices: int,
     console: Console,
+    nodes: int = 1,
     format: str | None = None,
     scale: float | None = None,
     strict: bool = False,
@@ -98,30 +100,42 @@ def run_training(
     command: str = "neilfpp train",
     at_end: Callable[[Path], None] | None = None,
 ) -> Path:
-    """Train a run to its end and return its folder. A run that is finished is left as it is.
+    """Train a run to its end. A run that is finished already is left unchanged.
 
     Args:
-        config: the settings; none, with `resume`: those of the run.
-        format: the capture's format; none: told from what is in the folder.
-        scale: size of the images over that of their files; none: as large as the rays of the training can
-            use.
-        strict: end with an error where the result is of no use.
-        effects: which effects are simulated (`effects.asked`); none: those of the settings, or with `resume`
-            of the run.
-        budget: seconds that all of it may take, from here to the end of `at_end`; none: as many steps as the
-            settings say, or with `resume` what the run was given.
-        command: what a person types to get here, for the line that says how a stopped run continues.
-        at_end: called with the folder of a run that came to its end, sound or not, by the first process.
+        data: folder of the capture; required unless `resume`.
+        out: the run folder; None for `runs/CAPTURE-PRESET`. Required with `resume`.
+        config: the settings; None, with `resume`, for those of the run.
+        resume: whether to continue an existing run.
+        test_every: every how many views one is held out, if the capture does not say; None for the default.
+        response: what pixels hold: "linear", "srgb", or "auto" for what the files say.
+        device: name of the device (`train.device`).
+        devices: number of processes on this machine, each with a GPU of its own if the device is "cuda".
+        nodes: number of machines, each with `devices` processes that torchrun has started.
+        console: where progress is printed.
+        format: format of the capture; None to recognise it from the files.
+        scale: size of the images relative to their files; None for the largest that the rays of the training
+            can use.
+        strict: whether to raise `Unsound` if the result is unusable.
+        effects: the value of `--effects` (`effects.asked`); None for the effects of the settings or, with
+            `resume`, of the run.
+        budget: time of everything from here to the end of `at_end`, in seconds; None to train as many steps
+            as the settings say or, with `resume`, to keep the budget of the run.
+        command: beginning of the command line that continues a stopped run, for messages.
+        at_end: called in the first process with the folder of the finished run, even if its health is bad.
+
+    Returns:
+        The run folder.
 
     Raises:
-        UserError: bad input; no run folder is left behind.
-        Stopped: a person asked for it; names the command that continues.
+        UserError: if the input is unusable; no run folder is left behind.
+        Stopped: if the user stops the training; the message names the command that continues it.
         Diverged: see `train.loop.train`.
-        Unsound: `strict`, and a finding is severe; the run is kept.
+        Unsound: with `strict`, if a finding is severe; the run is kept.
     """
-    place = pick_device(device)
-    ledger = Ledger(synchronise=waiting(place))
-    # Whatever the headers and the settings can tell is told before other processes start.
+    torch_device = pick_device(device)
+    ledger = Ledger(synchronise=waiting(torch_device))
+    # Errors that the settings and file headers reveal are raised before other processes start.
     if resume:
         if out is None:
             raise UserError("--resume needs the run's folder", "give it with --out RUN")
@@ -134,11 +148,12 @@ def run_training(
             )
         config, planned = plan.config_of_model, read_budget(out)
         if budget not in (None, planned and planned.budget):
-            was = "no budget" if planned is None else f"a budget of {time_in_words(planned.budget)}"
-            raise UserError(f"{out}: the run has {was}", "leave --budget out, or start a new run")
+            has = "no budget" if planned is None else f"a budget of {time_in_words(planned.budget)}"
+            raise UserError(f"{out}: the run has {has}", "leave --budget out, or start a new run")
         ledger.add(read_work(out))
         if _is_finished(out, plan.config):
-            if planned is not None and planned.took is None:  # it was ended while its report was made
+            # The command was stopped while it wrote the report.
+            if planned is not None and planned.took is None:
                 close_budget(out, planned, ledger.total)
             console.print(f"run folder {out}: finished already, nothing to continue", soft_wrap=True)
             return out
@@ -154,20 +169,28 @@ def run_training(
     if not resume:
         planned = None
         if budget is not None:
-            with_page = at_end is not None
+            with_report = at_end is not None
             planned = plan_budget(
-                budget, capture, config, asked, place, devices, ledger, with_page, console.print
+                budget,
+                capture,
+                config,
+                asked,
+                torch_device,
+                devices * nodes,
+                ledger,
+                with_report,
+                console.print,
             )
             config = planned_settings(planned, config)
         settings, plan = config, Plan.begin(asked, config)
         if planned is not None:
             planned_effects(planned, plan)
         config = plan.config
-        rays = config.train.rays * devices * sum(stage_steps(config.train).values())
+        rays = config.train.rays * devices * nodes * sum(stage_steps(config.train).values())
         source = replace(source, scale=scale_for_rays(capture.train_views, rays) if scale is None else scale)
         capture = at_scale(capture, source.scale)
     check_training_memory(capture)
-    fabric = _launch(place, devices)
+    fabric = _launch(torch_device, devices, nodes)
     with listening(ledger), _nothing_left_on_failure(out), alone_in(out):
         pixels = load_pixels(capture, out / PIXELS, fabric, console)
         if resume:
@@ -179,8 +202,8 @@ def run_training(
         config = plan.config_of_model
         seed_step(config.train.seed, step=-1)
         model = build_model(capture, facts, config)
-        begins = not (out / "checkpoints" / "last.pt").exists()
-        if begins:
+        is_new = not (out / "checkpoints" / "last.pt").exists()
+        if is_new:
             show_known_light(model)
         if fabric.is_global_zero:
             if not resume:
@@ -198,42 +221,43 @@ def run_training(
                     if line is not None:
                         console.print(line, soft_wrap=True)
             console.print(f"run folder {out}", soft_wrap=True)
-        # Every process fits the same geometry for itself.
-        started = start_geometry(model, capture, config) if begins else None
-        if started and fabric.is_global_zero:
-            console.print(started.text, style="yellow" if started.warning else None, soft_wrap=True)
+        # Every process computes the same initial geometry.
+        start = start_geometry(model, capture, config) if is_new else None
+        if start and fabric.is_global_zero:
+            console.print(start.text, style="yellow" if start.warning else None, soft_wrap=True)
     fabric.barrier()
-    continue_with = _continue_with(command, out, device, devices)
+    continue_with = _continue_with(command, out, device, devices, nodes)
     with (
         alone_in(out),
         listening(ledger),
         reporting(out, console, fabric.is_global_zero) as reporter,
         _stop_request(continue_with) as stopped,
     ):
-        # What began without, in nerfstudio, goes on with all pixels.
-        held_back = hold_back(pixels, config.train.seed, PATCHES if begins or has_looks(out) else 0)
+        # A run that began without held-back pixels, in nerfstudio, continues to train on all pixels.
+        held_back = hold_back(pixels, config.train.seed, PATCHES if is_new or has_looks(out) else 0)
         preview = _preview(out, capture, fabric, reporter)
         solver, watch = model.light_solver(), _watch(pixels, config, reporter)
         training = Training(
-            out,
-            config,
-            model,
-            pixels,
-            fabric,
-            reporter,
-            stopped,
-            preview,
-            continue_with,
-            solver,
-            watch,
-            plan,
-            Quality(held_back, capture.hdr),
-            ledger,
-            None if planned is None else Pace(planned, ledger),
+            path=out,
+            config=config,
+            model=model,
+            pixels=pixels,
+            fabric=fabric,
+            reporter=reporter,
+            should_stop=stopped,
+            preview=preview,
+            continue_with=continue_with,
+            light_solver=solver,
+            watch=watch,
+            plan=plan,
+            quality=Quality(held_back, capture.hdr),
+            ledger=ledger,
+            pace=None if planned is None else Pace(planned, ledger),
         )
         train(training)
     if fabric.is_global_zero:
-        write_work(out, ledger)  # with the last checkpoint and picture
+        # Written once more, to include the time of the last checkpoint and preview.
+        write_work(out, ledger)
     if fabric.is_global_zero and training.fits:
         console.print(f"light: {in_words(config.light, training.fits)}", soft_wrap=True)
     if fabric.is_global_zero and training.plan.asked.base != "as-set":
@@ -252,20 +276,21 @@ def run_training(
 
 
 def _log_gains(plan: Plan, capture: Capture, pixels: PixelDataset) -> Tensor | None:
-    """The gains that photographs start with, where the plan has them on after it has heard the photographs;
-    zeros where a person asks for them and nothing shows what they are.
+    """Initial log gains of the photographs, after the decision whether photographs have gains.
+
+    Returns None if they have none, and zeros if they are requested but cannot be measured.
     """
     if not plan.is_on("exposure"):
         return None
-    found = exposures_of(capture, pixels)
-    note_exposures(plan, found)
+    exposures = exposures_of(capture, pixels)
+    note_exposures(plan, exposures)
     if not plan.is_on("exposure"):
         return None
-    return torch.zeros(len(pixels.views), 3) if found is None else found.log_gain
+    return torch.zeros(len(pixels.views), 3) if exposures is None else exposures.log_gain
 
 
 def _exposures_in_words(plan: Plan) -> str | None:
-    """That photographs have gains, and why; none where they have none."""
+    """One line that photographs have gains, with the reason; None if they have none."""
     decision = plan.newest("exposure")
     return f"effects: exposure on, {decision.reason}" if decision is not None and decision.on else None
 
@@ -285,7 +310,7 @@ def _refuse_changes(
     format: str | None,
     scale: float | None,
 ) -> None:
-    """That what is given beside --resume, where something is, is what the run was made of."""
+    """Raise a `UserError` if an option given together with --resume differs from that of the run."""
     source = described.source
     given = CaptureSource(
         source.root if data is None else str(data.resolve()),
@@ -296,8 +321,8 @@ def _refuse_changes(
     )
     if given != source or config not in (None, described.config):
         raise UserError(
-            f"{out}: a run keeps its capture and its settings, and others are given with --resume",
-            "leave them out, or start a new run in another --out",
+            f"{out}: a run keeps its capture and its settings, and --resume was given with different ones",
+            "leave these options out, or start a new run in another --out",
         )
 
 
@@ -306,27 +331,62 @@ def _is_finished(out: Path, config: NeilfConfig) -> bool:
     return last.exists() and load_checkpoint(last)["step"] >= sum(stage_steps(config.train).values())
 
 
-def _continue_with(command: str, out: Path, device: str, devices: int) -> str:
-    chosen = ["--device", device] if device != "auto" else []
-    chosen += ["--devices", str(devices)] if devices != 1 else []
-    return f"{command} {shlex.join(['--out', str(out), '--resume', *chosen])}"
+def _continue_with(command: str, out: Path, device: str, devices: int, nodes: int) -> str:
+    """The command line that continues a stopped run."""
+    options = ["--device", device] if device != "auto" else []
+    options += ["--devices", str(devices)] if devices != 1 else []
+    options += ["--nodes", str(nodes)] if nodes != 1 else []
+    return f"{command} {shlex.join(['--out', str(out), '--resume', *options])}"
 
 
-def _launch(place: torch.device, devices: int) -> Fabric:
+def _launch(device: torch.device, devices: int, nodes: int) -> Fabric:
+    """Start the processes of the training."""
     if devices < 1:
-        raise UserError(f"{devices} processes cannot share the work", "set --devices to 1 or more")
-    if place.type == "cuda" and devices > (torch.cuda.device_count() if place.index is None else 1):
+        raise UserError(f"--devices is {devices}", "set it to 1 or more")
+    if nodes < 1:
+        raise UserError(f"--nodes is {nodes}", "set it to 1 or more")
+    _check_torchrun(devices, nodes)
+    if device.type == "cuda" and devices > (torch.cuda.device_count() if device.index is None else 1):
         raise UserError(
-            f"{place} is not {devices} GPUs", "use --device cuda, and --devices up to the number of GPUs"
+            f"--device {device} has fewer than {devices} GPUs",
+            "use --device cuda, and --devices up to the number of GPUs",
         )
-    chosen = devices if place.index is None else [place.index]
-    strategy = DDPStrategy(find_unused_parameters=True) if devices > 1 else "auto"
-    fabric = Fabric(accelerator=place.type, devices=chosen, strategy=strategy)
+    fabric = Fabric(
+        accelerator=device.type,
+        devices=devices if device.index is None else [device.index],
+        num_nodes=nodes,
+        strategy=DDPStrategy(find_unused_parameters=True) if devices * nodes > 1 else "auto",
+    )
     fabric.launch()
     return fabric
 
 
+def _check_torchrun(devices: int, nodes: int) -> None:
+    """Check that torchrun, if it started this process, started as many as the options say.
+
+    Raises:
+        UserError: if it did not, or if there are several nodes and no torchrun.
+    """
+    started = int(os.environ.get("WORLD_SIZE", "1")) if "TORCHELASTIC_RUN_ID" in os.environ else None
+    if started is None and nodes > 1:
+        raise UserError(
+            f"--nodes {nodes}: one command starts the processes of one machine only",
+            "start it with torchrun on each machine (docs/performance.md)",
+        )
+    if started is not None and started != devices * nodes:
+        raise UserError(
+            f"torchrun started {started} processes, and --devices {devices} --nodes {nodes} make "
+            f"{devices * nodes}",
+            "set --devices to torchrun's --nproc-per-node and --nodes to its --nnodes",
+        )
+
+
 def _check(config: NeilfConfig) -> None:
+    """Check the settings of a new run.
+
+    Raises:
+        UserError: if a setting is out of range, or the known map is unusable.
+    """
     if min(stage_steps(config.train).values()) < 0 or sum(stage_steps(config.train).values()) == 0:
         raise UserError(
             "the stages have no steps", "set --config.train.sdf-steps and the others to 0 or more"
@@ -339,27 +399,27 @@ def _check(config: NeilfConfig) -> None:
     if config.known_map is not None:
         check_environment(Path(config.known_map))
     if config.train.sdf_steps and config.loss.volume <= 0.0:
-        raise UserError("--config.loss.volume is off, so nothing compares with the images", "set it above 0")
+        raise UserError("--config.loss.volume is 0, so R is not compared with the images", "set it above 0")
 
 
 def _scaled(scale: float, pixels: int, rays: int) -> str:
     return (
-        f"images at {scale:.3g} of their size: {pixels / 1e6:.1f} million pixels for {rays / 1e6:.1f} "
-        "million rays; --scale 1 takes them whole"
+        f"images scaled to {scale:.3g} of their size: {pixels / 1e6:.1f} million pixels for "
+        f"{rays / 1e6:.1f} million rays; --scale 1 uses the full size"
     )
 
 
 @contextmanager
 def _nothing_left_on_failure(out: Path) -> Iterator[None]:
-    """What fails before there is a run leaves no folder, nor one above it that was made for it."""
-    made = [folder for folder in (out, *out.parents) if not folder.exists()]
+    """If the context fails before the run exists, remove all folders that were created for it."""
+    created = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
         yield
     except BaseException:
         if not (out / "config.json").exists():
             shutil.rmtree(out / PIXELS, ignore_errors=True)
             with suppress(OSError):
-                for folder in made:
+                for folder in created:
                     folder.rmdir()
         raise
 
@@ -377,24 +437,27 @@ def _preview(
 
 @contextmanager
 def _stop_request(continue_with: str) -> Iterator[Callable[[], bool]]:
-    """Ctrl-C and SIGTERM ask for a stop after the step in progress; a second one does not wait, and loses the
-    steps since the last checkpoint.
+    """Handle Ctrl-C and SIGTERM; yields a function that returns whether a stop has been requested.
+
+    The first signal requests a stop after the current step. A second one stops at once and loses the steps
+    since the last checkpoint.
     """
-    asked = []
+    received = []
 
-    def ask(number: int, _frame: object) -> None:
-        if asked:
+    def handle(number: int, _frame: object) -> None:
+        if received:
             raise KeyboardInterrupt
-        asked.append(number)
+        received.append(number)
 
     try:
-        before = {s: signal.signal(s, ask) for s in (signal.SIGINT, signal.SIGTERM)}
-    except ValueError:  # Not the main thread: somebody else handles signals.
-        before = {}
+        previous = {s: signal.signal(s, handle) for s in (signal.SIGINT, signal.SIGTERM)}
+    except ValueError:
+        # Signal handlers can only be set in the main thread.
+        previous = {}
     try:
-        yield lambda: bool(asked)
+        yield lambda: bool(received)
     except KeyboardInterrupt:
-        raise Stopped("stopped at once", f"continue from its last checkpoint with: {continue_with}") from None
+        raise Stopped("stopped at once", f"continue from the last checkpoint with: {continue_with}") from None
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)

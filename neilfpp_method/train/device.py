@@ -1,4 +1,4 @@
-"""Which device to compute on."""
+"""Choose the device to compute on."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ __all__ = ["pick_device"]
 
 
 def pick_device(name: str) -> torch.device:
-    """The device of a name; "auto" takes a GPU where there is one.
+    """The device with this name; "auto" selects a GPU if there is one and the CPU otherwise.
 
     Raises:
-        UserError: no device has this name here.
+        UserError: if this machine has no such device.
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")

@@ -1,8 +1,12 @@
-"""The effects of a run, in `RUN/effects.json`: decisions and table; read by resumed and loaded runs.
+"""The effects of a run, stored in `RUN/effects.json` and read when a run is resumed or loaded.
 
-format      1 asked       the value of --effects decisions   in order: step, effect, on, by, reason, evidence
-(null, or what, value, deviation, threshold, samples) effects     a row per effect as `effects.table.rows` has
-it, for whoever shows a run; it follows from the decisions
+The keys of the file are
+
+- `format`: 1;
+- `asked`: the value of `--effects`;
+- `decisions`: all decisions in order, with the attributes of `effects.plan.Decision`;
+- `effects`: a row per effect (`effects.table.rows`), which follows from the decisions and is stored for other
+  programs.
 """
 
 from __future__ import annotations
@@ -28,7 +32,7 @@ FILE = "effects.json"
 
 
 def write_plan(run: Path, plan: Plan) -> None:
-    """The decisions so far, and the table that they come to."""
+    """Write the decisions so far, and the table that follows from them, into the run folder."""
     decisions = [dataclasses.asdict(decision) for decision in plan.decisions]
     write_json(
         run / FILE,
@@ -37,10 +41,18 @@ def write_plan(run: Path, plan: Plan) -> None:
 
 
 def read_plan(run: Path, settings: NeilfConfig, before: int | None = None) -> Plan:
-    """The plan of a run as it was after `before` steps (none: now). Without one, settings hold as they are.
+    """Read the effects of a run.
+
+    Args:
+        run: the run folder.
+        settings: the settings of the run.
+        before: number of steps after which the plan is wanted; None for the newest plan.
+
+    Returns:
+        The plan; if the run has no record, a plan that leaves the settings as they are.
 
     Raises:
-        UserError: the file is damaged or of another version.
+        UserError: if the file is damaged or of another version.
     """
     path = run / FILE
     if not path.is_file():
@@ -53,26 +65,23 @@ def read_plan(run: Path, settings: NeilfConfig, before: int | None = None) -> Pl
     try:
         decisions = [_decision(entry, str(path)) for entry in stored["decisions"]]
         asked = read_asked(stored["asked"])
-    except (
-        TypeError,
-        AttributeError,
-        KeyError,
-    ) as error:  # Something that must be there is missing, or is no object.
+    except (TypeError, AttributeError, KeyError) as error:
+        # A key is missing, or a value is not an object.
         raise UserError(
             f"{path}: not a complete record ({error})", "restore the file or train again"
         ) from error
-    return Plan(
-        asked, settings, [d for d in decisions if before is None or d.before_training or d.step <= before]
-    )
+    if before is not None:
+        decisions = [one for one in decisions if one.before_training or one.step <= before]
+    return Plan(asked, settings, decisions)
 
 
 def _decision(entry: dict[str, Any], where: str) -> Decision:
     evidence = entry["evidence"]
-    plain = from_dict(Decision, {name: value for name, value in entry.items() if name != "evidence"}, where)
-    if plain.effect not in EFFECTS:
+    decision = from_dict(Decision, {key: value for key, value in entry.items() if key != "evidence"}, where)
+    if decision.effect not in EFFECTS:
         raise UserError(
-            f"{where}: no effect '{plain.effect}'", "use the version of neilfpp that wrote the run"
+            f"{where}: no effect '{decision.effect}'", "use the version of neilfpp that wrote the run"
         )
-    return dataclasses.replace(
-        plain, evidence=None if evidence is None else from_dict(Measurement, evidence, where)
-    )
+    if evidence is None:
+        return decision
+    return dataclasses.replace(decision, evidence=from_dict(Measurement, evidence, where))

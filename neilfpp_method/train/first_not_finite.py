@@ -1,7 +1,8 @@
-"""Which operation is the first whose result is not finite, and comes to bear on a loss or a gradient.
+"""Find the first operation whose non-finite result reaches a loss or a gradient.
 
-Infinities that a mask takes out again are harmless and common. So every value that is not finite is
-followed from the operation that made it out of finite values, and only what arrives at the end is told.
+A NaN or infinity that a mask removes later is harmless and common. So every non-finite value is traced from
+the operation that produced it out of finite values, and only origins that reach a loss or gradient are
+reported.
 """
 
 from __future__ import annotations
@@ -21,25 +22,25 @@ __all__ = ["Origin", "OriginsOfNotFinite", "is_finite"]
 
 PACKAGE = Path(__file__).parents[1]
 UNINITIALISED = ("empty", "new_empty", "resize")
-"""Operations whose results hold whatever the memory held before."""
+"""Prefixes of the names of operations that return uninitialised memory."""
 
 
 @dataclass(frozen=True)
 class Origin:
-    """An operation that made values that are not finite out of finite ones.
+    """An operation that produced non-finite values out of finite ones.
 
     Attributes:
-        order: how many such operations came before it.
-        operation: torch's name of it, such as `aten.div.Tensor`.
-        derivative_of: the operation whose derivative it computes, such as `DivBackward0`; none: it is part of
+        order: number of such operations before it.
+        operation: name of the operation in torch, such as `aten.div.Tensor`.
+        derivative_of: name of the autograd node whose derivative it computes, such as `DivBackward0`; None in
             the forward pass.
-        place: file, line and function of this package that asked for it, of the forward operation where it is
-            a derivative; none: no code of this package did.
-        code: that line.
-        broken: how many of its values are not finite.
-        values: how many values it has.
-        rows: along its first axis, those with such a value.
-        length: of its first axis.
+        place: file, line and function of this package that called it, for a derivative those of the forward
+            operation; None if it was not called by this package.
+        code: source code of that line.
+        broken: number of non-finite values in the result.
+        values: number of values in the result.
+        rows: indices along the first axis of the result that contain non-finite values.
+        length: length of the first axis of the result.
     """
 
     order: int
@@ -54,7 +55,7 @@ class Origin:
 
 
 class OriginsOfNotFinite(TorchDispatchMode):
-    """A context in which every operation of torch is looked at; `origin_of` tells where a value came from.
+    """A context manager that checks the result of every torch operation; see `origin_of`.
 
     Example:
         >>> with OriginsOfNotFinite() as origins:
@@ -70,8 +71,9 @@ class OriginsOfNotFinite(TorchDispatchMode):
         self._count = 0
 
     def origin_of(self, value: Tensor) -> Origin | None:
-        """The operation that a value's NaN or infinity comes from; none: the value is finite, or no operation
-        of the context made it.
+        """The operation from which a NaN or infinity in a tensor originates.
+
+        Returns None if the tensor is finite, or if its non-finite values come from outside of the context.
         """
         return None if is_finite(value) else self._origins.get(_memory(value))
 
@@ -79,22 +81,24 @@ class OriginsOfNotFinite(TorchDispatchMode):
         broken = [_memory(value) for value in _tensors((args, kwargs)) if not is_finite(value)]
         known = [self._origins[memory] for memory in broken if memory in self._origins]
         result = func(*args, **(kwargs or {}))
-        fresh = func.__name__.startswith(UNINITIALISED)
+        uninitialised = func.__name__.startswith(UNINITIALISED)
         for value in _tensors(result):
-            if fresh:
+            if uninitialised:
                 self._origins.pop(_memory(value), None)
             elif is_finite(value):
                 continue
             elif known:
                 self._origins[_memory(value)] = min(known, key=lambda origin: origin.order)
-            elif not broken:  # else it came in as it is: from outside, or out of a compiled loop
+            elif not broken:
+                # If an input was not finite but has no known origin, the value comes from outside of the
+                # context or from a compiled loop, which is not a torch operation.
                 self._origins[_memory(value)] = _origin(self._count, func, value)
                 self._count += 1
         return result
 
 
 def is_finite(value: Tensor) -> bool:
-    """Whether all of a tensor is; integers always are."""
+    """Whether all elements of a tensor are finite; always true for integers."""
     return not value.dtype.is_floating_point or bool(torch.isfinite(value).all())
 
 
@@ -103,7 +107,7 @@ def _tensors(nest: Any) -> Iterator[Tensor]:
 
 
 def _memory(value: Tensor) -> int:
-    """Views, and what is written in place, share the memory of what they were."""
+    """Key of a tensor: its memory, which views and the results of in-place operations share."""
     return value.untyped_storage().data_ptr()
 
 
@@ -118,6 +122,7 @@ def _origin(order: int, func: Any, value: Tensor) -> Origin:
 
 
 def _place_here() -> tuple[str | None, str]:
+    """Place and source line of the innermost frame of this package on the call stack."""
     for frame in reversed(traceback.extract_stack()):
         path = Path(frame.filename)
         if path.is_relative_to(PACKAGE) and path != Path(__file__):
@@ -126,8 +131,9 @@ def _place_here() -> tuple[str | None, str]:
 
 
 def _place_of_forward(node: Any) -> tuple[str | None, str]:
-    """From what torch's anomaly mode noted when the operation was computed: lines `File "…", line 3, in
-    f`.
+    """Place and source line of the forward operation of an autograd node.
+
+    Torch's anomaly mode stores the traceback, as lines of the form `File "…", line 3, in f`.
     """
     for entry in reversed(node.metadata.get("traceback_", [])):
         head, _, code = entry.strip().partition("\n")

@@ -1,4 +1,4 @@
-"""The findings of a run, in `RUN/health.json`: written with checkpoints; read by eval and report."""
+"""The findings of a run, stored in `RUN/health.json` with each checkpoint and read by eval and report."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ __all__ = ["in_words", "read_findings", "write_findings"]
 
 
 def write_findings(run: Path, watch: Watch) -> None:
-    """The findings so far, and the verdict that they come to."""
+    """Write the findings so far, and the verdict that follows from them, into the run folder."""
     write_json(run / FILE, watch.record())
 
 
 def read_findings(run: Path) -> list[Finding] | None:
-    """The findings of a run; none where it has no record, as a run that has not saved anything yet.
+    """Read the findings of a run.
+
+    Returns:
+        The findings; None if the run has no record because nothing has been saved yet.
 
     Raises:
-        UserError: the file is damaged or of another version.
+        UserError: if the file is damaged or of another version.
     """
     path = run / FILE
     if not path.is_file():
@@ -41,5 +44,5 @@ def read_findings(run: Path) -> list[Finding] | None:
 
 
 def in_words(findings: list[Finding]) -> str:
-    """A verdict in one line."""
+    """The verdict in one line."""
     return str(Health.of(findings))

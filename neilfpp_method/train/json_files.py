@@ -1,4 +1,4 @@
-"""JSON objects in a run folder."""
+"""Read and write JSON objects in a run folder."""
 
 from __future__ import annotations
 
@@ -15,16 +15,20 @@ __all__ = ["is_finite_number", "read_json", "write_json"]
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """A JSON object, in one step."""
+    """Write a JSON object atomically.
+
+    Raises:
+        UserError: if the file cannot be written.
+    """
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object.
+    """Read a JSON object.
 
     Raises:
-        UserError: missing or malformed.
+        UserError: if the file is missing or malformed, or holds something other than an object.
     """
     try:
         value = json.loads(path.read_text())
@@ -33,7 +37,7 @@ def read_json(path: Path) -> dict[str, Any]:
             f"{path}: not readable as JSON ({error})", "restore the file or train again"
         ) from error
     if not isinstance(value, dict):
-        raise UserError(f"{path}: holds no JSON object", "restore the file or train again")
+        raise UserError(f"{path}: not a JSON object", "restore the file or train again")
     return value
 
 

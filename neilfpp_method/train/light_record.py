@@ -1,4 +1,4 @@
-"""The evidence for lamps before the environment map, fit by fit, in `RUN/light.json`."""
+"""The evidence for lamps at each fit of the light, stored in `RUN/light.json`."""
 
 from __future__ import annotations
 
@@ -21,15 +21,14 @@ FILE = "light.json"
 
 @dataclass(frozen=True)
 class LightFit:
-    """What one fit of the light found.
+    """The result of a fit of the light with and without lamps.
 
     Attributes:
-        step: of the training.
-        gain: how much lower the mean relative error is with lamps, at points that were kept back from the
-            fit.
-        deviation: the standard error of that mean.
-        points: how many were kept back.
-        lamps: how many are lit since.
+        step: the training step.
+        gain: reduction of the mean relative error by lamps, at points held back from the fit.
+        deviation: standard error of that mean.
+        points: number of held-back points.
+        lamps: number of lamps in use after the fit.
     """
 
     step: int
@@ -40,22 +39,22 @@ class LightFit:
 
 
 def note_fit(fits: list[LightFit], found: Evidence | None, lamps: int, step: int) -> None:
-    """Add what a fit measured for and against lamps, where it did, and how many are lit since."""
+    """Append the result of a fit to `fits` if it compared the light with and without lamps."""
     if found is not None:
         fits.append(LightFit(step, found.gain, found.deviation, found.points, lamps))
 
 
 def write_fits(run: Path, fits: Sequence[LightFit]) -> None:
-    """The record into the run's folder, where there is anything to record."""
+    """Write the results of the fits into the run folder if there are any."""
     if fits:
         write_json(run / FILE, {"format": FORMAT, "fits": [dataclasses.asdict(fit) for fit in fits]})
 
 
 def read_fits(run: Path, before: int) -> list[LightFit]:
-    """The record of a run up to a step; empty where the light was never fitted both ways.
+    """Read the results of the fits before a step; empty if none compared the light with and without lamps.
 
     Raises:
-        UserError: the file is damaged or of another version.
+        UserError: if the file is damaged or of another version.
     """
     path = run / FILE
     if not path.is_file():
@@ -67,7 +66,8 @@ def read_fits(run: Path, before: int) -> list[LightFit]:
         )
     try:
         fits = [from_dict(LightFit, fit, str(path)) for fit in stored["fits"]]
-    except (TypeError, AttributeError) as error:  # Something that must be there is missing, or is no object.
+    except (TypeError, AttributeError) as error:
+        # A key is missing, or a value is not an object.
         raise UserError(
             f"{path}: not a complete record ({error})", "remove the file, or train again"
         ) from error
@@ -75,17 +75,17 @@ def read_fits(run: Path, before: int) -> list[LightFit]:
 
 
 def in_words(config: FreeLightConfig | MapLightConfig, fits: Sequence[LightFit]) -> str:
-    """The light that a run came to, and why, in one line; without a reason where the settings had decided."""
+    """One line on the kind of light of a run, with the evidence unless the settings decide."""
     if isinstance(config, FreeLightConfig):
         return "a field that is free at every point"
-    sky = "an environment map" if config.map is None else "the given environment map"
+    map_kind = "an environment map" if config.map is None else "the given environment map"
     if not fits:
-        return f"{sky} and lamps before it" if config.kind == "distant_near" else sky
+        return f"{map_kind} and near lamps" if config.kind == "distant_near" else map_kind
     last = fits[-1]
     if last.points < MIN_POINTS:
-        return f"{sky}; {last.points} points kept back are too few to say anything of lamps"
-    change = f"error {-100 * last.gain:+.1f} ± {100 * last.deviation:.1f} % at {last.points} points kept back"
-    change = change.replace("-", "\N{MINUS SIGN}")
+        return f"{map_kind}; lamps were not decided on, with only {last.points} held-back points"
+    size = f"{-100 * last.gain:+.1f} ± {100 * last.deviation:.1f} %".replace("-", "\N{MINUS SIGN}")
+    change = f"error {size} at {last.points} held-back points"
     if last.lamps:
-        return f"{sky} and {last.lamps} lamp{'s' if last.lamps > 1 else ''} before it ({change})"
-    return f"{sky}; lamps were not needed ({change})"
+        return f"{map_kind} and {last.lamps} near lamp{'s' if last.lamps > 1 else ''} ({change} with lamps)"
+    return f"{map_kind} without lamps ({change} with lamps)"

@@ -1,4 +1,8 @@
-"""The training loop: three stages, one optimiser, and a step that depends on seed and number alone."""
+"""The training loop: up to three stages with one optimizer.
+
+The random numbers of a step depend only on the seed and the step number, so a resumed run continues exactly
+as an uninterrupted one.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,13 @@ from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.first_light import start_with
-from neilfpp_method.effects.looks import after_fit, look_at_light, look_at_surface, wants_surface
+from neilfpp_method.effects.looks import (
+    MOST_PIXELS,
+    after_fit,
+    look_at_light,
+    look_at_surface,
+    wants_surface,
+)
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.errors import Diverged, Stopped, UserError
 from neilfpp_method.health.guard import MAX_SKIPPED_IN_A_ROW
@@ -51,13 +61,33 @@ from neilfpp_method.train.work_record import write_work
 __all__ = ["Training", "train"]
 
 LOG_EVERY = 50
-"""Steps between TensorBoard scalars: a thousand points of a curve in the longest training."""
+"""Steps between two entries in the TensorBoard log. The longest preset then has about a thousand."""
 
 
 @dataclass
 class Training:
-    """A run in progress. `continue_with` is the command that goes on with it after a stop, `pace` keeps it
-    to a budget; none: it has none.
+    """The state of a run in progress.
+
+    Attributes:
+        path: the run folder.
+        config: the settings, with the current numbers of steps.
+        model: the model.
+        pixels: the training pixels.
+        fabric: device and processes.
+        reporter: progress output.
+        should_stop: whether a stop has been requested; asked once per step.
+        preview: writes the preview picture at the end of a stage.
+        continue_with: command line that continues the run after a stop.
+        light_solver: fits the light.
+        watch: health checks.
+        plan: the effects that are simulated.
+        quality: measurements at held-back pixels.
+        ledger: the clock.
+        pace: adapts the number of steps to a time budget; None without a budget.
+        fits: results of the fits of the light so far.
+        skipped: number of steps skipped so far because they were not finite.
+        skipped_in_a_row: number of steps skipped since the last one that was not.
+        seconds: time of each stage.
     """
 
     path: Path
@@ -82,11 +112,12 @@ class Training:
 
 
 def train(run: Training) -> None:
-    """Train from the last checkpoint, or from the start, to the end.
+    """Train to the end, from the last checkpoint if there is one.
 
     Raises:
-        Stopped: `run.should_stop` said so; the state is saved, and training continues from it bit for bit.
-        Diverged: ten steps in a row were not finite; the last good checkpoint is kept.
+        Stopped: if `run.should_stop` returns True. The state is saved, and continuing from it gives the same
+            result as not stopping.
+        Diverged: if ten steps in a row are not finite; the last good checkpoint is kept.
     """
     model = run.model.to(run.fabric.device).train()
     run.light_solver.to(run.fabric.device)
@@ -114,17 +145,18 @@ def train(run: Training) -> None:
 def _train_stage(
     run: Training, model: NeilfModel, optimizer: torch.optim.Optimizer, step: int, position: StagePosition
 ) -> int:
-    """The rest of a stage. Returns the number of the step that follows it."""
+    """Train the remaining steps of a stage. Returns the number of steps trained so far in all stages."""
     settings = run.config.train
     stage = position.stage
     model.freeze_for(stage)
-    # Set up anew in each stage: data-parallel wrappers fix the set of moving parameters when they are made.
+    # A data-parallel wrapper is made for each stage, because it fixes the set of trained parameters.
     wrapped = run.fabric.setup_module(model, move_to_device=False)
     run.ledger.enter(stage.value)
     run.reporter.begin_stage(stage.value, position.step, position.length)
     started = time.perf_counter()
     before = run.seconds.get(stage.value, 0.0)
-    gradients = "smoothness" in active_losses(stage, model.config, model.stages)  # nothing else asks for them
+    # Only the smoothness loss reads image gradients.
+    gradients = "smoothness" in active_losses(stage, model.config, model.stages)
     number, length = position.step, position.length
     while number < length:
         with run.ledger.step(number):
@@ -144,7 +176,8 @@ def _train_stage(
         _look_at_quality(run, model, StagePosition(stage, number, length), step)
         run.seconds[stage.value] = before + time.perf_counter() - started
         if number == length:
-            break  # The end of a stage is saved under its name, and a stop waits for that.
+            # `train` saves the end of a stage under its name, and a stop takes effect after that.
+            break
         if stop or step % settings.checkpoint_every == 0:
             _save(run, optimizer, step)
         if stop:
@@ -153,18 +186,21 @@ def _train_stage(
 
 
 def _keep_pace(run: Training, position: StagePosition, step: int) -> int:
-    """Keep to the budget, where there is one. Returns how many steps the stage has."""
+    """Adapt the number of steps to the budget if there is one. Returns the length of the stage."""
     if run.pace is None:
         return position.length
-    kept = run.pace.keep(run.config.train, position, step)
-    if kept is not run.config.train:
-        run.config = dataclasses.replace(run.config, train=kept)
-        run.reporter.lengthen(stage_steps(kept)[position.stage])
-    return stage_steps(kept)[position.stage]
+    revised = run.pace.keep(run.config.train, position, step)
+    if revised is not run.config.train:
+        run.config = dataclasses.replace(run.config, train=revised)
+        run.reporter.lengthen(stage_steps(revised)[position.stage])
+    return stage_steps(revised)[position.stage]
 
 
 def _solve_light(run: Training, model: NeilfModel, computed: StepResult, step: int) -> None:
-    """Show a step to the light solver, which sets the light when due. The first process does it for all."""
+    """Pass a step to the light solver, which fits the light when that is due.
+
+    The first process does this for all.
+    """
     fabric, solver = run.fabric, run.light_solver
     if fabric.is_global_zero:
         with doing("light_fits"):
@@ -174,45 +210,49 @@ def _solve_light(run: Training, model: NeilfModel, computed: StepResult, step: i
     if fabric.is_global_zero:
         run.watch.after_fit(solver.points, step)
         with doing("light_fits", apart=True):
-            found = solver.solve(model.brdf, model.scene)
-        note_fit(run.fits, found, model.lamps.lit, step)
-        _tell(run, after_fit(run.plan, found, model.lamps.lit, step + 1))
+            evidence = solver.solve(model.brdf, model.scene)
+        note_fit(run.fits, evidence, model.lamps.lit, step)
+        _report(run, after_fit(run.plan, evidence, model.lamps.lit, step + 1))
     _share_light(run, model)
 
 
 def _share_light(run: Training, model: NeilfModel) -> None:
-    """Let all processes have the light of the first."""
+    """Copy the light of the first process to all others."""
     if run.fabric.world_size > 1:
         for part in (model.light, model.lamps):
             part.load_state_dict(run.fabric.broadcast(part.state_dict()))
 
 
 def _look(run: Training, model: NeilfModel, step: int) -> None:
-    """What is looked at between two stages, where the next one learns a material."""
+    """Take the measurements before a stage that trains material."""
     if model.stages[stage_at(step, run.config.train).stage].moves_material:
         _look_at_effects(run, model, step)
         _start_light(run, model, step)
 
 
 def _start_light(run: Training, model: NeilfModel, step: int) -> None:
-    """Find the light that training starts with, before a material is learned. The first process does it for
-    all.
-    """
+    """Set the initial light before a material is trained. The first process does this for all."""
     if not run.light_solver.seeks_start:
         return
     decisions: list[Decision] = []
     if run.fabric.is_global_zero:
         seed_step(run.config.train.seed, -4 - step)
-        decisions, found = look_at_light(run.plan, model, run.pixels, step)
-        _tell(run, decisions)
-        if found is not None:
-            run.reporter.say(found.in_words())
-            start_with(model, found)
-            measured = run.light_solver.start(found.observed, found.material, model.scene)
-            note_fit(run.fits, measured, model.lamps.lit, step)
-            _tell(run, after_fit(run.plan, measured, model.lamps.lit, step))
+        decisions, first = look_at_light(run.plan, model, run.pixels, step, _light_pixels(run))
+        _report(run, decisions)
+        if first is not None:
+            run.reporter.say(first.in_words())
+            start_with(model, first)
+            evidence = run.light_solver.start(first.observed, first.material, model.scene)
+            note_fit(run.fits, evidence, model.lamps.lit, step)
+            _report(run, after_fit(run.plan, evidence, model.lamps.lit, step))
     _share_light(run, model)
     _share_decisions(run, model, decisions)
+
+
+def _light_pixels(run: Training) -> int:
+    """Maximum number of pixels for the search of the initial light; a budget may limit it."""
+    most = None if run.pace is None else run.pace.plan.light_pixels
+    return MOST_PIXELS if most is None else most
 
 
 @doing("looks", apart=True)
@@ -222,19 +262,19 @@ def _look_at_quality(run: Training, model: NeilfModel, position: StagePosition, 
 
 
 def _look_at_effects(run: Training, model: NeilfModel, step: int) -> None:
-    """Let evidence decide the open effects from here on. The first process decides for all."""
+    """Decide open effects by evidence. The first process does this for all."""
     if not wants_surface(run.plan):
         return
     decisions: list[Decision] = []
     if run.fabric.is_global_zero:
         seed_step(run.config.train.seed, -3 - step)
         decisions = look_at_surface(run.plan, model, run.pixels, step)
-        _tell(run, decisions)
+        _report(run, decisions)
     _share_decisions(run, model, decisions)
 
 
 def _share_decisions(run: Training, model: NeilfModel, decisions: Sequence[Decision]) -> None:
-    """Let all processes compute as the first has decided."""
+    """Apply the decisions of the first process in all processes."""
     decisions = run.fabric.broadcast(decisions)
     if not run.fabric.is_global_zero:
         run.plan.decisions += decisions
@@ -242,7 +282,7 @@ def _share_decisions(run: Training, model: NeilfModel, decisions: Sequence[Decis
 
 
 def _use(run: Training, model: NeilfModel) -> None:
-    """Compute as the plan says; evidence may take the joint stage away."""
+    """Apply the plan of effects to the model and the light solver; it may remove the joint stage."""
     config = run.plan.config
     if not config.train.joint_steps:
         run.config = dataclasses.replace(
@@ -252,7 +292,8 @@ def _use(run: Training, model: NeilfModel) -> None:
     run.light_solver.use(config.light, model.lobe)
 
 
-def _tell(run: Training, decisions: Sequence[Decision]) -> None:
+def _report(run: Training, decisions: Sequence[Decision]) -> None:
+    """Print decisions on effects, a line each."""
     for decision in decisions:
         run.reporter.say(f"effects: {decision.effect} {'on' if decision.on else 'off'}, {decision.reason}")
 
@@ -267,9 +308,9 @@ def _update(
     moment: Moment,
     step: int,
 ) -> bool:
-    """One step down the gradient; a step whose loss or gradient is not finite is left out, counted and named.
+    """Take an optimizer step. A step whose loss or gradient is not finite is skipped and reported.
 
-    Returns whether a person has asked to stop.
+    Returns whether a stop has been requested.
     """
     optimizer.zero_grad(set_to_none=True)
     if total.loss.requires_grad:
@@ -278,22 +319,24 @@ def _update(
     norms = gradient_norms(model)
     psnr = _psnr(terms, run.model.units)
     stop = torch.full_like(psnr, run.should_stop())
-    # The one transfer of the step: everything that the loop and the person must know. Every process takes the
-    # mean over all of them, so that all leave out the same steps and all stop after the same one.
-    known = run.fabric.all_reduce(torch.stack([total.loss.detach(), psnr, stop, *norms.values()])).tolist()
-    loss, decibels, asked, found = known[0], known[1], known[2], dict(zip(norms, known[3:], strict=True))
-    if all(math.isfinite(value) for value in (loss, *found.values())):
+    # The only transfer from the device in a step. All processes use the mean over the processes, so that they
+    # skip the same steps and stop after the same step.
+    means = run.fabric.all_reduce(torch.stack([total.loss.detach(), psnr, stop, *norms.values()])).tolist()
+    loss, decibels, stopping, *mean_norms = means
+    if all(math.isfinite(value) for value in (loss, *mean_norms)):
         optimizer.step()
         run.skipped_in_a_row = 0
     else:
-        _skip(run, total, found, _kept(run, model, moment, step), step)
+        named_norms = dict(zip(norms, mean_norms, strict=True))
+        _skip(run, total, named_norms, _keep_skipped(run, model, moment, step), step)
     run.reporter.step(loss, decibels)
     if step % LOG_EVERY == 0:
         _log(run, model, total, decibels, loss, step)
-    return asked > 0.0
+    return stopping > 0.0
 
 
 def _skip(run: Training, total: Total, norms: Mapping[str, float], kept: str, step: int) -> None:
+    """Count and report a skipped step; raise `Diverged` after too many in a row."""
     run.skipped += 1
     run.skipped_in_a_row += 1
     culprits = [name for name, value in total.terms.items() if not math.isfinite(value.item())]
@@ -312,21 +355,21 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], kept: str, st
         )
 
 
-def _kept(run: Training, model: NeilfModel, moment: Moment, step: int) -> str:
-    """Write down what is skipped, and say how it is looked into; a full disk is no reason to stop for it."""
+def _keep_skipped(run: Training, model: NeilfModel, moment: Moment, step: int) -> str:
+    """Store a skipped step and return the end of its message. A full disk does not stop the training."""
     if not run.fabric.is_global_zero:
         return ""
     try:
         kept = keep_step(run.path, model, moment, step)
     except UserError as error:
-        return f"; its rays are not kept: {error.problem}"
+        return f"; the step is not stored: {error.problem}"
     return f"; see neilfpp replay {shlex.quote(str(run.path))} {step}" if kept else ""
 
 
 def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
-    """PSNR of the pixels that the stage compares, dB, in the capture's own response; NaN where there is none.
+    """PSNR of the pixels of a step in dB, in the response of the capture; NaN if it has none.
 
-    The peak is 1, and errors are capped there: a few HDR highlights would else dominate the figure.
+    The peak is 1. Errors are clipped at 1, because a few HDR highlights would otherwise dominate.
     """
     term, unit = (
         (terms["physical"], units.physical) if "physical" in terms else (terms["volume"], units.volume)
@@ -342,7 +385,8 @@ def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
 def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str | None = None) -> None:
     if run.fabric.is_global_zero:
         try:
-            # Fits first: extra ones are dropped on resume, gaps cannot be recovered.
+            # The records are written before the checkpoint: when the run is resumed, entries after the
+            # checkpoint are dropped, whereas missing ones could not be recovered.
             write_fits(run.path, run.fits)
             write_findings(run.path, run.watch)
             write_plan(run.path, run.plan)

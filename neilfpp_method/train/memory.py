@@ -1,4 +1,4 @@
-"""What a training takes of memory, asked before it takes any."""
+"""Check before a training that its memory is available."""
 
 from __future__ import annotations
 
@@ -13,17 +13,19 @@ from neilfpp_method.data.views import View
 __all__ = ["check_training_memory", "training_bytes"]
 
 READING = 48
-"""Bytes per pixel of the largest file while decoded, made linear, averaged and encoded. Estimate."""
+"""Bytes per pixel of the largest image file while it is decoded, linearised, averaged and encoded (estimate).
+"""
 COUNTED = 3 * 8 / 1024
-"""Bytes to a pixel of all views: counts of three sets of pixels, by block."""
+"""Bytes per pixel of all views for the index of three sets of pixels: 8 bytes per block of 1024."""
 LOADED = 0.8e9
-"""Bytes of a training with its libraries, the statistics of the images, and a model of the preset `fast`."""
+"""Bytes of the libraries, the statistics of the images, and a model of preset `fast`."""
 
 
 def training_bytes(views: Sequence[View]) -> int:
-    """About the least memory of a training, in bytes, without file pages, which the system reclaims.
+    """Lower bound of the memory of a training, in bytes.
 
-    What single steps take is left out: it follows from the settings, not from the images.
+    Mapped file pages are not counted because the system can reclaim them. The memory of a training step is
+    not counted because it depends on the settings rather than on the images.
     """
     largest = max(math.prod(file_size(view)) for view in views)
     pixels = sum(view.camera.width * view.camera.height for view in views)
@@ -31,10 +33,10 @@ def training_bytes(views: Sequence[View]) -> int:
 
 
 def check_training_memory(capture: Capture) -> None:
-    """That a training fits into the memory that is free.
+    """Check that a training fits into the free memory.
 
     Raises:
-        UserError: it does not.
+        UserError: if it does not.
     """
     views = capture.train_views
     largest = max(math.prod(file_size(view)) for view in views) / 1e6

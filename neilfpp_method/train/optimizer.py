@@ -1,4 +1,4 @@
-"""What training loops have in common: Adam with a rate for each field, and the seed of a step."""
+"""Parts that all training loops share: Adam with a learning rate per field, and the seed of a step."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ __all__ = ["adam", "gradient_norms", "make_optimizer", "seed_step", "set_rates"]
 
 
 def make_optimizer(model: NeilfModel, config: OptimizerConfig) -> torch.optim.Optimizer:
-    """Adam with a named group for each field; frozen parameters get no gradient and do not move."""
+    """Make Adam with a named parameter group for each field.
+
+    Frozen parameters are included; they receive no gradient and are not changed.
+    """
     groups = [
         {"params": parameters, "name": name, "lr": getattr(config, name)}
         for name, parameters in model.parameter_groups().items()
@@ -25,9 +28,10 @@ def make_optimizer(model: NeilfModel, config: OptimizerConfig) -> torch.optim.Op
 
 
 def adam(groups: Sequence[Mapping[str, object]]) -> torch.optim.Adam:
-    """Adam as every loop here uses it.
+    """Make Adam with the options that every training loop of this package uses.
 
-    Fused: one pass over the tables of hash grids, which are most of all parameters, in place of a dozen.
+    The fused implementation makes one pass over the parameters instead of a dozen. Most parameters are
+    tables of hash grids, for which this matters.
     """
     return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
@@ -38,11 +42,16 @@ def set_rates(
     position: StagePosition,
     background_waits: bool = True,
 ) -> None:
-    """The rate of each field at a step of a stage.
+    """Set the learning rate of each field for a step of a stage.
 
-    `background_waits` off: what lies beyond the scene moves from the start, whatever `config.background_from`
-    says. Where structure from motion has found points there, one colour is no stand-in for it: training would
-    fill the scene with clouds.
+    Args:
+        optimizer: an optimizer with a group per field, as `make_optimizer` returns it.
+        config: the learning rates and their schedule.
+        position: the stage and the step within it.
+        background_waits: whether the background field stays fixed for the first part of SDF init
+            (`config.background_from`). It must not if structure from motion has found points behind the
+            scene: a constant colour does not represent such a background, and training would explain it by
+            density within the scene instead.
     """
     factor = rate_factor(config, position)
     waits = background_waits and position.stage is Stage.SDF_INIT and position.share < config.background_from
@@ -52,12 +61,16 @@ def set_rates(
 
 
 def seed_step(seed: int, step: int, rank: int = 0) -> None:
-    """Seed every random number of a step: what a step draws depends on these three numbers alone."""
+    """Seed the random number generator of torch for a step.
+
+    What a step draws depends only on the seed of the run, the number of the step, and the rank of the
+    process. So a resumed run draws the same numbers as one that was never interrupted.
+    """
     torch.manual_seed((seed * 1_000_003 + step) * 4_099 + rank)
 
 
 def gradient_norms(model: NeilfModel) -> dict[str, Tensor]:
-    """Length of the gradient of each field that has one."""
+    """L2 norm of the gradient of each field that has one."""
     norms = {}
     for name, parameters in model.parameter_groups().items():
         gradients = [p.grad for p in parameters if p.grad is not None]

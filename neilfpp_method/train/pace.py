@@ -1,4 +1,4 @@
-"""Keeps a training to its budget: now and then its steps are planned again by its own clock."""
+"""Keep a training within its time budget by planning its remaining steps again from measured times."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from neilfpp_method.train.run import rewrite_training
 __all__ = ["Pace", "with_steps"]
 
 EVERY = 0.02
-"""Of the budget between two looks at the clock."""
+"""Minimum time between two revisions of the plan, as a share of the budget."""
 SETTINGS = {
     Stage.SDF_INIT: "sdf_steps",
     Stage.MATERIAL_INIT: "material_steps",
     Stage.JOINT: "joint_steps",
 }
-"""What the settings of the loop call the steps of a stage."""
+"""Name of the setting that holds the number of steps of each stage."""
 
 
 def with_steps(config: TrainConfig, steps: Mapping[str, int]) -> TrainConfig:
-    """The settings of the loop with other numbers of steps; stages that are not named have none."""
+    """The settings with other numbers of steps; a stage that is not in `steps` gets none."""
     return replace(config, **{setting: steps.get(stage.value, 0) for stage, setting in SETTINGS.items()})
 
 
 @dataclass
 class Pace:
-    """Keeps a training to its plan, and the plan to the clock.
+    """Adapts the number of steps of a training to its time budget.
 
     Attributes:
-        plan: takes the revisions.
+        plan: the plan, to which revisions are added.
         ledger: the clock.
-        looked: seconds at the last look at it.
+        looked: time of the last revision, in seconds.
     """
 
     plan: BudgetPlan
@@ -45,12 +45,15 @@ class Pace:
     looked: float = 0.0
 
     def keep(self, config: TrainConfig, position: StagePosition, step: int) -> TrainConfig:
-        """The settings to go on with.
+        """Plan the remaining steps again if it is time to do so.
 
         Args:
-            config: what was planned so far.
-            position: how many steps of the stage are over, and how many it has.
-            step: how many steps have been trained.
+            config: the settings with the steps planned so far.
+            position: the stage, the number of its steps trained so far, and its length.
+            step: number of steps trained so far in all stages.
+
+        Returns:
+            The settings with the new steps; `config` itself if nothing has changed.
         """
         now = self.ledger.total
         if now - self.looked < EVERY * self.plan.budget or position.step >= position.length:
@@ -67,8 +70,6 @@ class Pace:
         return with_steps(config, steps)
 
     def save(self, run: Path, config: TrainConfig) -> None:
-        """The plan into the run's folder, and the steps of its stages into the settings there: all who load
-        the run find them as they are.
-        """
+        """Write the plan into the run folder, and the planned steps into the settings stored there."""
         rewrite_training(run, config)
         write_budget(run, self.plan)

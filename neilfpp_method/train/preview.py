@@ -1,4 +1,4 @@
-"""A picture at the end of a stage: the photograph, and beside it what the model makes of that view."""
+"""A preview picture at the end of each stage: a photograph next to the renderings of the same view."""
 
 from __future__ import annotations
 
@@ -19,19 +19,28 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.structures import RayBatch
 
-__all__ = ["write_preview"]
+__all__ = ["preview_pixels", "write_preview"]
 
 MAX_SIDE = 160
-"""Longest side of a panel."""
+"""Longest side of a panel, in pixels."""
 
 
 def write_preview(model: NeilfModel, capture: Capture, stage: Stage, path: Path) -> np.ndarray:
-    """Render the first test view (or training view) small, write it, and return the picture, (H, W, 3) uint8.
+    """Render a small preview of the first test view, or of the first training view if there is no test view.
 
-    Left to right: photograph, R, normals; with a material also PBR, base colour, roughness, metallic.
+    The panels from left to right are photograph, R and normals; in a stage that trains material also PBR
+    rendering, base colour, roughness and metallic.
+
+    Args:
+        model: the model, in evaluation mode.
+        capture: the capture.
+        stage: the stage that has just ended.
+        path: the PNG file to write.
+
+    Returns:
+        The picture, (H, W, 3) uint8.
     """
-    view = (capture.test_views or capture.train_views)[0]
-    view = scaled_view(view, min(1.0, MAX_SIDE / max(file_size(view))))
+    view = _small_view(capture)
     shape = (view.camera.height, view.camera.width, 3)
     panels = [_photograph(view, capture.hdr)]
     rays = camera_rays(capture.normalisation.camera(view.camera))
@@ -42,6 +51,17 @@ def write_preview(model: NeilfModel, capture: Capture, stage: Stage, path: Path)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_png(path, picture)
     return picture
+
+
+def preview_pixels(capture: Capture) -> int:
+    """How many pixels a panel of the picture has."""
+    camera = _small_view(capture).camera
+    return camera.width * camera.height
+
+
+def _small_view(capture: Capture) -> View:
+    view = (capture.test_views or capture.train_views)[0]
+    return scaled_view(view, min(1.0, MAX_SIDE / max(file_size(view))))
 
 
 def _photograph(view: View, hdr: bool) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What a person sees while a run trains: a bar per stage, TensorBoard, and a picture after each."""
+"""Progress output of a training: a progress bar per stage, console lines, and a TensorBoard log."""
 
 from __future__ import annotations
 
@@ -28,7 +28,14 @@ TITLES = {"sdf_init": "SDF init", "material_init": "material init", "joint": "jo
 
 @dataclass
 class Reporter:
-    """The bars and the log of one process; a process that reports nothing has neither."""
+    """Writes the progress of a training to the console and to TensorBoard.
+
+    Attributes:
+        console: the console.
+        progress: the progress bars; None in a process that prints nothing.
+        writer: the TensorBoard log; None in a process that writes none.
+        task: the progress bar of the current stage.
+    """
 
     console: Console
     progress: Progress | None
@@ -36,49 +43,49 @@ class Reporter:
     task: TaskID | None = None
 
     def begin_stage(self, stage: str, done: int, length: int) -> None:
-        """Open a bar for a stage, `done` of whose `length` steps are behind it."""
+        """Add a progress bar for a stage with `length` steps, of which `done` are already trained."""
         if self.progress is not None:
             self.task = self.progress.add_task(
                 TITLES[stage], total=length, completed=done, loss="–", psnr="–"
             )
 
     def lengthen(self, length: int) -> None:
-        """The stage has another number of steps than it began with."""
+        """Change the number of steps of the current stage."""
         if self.progress is not None and self.task is not None:
             self.progress.update(self.task, total=length)
 
     def step(self, loss: float, psnr: float) -> None:
-        """One step further; `psnr` is NaN where the step compared no pixel."""
+        """Advance the progress bar by a step; `psnr` is NaN if the step compared no pixel."""
         if self.progress is not None and self.task is not None:
-            shown = f"{psnr:.1f} dB" if math.isfinite(psnr) else "–"
-            self.progress.update(self.task, advance=1, loss=f"{loss:.4f}", psnr=shown)
+            decibels = f"{psnr:.1f} dB" if math.isfinite(psnr) else "–"
+            self.progress.update(self.task, advance=1, loss=f"{loss:.4f}", psnr=decibels)
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
-        """Values for TensorBoard, where they are finite."""
+        """Log the finite ones of some values to TensorBoard."""
         if self.writer is not None:
             for name, value in values.items():
                 if math.isfinite(value):
                     self.writer.add_scalar(name, value, step)
 
     def picture(self, step: int, name: str, pixels: np.ndarray) -> None:
-        """A picture (H, W, 3) uint8 for TensorBoard."""
+        """Log a picture, (H, W, 3) uint8, to TensorBoard."""
         if self.writer is not None:
             self.writer.add_image(name, pixels, step, dataformats="HWC")
 
     def say(self, text: str) -> None:
-        """A line for the person, above the bars, of something that is as it should be."""
+        """Print a line of information above the progress bars."""
         if self.progress is not None:
             self.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
     def warn(self, text: str) -> None:
-        """A line for the person, above the bars."""
+        """Print a warning above the progress bars."""
         if self.progress is not None:
             self.console.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)
 
 
 @contextmanager
 def reporting(run: Path, console: Console, first_process: bool) -> Iterator[Reporter]:
-    """Bars and log for the first process of a run; silence for the others."""
+    """A reporter with progress bars and a log in the first process of a run, and a silent one in others."""
     if not first_process:
         yield Reporter(console, None, None)
         return
@@ -98,7 +105,7 @@ def reporting(run: Path, console: Console, first_process: bool) -> Iterator[Repo
         with progress:
             yield Reporter(console, progress, writer)
     finally:
-        with suppress(
-            OSError
-        ):  # A disk that is full ends the run by what could not be saved, not by its log.
+        # If the disk is full, the error is reported when a checkpoint cannot be saved; the log must not hide
+        # it with an error of its own.
+        with suppress(OSError):
             writer.close()

@@ -1,10 +1,10 @@
-"""How good a training is while it runs, by pixels that no step learns from (`data.held_back`): the record
-`RUN/quality.json`.
+"""Measure the quality of a training while it runs, at held-back pixels (`data.held_back`).
 
-A look renders them as evaluation renders test views, so its PSNR is that of `volume_psnr` and `pbr_psnr`:
-clipped, encoded as sRGB. A look follows every tenth of a stage, `MIN_STEPS` steps after the last one at
-least, and each stage ends with one. Looks that took more than `MAX_SHARE` of the run so far wait, but for
-those at the ends of stages.
+The pixels are rendered as evaluation renders test views, so the PSNR is that of `volume_psnr` and `pbr_psnr`:
+clipped and encoded as sRGB. A measurement (a "look") is made after every tenth of a stage but at least
+`MIN_STEPS` steps after the previous one, and at the end of each stage. Looks within a stage are postponed
+while all looks together have taken more than `MAX_SHARE` of the time of the run. The record is
+`RUN/quality.json`.
 """
 
 from __future__ import annotations
@@ -33,23 +33,24 @@ __all__ = ["FILE", "Look", "Quality", "has_looks", "read_looks", "write_looks"]
 FORMAT = 1
 FILE = "quality.json"
 LOOKS_OF_STAGE = 10
+"""Number of measurements per stage."""
 MIN_STEPS = 200
-"""Steps between two looks of a stage, at least: a look is about as much work as a step."""
+"""Minimum number of steps between two measurements in a stage; each costs about as much as a step."""
 MAX_SHARE = 0.015
-"""Of the time of a run that looks within stages take at most."""
+"""Share of the time of the run above which measurements within a stage are postponed."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """What held-back pixels showed.
+    """A measurement at the held-back pixels.
 
     Attributes:
-        step: how many steps had been trained.
-        stage: the one that these ended in.
-        seconds: of the whole run, at the look.
+        step: number of steps trained so far.
+        stage: the current stage.
+        seconds: time of the run so far.
         radiance: PSNR of R, dB.
-        physical: PSNR of the rendering equation, dB; none before there is a material.
-        took: seconds.
+        physical: PSNR of the PBR rendering, dB; None before there is a material.
+        took: time of the measurement, in seconds.
     """
 
     step: int
@@ -62,11 +63,12 @@ class Look:
 
 @dataclass
 class Quality:
-    """The looks of a training so far.
+    """The measurements of a training so far.
 
     Attributes:
-        pixels: that are held back; where a capture is too small for any, nothing is looked at.
-        hdr: whether they are linear radiance; else display values.
+        pixels: the held-back pixels; if the capture is too small to hold any back, nothing is measured.
+        hdr: whether the pixels are linear radiance rather than display values.
+        looks: the measurements in order.
     """
 
     pixels: PixelBatch
@@ -74,13 +76,13 @@ class Quality:
     looks: list[Look] = field(default_factory=list)
 
     def look_when_due(self, model: NeilfModel, position: StagePosition, step: int, seconds: float) -> None:
-        """Look, if it is time.
+        """Measure the quality if a measurement is due.
 
         Args:
-            model: comes back in the mode that it is in.
-            position: how many steps of the stage are over, and how many it has.
-            step: how many steps have been trained.
-            seconds: of the whole run.
+            model: the model; its training mode is left unchanged.
+            position: the stage, the number of its steps trained so far, and its length.
+            step: number of steps trained so far in all stages.
+            seconds: time of the run so far.
         """
         if not len(self.pixels) or not self._due(position, step, seconds):
             return
@@ -89,8 +91,9 @@ class Quality:
             model, self.pixels, model.stages[position.stage].moves_material, self.hdr
         )
         took = time.perf_counter() - began
+        # A model that is not finite is reported by `health`.
         if not all(map(math.isfinite, (radiance, physical or 0.0))):
-            return  # health says what is wrong with such a model
+            return
         self.looks.append(Look(step, position.stage.value, seconds, radiance, physical, took))
 
     def _due(self, position: StagePosition, step: int, seconds: float) -> bool:
@@ -106,6 +109,7 @@ class Quality:
 def _decibels(
     model: NeilfModel, pixels: PixelBatch, with_material: bool, hdr: bool
 ) -> tuple[float, float | None]:
+    """PSNR of R, and of the PBR rendering if there is a material."""
     mode = model.training
     model.eval()
     maps = model.maps(pixels.rays, with_material)
@@ -115,26 +119,33 @@ def _decibels(
     return _psnr(tone_map(maps.rgb_volume), photograph), physical
 
 
-def _psnr(shown: Float[Tensor, "N 3"], photograph: Float[Tensor, "N 3"]) -> float:
-    return -10.0 * math.log10(max(float((shown - photograph).square().mean()), 1e-10))
+def _psnr(rendered: Float[Tensor, "N 3"], photograph: Float[Tensor, "N 3"]) -> float:
+    return -10.0 * math.log10(max(float((rendered - photograph).square().mean()), 1e-10))
 
 
 def write_looks(run: Path, quality: Quality) -> None:
-    """The looks so far, and how many pixels they are of."""
+    """Write the measurements so far, and the number of held-back pixels, into the run folder."""
     looks = [dataclasses.asdict(look) for look in quality.looks]
     write_json(run / FILE, {"format": FORMAT, "pixels": len(quality.pixels), "looks": looks})
 
 
 def has_looks(run: Path) -> bool:
-    """Whether a run holds pixels back."""
+    """Whether a run has a record of held-back pixels."""
     return (run / FILE).exists()
 
 
 def read_looks(run: Path, before: int | None = None) -> Sequence[Look]:
-    """The looks of a run at its first `before` steps; none: all. Empty where the run has no record.
+    """Read the measurements of a run.
+
+    Args:
+        run: the run folder.
+        before: number of steps up to which measurements are wanted; None for all.
+
+    Returns:
+        The measurements; empty if the run has no record.
 
     Raises:
-        UserError: the file is damaged or of another version.
+        UserError: if the file is damaged or of another version.
     """
     path = run / FILE
     if not path.is_file():
@@ -146,7 +157,8 @@ def read_looks(run: Path, before: int | None = None) -> Sequence[Look]:
         )
     try:
         looks = [from_dict(Look, look, str(path)) for look in stored["looks"]]
-    except (TypeError, AttributeError) as error:  # Something that must be there is missing, or is no object.
+    except (TypeError, AttributeError) as error:
+        # A key is missing, or a value is not an object.
         raise UserError(
             f"{path}: not a complete record ({error})", "remove the file, or train again"
         ) from error

@@ -1,4 +1,4 @@
-"""The pixels of a capture's training views, read by one process for all."""
+"""Read the pixels of the training views, in one process for all processes of a training."""
 
 from __future__ import annotations
 
@@ -18,7 +18,11 @@ __all__ = ["load_pixels"]
 
 @doing("data", apart=True)
 def load_pixels(capture: Capture, folder: Path, fabric: Fabric, console: Console) -> PixelDataset:
-    """One process reads the images, all find them in the folder; an error in them ends all of them."""
+    """Read the training pixels into a folder in the first process, and open them there in all processes.
+
+    Raises:
+        UserError: in all processes, if an image cannot be read.
+    """
     problem: tuple[str, str] | None = None
     if fabric.is_global_zero:
         try:

@@ -1,4 +1,4 @@
-"""A skipped step, run again from its own rays and weights, to see what in it is not finite."""
+"""Run a skipped step again from its stored rays and weights, to find what in it is not finite."""
 
 from __future__ import annotations
 
@@ -22,19 +22,20 @@ from neilfpp_method.train.skipped import SkippedStep, load_step
 __all__ = ["Rerun", "in_words", "rerun_step"]
 
 ROWS_SHOWN = 8
+"""Maximum number of rays that the report of a step lists."""
 
 
 @dataclass(frozen=True)
 class Rerun:
-    """What a step showed when it was run again.
+    """The result of running a skipped step again.
 
     Attributes:
         skipped: the step.
-        inputs: names of weights and parts of the batch that are not finite before anything is computed.
+        inputs: names of the weights and parts of the batch that are not finite before the step.
         losses: names of the losses that are not finite.
         gradients: names of the fields whose gradient is not finite.
-        origin: the first operation that is not finite and comes to bear on one of these; none: all is finite,
-            or it was not an operation of torch.
+        origin: the first operation whose non-finite result reaches one of these; None if everything is
+            finite, or if the values do not come from a torch operation.
     """
 
     skipped: SkippedStep
@@ -45,15 +46,15 @@ class Rerun:
 
     @property
     def finite(self) -> bool:
-        """Whether nothing was wrong this time."""
+        """Whether everything is finite this time."""
         return not (self.inputs or self.losses or self.gradients)
 
 
 def rerun_step(run: Path, step: int) -> Rerun:
-    """Run a skipped step again, on the CPU, with the random numbers that it had there.
+    """Run a skipped step again on the CPU, with the same random numbers.
 
     Raises:
-        UserError: no run there, or no such step is kept in it.
+        UserError: if the folder is no run, or if it has not stored this step.
     """
     described, skipped = read_description(run), load_step(run, step)
     plan = read_plan(run, described.config, step)
@@ -69,7 +70,7 @@ def rerun_step(run: Path, step: int) -> Rerun:
 def _computed(model: NeilfModel, skipped: SkippedStep) -> Rerun:
     inputs = tuple(_broken_inputs(model, skipped.batch))
     weights = active_losses(skipped.stage, model.config, model.stages, skipped.share)
-    # Anomaly mode notes, for each derivative, which line its operation was on.
+    # Anomaly mode stores with each derivative the source line of its forward operation.
     with anomaly_mode.set_detect_anomaly(True, check_nan=False), OriginsOfNotFinite() as origins:
         terms = model.step(skipped.batch, skipped.stage).terms
         total = weigh(terms, weights)
@@ -88,22 +89,23 @@ def _computed(model: NeilfModel, skipped: SkippedStep) -> Rerun:
 
 
 def _broken_inputs(model: NeilfModel, batch: PixelBatch) -> Iterator[str]:
+    """Names of the parameters and parts of the batch that are not finite."""
     yield from (name for name, p in model.named_parameters() if not is_finite(p))
     yield from (f.name for f in fields(batch) if not is_finite(getattr(batch, f.name)))
 
 
 def in_words(rerun: Rerun) -> str:
-    """What was found, a few lines."""
+    """A report of a few lines for the console."""
     skipped, origin = rerun.skipped, rerun.origin
     lines = [f"step {skipped.step}, stage {skipped.stage.value}, {len(skipped.batch)} rays"]
     if rerun.finite:
-        lines.append("every loss and gradient is finite now: another process or device computed what was not")
+        lines.append("every loss and gradient is finite now; the values came from another process or device")
         return "\n".join(lines)
-    parts = {"not finite from the start": rerun.inputs, "losses": rerun.losses, "gradients": rerun.gradients}
-    lines += [f"{what}: {', '.join(names)}" for what, names in parts.items() if names]
+    parts = {"inputs": rerun.inputs, "losses": rerun.losses, "gradients": rerun.gradients}
+    lines += [f"{what} that are not finite: {', '.join(names)}" for what, names in parts.items() if names]
     if origin is None:
         lines.append(
-            "first operation: none of torch's; the value came into the step as it is, or from a compiled loop"
+            "first operation: not a torch operation; the values are in the inputs or from a compiled loop"
         )
         return "\n".join(lines)
     derivative = f", in the derivative of {origin.derivative_of}" if origin.derivative_of else ""
@@ -114,6 +116,6 @@ def in_words(rerun: Rerun) -> str:
     if origin.length == len(skipped.batch):
         views = skipped.batch.view[list(origin.rows[:ROWS_SHOWN])].tolist()
         more = " …" if len(origin.rows) > ROWS_SHOWN else ""
-        told = ", ".join(f"{row} (training view {v})" for row, v in zip(origin.rows, views, strict=False))
-        lines.append(f"rays: {told}{more}")
+        rays = ", ".join(f"{row} (training view {v})" for row, v in zip(origin.rows, views, strict=False))
+        lines.append(f"rays: {rays}{more}")
     return "\n".join(lines)

@@ -1,16 +1,21 @@
-"""A run folder: everything that made a result, and the result.
+"""A run folder: the result of a training and everything that is needed to reproduce it.
 
-config.json       every setting               environment.json  versions, hardware, command
-capture.json      where the images are        timing.json       seconds of each stage
-scene.json        what the images decided     checkpoints/      last.pt, and one at the end of each stage
-previews/         a picture per stage         tensorboard/      scalars and pictures
-pixels/           of the training views; can be deleted, and is made again when training goes on
-work.json         seconds of each stage by kind of work (docs/budget.md)
-quality.json      how good the run was on the way, at pixels that no step learned from
-plan.json         what was planned for a budget, and how the clock changed it; not there without --budget
-effects.json      which effects are simulated, and why
-light.json        what spoke for lamps, fit by fit; not there where the settings had decided
-skipped/          steps that were not finite, for `neilfpp replay`; not there where none was
+- `config.json`: all settings;
+- `capture.json`: location of the capture and how it is read;
+- `scene.json`: facts that were measured in the images before training;
+- `environment.json`: versions, hardware, command line;
+- `checkpoints/`: `last.pt`, and one checkpoint at the end of each stage;
+- `previews/`: a picture per stage;
+- `tensorboard/`: scalars and pictures;
+- `pixels/`: pixels of the training views; it can be deleted and is created again when training continues;
+- `timing.json`: seconds of each stage;
+- `work.json`: seconds of each stage by kind of work (docs/budget.md);
+- `quality.json`: PSNR of held-back pixels during training;
+- `health.json`: findings of the health checks (docs/health.md);
+- `effects.json`: the simulated effects and the reasons (docs/effects.md);
+- `light.json`: evidence for lamps at each fit of the light; missing if the settings decide;
+- `plan.json`: the plan of a run with `--budget`, and its revisions;
+- `skipped/`: steps that were not finite, for `neilfpp replay`; missing if there were none.
 """
 
 from __future__ import annotations
@@ -42,6 +47,7 @@ from neilfpp_method.train.build import build_model
 from neilfpp_method.train.effects_record import read_plan
 from neilfpp_method.train.json_files import read_json, write_json
 from neilfpp_method.train.lock import LOCK
+from neilfpp_method.train.output import check_folder
 
 __all__ = [
     "BESIDE_NERFSTUDIO",
@@ -49,11 +55,8 @@ __all__ = [
     "CaptureSource",
     "Description",
     "Run",
-    "check_folder",
     "check_free",
-    "check_writable",
     "create_run",
-    "default_folder",
     "load_checkpoint",
     "load_run",
     "load_weights",
@@ -66,14 +69,15 @@ __all__ = [
 ]
 
 FORMAT = 2
+"""Version of the layout of a run folder and of its checkpoints."""
 BESIDE_NERFSTUDIO = "neilfpp"
-"""Folder beside nerfstudio's `config.yml` in which the plugin keeps a training as a run."""
+"""Name of the run folder that the plugin writes next to nerfstudio's `config.yml`."""
 PIXELS = "pixels"
-"""Folder of a run in which the pixels of its training views are kept."""
+"""Folder within a run for the pixels of its training views."""
 DESCRIBING = ("capture.json", "scene.json", "environment.json")
-"""What is written before `config.json`, which makes a folder a run."""
+"""Files that are written before `config.json`; a folder is a run once it contains `config.json`."""
 HALF_WRITTEN = re.compile(r"\.(capture|scene|environment|config)\.[0-9]+\.json")
-"""What `replacing` calls them while they are written."""
+"""Temporary names of these files while `replacing` writes them."""
 PACKAGES = (
     "neilfpp-method",
     "torch",
@@ -84,12 +88,22 @@ PACKAGES = (
     "trimesh",
     "scikit-image",
 )
+"""Packages whose versions are recorded."""
 CHECKPOINT_KEYS = {"format", "step", "model", "light_solver", "optimizer"}
+"""Keys of a checkpoint."""
 
 
 @dataclass(frozen=True)
 class CaptureSource:
-    """How the capture of a run is read again."""
+    """Location of a capture and the options with which it is read.
+
+    Attributes:
+        root: folder of the capture.
+        test_every: every how many views one is held out; None for the default of the format.
+        response: "linear", "srgb", or "auto" for what the files say.
+        format: format of the capture; None to recognise it from the files.
+        scale: size of the images relative to their files.
+    """
 
     root: str
     test_every: int | None = None
@@ -98,22 +112,21 @@ class CaptureSource:
     scale: float = 1.0
 
     def load(self) -> Capture:
-        """The capture, its views at `scale` times the size of their files."""
+        """Load the capture, with views of `scale` times the size of their files."""
         return at_scale(
             load_capture(Path(self.root), self.format, self.test_every, response=self.response), self.scale
         )
 
     def load_again(self, run: Path) -> Capture:
-        """The capture of a run that is there already.
+        """Load the capture of an existing run.
 
         Raises:
-            UserError: the capture has moved, or cannot be read any more.
+            UserError: if the capture has been moved or is unreadable.
         """
         if not Path(self.root).is_dir():
-            place = run / "capture.json"
             raise UserError(
                 f"{self.root}: the run's capture is not there",
-                f"move it back, or give its new place in {place}",
+                f"move it back, or set its new location in {run / 'capture.json'}",
             )
         return self.load()
 
@@ -124,15 +137,14 @@ class Run:
 
     Attributes:
         path: the run folder.
-        config: every setting that it was trained with, the effects as they were decided last.
-        capture: the images that it was trained on, with their cameras in the world frame;
-            `capture.normalisation` leads from there to the scene frame, in which all fields of the model
-            live.
-        facts: what the images decided before training, such as the unit of radiance and the background.
-        model: in evaluation mode, with the weights of step `step`. `model.materials(x)`,
-            `model.incident_light(x, wi)` and `model.maps(rays)` answer for points and rays in the scene
-            frame.
-        step: how many steps of training the weights have seen.
+        config: all settings of the training, with the decisions on effects applied.
+        capture: the capture, with cameras in the world frame. `capture.normalisation` converts to the scene
+            frame, in which all fields of the model are defined.
+        facts: facts that were measured in the images before training, such as the unit of radiance and the
+            kind of background.
+        model: the model in evaluation mode, with the weights after `step` steps. `model.materials(x)`,
+            `model.incident_light(x, wi)` and `model.maps(rays)` take points and rays in the scene frame.
+        step: number of training steps of these weights.
 
     Example:
         >>> run = load_run("runs/teapot")                                              # doctest: +SKIP
@@ -150,15 +162,15 @@ class Run:
 
     @property
     def has_material(self) -> bool:
-        """Whether a step has moved the material and the light; before that they are what they start as."""
+        """Whether material and light have been trained; before that they have their initial values."""
         return has_material(self.step, self.config.train)
 
 
 def run_folder(path: Path) -> Path:
-    """The run folder that a person means: the folder itself, or the one beside nerfstudio's `config.yml`.
+    """The run folder for a path: the path itself or, for nerfstudio's `config.yml`, the folder next to it.
 
     Raises:
-        UserError: there is none beside that file.
+        UserError: if there is no run folder next to that file.
     """
     if path.suffix != ".yml":
         return path
@@ -166,22 +178,19 @@ def run_folder(path: Path) -> Path:
     if not (folder / "config.json").is_file():
         raise UserError(
             f"{path}: no run folder {BESIDE_NERFSTUDIO}/ beside it",
-            "it is there once `ns-train neilfpp` has saved, on hosts of this package (docs/nerfstudio.md)",
+            "`ns-train neilfpp` writes it with the first checkpoint, for hosts of this package "
+            "(docs/nerfstudio.md)",
         )
     return folder
 
 
-def default_folder(data: Path, config: NeilfConfig) -> Path:
-    """The folder of a new run without --out: runs/CAPTURE-PRESET."""
-    return Path("runs") / f"{data.resolve().name}-{config.preset}"
-
-
 def check_free(path: Path) -> None:
-    """That a new run may take this folder.
+    """Check that a new run can be created in this folder.
+
+    Files that a training left behind when it was killed before the run existed are ignored.
 
     Raises:
-        UserError: the folder is there already and holds more than a training that never began left there, or
-            cannot be made.
+        UserError: if the folder contains other files, or cannot be created.
     """
     if path.exists() and (not path.is_dir() or any(not _of_no_run(inner.name) for inner in path.iterdir())):
         raise UserError(f"{path}: exists already", "choose another --out, or continue it with --resume")
@@ -189,41 +198,19 @@ def check_free(path: Path) -> None:
 
 
 def _of_no_run(name: str) -> bool:
-    """Whether a file is left over from a training that was killed before it was a run."""
+    """Whether a file is left over from a training that was killed before the run existed."""
     return name in (PIXELS, LOCK, *DESCRIBING) or bool(HALF_WRITTEN.fullmatch(name))
 
 
-def check_writable(path: Path) -> None:
-    """Raise a UserError if a file cannot be written here. Its folder need not exist."""
-    if path.is_dir():
-        raise UserError(f"{path}: is a folder", "name a file with --out")
-    _check_above(path, path)
-
-
-def check_folder(path: Path) -> None:
-    """Raise a UserError if files cannot be written into this folder. It need not exist."""
-    if path.exists() and not path.is_dir():
-        raise UserError(f"{path}: is a file", "name a folder with --out")
-    _check_above(path / "file", path)
-
-
-def _check_above(path: Path, named: Path) -> None:
-    above = next(folder for folder in path.absolute().parents if folder.exists())
-    if not above.is_dir() or not os.access(above, os.W_OK):
-        raise UserError(
-            f"{named}: cannot be written, for nothing can be made in {above}", "choose another --out"
-        )
-
-
 def create_run(path: Path, config: NeilfConfig, source: CaptureSource, facts: SceneFacts) -> None:
-    """Write the description of a new run, whole or not at all, into a folder that is missing or empty."""
+    """Write the description of a new run into a missing or empty folder; on failure, write nothing."""
     check_free(path)
     path.mkdir(parents=True, exist_ok=True)
     description = {
         "capture.json": dataclasses.asdict(source),
         "scene.json": dataclasses.asdict(facts),
         "environment.json": environment(),
-        # The settings come last: a folder that has them is a run.
+        # The settings are written last, because a folder that contains them is a run.
         "config.json": {"format": FORMAT, "config": to_dict(config)},
     }
     try:
@@ -236,22 +223,22 @@ def create_run(path: Path, config: NeilfConfig, source: CaptureSource, facts: Sc
 
 
 def rewrite_training(path: Path, config: TrainConfig) -> None:
-    """The settings of the loop of a run that is there already, where its steps are planned anew."""
+    """Replace the stored training settings of a run, after its steps have been planned again."""
     stored = read_json(path / "config.json")
     stored["config"]["train"] = to_dict(config)
     write_json(path / "config.json", stored)
 
 
 def load_run(path: Path | str, device: torch.device | str = "cpu", checkpoint: str = "last") -> Run:
-    """A run from its folder.
+    """Load a run from its folder.
 
     Args:
         path: the run folder.
-        device: where the model goes.
+        device: device of the model.
         checkpoint: "last", or the name of a stage for the weights at its end.
 
     Raises:
-        UserError: no run there, one of another version, or one without the checkpoint.
+        UserError: if the folder is no run, or a run of another version or without this checkpoint.
     """
     path = Path(path)
     described = read_description(path)
@@ -266,7 +253,7 @@ def load_run(path: Path | str, device: torch.device | str = "cpu", checkpoint: s
 
 @dataclass(frozen=True)
 class Description:
-    """What a run was made of."""
+    """The settings, the capture and the measured facts of a run."""
 
     config: NeilfConfig
     source: CaptureSource
@@ -274,10 +261,10 @@ class Description:
 
 
 def read_description(path: Path) -> Description:
-    """The settings, the capture's whereabouts and the scene facts of a run folder.
+    """Read the description of a run.
 
     Raises:
-        UserError: no run there, or one of another version.
+        UserError: if the folder is no run, or a run of another version.
     """
     if not (path / "config.json").is_file():
         raise UserError(
@@ -303,7 +290,8 @@ Part = TypeVar("Part")
 def _described(kind: type[Part], values: Any, where: str) -> Part:
     try:
         return from_dict(kind, values, where)
-    except (TypeError, AttributeError) as error:  # Something that must be there is missing, or is no object.
+    except (TypeError, AttributeError) as error:
+        # A key is missing, or a value is not an object.
         raise UserError(
             f"{where}: not a complete description ({error})", "restore the file or train again"
         ) from error
@@ -315,29 +303,31 @@ def _described(kind: type[Part], values: Any, where: str) -> Part:
 def save_checkpoint(
     path: Path, model: nn.Module, light_solver: nn.Module, optimizer: torch.optim.Optimizer, step: int
 ) -> None:
-    """Weights, solver memory and optimiser after `step` steps, written atomically."""
+    """Write the state of model, light solver and optimizer after `step` steps, atomically."""
     parts = {"model": model, "light_solver": light_solver, "optimizer": optimizer}
     contents = {"format": FORMAT, "step": step, **{name: part.state_dict() for name, part in parts.items()}}
     with replacing(path) as temporary, temporary.open("wb") as file:
         try:
             torch.save(contents, file)
         except RuntimeError as error:
-            if isinstance(error.__context__, OSError):  # a full disk, of which torch tells what followed
+            # If the disk is full, torch raises an error that hides the original one.
+            if isinstance(error.__context__, OSError):
                 raise error.__context__ from None
             raise
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """A checkpoint's contents; a file that holds more than tensors and plain values is refused.
+    """Read a checkpoint. A file that contains anything but tensors and plain values is rejected.
 
     Raises:
-        UserError: missing, unreadable, or of another version.
+        UserError: if the file is missing, unreadable, or of another version.
     """
     if not path.is_file():
         raise UserError(f"{path}: no checkpoint", "train the run first, or continue it with --resume")
     try:
         contents = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # A damaged or forged file can fail anywhere in the unpickler.
+    except Exception as error:
+        # A damaged or forged file can raise any exception in the unpickler.
         remedy = "copy a stage's checkpoint over it, or train again"
         raise UserError(f"{path}: not a readable checkpoint", remedy) from error
     if not isinstance(contents, dict) or contents.get("format") != FORMAT or CHECKPOINT_KEYS - set(contents):
@@ -348,10 +338,10 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def load_weights(module: nn.Module, weights: Mapping[str, Any], run: Path) -> None:
-    """Put weights of a checkpoint into the model, or the light solver, that the settings of its run describe.
+    """Load weights of a checkpoint into a model or a light solver.
 
     Raises:
-        UserError: they do not fit.
+        UserError: if they do not fit, because the settings of the run have been changed.
     """
     try:
         module.load_state_dict(weights)
@@ -366,7 +356,7 @@ def load_weights(module: nn.Module, weights: Mapping[str, Any], run: Path) -> No
 
 
 def environment() -> dict[str, Any]:
-    """Versions and hardware, so that a figure can be traced."""
+    """Command line, versions and hardware, for the record of a run."""
     versions = {}
     for package in PACKAGES:
         try:
@@ -387,6 +377,7 @@ def environment() -> dict[str, Any]:
 
 
 def _processor() -> str:
+    """Model name of the processor."""
     information = Path("/proc/cpuinfo")
     if information.is_file():
         for line in information.read_text().splitlines():

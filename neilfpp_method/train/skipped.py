@@ -1,6 +1,4 @@
-"""Steps that were skipped because they were not finite, in `RUN/skipped/STEP.pt`: all that it takes to run
-one of them again.
-"""
+"""Store skipped steps, which were not finite, in `RUN/skipped/STEP.pt`, so that they can be run again."""
 
 from __future__ import annotations
 
@@ -22,18 +20,24 @@ __all__ = ["FOLDER", "Moment", "SkippedStep", "keep_step", "load_step"]
 
 FOLDER = "skipped"
 MAX_KEPT = 4
-"""Steps of a run that are kept, the first ones: a file is as large as the model, and later faults are
-mostly the first one again.
+"""Maximum number of stored steps of a run, the first ones. A file is as large as the model, and later steps
+mostly fail for the same reason as the first.
 """
 FORMAT = 1
+"""Version of the layout of a file."""
 KEYS = {"format", "step", "stage", "share", "batch", "model", "random"}
+"""Keys of a file."""
 
 
 @dataclass(frozen=True)
 class Moment:
-    """What a step begins with: its pixels, where in its stage it is, the state of the random numbers, and the
-    surface points that are remembered, which it changes. The weights are changed at its end alone, and not by
-    a step that is skipped.
+    """The state before a training step, apart from the weights, which a skipped step does not change.
+
+    Attributes:
+        batch: the pixels of the step.
+        position: the stage and the position within it.
+        random: state of torch's random number generator on the CPU.
+        remembered: state of the replay buffer (`lighting.replay`), which the step changes.
     """
 
     batch: PixelBatch
@@ -43,8 +47,9 @@ class Moment:
 
     @staticmethod
     def before_step(model: NeilfModel, batch: PixelBatch, position: StagePosition) -> Moment:
-        """The moment after the pixels of a step are drawn. Where the step shades points of earlier ones too,
-        these are copied, some hundred kilobytes.
+        """Record the state after the pixels of a step are drawn.
+
+        The replay buffer, some hundred kilobytes, is copied if the step uses it.
         """
         remembered = {}
         if not model.stages[position.stage].moves_host:
@@ -58,12 +63,12 @@ class SkippedStep:
     """A step to run again.
 
     Attributes:
-        step: its number in the training.
+        step: number of the step.
         stage: its stage.
-        share: of the stage that was done.
+        share: share of the stage that was trained before it.
         batch: its pixels and their rays.
-        model: the weights that it was computed with, as `NeilfModel.load_state_dict` takes them.
-        random: the state of torch's random numbers on the CPU after the pixels were drawn.
+        model: the weights of the model, as `NeilfModel.load_state_dict` takes them.
+        random: state of torch's random number generator on the CPU after the pixels were drawn.
     """
 
     step: int
@@ -75,10 +80,13 @@ class SkippedStep:
 
 
 def keep_step(run: Path, model: NeilfModel, moment: Moment, step: int) -> Path | None:
-    """Write a step down, unless enough of them are kept already; returns the file.
+    """Store a step unless `MAX_KEPT` steps are stored already.
+
+    Returns:
+        The file; None if the step is not stored.
 
     Raises:
-        UserError: it cannot be written.
+        UserError: if the file cannot be written.
     """
     folder = run / FOLDER
     if folder.is_dir() and len(list(folder.glob("*.pt"))) >= MAX_KEPT:
@@ -99,20 +107,24 @@ def keep_step(run: Path, model: NeilfModel, moment: Moment, step: int) -> Path |
 
 
 def load_step(run: Path, step: int) -> SkippedStep:
-    """A step that a run has skipped and kept.
+    """Read a stored step of a run.
 
     Raises:
-        UserError: it is not there, damaged, or of another version.
+        UserError: if the file is missing, damaged, or of another version.
     """
     path = run / FOLDER / f"{step}.pt"
     if not path.is_file():
         kept = sorted(int(file.stem) for file in (run / FOLDER).glob("*.pt") if file.stem.isdecimal())
-        told = f"it has {', '.join(map(str, kept))}" if kept else "it has none: nothing was skipped"
-        raise UserError(f"{run}: no skipped step {step} is kept", f"{told} (the first {MAX_KEPT} are kept)")
+        if kept:
+            remedy = f"choose one of {', '.join(map(str, kept))} (the first {MAX_KEPT} are stored)"
+        else:
+            remedy = "the run has skipped no step, so there is nothing to replay"
+        raise UserError(f"{run}: step {step} is not a stored skipped step", remedy)
     try:
         stored = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # A damaged or forged file can fail anywhere in the unpickler.
-        raise UserError(f"{path}: not a step that can be read", "train again") from error
+    except Exception as error:
+        # A damaged or forged file can raise any exception in the unpickler.
+        raise UserError(f"{path}: not a readable step", "train again") from error
     if not isinstance(stored, dict) or stored.get("format") != FORMAT or KEYS - set(stored):
         raise UserError(f"{path}: a step of another version", "use the version of neilfpp that wrote it")
     try:

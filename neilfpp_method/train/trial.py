@@ -1,19 +1,16 @@
-"""What a training costs on this machine and this capture: a few steps of each stage, measured and thrown
-away.
+"""Measure the costs of a training on this machine and capture, with a few steps of each stage.
 
-A trial trains a model of its own on four views, with a few steps of each stage and two small fits of the
-light, and makes small pictures. What it cannot try in seconds is estimated from that: the report, from the
-pictures. Geometry that is still a sphere, or a hull, costs other than a finished one; so a plan is made again
-by the clock (`budget.plan`).
+A trial trains a separate model on four views for a few steps of each stage and two small fits of the light,
+and renders small previews. The time of the report, which would take too long, is estimated from that of a
+preview. The costs change during training, because a sphere or a hull is rendered at another speed than the
+final geometry; the plan is therefore revised from measured times (`budget.plan`).
 """
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import torch
 
@@ -22,7 +19,14 @@ from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import PIXELS_OF_A_VIEW, at_scale, scale_for_pixels
 from neilfpp_method.effects.asked import Asked
-from neilfpp_method.effects.looks import look_at_surface, note_facts
+from neilfpp_method.effects.first_light import seconds_of_pixel
+from neilfpp_method.effects.looks import (
+    FEWEST_PIXELS,
+    MIN_PHOTOGRAPHS,
+    MOST_PIXELS,
+    look_at_surface,
+    note_facts,
+)
 from neilfpp_method.effects.material import JUDGED, seconds_of_evidence
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.health.look import look
@@ -34,39 +38,58 @@ from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.optimizer import make_optimizer, seed_step, set_rates
-from neilfpp_method.train.preview import write_preview
+from neilfpp_method.train.preview import preview_pixels
 
 __all__ = ["Trial", "try_out"]
 
 VIEWS = 4
-"""Training views that a trial reads."""
-WARM_STEPS, MIN_STEPS, MAX_STEPS = 2, 4, 40
-"""Steps of a stage that are not counted, as they compile and allocate; and how many are counted."""
-FIT_EVERY, FIT_PART = 2, 8
-"""Steps between the fits of a trial, and one in how many points they have: a whole first fit takes as long as
-a hundred steps. Time and points are taken to be proportional.
+"""Number of training views that a trial reads."""
+WARM_STEPS = 2
+"""Steps of a stage that are not timed, because they compile and allocate."""
+MIN_STEPS = 4
+"""Minimum number of timed steps of a stage."""
+MAX_STEPS = 40
+"""Maximum number of timed steps of a stage."""
+FIT_EVERY = 2
+"""Steps between two fits of the light in a trial."""
+FIT_PART = 8
+"""A fit of a trial uses one in this many points, because a full first fit takes as long as a hundred steps.
+The time of a fit is assumed to be proportional to the number of points.
 """
+LOOSE = 1e-3
+"""Minimum concentration of a hit in a trial. The density of an untrained field is spread out, so with the
+value of the settings no point would be shaded and no light fitted.
+"""
+WARM_RAYS = 32
+"""Rays that are rendered first, which includes work that a picture needs once."""
+PICTURE_RAYS = 1024
+"""Rays from whose time that of a preview is estimated."""
 REPORT = 12.0
-"""Time of the report over that of a picture, which has an eighth of the pixels of the report's views; the
-rest is for its surface. An estimate, not measured.
+"""Time of the report as a multiple of that of a preview (estimate). A preview has an eighth of the pixels of
+the report's views; the rest is for the surface of the report.
 """
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What was measured.
+    """The result of a trial.
 
     Attributes:
-        costs: of a training.
-        places: of them, those of looks at places; 0 where there are none.
+        costs: costs of the training.
+        places: time of the measurements at places within these costs, in seconds; 0 if there are none.
+        light_pixels: number of pixels for which the search of the initial light has time; 0 if there is no
+            time for it; None if the training does not search.
     """
 
     costs: Costs
     places: float
+    light_pixels: int | None
 
 
 @dataclass
 class _Seconds:
+    """Times of the steps and of the fits of a stage."""
+
     steps: list[float] = field(default_factory=list)
     fits: list[float] = field(default_factory=list)
 
@@ -78,20 +101,25 @@ def try_out(
     device: torch.device,
     limit: float,
     most_for_places: float,
+    most_for_light: float,
     report: bool,
     wait: Callable[[], object] = lambda: None,
 ) -> Trial:
-    """Measure what a training costs.
+    """Measure the costs of a training.
 
     Args:
-        capture: whose views are read as they are, or smaller where they are large: that changes no step.
-        config: of the training; its steps are the proportions of the stages.
-        asked: which effects are simulated.
-        device: where to compute.
-        limit: seconds that the steps of all stages may take together, about.
-        most_for_places: seconds that looks at places may take; if they take more there are none.
-        report: whether the run will end with its page.
-        wait: returns when the device has done its work.
+        capture: the capture. Large views are read at a smaller size, which does not affect the time of a
+            step.
+        config: the settings; the steps of its stages are used as proportions.
+        asked: the value of `--effects`.
+        device: the device of the training.
+        limit: approximate time that the steps of all stages may take together, in seconds.
+        most_for_places: maximum time of the measurements at places, in seconds. If they would take more they
+            are left out.
+        most_for_light: maximum time of the search for the initial light, in seconds. It determines the number
+            of pixels of the search.
+        report: whether the command ends by writing the report.
+        wait: returns when the device has finished its work.
     """
     small = replace(capture, views=_some(capture))
     small = at_scale(small, scale_for_pixels(small.views, PIXELS_OF_A_VIEW * len(small.views)))
@@ -100,49 +128,62 @@ def try_out(
     facts = scene_facts(small, pixels, config)
     note_facts(plan, facts)
     config = plan.config_of_model
-    often, larger = config, 1.0
+    trial_config, fit_scale = changed(config, {"shading.hit_share": LOOSE}), 1.0
     if config.light.kind != "free":
         points = max(1, config.light.fit.points // FIT_PART)
-        often = changed(config, {"light.fit.every": FIT_EVERY, "light.fit.points": points})
-        larger = config.light.fit.points / points
+        trial_config = changed(trial_config, {"light.fit.every": FIT_EVERY, "light.fit.points": points})
+        fit_scale = config.light.fit.points / points
     seed_step(config.train.seed, step=-1)
-    model = build_model(small, facts, often).to(device).train()
+    model = build_model(small, facts, trial_config).to(device).train()
     show_known_light(model)
     solver = model.light_solver().to(device)
     optimizer = make_optimizer(model, config.optimizer)
 
     lengths = {stage: steps for stage, steps in stage_steps(config.train).items() if steps}
-    judged = model.lobe is not None and any(plan.is_open(name) for name in JUDGED)
-    places = seconds_of_evidence(device) if judged else 0.0
-    if places > most_for_places:
-        places = 0.0
+    measures_places = model.lobe is not None and any(plan.is_open(name) for name in JUDGED)
+    place_look = seconds_of_evidence(device) if measures_places else 0.0
+    with_material = [stage for stage in lengths if model.stages[stage].moves_material]
+    if place_look * len(with_material) > most_for_places:
+        place_look = 0.0
+    light_pixels, light = None, 0.0
+    if solver.seeks_start and len(capture.train_views) >= MIN_PHOTOGRAPHS and with_material:
+        rate = seconds_of_pixel(device, plan.is_open("long-tails"))
+        light_pixels = min(MOST_PIXELS, int(most_for_light / rate))
+        light_pixels = 0 if light_pixels < FEWEST_PIXELS else light_pixels
+        light = rate * light_pixels
     surface = _timed(lambda: _look_at_surface(plan, model, pixels), wait)
     costs, picture, fitted = {}, 0.0, False
     for stage, steps in lengths.items():
         moves = model.stages[stage].moves_material
-        seconds = _steps(model, solver, optimizer, pixels, often, stage, limit / len(lengths), wait)
+        seconds = _steps(model, solver, optimizer, pixels, trial_config, stage, limit / len(lengths), wait)
         model.eval()
-        picture = _timed(lambda stage=stage: _preview(model, small, stage), wait)
-        seen = pixels.sample(LOOKED_AT, gradients=False)
-        looked = _timed(lambda seen=seen, moves=moves: look(model, seen, moves), wait)
+        picture = _picture_seconds(model, small, pixels, moves, wait)
+        sample = pixels.sample(LOOKED_AT, gradients=False)
+        looked = _timed(lambda sample=sample, moves=moves: look(model, sample, moves), wait)
         model.train()
         first, later = (seconds.fits[:1] or [0.0])[0], (seconds.fits[-1:] or [0.0])[0]
         every = 1 if config.light.kind == "free" else config.light.fit.every
         step = sum(seconds.steps) / len(seconds.steps)
+        begins = moves and not fitted
+        # The search for the initial light ends with the solver's first fit. Without the search, the first fit
+        # is made within the stage.
+        first_fit = fit_scale * first if begins else 0.0
+        before = (light + first_fit if light_pixels else 0.0) if begins else 0.0
         costs[stage.value] = StageCost(
             steps,
             step,
-            fit=larger * later / every,
-            start=(surface if moves else 0.0) + (places if moves and not fitted else 0.0),
+            fit=fit_scale * later / every,
+            start=(surface + place_look if moves else 0.0) + before,
             end=picture + 2 * looked,
-            first_fit=0.0 if fitted else larger * first,
+            first_fit=0.0 if light_pixels else first_fit,
         )
         fitted = fitted or moves
-    return Trial(Costs(costs, REPORT * picture if report else 0.0), places)
+    places = place_look * len(with_material)
+    return Trial(Costs(costs, REPORT * picture if report else 0.0), places, light_pixels)
 
 
 def _some(capture: Capture) -> tuple:
-    """The first test view, for the picture, and some training views, evenly chosen."""
+    """The first test view, for the preview, and about `VIEWS` evenly spaced training views."""
     views = capture.train_views
     return (*capture.test_views[:1], *views[:: -(-len(views) // VIEWS)])
 
@@ -157,11 +198,13 @@ def _steps(
     limit: float,
     wait: Callable[[], object],
 ) -> _Seconds:
-    """Steps of a stage as `train.loop` takes them, until the time is over and, where light is fitted, there
-    were two fits; at most `MAX_STEPS` are counted.
+    """Time steps of a stage as `train.loop` takes them.
+
+    It ends when the time limit has passed and, if the stage fits the light, two fits have been made, or after
+    `MAX_STEPS` timed steps.
     """
     model.freeze_for(stage)
-    found, began = _Seconds(), time.perf_counter()
+    times, began = _Seconds(), time.perf_counter()
     fits = model.stages[stage].moves_material and not isinstance(solver, NothingToSolve)
     gradients = "smoothness" in active_losses(stage, config, model.stages)
     for number in range(WARM_STEPS + MAX_STEPS):
@@ -176,33 +219,43 @@ def _steps(
             optimizer.step()
         wait()
         if number >= WARM_STEPS:
-            found.steps.append(time.perf_counter() - step_began)
+            times.steps.append(time.perf_counter() - step_began)
         solver.observe(computed)
         if solver.due:
-            found.fits.append(_timed(lambda: solver.solve(model.brdf, model.scene), wait))
+            times.fits.append(_timed(lambda: solver.solve(model.brdf, model.scene), wait))
         if (
             number >= WARM_STEPS + MIN_STEPS
             and time.perf_counter() - began > limit
-            and (not fits or len(found.fits) > 1)
+            and (not fits or len(times.fits) > 1)
         ):
             break
-    return found
+    return times
 
 
 def _look_at_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset) -> None:
-    """Evidence of the surface but for that of places, which takes longer than a trial."""
-    tried = [Decision(0, name, plan.is_on(name), "settings", "not tried out") for name in JUDGED]
-    decided = [*plan.decisions, *tried]
+    """Measure evidence at the surface, except that at places, which takes longer than a trial."""
+    excluded = [Decision(0, name, plan.is_on(name), "settings", "not part of a trial") for name in JUDGED]
+    decided = [*plan.decisions, *excluded]
     if plan.is_open("inter-reflection"):
         look_at_surface(Plan(plan.asked, plan.settings, decided), model, pixels, 0)
 
 
-def _preview(model: NeilfModel, capture: Capture, stage: Stage) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        write_preview(model, capture, stage, Path(folder) / "preview.png")
+def _picture_seconds(
+    model: NeilfModel,
+    capture: Capture,
+    pixels: PixelDataset,
+    with_material: bool,
+    wait: Callable[[], object],
+) -> float:
+    """Estimate the time of the picture at the end of a stage from that of some of its rays."""
+    warm, timed = (pixels.sample(count, gradients=False).rays for count in (WARM_RAYS, PICTURE_RAYS))
+    once = _timed(lambda: model.maps(warm, with_material), wait)
+    part = _timed(lambda: model.maps(timed, with_material), wait)
+    return once + part * preview_pixels(capture) / PICTURE_RAYS
 
 
 def _timed(work: Callable[[], object], wait: Callable[[], object]) -> float:
+    """Time of a function call including its work on the device, in seconds."""
     began = time.perf_counter()
     work()
     wait()

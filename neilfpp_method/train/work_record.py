@@ -1,4 +1,4 @@
-"""Where the time of a run went, in `RUN/work.json`: seconds by stage and by kind of work (docs/budget.md)."""
+"""The time of a run by stage and by kind of work, stored in `RUN/work.json` (docs/budget.md)."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ FORMAT = 1
 
 
 def write_work(run: Path, ledger: Ledger) -> None:
-    """The seconds so far, of all sessions of the run."""
+    """Write the times so far, of all sessions of the run, into the run folder."""
     write_json(run / FILE, {"format": FORMAT, "seconds": ledger.seconds()})
 
 
 def read_work(run: Path) -> dict[str, dict[str, float]]:
-    """Seconds by stage and by kind of work; empty where the run has no record.
+    """Read the seconds of a run by stage and by kind of work; empty if the run has no record.
 
     Raises:
-        UserError: the file is damaged or of another version.
+        UserError: if the file is damaged or of another version.
     """
     path = run / FILE
     if not path.is_file():
@@ -44,11 +44,11 @@ def read_work(run: Path) -> dict[str, dict[str, float]]:
             good = is_finite_number(seconds) and seconds >= 0
             if work not in WORK or not good:
                 raise UserError(
-                    f"{path}: {stage}.{work}: no time of a known kind", "remove the file, or train again"
+                    f"{path}: {stage}.{work}: not a valid time", "remove the file, or train again"
                 )
     return stages
 
 
 def waiting(device: torch.device) -> Callable[[], object] | None:
-    """What waits until a device has done its work; none where a call returns when it is done."""
+    """A function that waits until a device has finished its work; None if calls are synchronous."""
     return (lambda: torch.cuda.synchronize(device)) if device.type == "cuda" else None

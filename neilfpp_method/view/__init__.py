@@ -1,1 +1,1 @@
-"""The viewer in the browser. Only `browser` knows viser; the rest works and is tested without it."""
+"""The viewer in the browser. Only `browser` and `session` import viser."""

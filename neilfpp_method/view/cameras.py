@@ -1,4 +1,4 @@
-"""Between the browser's camera and ours; both have OpenCV axes."""
+"""Convert between the browser's cameras and `Camera`; both have OpenCV axes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,19 @@ from neilfpp_method.data.views import Camera
 __all__ = ["Pose", "pinhole", "pose_of"]
 
 MAX_SIDE = 1600
-"""Pixels: larger windows show a picture of this size enlarged."""
+"""Largest width and height of an image, pixels; in a larger window it is enlarged."""
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a camera stands, its orientation (w x y z), and its vertical field of view in radians."""
+    """Pose and field of view of a camera in the browser.
+
+    Attributes:
+        position: position, scene frame.
+        wxyz: orientation as a unit quaternion, camera to scene.
+        fov: vertical field of view, radians.
+        aspect: width over height.
+    """
 
     position: Float[np.ndarray, " 3"]
     wxyz: Float[np.ndarray, " 4"]
@@ -28,9 +35,9 @@ class Pose:
 
 
 def pinhole(pose: Pose, width: int, height: int) -> Camera:
-    """The camera of a window of width × height pixels."""
-    share = min(1.0, MAX_SIDE / max(width, height, 1))
-    width, height = max(1, round(width * share)), max(1, round(height * share))
+    """Build the camera for a window of width × height pixels, reduced to `MAX_SIDE`."""
+    factor = min(1.0, MAX_SIDE / max(width, height, 1))
+    width, height = max(1, round(width * factor)), max(1, round(height * factor))
     rotation = Rotation.from_quat(np.roll(pose.wxyz, -1)).as_matrix().T
     w2c = np.eye(4)
     w2c[:3, :3], w2c[:3, 3] = rotation, -rotation @ pose.position
@@ -39,9 +46,8 @@ def pinhole(pose: Pose, width: int, height: int) -> Camera:
 
 
 def pose_of(camera: Camera) -> Pose:
-    """A camera's pose; its lens is taken for straight and its principal point for the middle."""
+    """Convert a camera to a pose. Lens distortion and the offset of the principal point are ignored."""
     pose = camera.c2w
     wxyz = np.roll(Rotation.from_matrix(pose[:, :3]).as_quat(), 1)
-    return Pose(
-        pose[:, 3], wxyz, 2 * math.atan(camera.height / (2 * camera.fy)), camera.width / camera.height
-    )
+    fov = 2 * math.atan(camera.height / (2 * camera.fy))
+    return Pose(pose[:, 3], wxyz, fov, camera.width / camera.height)

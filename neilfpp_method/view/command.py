@@ -1,4 +1,4 @@
-"""`neilfpp view`: load a run, open the page, and stay until a person stops it."""
+"""`neilfpp view`: load a run, and serve the page until the user stops the command."""
 
 from __future__ import annotations
 
@@ -13,21 +13,22 @@ from neilfpp_method.relight.maps import Layout, check_map, map_names, read_map
 from neilfpp_method.relight.sky import Sky
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.run import load_run
-from neilfpp_method.view.address import check_free, only_here
+from neilfpp_method.view.address import check_free, is_local
 from neilfpp_method.view.subject import Subject, subject_of
 
 __all__ = ["Request", "view"]
 
 MAPS = (".exr", ".hdr", ".png", ".jpg", ".jpeg")
-LOOKED_EVERY = 2.0
-"""Seconds between two looks for a new checkpoint."""
+"""Suffixes of the environment maps that are read from a folder."""
+POLL_SECONDS = 2.0
+"""Seconds between two checks for a new checkpoint."""
 MIN_VERSION = 1
-"""Major version of viser that the page is written for."""
+"""Oldest supported major version of viser."""
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for; the fields are those of `commands.view.View`, which says what they mean."""
+    """Options of the command; `commands.view.View` documents the fields."""
 
     run: Path
     env: tuple[Path, ...]
@@ -45,53 +46,52 @@ def view(
     say: Callable[[str], None] = lambda text: None,
     until: Callable[[float], bool] = lambda seconds: bool(time.sleep(seconds)),
 ) -> None:
-    """Serve a run until a person stops the command.
+    """Serve a run until the user stops the command.
 
     Args:
-        request: what.
-        say: takes lines for the person who waits.
-        until: waits some seconds, and tells whether to end.
+        request: options of the command.
+        say: receives messages for the user, line by line.
+        until: waits for some seconds, and returns whether to stop.
 
     Raises:
-        UserError: something that was asked for cannot be.
+        UserError: an option is invalid, or viser is missing.
     """
     check_viser()
     check_free(request.host, request.port)
     skies = _skies(request.env, request.env_layout)
-    seen = _age(request)
-    subject = None if request.follow and seen is None else _load(request)
+    loaded = _checkpoint_time(request)
+    subject = None if request.follow and loaded is None else _load(request)
+    # viser is optional, so it is imported only after check_viser.
     from neilfpp_method.view.browser import open_page
 
-    skies = {
-        name: replace(sky, radiance=sky.radiance.to(pick_device(request.device)))
-        for name, sky in skies.items()
-    }
+    device = pick_device(request.device)
+    skies = {name: replace(sky, radiance=sky.radiance.to(device)) for name, sky in skies.items()}
     page = open_page(subject, skies, request.host, request.port, "neilfpp view")
     try:
-        if not only_here(request.host):
+        if not is_local(request.host):
             say(
-                f"warning: anybody who reaches port {request.port} of this machine sees the run and its "
-                "photographs"
+                f"warning: everybody who can connect to port {request.port} of this machine can see the run "
+                "and its photographs"
             )
         if subject is None:
             say(f"waiting for the first checkpoint of {request.run}")
         elif subject.note:
             say(subject.note)
-        say(f"open http://{_named(request.host)}:{request.port} in a browser; Ctrl-C ends")
-        while not until(LOOKED_EVERY):
-            age = _age(request) if request.follow else seen
-            if age != seen:
-                seen = age
+        say(f"open http://{_url_host(request.host)}:{request.port} in a browser; press Ctrl-C to stop")
+        while not until(POLL_SECONDS):
+            written = _checkpoint_time(request) if request.follow else loaded
+            if written != loaded:
+                loaded = written
                 page.show(_load(request))
     finally:
         page.stop()
 
 
 def check_viser() -> None:
-    """That the library of the page is installed.
+    """Check that viser is installed.
 
     Raises:
-        UserError: it is not, or is too old.
+        UserError: it is not installed, or too old.
     """
     remedy = "install it with: pip install 'neilfpp-method[view]'"
     try:
@@ -99,7 +99,9 @@ def check_viser() -> None:
     except metadata.PackageNotFoundError as error:
         raise UserError("neilfpp view needs viser, which is not installed", remedy) from error
     if int(version.split(".")[0]) < MIN_VERSION:
-        raise UserError(f"neilfpp view needs viser {MIN_VERSION} or newer, {version} is installed", remedy)
+        raise UserError(
+            f"neilfpp view needs viser {MIN_VERSION} or newer, but {version} is installed", remedy
+        )
 
 
 def _load(request: Request) -> Subject:
@@ -107,14 +109,15 @@ def _load(request: Request) -> Subject:
     return subject_of(run, request.resolution)
 
 
-def _age(request: Request) -> int | None:
-    """When the checkpoint was written; none: there is none."""
+def _checkpoint_time(request: Request) -> int | None:
+    """Time at which the checkpoint was written, ns; None if there is no checkpoint."""
     path = request.run / "checkpoints" / f"{request.checkpoint}.pt"
     return path.stat().st_mtime_ns if path.is_file() else None
 
 
-def _skies(given: Sequence[Path], layout: Layout) -> dict[str, Sky]:
-    paths = [inner for path in given for inner in (_maps_in(path) if path.is_dir() else [path])]
+def _skies(files_or_folders: Sequence[Path], layout: Layout) -> dict[str, Sky]:
+    """Read environment maps by name; a folder stands for all maps in it."""
+    paths = [file for path in files_or_folders for file in (_maps_in(path) if path.is_dir() else [path])]
     for path in paths:
         check_map(path)
     return {name: read_map(path, layout).sky for name, path in zip(map_names(paths), paths, strict=True)}
@@ -127,5 +130,9 @@ def _maps_in(folder: Path) -> list[Path]:
     return maps
 
 
-def _named(host: str) -> str:
-    return "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+def _url_host(host: str) -> str:
+    """The host part of the URL to open."""
+    if host in ("0.0.0.0", "::"):
+        return "localhost"
+    # IPv6 addresses are written in brackets.
+    return f"[{host}]" if ":" in host else host

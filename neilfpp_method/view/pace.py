@@ -1,4 +1,4 @@
-"""How large a picture may be to be there at once: chosen from the speed that was measured."""
+"""Choose the size of the first image from the measured rendering speed, so that it appears immediately."""
 
 from __future__ import annotations
 
@@ -7,42 +7,45 @@ from dataclasses import dataclass, field
 
 __all__ = ["Pace", "sizes"]
 
-AT_ONCE = 0.12
-"""Seconds that the first picture of a wish may take: about eight a second while the camera moves."""
-CHECKED = 0.05
-"""Seconds between two looks at whether the picture is still wanted."""
-UNKNOWN = 20_000.0
-"""Rays a second, before any were measured."""
-MIN_PIXELS = 256
-"""Rays that are traced together at least: fewer cost as much."""
-NEW_SHARE = 0.5
-"""What the last measurement counts for; the rest is what was known."""
+FIRST_IMAGE = 0.12
+"""Seconds that the first image of a view may take, which gives about eight images per second while the camera
+moves.
+"""
+BATCH = 0.05
+"""Seconds that a batch of rays should take. Between batches, an outdated image can be abandoned."""
+DEFAULT_SPEED = 20_000.0
+"""Assumed rays per second before the first measurement."""
+MIN_RAYS = 256
+"""Smallest batch; a smaller one would take as long."""
+NEW_WEIGHT = 0.5
+"""Weight of the newest measurement in the moving average."""
 
 
 @dataclass
 class Pace:
-    """Rays a second by layer, as measured."""
+    """Measured rendering speed by layer, rays per second."""
 
-    known: dict[str, float] = field(default_factory=dict)
+    speed: dict[str, float] = field(default_factory=dict)
 
     def note(self, layer: str, rays: int, seconds: float) -> None:
-        """Take a measurement in."""
-        speed = rays / max(seconds, 1e-6)
-        before = self.known.get(layer, speed)
-        self.known[layer] = (1 - NEW_SHARE) * before + NEW_SHARE * speed
+        """Add a measurement."""
+        measured = rays / max(seconds, 1e-6)
+        before = self.speed.get(layer, measured)
+        self.speed[layer] = (1 - NEW_WEIGHT) * before + NEW_WEIGHT * measured
 
-    def at_once(self, layer: str) -> int:
-        """Rays for a first picture."""
-        return max(MIN_PIXELS, int(AT_ONCE * self.known.get(layer, UNKNOWN)))
+    def first_image(self, layer: str) -> int:
+        """Number of rays of a first image."""
+        return max(MIN_RAYS, int(FIRST_IMAGE * self.speed.get(layer, DEFAULT_SPEED)))
 
-    def together(self, layer: str) -> int:
-        """Rays until the next look at whether the picture is still wanted."""
-        return max(MIN_PIXELS, int(CHECKED * self.known.get(layer, UNKNOWN)))
+    def batch(self, layer: str) -> int:
+        """Number of rays of a batch."""
+        return max(MIN_RAYS, int(BATCH * self.speed.get(layer, DEFAULT_SPEED)))
 
 
 def sizes(width: int, height: int, at_once: int) -> list[float]:
-    """Factors of ever larger pictures, up to 1; the first has no more pixels than `at_once`, about, and each
-    that follows has four times as many, or fewer.
+    """Scale factors of successively larger images, up to 1.
+
+    The first image has about `at_once` pixels or fewer; each further one has at most four times as many.
 
     >>> sizes(640, 480, 19_200)
     [0.25, 0.5, 1.0]

@@ -1,4 +1,4 @@
-"""A thread that makes one browser's pictures: the newest wish counts, older ones are given up."""
+"""A thread that renders the images of one browser; a new request replaces the current one."""
 
 from __future__ import annotations
 
@@ -8,65 +8,67 @@ from typing import Generic, TypeVar
 
 __all__ = ["Painter"]
 
-Asked = TypeVar("Asked")
-Made = TypeVar("Made")
+Request = TypeVar("Request")
+Image = TypeVar("Image")
 
 
-class Painter(Generic[Asked, Made]):
-    """Shows ever finer pictures of the newest wish.
+class Painter(Generic[Request, Image]):
+    """Renders the newest request in a thread, as a sequence of successively finer images.
 
-    A wish's first picture is always finished: nothing would be seen while a camera moves otherwise.
+    A new request replaces the current one, but only after the first image of the current one: otherwise no
+    image would appear while the camera moves.
 
     Args:
-        frames: pictures of a wish; None where it can be given up.
-        show: takes a picture.
-        failed: takes what went wrong with a wish; the thread goes on with the next.
-        turn: held while a part of a picture is computed, by all painters that share a model.
+        frames: yields images of a request, and None between batches of work, when rendering may stop.
+        show: receives each image.
+        failed: receives an exception raised for a request; the thread continues with the next request.
+        lock: held while a batch is computed; shared by all painters that use the same model.
     """
 
     def __init__(
         self,
-        frames: Callable[[Asked], Iterator[Made | None]],
-        show: Callable[[Made], None],
+        frames: Callable[[Request], Iterator[Image | None]],
+        show: Callable[[Image], None],
         failed: Callable[[Exception], None],
-        turn: threading.Lock,
+        lock: threading.Lock,
     ) -> None:
-        self._frames, self._show, self._failed, self._turn = frames, show, failed, turn
-        self._news = threading.Condition()
-        self._wish: Asked | None = None
-        self._ended = False
+        self._frames, self._show, self._failed, self._lock = frames, show, failed, lock
+        self._changed = threading.Condition()
+        self._request: Request | None = None
+        self._stopped = False
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
-    def ask(self, wish: Asked) -> None:
-        """Wish for something else; what was wished for before and has not begun is forgotten."""
-        with self._news:
-            self._wish = wish
-            self._news.notify()
+    def request(self, request: Request) -> None:
+        """Request new images. A previous request that has not begun is dropped."""
+        with self._changed:
+            self._request = request
+            self._changed.notify()
 
     def stop(self) -> None:
-        """End the thread, at the latest after the part that it computes."""
-        with self._news:
-            self._ended = True
-            self._news.notify()
+        """Stop the thread after the current batch, and wait for its end."""
+        with self._changed:
+            self._stopped = True
+            self._changed.notify()
         self._thread.join()
 
     def _work(self) -> None:
         while True:
-            with self._news:
-                self._news.wait_for(lambda: self._ended or self._wish is not None)
-                wish, self._wish = self._wish, None
-                if self._ended:
+            with self._changed:
+                self._changed.wait_for(lambda: self._stopped or self._request is not None)
+                request, self._request = self._request, None
+                if self._stopped:
                     return
             try:
-                self._paint(wish)
-            except Exception as error:  # A person must learn of it; the next wish may well go.
+                self._paint(request)
+            # Any failure is reported to the user, and the next request may succeed.
+            except Exception as error:
                 self._failed(error)
 
-    def _paint(self, wish: Asked) -> None:
-        shown, frames = False, self._frames(wish)
-        while not self._ended and (self._wish is None or not shown):
-            with self._turn:
+    def _paint(self, request: Request) -> None:
+        shown, frames = False, self._frames(request)
+        while not self._stopped and (self._request is None or not shown):
+            with self._lock:
                 try:
                     frame = next(frames)
                 except StopIteration:

@@ -1,4 +1,4 @@
-"""From a wish to ever finer pictures: by layer, in parts that are small enough to be given up."""
+"""Render a layer of a run as successively finer images, in small batches between which rendering may stop."""
 
 from __future__ import annotations
 
@@ -20,29 +20,31 @@ from neilfpp_method.structures import RayBatch
 from neilfpp_method.view.pace import Pace, sizes
 from neilfpp_method.view.subject import Lighting, Subject, scene_of
 
-__all__ = ["Frame", "Wish", "frames"]
+__all__ = ["Frame", "Request", "frames"]
 
 BOUNCES = 4
+"""Largest number of surface vertices of a path."""
 SAMPLES = 256
-"""Of a pixel, after which a picture is as good as it gets."""
+"""Number of samples per pixel after which an image is finished; more would not change it visibly."""
 SEED = 0
+"""Seed of the first sample."""
 PAPER = 0.93
-"""Grey of what lies behind a surface, on the screen."""
+"""Grey of the background, as a display value in [0, 1]."""
 FAR = 100.0
-"""Scene units: the depth of what is no surface, for the browser's own objects."""
+"""Depth of pixels without a surface, scene units; the browser's own objects appear in front of it."""
 
 
 @dataclass(frozen=True, eq=False)
-class Wish:
-    """What a browser wants to see.
+class Request:
+    """The view that a browser requests.
 
     Attributes:
-        subject: of what.
-        camera: a pinhole of the size of the window, scene frame.
-        layer: one of the subject's.
-        light: for the layer PBR.
-        exposure: stops by which radiance is shown brighter.
-        sky_behind: show the map behind the surface, in the layer PBR.
+        subject: the run.
+        camera: a pinhole camera of the size of the window, scene frame.
+        layer: one of the subject's layers.
+        light: the light for the layer PBR.
+        exposure: stops by which radiance is brightened.
+        sky_behind: whether the layer PBR shows the environment map behind the surface.
     """
 
     subject: Subject
@@ -55,9 +57,13 @@ class Wish:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A picture of a wish, perhaps smaller than the window: sRGB, and axial depths, scene units.
+    """A rendered image, which may be smaller than the window.
 
-    `share` is its size over that of the window, `samples` how many each pixel has.
+    Attributes:
+        image: sRGB bytes.
+        depth: depth along the camera's axis, scene units.
+        share: size relative to that of the window.
+        samples: number of samples per pixel.
     """
 
     image: UInt8[np.ndarray, "H W 3"]
@@ -66,47 +72,53 @@ class Frame:
     samples: int
 
 
-Part = Callable[[RayBatch, Tensor], Tensor]
-"""Rays, and their numbers in the picture, to RGB and opacity, (N, 4)."""
+Shader = Callable[[RayBatch, Tensor], Tensor]
+"""Maps rays and their pixel indices to RGB and opacity, (N, 4)."""
 
 
-def frames(wish: Wish, pace: Pace) -> Iterator[Frame | None]:
-    """Ever finer pictures; None between parts of one, where it can be given up.
+def frames(request: Request, pace: Pace) -> Iterator[Frame | None]:
+    """Yield successively finer images of a request, and None between batches, when rendering may stop.
 
     Args:
-        wish: what is shown.
-        pace: how fast this machine is, by layer; measurements are added to it.
+        request: the view to render.
+        pace: rendering speed of this machine, to which measurements are added.
     """
-    traced = wish.layer == "pbr" and wish.light.sky is not None
-    for share in sizes(wish.camera.width, wish.camera.height, pace.at_once(wish.layer)):
-        camera = resized(wish.camera, share)
+    traced = request.layer == "pbr" and request.light.sky is not None
+    for share in sizes(request.camera.width, request.camera.height, pace.first_image(request.layer)):
+        camera = resized(request.camera, share)
         total = None
         for sample in range(SAMPLES if traced and share == 1 else 1):
-            part = _paths(wish, camera, sample) if traced else _still(wish)
+            shader = _path_shader(request, camera, sample) if traced else _layer_shader(request)
             values = None
-            for values in _whole(wish, camera, part, pace, jitter=sample if traced else 0):
+            for values in _render(request, camera, shader, pace, jitter=sample if traced else 0):
                 if values is None:
                     yield None
             total = values if total is None else total + values
-            yield _frame(wish, camera, total / (sample + 1), share, sample + 1)
+            yield _frame(request, camera, total / (sample + 1), share, sample + 1)
 
 
-def _whole(wish: Wish, camera: Camera, part: Part, pace: Pace, jitter: int) -> Iterator[Tensor | None]:
-    """None after each part but the last, then all pixels; the first sample is at each pixel's centre."""
-    layer, device = wish.layer, wish.subject.device
+def _render(
+    request: Request, camera: Camera, shader: Shader, pace: Pace, jitter: int
+) -> Iterator[Tensor | None]:
+    """Yield None after each batch but the last, then the values of all pixels.
+
+    `jitter` seeds the position of the rays within their pixels; 0 stands for the centre.
+    """
+    layer, device = request.layer, request.subject.device
     pixels = torch.arange(camera.width * camera.height, device=device)
-    inside = (
-        torch.rand(2, generator=torch.Generator().manual_seed(jitter)) if jitter else torch.full((2,), 0.5)
-    )
-    inside = inside.to(device)
+    if jitter:
+        position = torch.rand(2, generator=torch.Generator().manual_seed(jitter)).to(device)
+    else:
+        position = torch.full((2,), 0.5, device=device)
     done, start = [], 0
     while start < len(pixels):
-        rows = pixels[start : start + pace.together(layer)]
+        rows = pixels[start : start + pace.batch(layer)]
         begun = time.perf_counter()
         corner = torch.stack((rows % camera.width, rows // camera.width), -1)
-        rays, _ = rays_through(camera, corner + inside)
+        rays, _ = rays_through(camera, corner + position)
+        # The copy to the CPU waits for the device, so that the measured time is that of the work.
         with torch.no_grad():
-            done.append(part(rays, rows).cpu())  # waits for the device, so the time is that of the work
+            done.append(shader(rays, rows).cpu())
         pace.note(layer, len(rows), time.perf_counter() - begun)
         start += len(rows)
         if start < len(pixels):
@@ -114,78 +126,78 @@ def _whole(wish: Wish, camera: Camera, part: Part, pace: Pace, jitter: int) -> I
     yield torch.cat(done)
 
 
-def _paths(wish: Wish, camera: Camera, sample: int) -> Part:
-    """Light along paths, one for each pixel."""
-    scene, pixels = scene_of(wish.subject, wish.light), camera.width * camera.height
-    numbers = Sequence(BOUNCES * DIMENSIONS, SEED + sample).next(1, pixels, wish.subject.device)
+def _path_shader(request: Request, camera: Camera, sample: int) -> Shader:
+    """A shader that traces one path per pixel."""
+    scene, pixels = scene_of(request.subject, request.light), camera.width * camera.height
+    numbers = Sequence(BOUNCES * DIMENSIONS, SEED + sample).next(1, pixels, request.subject.device)
 
-    def part(rays: RayBatch, rows: Tensor) -> Tensor:
-        found = trace_paths(scene, rays, numbers.of(rows), BOUNCES)
-        color, alpha = found.radiance, found.alpha[:, None]
-        if wish.sky_behind:
-            color, alpha = color + (1 - alpha) * scene.sky.look(rays.directions), torch.ones_like(alpha)
+    def shade(rays: RayBatch, rows: Tensor) -> Tensor:
+        traced = trace_paths(scene, rays, numbers.of(rows), BOUNCES)
+        color, alpha = traced.radiance, traced.alpha[:, None]
+        if request.sky_behind:
+            color, alpha = color + (1 - alpha) * scene.sky.lookup(rays.directions), torch.ones_like(alpha)
         return torch.cat((color, alpha), -1)
 
-    return part
+    return shade
 
 
-def _still(wish: Wish) -> Part:
-    """What is the same at every look."""
-    subject, layer = wish.subject, wish.layer
+def _layer_shader(request: Request) -> Shader:
+    """A deterministic shader of a layer."""
+    subject, layer = request.subject, request.layer
     model = subject.run.model
     if layer == "radiance":
-        return lambda rays, rows: _with_alpha(
-            model.host.render(rays).color, torch.ones_like(rays.origins[:, :1])
-        )
+        return lambda rays, rows: _opaque(model.host.render(rays).color)
 
-    def part(rays: RayBatch, rows: Tensor) -> Tensor:
-        met = subject.surface.cross(rays.origins, rays.directions)
-        met = met[torch.nonzero(met.outside)[:, 0]]
-        shown = rays.origins.new_zeros(len(rays), 4)
-        if not len(met.rows):
-            return shown
+    def shade(rays: RayBatch, rows: Tensor) -> Tensor:
+        hits = subject.surface.intersect(rays.origins, rays.directions)
+        hits = hits[torch.nonzero(hits.outside)[:, 0]]
+        result = rays.origins.new_zeros(len(rays), 4)
+        if not len(hits.rows):
+            return result
         if layer == "normal":
-            value = met.normal
+            value = hits.normal
         else:
-            material = model.materials(met.position)
+            material = model.materials(hits.position)
             if layer == "pbr":
-                wo = -rays.directions[met.rows]
-                value = model.shade(
-                    met.position, met.normal, wo, material, model.config.shading.eval_samples
-                ).color
+                wo, samples = -rays.directions[hits.rows], model.config.shading.eval_samples
+                value = model.shade(hits.position, hits.normal, wo, material, samples).color
             else:
                 value = getattr(material, layer).expand(-1, 3)
-        shown[met.rows] = _with_alpha(value, torch.ones_like(value[:, :1]))
-        return shown
+        result[hits.rows] = _opaque(value)
+        return result
 
-    return part
-
-
-def _with_alpha(color: Tensor, alpha: Tensor) -> Tensor:
-    return torch.cat((color, alpha), -1)
+    return shade
 
 
-def _frame(wish: Wish, camera: Camera, values: Float[Tensor, "P 4"], share: float, samples: int) -> Frame:
+def _opaque(color: Float[Tensor, "N 3"]) -> Float[Tensor, "N 4"]:
+    return torch.cat((color, torch.ones_like(color[:, :1])), -1)
+
+
+def _frame(
+    request: Request, camera: Camera, values: Float[Tensor, "P 4"], share: float, samples: int
+) -> Frame:
+    """Convert RGB and opacity to an 8-bit image over the background."""
     shape = (camera.height, camera.width)
     alpha = values[:, 3:].clamp(0, 1)
-    shown = (values[:, :3] / alpha.clamp_min(1e-6)).view(*shape, 3).numpy()
-    if wish.layer in ("pbr", "radiance"):
-        image = display_color(shown, 2.0**wish.exposure)
-    elif wish.layer in ("roughness", "metallic"):
-        image = display(wish.layer, shown[..., :1]).repeat(3, -1)
+    straight = (values[:, :3] / alpha.clamp_min(1e-6)).view(*shape, 3).numpy()
+    if request.layer in ("pbr", "radiance"):
+        image = display_color(straight, 2.0**request.exposure)
+    elif request.layer in ("roughness", "metallic"):
+        image = display(request.layer, straight[..., :1]).repeat(3, -1)
     else:
-        image = display(wish.layer, shown)
-    covered = alpha.view(*shape, 1).numpy()
-    image = np.rint(covered * image + (1 - covered) * 255 * PAPER).astype(np.uint8)
-    return Frame(image, _depth(wish.subject, camera), share, samples)
+        image = display(request.layer, straight)
+    opacity = alpha.view(*shape, 1).numpy()
+    image = np.rint(opacity * image + (1 - opacity) * 255 * PAPER).astype(np.uint8)
+    return Frame(image, _depth(request.subject, camera), share, samples)
 
 
 def _depth(subject: Subject, camera: Camera) -> Float[np.ndarray, "H W"]:
+    """Depth along the camera's axis; `FAR` without a surface."""
     pixels = torch.arange(camera.width * camera.height, device=subject.device)
     depth = torch.full((len(pixels),), FAR, device=subject.device)
     if subject.surface is not None:
         rays, _ = rays_through(camera, torch.stack((pixels % camera.width, pixels // camera.width), -1) + 0.5)
-        met = subject.surface.cross(rays.origins, rays.directions)
+        hits = subject.surface.intersect(rays.origins, rays.directions)
         forward = torch.from_numpy(camera.w2c[2, :3].astype(np.float32)).to(subject.device)
-        depth[met.rows] = met.distance * (rays.directions[met.rows] @ forward)
+        depth[hits.rows] = hits.distance * (rays.directions[hits.rows] @ forward)
     return depth.view(camera.height, camera.width).cpu().numpy()

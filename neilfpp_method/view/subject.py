@@ -1,4 +1,4 @@
-"""What is looked at: a run with its surface, the layers that it has, and the light that is chosen for it."""
+"""The run that the viewer shows: its surface, its layers, and the light selected for it."""
 
 from __future__ import annotations
 
@@ -26,18 +26,19 @@ LAYERS = {
     "metallic": "metallic",
     "normal": "normal",
 }
-"""Names of layers, and how they are called on the screen."""
+"""Layers by name, with their titles on the page."""
 OF_MATERIAL = {"pbr", "base_color", "roughness", "metallic"}
+"""Layers that need a material."""
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A run to look at.
+    """A run to view.
 
     Attributes:
-        run: with its model in evaluation mode.
-        surface: where rays of all layers but R end; none: the run has no surface.
-        note: what is missing and why, in a sentence for people; empty where nothing is.
+        run: the run, with its model in evaluation mode.
+        surface: the surface that all layers except R show; None if the run has no surface.
+        note: a sentence for the user on what is missing and why; empty if nothing is missing.
     """
 
     run: Run
@@ -46,12 +47,12 @@ class Subject:
 
     @property
     def device(self) -> torch.device:
-        """Where it is computed."""
+        """Device of the model."""
         return next(self.run.model.parameters()).device
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """Those that can be shown."""
+        """Names of the layers that can be shown."""
         if self.surface is None:
             return ("radiance",)
         return tuple(name for name in LAYERS if self.run.has_material or name not in OF_MATERIAL)
@@ -59,42 +60,48 @@ class Subject:
 
 @dataclass(frozen=True)
 class Lighting:
-    """The chosen light. `own`: the run's own, unchanged. No sky: light that is free at every point."""
+    """The selected light.
+
+    Attributes:
+        sky: the environment map; None if the run has a free light, which cannot be changed.
+        lamps: the lamps, or None.
+        own: whether this is the run's own light, unchanged.
+    """
 
     sky: Sky | None
     lamps: Lamplight | None
     own: bool = True
 
     def turned(self, degrees: float) -> Lighting:
-        """With the sky turned about +z, counter-clockwise seen from above."""
+        """Rotate the sky around +z, counter-clockwise seen from above."""
         if self.sky is None or degrees == 0:
             return self
         return replace(self, sky=replace(self.sky, start=self.sky.start - math.radians(degrees)), own=False)
 
     def with_lamps(self, lamps: Lamplight | None) -> Lighting:
-        """With lamps elsewhere, or without."""
+        """Replace the lamps, or remove them with None."""
         return replace(self, lamps=lamps, own=False)
 
 
 def subject_of(run: Run, resolution: int) -> Subject:
-    """A run as it can be shown.
+    """Prepare a run for viewing.
 
     Args:
-        run: as loaded.
-        resolution: cells along an edge of the scene's cube, where the surface is extracted from a distance
-            field.
+        run: the run.
+        resolution: number of cells along an edge of the scene's cube when a surface is extracted from a
+            distance field.
     """
     try:
         surface, note = surface_of_run(run, resolution), ""
     except UserError as error:
-        surface, note = None, f"There is no surface yet, so R alone can be shown: {error.problem}."
+        surface, note = None, f"Only R can be shown, because there is no surface yet: {error.problem}."
     if surface is not None and not run.has_material:
         note = f"There is no material at step {run.step}: train the next stage."
     return Subject(run, surface, note)
 
 
 def own_light(run: Run) -> Lighting:
-    """The light that a run has found."""
+    """The estimated light of a run."""
     light = run.model.light
     if not isinstance(light, EnvironmentLight):
         return Lighting(None, None)
@@ -103,7 +110,7 @@ def own_light(run: Run) -> Lighting:
 
 @torch.no_grad()
 def scene_of(subject: Subject, light: Lighting) -> Scene:
-    """What paths are traced through; asks for a surface and a sky."""
+    """Build the scene of the path tracer. The subject must have a surface, and the light a sky."""
     assert subject.surface is not None
     assert light.sky is not None
     model = subject.run.model

@@ -1,4 +1,4 @@
-"""Adding up along a ray: emission and absorption (METHOD §3)."""
+"""Emission-absorption compositing along rays (METHOD §3)."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ __all__ = ["Weights", "composite", "depth_weights", "render_weights", "sample_we
 
 @dataclass(frozen=True)
 class Weights:
-    """How much each interval, or sample, of a ray counts, what passes them all, and what they stop.
+    """Rendering weights of the intervals of rays, with transmittance and opacity of each whole ray.
 
-    Σ weights = opacity = 1 − transmittance; the opacity is accurate also where it is tiny.
+    Σ weights = opacity = 1 − transmittance. The opacity is computed separately, so tiny values are accurate.
     """
 
     weights: Float[Tensor, "N M"]
@@ -24,13 +24,16 @@ class Weights:
 
 
 def depth_weights(depth: Float[Tensor, "N K"]) -> Weights:
-    """w_i = T_i (1 − exp(−τ_i)), T_i = exp(−Σ_{j<i} τ_j), for intervals of optical depth τ_i ≥ 0 (Max 1995).
+    """Rendering weights w_i = T_i (1 − exp(−τ_i)) with T_i = exp(−Σ_{j<i} τ_j) (Max 1995).
 
-    Optical depths are added before any exponential is taken, and 1 − exp is `expm1`: thin media keep their
-    precision, opaque ones do not overflow. Half-precision inputs are added up in float32, and stay float32.
+    Optical depths are summed before the exponential, and 1 − exp is computed by `expm1`: thin media keep
+    their precision, and opaque ones do not overflow. Half-precision inputs are converted to float32.
+
+    Args:
+        depth: optical depths τ_i ≥ 0 of the intervals.
     """
     depth = depth.to(torch.promote_types(depth.dtype, torch.float32))
-    # Summed afresh from a leading 0, not as "inclusive minus own": that cancels behind an opaque interval.
+    # An exclusive sum, not the inclusive sum minus τ_i, which cancels behind an opaque interval.
     depth_before = torch.nn.functional.pad(depth, (1, 0)).cumsum(dim=-1)
     weights = torch.exp(-depth_before[:, :-1]) * -torch.expm1(-depth)
     total = depth_before[:, -1]
@@ -38,7 +41,7 @@ def depth_weights(depth: Float[Tensor, "N K"]) -> Weights:
 
 
 def sample_weights(weights: Float[Tensor, "N K"]) -> Float[Tensor, "N K+1"]:
-    """The weights of the samples at the ends of intervals: half of each interval's goes to either end.
+    """Weights of samples at the ends of intervals: each interval gives half of its weight to either end.
 
     Example:
         >>> sample_weights(torch.tensor([[0.5, 0.2]]))
@@ -53,7 +56,14 @@ def share_near(
     depth: Float[Tensor, " N"],
     radius: float,
 ) -> Float[Tensor, " N"]:
-    """The weight of intervals within `radius` of a depth; partial intervals count in part."""
+    """Sum of the weights within `radius` of a depth along the ray; an interval that is cut counts in part.
+
+    Args:
+        distances: ends of the intervals, ascending.
+        weights: weights of the intervals.
+        depth: center along each ray.
+        radius: largest distance from the center.
+    """
     start = torch.maximum(distances[:, :-1], depth[:, None] - radius)
     end = torch.minimum(distances[:, 1:], depth[:, None] + radius)
     width = distances.diff(dim=-1).clamp_min(torch.finfo(distances.dtype).tiny)
@@ -68,16 +78,14 @@ def render_weights(
     Args:
         density: σ_i ≥ 0 between sample i and the next, 1 / scene unit.
         distances: t_i, ascending.
-        far: where the last interval ends.
+        far: end of the last interval.
     """
-    widths = torch.cat([distances, far[:, None]], dim=-1).diff(dim=-1)
-    # Rounding in a sampler can swap neighbours by one unit in the last place; a negative width would emit.
-    return depth_weights(
-        density.to(torch.promote_types(density.dtype, torch.float32)) * widths.clamp_min(0.0)
-    )
+    # Rounding in a sampler can swap neighboring samples by one unit in the last place: no negative widths.
+    widths = torch.cat([distances, far[:, None]], dim=-1).diff(dim=-1).clamp_min(0.0)
+    return depth_weights(density.to(torch.promote_types(density.dtype, torch.float32)) * widths)
 
 
 def composite(weights: Float[Tensor, "N M"], values: Float[Tensor, "N M C"]) -> Float[Tensor, "N C"]:
     """Σ_i w_i v_i for each ray, in the wider of the two types."""
-    # Not a matrix product: automatic mixed precision would take that in half precision.
+    # Not a matrix product, which automatic mixed precision would compute in half precision.
     return (weights[..., None] * values).sum(dim=-2)

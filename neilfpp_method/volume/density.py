@@ -1,4 +1,4 @@
-"""From signed distance to density: the Laplace density of VolSDF (METHOD §3)."""
+"""Density from signed distance: the Laplace density of VolSDF (METHOD §3)."""
 
 from __future__ import annotations
 
@@ -11,23 +11,24 @@ from neilfpp_method.errors import UserError
 __all__ = ["LaplaceDensity", "laplace_density", "laplace_depth"]
 
 CLOSE = 0.03
-"""Ends of an interval that differ by less than this share of β: their divided difference loses digits, and
-Simpson's rule is exact to 1e-5 even across the kink of the density.
+"""Difference of the signed distance over an interval, in units of β, below which Simpson's rule replaces the
+divided difference. The latter loses digits there; the former is exact to 1e-5, even across the kink of the
+density.
 """
 
 BETA_FLOOR = 1e-4
-"""The smallest β, scene units (VolSDF): below it a ray of 128 cuts cannot find the surface."""
+"""Smallest β, scene units (VolSDF). Below it 128 samples per ray cannot find the surface."""
 
 
 def laplace_density(sdf: Float[Tensor, "*shape"], beta: Float[Tensor, "*#shape"]) -> Float[Tensor, "*shape"]:
     """σ = α Ψ_β(−sdf), α = 1/β, Ψ_β the CDF of a zero-mean Laplace distribution (VolSDF eq. 2, 3).
 
-    Half of 1/β on the surface, 1/β deep inside, 0 far outside. No exponential grows, so value and gradients
-    are finite for any distance; small densities outside keep their relative precision.
+    The density is 1/(2β) on the surface, 1/β deep inside and 0 far outside. All exponents are ≤ 0, so value
+    and gradients are finite for any distance, and small densities keep their relative precision.
 
     Args:
         sdf: signed distance, negative inside, scene units.
-        beta: scale > 0, scene units; one for all, or one per ray.
+        beta: scale β > 0, scene units; one for all rays, or one per ray.
 
     Returns:
         Density, 1 / scene unit.
@@ -42,40 +43,41 @@ def laplace_density(sdf: Float[Tensor, "*shape"], beta: Float[Tensor, "*#shape"]
 def laplace_depth(
     sdf: Float[Tensor, "*shape M"], distances: Float[Tensor, "*shape M"], beta: Float[Tensor, "*#shape"]
 ) -> Float[Tensor, "*shape M-1"]:
-    """Optical depth between neighbouring samples of a ray: the density's integral, the SDF linear there.
+    """Optical depth between neighboring samples: the exact integral of the density for a linear SDF.
 
-    With u = sdf/β the antiderivative of Ψ(−u) is F(u) = min(u, 0) − ½ e^{−|u|}, so an interval of width δ has
-    the depth (δ/β) (F(u₁) − F(u₀)) / (u₁ − u₀). An even cut of a homogeneous medium gives δ σ.
+    With u = sdf/β an antiderivative of Ψ(−u) is F(u) = min(u, 0) − ½ e^{−|u|}, so an interval of width δ has
+    the depth (δ/β) (F(u₁) − F(u₀)) / (u₁ − u₀). For a constant SDF this is δ σ.
 
-    The rule of VolSDF, δ times the density of the first sample, takes the last sample before empty space for
-    all of it: rays that graze a surface come out too opaque.
+    VolSDF uses δ times the density of the first sample instead. Rays that graze a surface then come out too
+    opaque, because the density of the last sample near the surface extends into the empty space behind it.
 
     Args:
         sdf: signed distance at the samples, scene units.
-        distances: of the samples, ascending.
-        beta: scale > 0, scene units.
+        distances: distances of the samples along the ray, ascending.
+        beta: scale β > 0, scene units.
 
     Returns:
         Depths ≥ 0, in float32 or wider.
 
     Example:
-        >>> along_a_surface = torch.zeros(2)  # its density is 1 / (2 β)
-        >>> laplace_depth(along_a_surface, torch.tensor([0.0, 1.0]), torch.tensor(0.1))
+        >>> sdf_on_surface = torch.zeros(2)  # the density is 1 / (2 β)
+        >>> laplace_depth(sdf_on_surface, torch.tensor([0.0, 1.0]), torch.tensor(0.1))
         tensor([5.])
     """
     scaled = sdf.to(torch.promote_types(sdf.dtype, torch.float32)) / beta
     outside, inside = torch.relu(scaled), scaled.clamp_max(0.0)
-    # The terms of F are subtracted apart: deep inside, the first is large and would absorb the second.
+    # The differences of both terms of F are taken separately: deep inside, the first term is large and would
+    # absorb the second.
     rise = inside.diff(dim=-1) - 0.5 * torch.exp(inside - outside).diff(dim=-1)
     step = scaled.diff(dim=-1)
     close = step.abs() < CLOSE
-    # A divisor of 1 where the quotient is not used: an unused branch must not send NaN to the gradient.
+    # The divisor is 1 where the quotient is not used: an unused branch must not make the gradient NaN.
     quotient = rise / torch.where(close, torch.ones_like(step), step)
     one = torch.ones_like(beta)
     at_ends = laplace_density(scaled, one)
     middle = laplace_density(0.5 * (scaled[..., :-1] + scaled[..., 1:]), one)
     simpson = (at_ends[..., :-1] + 4.0 * middle + at_ends[..., 1:]) / 6.0
-    # Rounding in a sampler can swap neighbours by one unit in the last place; a negative width would emit.
+    # Rounding in a sampler can swap neighboring samples by one unit in the last place: no negative widths.
     return torch.where(close, simpson, quotient) * distances.diff(dim=-1).clamp_min(0.0) / beta
 
 
@@ -83,11 +85,11 @@ class LaplaceDensity(nn.Module):
     """The Laplace density with a learned scale β = |parameter| + floor (VolSDF).
 
     Args:
-        beta_init: β at the start, scene units.
-        beta_floor: the smallest β.
+        beta_init: initial β, scene units.
+        beta_floor: smallest β, scene units.
 
     Raises:
-        UserError: β would start at its floor, or below, where it cannot move, or the floor is not positive.
+        UserError: the initial β is not above the floor, or the floor is not positive.
     """
 
     def __init__(self, beta_init: float, beta_floor: float = BETA_FLOOR) -> None:
@@ -102,9 +104,9 @@ class LaplaceDensity(nn.Module):
         self.above_floor = nn.Parameter(torch.tensor(beta_init - beta_floor))
 
     def beta(self) -> Float[Tensor, ""]:
-        """The scale of the density, scene units."""
+        """The scale β, scene units."""
         return self.above_floor.abs() + self.beta_floor
 
     def forward(self, sdf: Float[Tensor, "N M"], distances: Float[Tensor, "N M"]) -> Float[Tensor, "N M-1"]:
-        """Optical depth between the samples of rays; see `laplace_depth`."""
+        """Optical depth between the samples of rays, see `laplace_depth`."""
         return laplace_depth(sdf, distances, self.beta())

@@ -1,6 +1,7 @@
-"""A distance field sampled on a grid, and rays traced through it: visibility at the price of a look-up.
+"""A distance field sampled on a grid, and sphere tracing in it, for cheap visibility.
 
-The grid spans the cube [−radius, radius]³, vertices on its faces, stored z, y, x (`grid_sample`).
+The grid spans the cube [−radius, radius]³ with vertices on its faces, in the order z, y, x (as
+`grid_sample`).
 """
 
 from __future__ import annotations
@@ -20,14 +21,15 @@ __all__ = ["GRID_RESOLUTION", "GridHits", "cell_size", "look_up", "sample_grid",
 GRID_RESOLUTION = 96
 """Vertices along an edge of the grid that hard inter-reflection traces."""
 CHUNK = 65_536
+"""Points per evaluation of the field when a grid is sampled; limits memory."""
 STEPS = 40
-"""Most steps of a ray; one that has not ended by then passes close to a surface without meeting it."""
+"""Maximum number of steps of a ray. A ray that has not ended by then grazes a surface: a miss."""
 HIT_CELLS = 0.25
-"""A ray meets the surface where the distance is below this share of a cell: the interpolation error."""
+"""Distance below which a ray hits, in cells: about the interpolation error."""
 
 
 def cell_size(grid: Float[Tensor, "R R R"], radius: float) -> float:
-    """Edge of a cell."""
+    """Edge length of a cell, scene units."""
     return 2 * radius / (grid.shape[0] - 1)
 
 
@@ -35,7 +37,7 @@ def cell_size(grid: Float[Tensor, "R R R"], radius: float) -> float:
 def sample_grid(
     sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]], radius: float, resolution: int, like: Tensor
 ) -> Float[Tensor, "R R R"]:
-    """The distance at resolution³ vertices, on the device and in the type of `like`."""
+    """Sample a signed distance field at resolution³ vertices, with the device and dtype of `like`."""
     axis = torch.linspace(-radius, radius, resolution, device=like.device, dtype=like.dtype)
     z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     vertices = torch.stack((x, y, z), -1).reshape(-1, 3)
@@ -45,14 +47,14 @@ def sample_grid(
 
 
 def look_up(grid: Float[Tensor, "R R R"], radius: float, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-    """The distance at points, by trilinear interpolation; beyond the cube that of the nearest face point."""
+    """Interpolate the distance trilinearly at points; points outside of the cube are clamped to it."""
     at = (x / radius).view(1, -1, 1, 1, 3)
     return functional.grid_sample(grid[None, None], at, padding_mode="border", align_corners=True).view(-1)
 
 
 @dataclass(frozen=True)
 class GridHits:
-    """Where rays meet the surface: the distance along the ray, and whether before they leave the cube."""
+    """Distances along rays, and whether they hit the surface before leaving the cube."""
 
     distance: Float[Tensor, " P"]
     hit: Bool[Tensor, " P"]
@@ -65,15 +67,21 @@ def trace_grid(
     origins: Float[Tensor, "P 3"],
     directions: Float[Tensor, "P 3"],
 ) -> GridHits:
-    """Sphere tracing: each step goes as far as the distance allows, and at least a quarter of a cell.
+    """Sphere-trace rays: each step is the interpolated distance, but at least a quarter of a cell.
 
-    On a CPU by compiled loops; elsewhere all rays take all steps together, without synchronisation.
+    On a CPU compiled loops do it. On other devices all rays take all steps together, without synchronisation.
+
+    Args:
+        grid: sampled distances.
+        radius: half the edge of the cube.
+        origins: starts of the rays, inside the cube.
+        directions: unit directions.
     """
     least = HIT_CELLS * cell_size(grid, radius)
     compiled = ray_tracer(origins.device.type)
     if compiled is None or grid.dtype.itemsize < 4:
         return _trace_together(grid, radius, origins, directions, least)
-    found = GridHits(grid.new_empty(len(origins)), grid.new_empty(len(origins), dtype=torch.bool))
+    hits = GridHits(grid.new_empty(len(origins)), grid.new_empty(len(origins), dtype=torch.bool))
     compiled(
         grid,
         radius,
@@ -81,10 +89,10 @@ def trace_grid(
         directions.to(grid.dtype),
         least,
         STEPS,
-        found.distance,
-        found.hit,
+        hits.distance,
+        hits.hit,
     )
-    return found
+    return hits
 
 
 def _trace_together(

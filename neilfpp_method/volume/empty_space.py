@@ -1,10 +1,11 @@
-"""Empty space that a ray may skip: a coarse grid of the distance field says where no surface can be.
+"""Empty space that rays may skip, according to a coarse grid of the distance field.
 
-The grid knows the field at its vertices, and how fast it changes between them. Within L · r of a place where
-it is known to be v, a field whose slope is at most L lies in v ± L · r: what is clear by that measure is
-skipped, and a plate thinner than a cell is not. The field moves while it trains. So every use asks it once
-per ray in the part that would be skipped; where one answer breaks the promise no ray skips anything, and the
-grid is soon sampled anew.
+The grid holds the field at its vertices and a bound L on its slope. Within a distance r of a point with value
+v the field lies in v ± L · r. Parts of rays that this bound shows to be empty are skipped; a plate thinner
+than a cell is not skipped.
+
+The field changes while it is trained. So every use checks the field itself at one random point per ray in the
+part to be skipped. If one of them is not empty, no ray skips anything, and the grid is soon sampled again.
 """
 
 from __future__ import annotations
@@ -24,34 +25,34 @@ from neilfpp_method.volume.intersect import Interval
 __all__ = ["EmptySpace", "Span"]
 
 LOOK_UPS = 128
-"""Places along a ray at which the grid is read."""
+"""Number of parts of a ray; the grid is read once in each."""
 RESOLUTION = 64
 """Vertices along an edge of the grid."""
 MARGIN = 1.1
-"""The field's slope over the largest between neighbouring vertices."""
+"""Ratio of the bound on the slope to the largest slope between neighboring vertices."""
 MISSED = 0.01
-"""Most opacity that the density of skipped space may have."""
+"""Largest opacity of skipped space in training."""
 HARDLY_MISSED = 1e-3
-"""The same in pictures: a quarter of a level of 8 bits."""
+"""Largest opacity of skipped space in evaluation: a quarter of an 8-bit level."""
 OPAQUE = 8.0
-"""Optical depth behind which nothing is seen."""
+"""Optical depth behind which nothing is visible."""
 MIN_LIFE, MAX_LIFE = 20, 100
-"""Steps in which the field moves before the grid may, and must, be sampled anew."""
+"""Training steps after which the grid may, and must, be sampled again."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """Which rays have a part that is taken, and where it starts and ends; the whole ray without one."""
+    """Which rays have a part to be sampled, and the interval of this part; the whole ray if there is none."""
 
     some: Bool[Tensor, " N"]
     interval: Interval
 
 
 class EmptySpace(nn.Module):
-    """The grid and its age, which are kept in checkpoints: a resumed run must skip the very same space.
+    """The grid and its age. Both are in checkpoints, so that a resumed run skips the same space.
 
     Args:
-        radius: of the scene sphere.
+        radius: radius of the scene sphere, scene units.
     """
 
     def __init__(self, radius: float) -> None:
@@ -62,7 +63,7 @@ class EmptySpace(nn.Module):
         self.age: int | None = None
 
     def moved(self) -> None:
-        """The field has taken a step."""
+        """Record that a training step has changed the field."""
         if self.age is not None:
             self.age += 1
 
@@ -74,18 +75,19 @@ class EmptySpace(nn.Module):
         interval: Interval,
         beta: Float[Tensor, ""],
     ) -> Interval:
-        """The part of each ray outside which the density of scale `beta` neither absorbs nor can be seen.
+        """The part of each ray outside of which the density of scale `beta` is negligible or occluded.
 
-        Costs one query of the field per ray. A ray that is empty all along keeps its whole interval. On a CPU
-        a broken promise is noticed at once; elsewhere nobody waits for the answer, and the age of the grid
-        alone decides.
+        It costs one query of the field per ray, on a CPU. An empty ray keeps its whole interval. On other
+        devices the check would have to wait for the device, so only the age of the grid decides when it is
+        sampled again.
         """
         self._renew(sdf)
         edges, clearance = self._edges(interval), self._clearance(beta, MISSED)
         empty, opaque = self._known(rays, edges, clearance, beta)
         if rays.origins.device.type == "cpu" and not self._holds(sdf, rays, edges, empty, clearance):
             if self.age is not None and self.age >= MIN_LIFE:
-                self.age = None  # the next use samples it
+                # Sample the grid again at its next use.
+                self.age = None
             return interval
         return _span(edges, ~empty & ~opaque, interval).interval
 
@@ -97,10 +99,10 @@ class EmptySpace(nn.Module):
         interval: Interval,
         beta: Float[Tensor, ""],
     ) -> Span:
-        """Which rays may show anything, and the part of each within which they do; a fixed field.
+        """Which rays may show a surface, and the part of each ray that is visible, for a fixed field.
 
-        The grid must be that of the field as it is: it is sampled by the first who asks, and no promise is
-        tested. What is left out has an opacity of at most `HARDLY_MISSED`.
+        The grid must belong to the current field, as the field itself is not checked; it is sampled at first
+        use. The parts that are left out have an opacity of at most `HARDLY_MISSED`.
         """
         self._renew(sdf)
         edges = self._edges(interval)
@@ -115,12 +117,12 @@ class EmptySpace(nn.Module):
         interval: Interval,
         beta: Float[Tensor, ""],
     ) -> Bool[Tensor, " N"]:
-        """Which rays may come down on a surface, for rays that leave one: their start is never clear.
+        """Which rays may hit a surface, for rays that start at a surface.
 
-        A ray that enters a surface does so where the distance falls. So a ray may meet one if somewhere the
-        grid's distance falls along it in a part that is not empty for sure. Between vertices the grid knows a
-        falling distance less well than a small one: a surface within a cell or two of the start may be
-        overlooked. Costs look-ups alone.
+        The start of such a ray is never empty, so `narrow` does not help. But a ray enters a surface where
+        the distance decreases. So a ray may hit if the distance decreases along it in a part that is not
+        certainly empty. This is less certain than `narrow`: a surface within one or two cells of the start
+        may be missed. It costs only grid look-ups.
         """
         self._renew(sdf)
         edges = self._edges(interval)
@@ -145,32 +147,33 @@ class EmptySpace(nn.Module):
         clearance: Float[Tensor, ""],
         beta: Float[Tensor, ""],
     ) -> tuple[Bool[Tensor, "N K"], Bool[Tensor, "N K"]]:
-        """Which parts of the rays are empty for sure, and which lie for sure behind what is opaque."""
+        """Which parts of the rays are certainly empty, and which are certainly behind an opaque part."""
         width, distance, doubt = edges.diff(dim=-1), self._read(rays, edges), self._doubt(edges)
-        # Inside, the density is at least half of 1/β.
+        # Inside, the density is at least 1 / (2 β).
         depth = ((distance + doubt < 0.0) * width / (2.0 * beta)).cumsum(dim=-1)
         return distance - doubt > clearance, depth - width / (2.0 * beta) > OPAQUE
 
     def _edges(self, interval: Interval) -> Float[Tensor, "N E"]:
-        """The ends of the parts of each ray."""
+        """The ends of the equal parts of each ray."""
         share = torch.linspace(0, 1, LOOK_UPS + 1, device=self.distance.device, dtype=interval.near.dtype)
         return torch.lerp(interval.near[:, None], interval.far[:, None], share)
 
     def _read(self, rays: RayBatch, edges: Float[Tensor, "N E"]) -> Float[Tensor, "N K"]:
-        """The grid's distance in the middle of each part."""
+        """The grid's distance at the center of each part."""
         middle = 0.5 * (edges[:, :-1] + edges[:, 1:])
         points = rays.origins[:, None] + middle[..., None] * rays.directions[:, None]
         return look_up(self.distance, self.radius, points.reshape(-1, 3)).view(middle.shape)
 
     def _doubt(self, edges: Float[Tensor, "N E"]) -> Float[Tensor, "N K"]:
-        """How far the field in a part may be from what the grid says in its middle."""
-        # A weighted mean of a cell's vertices is off by at most the slope times half of its diagonal.
+        """Bound on the difference between the field in a part and the grid's value at its center."""
+        # The error of interpolation in a cell is at most the slope times half of the cell's diagonal.
         reach = 0.5 * math.sqrt(3.0) * cell_size(self.distance, self.radius)
         return self.slope * (0.5 * edges.diff(dim=-1) + reach)
 
     def _clearance(self, beta: Float[Tensor, ""], missed: float) -> Float[Tensor, ""]:
-        """The distance from which a density of scale β adds up to at most `missed` along a ray."""
-        return beta * math.log(self.radius / missed) - beta * beta.log()  # e^(−G/β) · 2 radius / 2β ≤ missed
+        """Distance from the surface beyond which a ray has an opacity of at most `missed`."""
+        # Solves e^(−G/β) · 2 radius / (2β) ≤ missed for G.
+        return beta * math.log(self.radius / missed) - beta * beta.log()
 
     def _holds(
         self,
@@ -180,19 +183,19 @@ class EmptySpace(nn.Module):
         empty: Bool[Tensor, "N K"],
         clearance: Float[Tensor, ""],
     ) -> bool:
-        """Whether the field is clear at one random place of each ray, where the grid says that it is."""
+        """Whether the field itself is empty at one random point of each ray, if the grid says so there."""
         at = torch.rand_like(edges[:, :1])
         part = (at * LOOK_UPS).long().clamp_max(LOOK_UPS - 1)
         distance = torch.lerp(edges[:, :1], edges[:, -1:], at)
-        found = sdf(rays.origins + distance * rays.directions)
-        return not bool((empty.gather(-1, part)[:, 0] & (found <= clearance)).any())
+        actual = sdf(rays.origins + distance * rays.directions)
+        return not bool((empty.gather(-1, part)[:, 0] & (actual <= clearance)).any())
 
     def get_extra_state(self) -> dict[str, int | None]:
-        """The age, for checkpoints."""
+        """The age of the grid, for checkpoints."""
         return {"age": self.age}
 
     def set_extra_state(self, state: dict[str, int | None]) -> None:
-        """The inverse of `get_extra_state`."""
+        """Restore what `get_extra_state` returned."""
         self.age = state["age"]
 
 

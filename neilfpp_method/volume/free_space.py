@@ -1,9 +1,8 @@
-"""Free space before cameras: where a camera stands, and some way around it, there is nothing.
+"""Free space around cameras: a ball around every camera that contains no density.
 
-A view alone is explained as well by a veil before its own lens as by the surface that it shows, and where
-cameras stand within the space that may hold density, training finds veils first. So a ball about every camera
-is cut out of the scene, whoever's ray runs through it: new views, which stand among the others, see no veil
-either.
+A single view is explained as well by fog in front of its camera as by the surface that it shows. If cameras
+are inside the space that may have density, training finds the fog first. So a ball around every camera is cut
+out of the scene, for the rays of all views: new views, which are among the others, see no fog either.
 """
 
 from __future__ import annotations
@@ -17,27 +16,27 @@ from torch import Tensor, nn
 __all__ = ["FREE_SHARE", "OBJECT_RADIUS", "FreeSpace", "FreeSpaceSample", "cameras_within", "free_radius"]
 
 FREE_SHARE = 0.25
-"""Radius of the ball about a camera, in its distance from the scene's centre: 0.45 scene units for a camera
-that is 1.8 away, as half of them are where the box is about what they look at.
+"""Radius of the ball around a camera, relative to its distance from the scene's center: 0.45 scene units for
+a camera at 1.8, the median distance if the scene box was determined by what the cameras look at.
 """
 OBJECT_RADIUS = 1.0
-"""No ball reaches into the ball of this radius, scene units, which holds the object."""
+"""Radius of the ball that contains the object, scene units; no free ball reaches into it."""
 RESOLUTION = 64
-"""Vertices along an edge of the grid that says which camera's ball counts."""
+"""Vertices along an edge of the grid that stores the decisive camera of each place."""
 
 
 @dataclass(frozen=True)
 class FreeSpaceSample:
-    """Depth of N points within free space, scene units, negative outside, and its unit gradient."""
+    """Depth of N points in free space, scene units, negative outside of it, and its unit gradient."""
 
     depth: Float[Tensor, " N"]
     gradient: Float[Tensor, "N 3"]
 
 
 def free_radius(distance: Float[Tensor, " V"]) -> Float[Tensor, " V"]:
-    """Radius of the free ball about cameras at a distance from the scene's centre; 0 among the objects.
+    """Radius of the free balls of cameras at a distance from the scene's center.
 
-    The lesser of `FREE_SHARE` · distance and distance − `OBJECT_RADIUS`, and never negative.
+    It is the smaller of `FREE_SHARE` · distance and distance − `OBJECT_RADIUS`, and at least 0.
 
     >>> free_radius(torch.tensor([0.5, 1.2, 2.0])).tolist()
     [0.0, 0.20000004768371582, 0.5]
@@ -46,11 +45,11 @@ def free_radius(distance: Float[Tensor, " V"]) -> Float[Tensor, " V"]:
 
 
 def cameras_within(position: Float[Tensor, "V 3"], radius: float) -> Float[Tensor, "K 3"]:
-    """The cameras whose free balls reach into a scene of this radius; the others leave it as it is.
+    """Positions of the cameras whose free balls reach into the scene sphere.
 
     Args:
-        position: of cameras, scene frame.
-        radius: of the scene sphere, scene units.
+        position: camera positions, scene frame.
+        radius: radius of the scene sphere, scene units.
     """
     distance = position.norm(dim=-1)
     free = free_radius(distance)
@@ -58,20 +57,20 @@ def cameras_within(position: Float[Tensor, "V 3"], radius: float) -> Float[Tenso
 
 
 class FreeSpace(nn.Module):
-    """The union of the free balls, as a signed depth: max over cameras c of free_radius(‖c‖) − ‖x − c‖.
+    """The union of the free balls as a signed depth: max over cameras c of free_radius(‖c‖) − ‖x − c‖.
 
-    Which camera the maximum comes from is looked up, at the nearest vertex of a grid; the depth is that of
-    this camera, exactly. Where two balls meet it is too small by at most a cell and a half.
+    The camera of the maximum is looked up at the closest vertex of a grid; the depth for this camera is
+    exact. Where two balls meet, the depth is too small by at most one and a half cells.
 
     Args:
-        cameras: positions, scene frame; at least one.
-        radius: of the scene sphere, half an edge of the grid.
+        cameras: camera positions, scene frame; at least one.
+        radius: radius of the scene sphere, half an edge of the grid.
     """
 
     def __init__(self, cameras: Float[Tensor, "V 3"], radius: float) -> None:
         super().__init__()
         self.radius = radius
-        # Not stored: a run's capture has its cameras.
+        # Not in checkpoints: the cameras come from the capture.
         self.register_buffer("cameras", cameras, persistent=False)
         self.register_buffer("free", free_radius(cameras.norm(dim=-1)), persistent=False)
         axis = torch.linspace(-radius, radius, RESOLUTION, dtype=cameras.dtype, device=cameras.device)
@@ -81,7 +80,7 @@ class FreeSpace(nn.Module):
         )
 
     def forward(self, x: Float[Tensor, "N 3"]) -> FreeSpaceSample:
-        """Depth and gradient at points; beyond the grid by its nearest vertex."""
+        """Depth and gradient at points; outside of the grid, its closest vertex determines the camera."""
         x = x.detach()
         place = ((x / self.radius + 1.0) * (0.5 * (RESOLUTION - 1))).round().long().clamp(0, RESOLUTION - 1)
         camera = self.deepest[place[:, 0], place[:, 1], place[:, 2]]

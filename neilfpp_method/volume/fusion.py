@@ -1,9 +1,9 @@
-"""Oriented points fused into a sampled distance field: what has been seen of a surface, made traceable.
+"""Fusion of oriented points into a sampled distance field, in which rays can be traced.
 
 Near the points the distance is the weighted mean of the distances from their tangent planes (an implicit
 moving least-squares surface, Kolluri 2008; as a volume, Curless and Levoy 1996). Further away it is a lower
-bound of the distance from any vertex that is close to the surface, so that sphere tracing is safe and what
-nobody has seen is empty.
+bound on the distance to the closest vertex at the surface, so that sphere tracing is safe. Space without
+points is empty.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from neilfpp_method.volume.distance_grid import cell_size, look_up
 __all__ = ["FusedSurface", "fuse", "grid_normal", "mean_at"]
 
 WIDTH = 0.75
-"""Standard deviation of a point's influence, in cells: the next vertices, and little beyond. It flattens a
-surface of curvature κ by about WIDTH² κ / 2 cells squared.
+"""Standard deviation of a point's weight, in cells: it reaches the closest vertices and little beyond. It
+shifts a surface of curvature κ by about WIDTH² κ / 2 cells squared.
 """
 BEHIND = 1.25
-"""How far behind its plane a point counts, in cells: less than the thickness of thin objects."""
+"""Largest distance behind its plane at which a point has weight, in cells: less than thin objects have."""
 KNOWN = 0.15
-"""Least weight sum of a vertex with a known distance; a point one and a half cells away has 0.14."""
+"""Smallest sum of weights of a vertex with a known distance; a point 1.5 cells away has a weight of 0.14."""
 HALF_DIAGONAL = 0.87
-"""In cells: a vertex of the cell that holds a surface is no further from it."""
+"""Half the diagonal of a cell, in cells: some vertex of a cell with a surface is at most this far from it."""
 AT_ONCE = 8192
-"""Points that are fused together: bounds the memory."""
+"""Points per batch of the fusion; limits memory."""
 
 
 @dataclass(frozen=True)
 class FusedSurface:
-    """Distances at the cube's vertices, z, y, x; for means, the sums of weights and weighted values."""
+    """Distances at the vertices of the cube (z, y, x), and the sums of weights and of weighted values."""
 
     distance: Float[Tensor, "R R R"]
     weight: Float[Tensor, "R R R"]
@@ -51,17 +51,18 @@ def fuse(
     radius: float,
     resolution: int,
 ) -> FusedSurface:
-    """The surface through oriented points, with the mean of what they hold.
+    """Fuse oriented points with values into a surface.
 
     Args:
-        position: scene frame; what lies outside the cube [−radius, radius]³ is left out.
-        normal: unit, away from the surface.
-        value: numbers of each point, radiance say.
+        position: points, scene frame; those outside of the cube [−radius, radius]³ are left out.
+        normal: outward unit normals.
+        value: values of each point to average, for example radiance.
         radius: half the edge of the cube.
         resolution: vertices along an edge.
     """
     edge = 2 * radius / (resolution - 1)
-    sums = position.new_zeros(2 + value.shape[1], resolution**3)  # weight, weighted distance, weighted values
+    # Rows: sums of weights, of weighted distances, and of weighted values.
+    sums = position.new_zeros(2 + value.shape[1], resolution**3)
     inside = (position.abs() < radius - 2 * edge).all(-1)
     steps = torch.arange(-1, 3, device=position.device)
     around = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
@@ -84,14 +85,14 @@ def fuse(
 
 
 def mean_at(surface: FusedSurface, radius: float, x: Float[Tensor, "P 3"]) -> Float[Tensor, "P C"]:
-    """The weighted mean of the values about points; 0 where nothing is known."""
+    """Weighted mean of the values around points; 0 where there are none."""
     weight = look_up(surface.weight, radius, x)
     values = torch.stack([look_up(channel, radius, x) for channel in surface.value], -1)
     return values / weight.clamp_min(1e-6)[:, None]
 
 
 def grid_normal(grid: Float[Tensor, "R R R"], radius: float, x: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-    """Unit gradient of a sampled distance field, by central differences over a cell; 0 where it is flat."""
+    """Unit gradient of a sampled distance field, by central differences; 0 where it is constant."""
     step = 0.5 * cell_size(grid, radius)
     ends = torch.cat([x + sign * step * axis for axis in torch.eye(3).to(x) for sign in (1.0, -1.0)])
     values = look_up(grid, radius, ends).view(3, 2, len(x))
@@ -99,7 +100,7 @@ def grid_normal(grid: Float[Tensor, "R R R"], radius: float, x: Float[Tensor, "P
 
 
 def _far(near: Tensor, edge: float) -> Float[Tensor, "R R R"]:
-    """A lower bound of the surface's distance: the nearest vertex beside it, less half a cell diagonal."""
+    """Lower bound on the distance: that to the closest vertex at the surface, minus half a diagonal."""
     if not near.any():
         return torch.full(near.shape, near.shape[0] * edge, device=near.device)
     cells = torch.from_numpy(distance_transform_edt((~near).cpu().numpy())).to(near.device, torch.float32)

@@ -1,4 +1,4 @@
-"""Where a ray runs through the scene."""
+"""Intersection of rays with the scene sphere."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["Interval", "sphere_interval"]
+from neilfpp_method.structures import Segments
+
+__all__ = ["Interval", "clip_to_sphere", "sphere_interval"]
 
 
 @dataclass(frozen=True)
 class Interval:
-    """The part of each ray that counts: distances from the origin, 0 ≤ near ≤ far."""
+    """A part of each ray, as distances from its origin: 0 ≤ near ≤ far."""
 
     near: Float[Tensor, " N"]
     far: Float[Tensor, " N"]
@@ -23,12 +25,11 @@ class Interval:
 def sphere_interval(
     origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"], radius: float
 ) -> Interval:
-    """The part of each ray inside the sphere of `radius` about the scene's origin.
+    """The part of each ray inside the sphere of `radius` around the origin of the scene frame.
 
     near = max(m − h, 0) and far = max(m + h, 0), with m = −o·d the distance of closest approach and h² =
-    max(radius² − ‖o + m d‖², 0). A ray that starts inside has near = 0. A ray that misses the sphere, or has
-    left it behind, has near = far: an interval of no length. The ends are constants: no gradient flows
-    through where sampling starts and stops.
+    max(radius² − ‖o + m d‖², 0). A ray that starts inside has near = 0. A ray that misses the sphere has near
+    = far. No gradient flows through the ends.
 
     Args:
         origins: ray origins, scene frame.
@@ -36,7 +37,19 @@ def sphere_interval(
         radius: scene units.
     """
     closest = -(origins * directions).sum(dim=-1)
-    # From the perpendicular, not ‖o‖² − m²: the difference of large squares blurs edges of far cameras.
+    # Not ‖o‖² − m²: for distant cameras this difference of large squares loses digits.
     perpendicular = origins + closest[:, None] * directions
     half = (radius**2 - perpendicular.square().sum(dim=-1)).clamp_min(0.0).sqrt()
     return Interval((closest - half).clamp_min(0.0), (closest + half).clamp_min(0.0))
+
+
+@torch.no_grad()
+def clip_to_sphere(segments: Segments, radius: float) -> Segments:
+    """The parts of segments inside the sphere of `radius` around the origin; other segments are left out."""
+    length = segments.length
+    direction = (segments.end - segments.start) / length.clamp_min(1e-12)[:, None]
+    inside = sphere_interval(segments.start, direction, radius)
+    far = torch.minimum(inside.far, length)
+    kept = far > inside.near
+    start, direction = segments.start[kept], direction[kept]
+    return Segments(start + inside.near[kept, None] * direction, start + far[kept, None] * direction)

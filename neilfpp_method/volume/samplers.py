@@ -1,11 +1,11 @@
-"""Where to sample a ray: evenly, by a distribution, or with bounded opacity error (VolSDF §3).
+"""Samplers of distances along rays: uniform, by a distribution, or with bounded opacity error (VolSDF §3).
 
-The error-bounded sampler cuts a ray into intervals, bounds how wrong the opacity can be when the density is
-taken as constant on each, and cuts again where that bound comes from. Nothing here is differentiated.
+The error-bounded sampler cuts a ray into intervals, bounds the error of the opacity under a density that is
+constant on each interval, and adds cuts where they lower that bound most. No gradient flows through samples.
 
-The samples that are rendered are of two kinds (published code): most lie where a ray is stopped, and the
-rest, with both ends of the ray, between them, so that the density is known where it is low as well. Without
-the latter a ray that grazes a surface comes out too opaque.
+The rendered samples are of two kinds (published code): most are distributed by opacity, and the rest, with
+both ends of the ray, is spread over the whole ray, so that the density is also sampled where it is low.
+Without the latter a ray that grazes a surface comes out too opaque.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ __all__ = [
 ]
 
 OPACITY_ERROR = 0.1
-"""ε, the bound on the opacity's error (VolSDF)."""
+"""Bound ε on the error of the opacity (VolSDF)."""
 
 BISECTIONS = 10
-"""Halvings of the interval in which β is sought (published code)."""
+"""Number of bisection steps on β (published code)."""
 
 SPREAD = 1 / 3
-"""Share of the samples that are spread over the cuts of a ray: 32 of 96 in the published code."""
+"""Share of the rendered samples that are spread over the cuts of a ray: 32 of 96 in the published code."""
 
 SignedDistance = Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]
 
@@ -47,7 +47,7 @@ SignedDistance = Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]
 
 
 def strata(like: Float[Tensor, "N _"], count: int, stochastic: bool) -> Float[Tensor, "N {count}"]:
-    """Ascending numbers in [0, 1], one in each of `count` equal strata: anywhere in it, or at its middle."""
+    """Ascending numbers in [0, 1], one in each of `count` equal strata: random, or at the center."""
     shape = (like.shape[0], count)
     within = like.new_empty(shape).uniform_() if stochastic else like.new_full(shape, 0.5)
     return (torch.arange(count, device=like.device, dtype=like.dtype) + within) / count
@@ -57,7 +57,7 @@ def strata(like: Float[Tensor, "N _"], count: int, stochastic: bool) -> Float[Te
 def uniform_samples(
     near: Float[Tensor, " N"], far: Float[Tensor, " N"], count: int, stochastic: bool
 ) -> Float[Tensor, "N {count}"]:
-    """`count` ascending distances: both ends of [near, far], and one per equal part, random or central."""
+    """`count` ascending distances: near, far, and one in each equal part between, random or central."""
     within = torch.lerp(near[:, None], far[:, None], strata(near[:, None], count - 2, stochastic))
     return torch.cat([near[:, None], within, far[:, None]], dim=-1)
 
@@ -66,20 +66,21 @@ def uniform_samples(
 def inverse_cdf_samples(
     edges: Float[Tensor, "N E"], mass: Float[Tensor, "N E-1"], count: int, stochastic: bool
 ) -> Float[Tensor, "N {count}"]:
-    """Ascending distances distributed as `mass`, even within bins: one for each of `count` equal shares.
+    """Stratified samples of a piecewise constant distribution, in ascending order.
 
-    A bin without mass gets no sample. Without any mass the samples are even from first to last edge.
+    A bin without mass gets no sample. If all bins are without mass, samples are uniform from the first to the
+    last edge.
 
     Args:
-        edges: bounds of the bins, ascending; a bin may have no width.
-        mass: how much of the distribution lies in each bin, ≥ 0, up to a common factor.
-        count: samples per ray.
-        stochastic: at random in each share, or at its middle.
+        edges: bounds of the bins, ascending; a bin may have width 0.
+        mass: probability mass of each bin, ≥ 0, up to a common factor.
+        count: samples per ray, one in each of `count` equal shares of the mass.
+        stochastic: whether samples are random within their share; if False, they are at its center.
     """
     tiny = torch.finfo(edges.dtype).tiny
     mass = mass.to(edges.dtype)
     total = mass.sum(dim=-1, keepdim=True)
-    # The fallback is the widths, and at least `tiny`: an interval of no length is not divided by zero.
+    # Without mass, use the widths, at least `tiny` against a division by zero for rays of length 0.
     mass = torch.where(total > tiny, mass / total.clamp_min(tiny), edges.diff(dim=-1).clamp_min(tiny))
     cdf = torch.nn.functional.pad(mass.cumsum(dim=-1), (1, 0))
     cdf = cdf / cdf[:, -1:]
@@ -87,7 +88,7 @@ def inverse_cdf_samples(
     u = strata(edges, count, stochastic).clamp_max(1.0 - torch.finfo(edges.dtype).eps)
     end = torch.searchsorted(cdf, u, right=True).clamp_max(mass.shape[-1])
     low, high = cdf.gather(-1, end - 1), cdf.gather(-1, end)
-    # The clamps only matter where a parallel sum has rounded neighbours of the CDF out of order.
+    # The clamps only matter if a parallel sum has rounded neighboring values of the CDF out of order.
     fraction = ((u - low) / (high - low).clamp_min(tiny)).clamp(0.0, 1.0)
     return torch.lerp(edges.gather(-1, end - 1), edges.gather(-1, end), fraction)
 
@@ -97,7 +98,7 @@ def inverse_cdf_samples(
 
 @dataclass(frozen=True)
 class Partition(Indexable):
-    """Rays cut into intervals: the E cuts from near to far, the SDF there, and each width and d*."""
+    """Rays cut into intervals: distances of the E cuts, the SDF there, and width and d* of each interval."""
 
     distances: Float[Tensor, "N E"]
     sdf: Float[Tensor, "N E"]
@@ -106,13 +107,13 @@ class Partition(Indexable):
 
 
 def cut(distances: Float[Tensor, "N E"], sdf: Float[Tensor, "N E"]) -> Partition:
-    """Rays cut at `distances`, where the SDF is `sdf`.
+    """Make a partition of rays from the distances of the cuts and the SDF there.
 
-    d* is how close the surface can come to an interval (VolSDF Theorem 1 and supplement). The surface does
-    not enter the balls of radius |sdf| about the ends of the interval; d* is the distance from the interval
-    to what is outside both: to the circle where the spheres meet if its foot is in the interval, else the
-    smaller radius. It is 0 where they do not meet, and where the sign changes: a learned distance may promise
-    more room than there is.
+    d* is a lower bound on the distance between the surface and an interval (VolSDF Theorem 1 and supplement).
+    The surface does not enter the balls of radius |sdf| around the ends of the interval. d* is the distance
+    from the interval to the outside of both balls: to the circle in which the spheres intersect if its
+    projection lies in the interval, else the smaller radius. It is 0 if the spheres do not intersect, or if
+    the sign changes, which is possible as learned distances may be too large.
     """
     width = distances.diff(dim=-1)
     start, end = sdf[:, :-1], sdf[:, 1:]
@@ -125,15 +126,15 @@ def cut(distances: Float[Tensor, "N E"], sdf: Float[Tensor, "N E"]) -> Partition
 
 
 def optical_depth(partition: Partition, beta: Float[Tensor, "#N 1"]) -> Float[Tensor, "N K"]:
-    """R̂ up to the start of each interval, with the density constant on each (VolSDF §3.3)."""
+    """Optical depth R̂ up to the start of each interval, with constant density per interval (VolSDF §3.3)."""
     depth = laplace_density(partition.sdf[:, :-1], beta) * partition.width
     return torch.nn.functional.pad(depth[:, :-1], (1, 0)).cumsum(dim=-1)
 
 
 def depth_error(partition: Partition, beta: Float[Tensor, "#N 1"]) -> Float[Tensor, "N K"]:
-    """Ê, the bound on the error of R̂, up to each interval's end: Σ δ² exp(−d*/β) / (4 β²) (VolSDF §3.3).
+    """Bound Ê on the error of R̂ up to the end of each interval: Σ δ² exp(−d*/β) / (4 β²) (VolSDF §3.3).
 
-    The slope of the density is at most exp(−d*/β) / (2 β²) on an interval where |∇ sdf| ≤ 1 (Theorem 1).
+    It holds if |∇ sdf| ≤ 1; then the slope of the density is at most exp(−d*/β) / (2 β²) (Theorem 1).
     """
     share = torch.exp(-partition.least_distance / beta) * (partition.width / (2.0 * beta)).square()
     return share.cumsum(dim=-1)
@@ -142,7 +143,7 @@ def depth_error(partition: Partition, beta: Float[Tensor, "#N 1"]) -> Float[Tens
 def log_error_bound(partition: Partition, beta: Float[Tensor, "#N 1"]) -> Float[Tensor, "N 1"]:
     """Log of the bound on |O − Ô| along the ray: max_k exp(−R̂_k) (exp(Ê_{k+1}) − 1) (VolSDF Theorem 2).
 
-    In logs, as exp(Ê) overflows where exp(−R̂) has long undone it.
+    Logarithms are used because exp(Ê) can overflow although its product with exp(−R̂) is small.
     """
     error = depth_error(partition, beta)
     log_growth = error + torch.log(-torch.expm1(-error))
@@ -150,10 +151,11 @@ def log_error_bound(partition: Partition, beta: Float[Tensor, "#N 1"]) -> Float[
 
 
 def bound_shares(partition: Partition, beta: Float[Tensor, "N 1"]) -> Float[Tensor, "N K"]:
-    """What each interval adds to the bound, exp(Ê − R̂) · ΔÊ, up to a factor: where new cuts help.
+    """Contribution of each interval to the error bound, exp(Ê − R̂) · ΔÊ, normalised: where new cuts help.
 
-    The paper cuts in proportion to the bound itself. That piles up along the ray: behind a grazed surface it
-    stays high where nothing is to be gained. The shares reach the same bound with fewer queries.
+    The paper distributes new cuts by the bound itself, which accumulates along the ray: behind a grazed
+    surface it stays high although cuts there do not lower it. The contributions need fewer queries for the
+    same bound.
     """
     log_share = (
         2.0 * partition.width.clamp_min(torch.finfo(beta.dtype).tiny).log() - partition.least_distance / beta
@@ -164,9 +166,9 @@ def bound_shares(partition: Partition, beta: Float[Tensor, "N 1"]) -> Float[Tens
 def bounded_beta(
     partition: Partition, beta: Float[Tensor, "#N 1"], beta_plus: Float[Tensor, "N 1"], config: VolumeConfig
 ) -> Float[Tensor, "N 1"]:
-    """The smallest scale in [β, β₊] found by bisection for which the bound is ≤ ε; β₊ where there is none.
+    """The smallest scale in [β, β₊] for which the bound is ≤ ε, by bisection; β₊ if there is none.
 
-    The steps halve the ratio, not the difference, of the ends: the two may lie decades apart.
+    The bisection is in log space, because β and β₊ may differ by orders of magnitude.
     """
     low, high = beta.expand_as(beta_plus), beta_plus
     for _ in range(BISECTIONS):
@@ -181,11 +183,13 @@ def bounded_beta(
 
 @dataclass(frozen=True)
 class ErrorBoundedSamples:
-    """Samples of each ray, their cost, and how far the opacity they follow can be from the truth.
+    """Samples of rays, with their error bound and cost.
 
-    `distances` ascend. `error_bound` is that of `log_error_bound` at the true β, at most 1: above
-    `OPACITY_ERROR` the rounds were used up, and the samples follow a wider density. It holds where
-    |∇ sdf| ≤ 1. `sdf_queries` is the number of SDF queries per ray, a mean over the rays.
+    Attributes:
+        distances: distances of the samples, ascending.
+        error_bound: bound on the error of the opacity at the true β, at most 1; it holds if |∇ sdf| ≤ 1. If
+            it is above `OPACITY_ERROR`, the rounds were used up, and the samples follow a wider density.
+        sdf_queries: number of SDF queries per ray, averaged over the rays.
     """
 
     distances: Float[Tensor, "N M"]
@@ -204,22 +208,22 @@ def error_bounded_samples(
     config: VolumeConfig,
     stochastic: bool,
 ) -> ErrorBoundedSamples:
-    """Distances where the Laplace density stops a ray, to `config.epsilon`, and some between (Algorithm 1).
+    """Sample rays so that the error of the opacity is at most ε (`OPACITY_ERROR`; VolSDF Algorithm 1).
 
-    A ray is cut evenly, then up to `config.rounds` times where the bound on the error of its opacity comes
-    from (`bound_shares`), until the bound at β is ≤ ε. Each round asks for the SDF at the new cuts only. A
-    ray whose rounds are used up is sampled with the smallest wider scale β₊ that is bounded.
+    A ray is cut uniformly. Then up to `config.rounds` times cuts are added where they lower the error bound
+    most (`bound_shares`), until the bound at β is ≤ ε. Each round queries the SDF at the new cuts only. A ray
+    whose rounds are used up is sampled with the smallest scale β₊ > β for which the bound is ≤ ε.
 
-    A ray leaves the loop in the round in which it converges, where that is free (`can_leave_early`).
-    Elsewhere all rays take all rounds, and a converged ray keeps β.
+    On a CPU a ray leaves the loop when it has converged (`can_leave_early`). On other devices all rays take
+    all rounds, and a converged ray keeps β.
 
     Args:
-        sdf: signed distance of points, negative inside, scene frame.
-        origins, directions: the rays; unit directions.
-        near, far: where they enter and leave the scene; near = far for a ray that misses it.
-        beta: scale of the density, scene units.
-        config: `initial_samples`, `rounds`, `samples`.
-        stochastic: jitter the first cuts, the new cuts and the samples, or choose the middles.
+        sdf: signed distance at points of the scene frame, negative inside.
+        origins, directions: the rays, with unit directions.
+        near, far: distances at which rays enter and leave the scene; near = far for a ray that misses it.
+        beta: scale β of the density, scene units.
+        config: `initial_samples`, `rounds` and `samples` are used.
+        stochastic: whether the cuts and the samples are random; if False, they are central.
     """
     rays = RayBatch(origins, directions)
     beta = beta.to(near.dtype).reshape(1, 1)
@@ -256,7 +260,7 @@ def error_bounded_samples(
 
 
 def can_leave_early(device: torch.device) -> bool:
-    """Whether the host may ask which rays have converged: a CPU knows; other devices would be waited for."""
+    """Whether converged rays are removed: on other devices than a CPU this would need a synchronisation."""
     return device.type == "cpu"
 
 
@@ -268,7 +272,7 @@ def first_cuts(
     count: int,
     stochastic: bool,
 ) -> Partition:
-    """`count` cuts: both ends of the interval, and evenly between."""
+    """Cut rays uniformly by `count` cuts, both ends included."""
     distances = uniform_samples(near, far, count, stochastic)
     return cut(distances, query(sdf, rays, distances))
 
@@ -281,14 +285,14 @@ def with_cuts(
     count: int,
     stochastic: bool,
 ) -> Partition:
-    """The partition with `count` more cuts, in proportion to the shares of its intervals."""
+    """Add `count` cuts to a partition, distributed by the shares of its intervals."""
     new = inverse_cdf_samples(partition.distances, shares, count, stochastic)
     distances, order = torch.cat([partition.distances, new], dim=-1).sort(dim=-1)
     return cut(distances, torch.cat([partition.sdf, query(sdf, rays, new)], dim=-1).gather(-1, order))
 
 
 def query(sdf: SignedDistance, rays: RayBatch, distances: Float[Tensor, "N M"]) -> Float[Tensor, "N M"]:
-    """Signed distance at distances along the rays, in the type of the distances."""
+    """Signed distance at points along the rays, in the type of the distances."""
     points = rays.origins[:, None] + distances[..., None] * rays.directions[:, None]
     return sdf(points.reshape(-1, 3)).to(distances.dtype).reshape(distances.shape)
 
@@ -296,9 +300,9 @@ def query(sdf: SignedDistance, rays: RayBatch, distances: Float[Tensor, "N M"]) 
 def opacity_samples(
     partition: Partition, beta: Float[Tensor, "N 1"], count: int, stochastic: bool
 ) -> Float[Tensor, "N {count}"]:
-    """Both ends of each ray, between them two thirds of samples by opacity and one third over the cuts.
+    """Samples to render: both ends of each ray, and between them 2/3 by opacity and 1/3 spread over the cuts.
 
-    By opacity: the inverse of the partition's Ô, normalised to 1 at far (VolSDF Algorithm 1, last step).
+    Sampling by opacity inverts the partition's Ô, normalised to 1 at far (VolSDF Algorithm 1, last step).
     """
     distances = partition.distances
     density = laplace_density(partition.sdf[:, :-1], beta)

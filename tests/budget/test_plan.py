@@ -193,7 +193,7 @@ def test_times_are_read(text, seconds):
     "text", ["", "10", "ten", "-5m", "5 minutes", "0s", "1e3s", "99999h", "5m10", "nan s"]
 )
 def test_what_is_no_time(text):
-    with pytest.raises(UserError, match="no time"):
+    with pytest.raises(UserError, match=r"not a duration|out of range"):
         read_duration(text)
 
 

@@ -188,7 +188,7 @@ def test_figures_of_other_views_pixels_and_versions_are_marked(runs, tmp_path):
     other_views = {**stored, "measured": {**stored["measured"], "view_names": ["000", "004"]}}
     assert "measured on other views" in note(other_views)
     assert "same masks" in note({**stored, "mask_source": "rendered opacity"})
-    assert "an earlier version measured it" in note({"mask_source": "true depth"})
+    assert "measured by an earlier version" in note({"mask_source": "true depth"})
 
 
 def test_runs_of_two_captures_have_a_table_and_no_picture(runs, tmp_path):
@@ -196,7 +196,7 @@ def test_runs_of_two_captures_have_a_table_and_no_picture(runs, tmp_path):
     stranger = Path(shutil.copytree(runs["mesh"], tmp_path / "runs" / "stranger"))
     table = compare(tmp_path / "out", runs["found"], point_at(stranger, root=str(other)))
     assert table["views"] == []
-    assert "stranger is of another capture" in table["notes"][0]
+    assert "stranger was trained on another capture" in table["notes"][0]
     assert part(table, "figures", "neilfpp")["apart"] == ["stranger"]
     assert not (tmp_path / "out" / "compare.png").exists()
 
@@ -208,7 +208,7 @@ def test_other_photographs_from_the_same_cameras_are_told(runs, tmp_path):
         other = Path(shutil.copytree(runs["mesh"], tmp_path / "runs" / root.name))
         point_at(other, root=str(root))
         table = compare(tmp_path / "out", runs["found"], other, "--views", "1", "--size", "40")
-        assert sum("other photographs" in note for note in table["notes"]) == told
+        assert sum("different photographs" in note for note in table["notes"]) == told
         assert table["views"] == ["000"]
 
 
@@ -218,8 +218,8 @@ def test_other_photographs_from_the_same_cameras_are_told(runs, tmp_path):
 def test_a_run_without_test_views_shows_views_that_it_learned_from(runs, tmp_path):
     table = compare(tmp_path, runs["all"], runs["found"], "--views", "2", "--size", "40")
     assert table["views"] == ["000", "005"]
-    assert "all, found learned from the views that are shown" in table["notes"][0]
-    assert part(table, "figures", "shown")["title"].endswith("learned from")
+    assert "all, found used the views shown here" in table["notes"][0]
+    assert part(table, "figures", "shown")["title"].endswith("used in training")
     assert image_header(tmp_path / "compare.png").width == LEFT + 3 * CELL + 2 * GAP + 40
 
 
@@ -258,7 +258,7 @@ def test_what_is_no_run_is_told_in_one_line(runs, tmp_path, capsys):
     for arguments, told in (
         ([runs["found"], lone], f"{lone}: no run here"),
         ([runs["found"], tmp_path / "nowhere"], "nowhere: no run here"),
-        ([runs["found"]], "1 runs to compare"),
+        ([runs["found"]], "runs to compare: 1"),
         ([runs["found"], runs["found"] / ".." / "found"], "given twice"),
         ([runs["found"], runs["mesh"], "--views", "99"], "--views"),
         ([runs["found"], runs["mesh"], "--size", "3"], "--size"),

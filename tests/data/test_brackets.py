@@ -115,5 +115,5 @@ def test_opencv_agrees_where_nothing_is_clipped() -> None:
 def test_exposures_that_tell_no_response_are_refused() -> None:
     same = np.random.default_rng(0).uniform(0, 1, (16, 16, 3)).astype(np.float32)
     stack = Bracket((same, same[::-1].copy(), same[:, ::-1].copy()), (1.0, 2.0, 4.0))  # noise, not light
-    with pytest.raises(UserError, match="response cannot be told"):
+    with pytest.raises(UserError, match="response cannot be calibrated"):
         calibrate([stack])

@@ -59,5 +59,5 @@ def test_another_version_of_pycolmap_is_refused_in_one_line(tmp_path, version, c
     (error,) = done.stderr.splitlines()
     assert (
         error
-        == f"error: pycolmap {version} is installed, of another interface; pip install 'pycolmap>=4.2,<5'"
+        == f"error: pycolmap {version} is installed and has another interface; pip install 'pycolmap>=4.2,<5'"
     )

@@ -16,7 +16,7 @@ from neilfpp_method.effects.asked import read_asked
 from neilfpp_method.effects.exposure import judge_gains, measure_exposures
 from neilfpp_method.effects.looks import note_exposures
 from neilfpp_method.effects.plan import Plan
-from neilfpp_method.evaluate.protocols import exposed_alike
+from neilfpp_method.evaluate.map_metrics import exposed_alike
 from neilfpp_method.fields.exposure import at_mean_exposure
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel

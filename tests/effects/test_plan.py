@@ -213,7 +213,7 @@ def test_evidence_is_revised_and_said():
     assert plan.config_of_model == config
     unknown = plan.decide("inter-reflection", Measurement("directions", 0.5, 0.1, 0.01, 3), 9)
     assert not unknown.on
-    assert "too few" in unknown.reason
+    assert "only 3 samples" in unknown.reason
 
 
 def test_lamps_are_noted_when_the_choice_changes():
@@ -258,11 +258,11 @@ def test_names_switch_settings():
     [
         ("lamps", r"'lamps' has no sign; write \+lamps or -lamps"),
         ("auto,-lamp", "no effect 'lamp'; did you mean 'lamps'"),
-        ("some", "'some' is no choice; give auto"),
-        ("", "nothing is given"),
+        ("some", "'some' is not a choice; give auto"),
+        ("", "the value is empty"),
         ("+lamps,-lamps", "lamps is named twice"),
         ("-response", "--response"),
-        ("none,+metals", r"there is none without reflection; add \+reflection"),
+        ("none,+metals", r"metals requires reflection; add \+reflection"),
     ],
 )
 def test_bad_names_get_one_line(text, complaint):

@@ -18,12 +18,12 @@ from neilfpp_method.evaluate.confidence import (
     MIN_NOISE,
     gather_evidence,
     material_deviation,
-    shown_surface,
+    surface_at_pixels,
     with_deviation,
 )
+from neilfpp_method.evaluate.map_metrics import confidence_metrics
 from neilfpp_method.evaluate.metrics import confidence_ratio
 from neilfpp_method.evaluate.patches import by_patch, light_by_patch, patch_count
-from neilfpp_method.evaluate.protocols import confidence_metrics
 from neilfpp_method.evaluate.render_views import render_run
 from neilfpp_method.evaluate.sightings import TrainingViews
 from neilfpp_method.evaluate.views import known_test_views, render_test_views
@@ -90,12 +90,12 @@ def test_a_view_sees_the_part_of_a_sphere_that_faces_it(run: Run, mode: str):
         towards = views.centres - SPHERE * n
         cosine = (towards / towards.norm(dim=-1, keepdim=True)) @ n
         # Pixels at the rim are half off the object, and flat looks do not count.
-        assert (cosine > 0.2).sum() <= seen.seen[i].sum() <= (cosine > 0.05).sum()
+        assert (cosine > 0.2).sum() <= seen.visible[i].sum() <= (cosine > 0.05).sum()
     cosine = (seen.wo * normal[:, None]).sum(-1)
-    assert (cosine[seen.seen] > 0).all()
-    assert torch.equal(seen.wo[~seen.seen], normal[:, None].expand_as(seen.wo)[~seen.seen])
-    assert not seen.pixel[~seen.seen].any()
-    assert (seen.pixel[seen.seen] > 0).any(-1).all()
+    assert (cosine[seen.visible] > 0).all()
+    assert torch.equal(seen.wo[~seen.visible], normal[:, None].expand_as(seen.wo)[~seen.visible])
+    assert not seen.pixel[~seen.visible].any()
+    assert (seen.pixel[seen.visible] > 0).any(-1).all()
 
 
 def test_the_first_views_are_far_from_one_another(run: Run):
@@ -141,7 +141,7 @@ def test_what_no_view_sees_is_a_guess(run: Run, evidence):
     inside_out = material_deviation(run.model, evidence, SPHERE * normal, -normal)
     torch.testing.assert_close(inside_out.base_color, prior, rtol=1e-2, atol=0.0)
     outside = material_deviation(run.model, evidence, SPHERE * normal, normal)
-    seen = evidence.views.sightings(run.model, SPHERE * normal, normal, 5).seen.any(1)
+    seen = evidence.views.sightings(run.model, SPHERE * normal, normal, 5).visible.any(1)
     # Those whose pixels nothing explains are a guess as well.
     assert ((outside.base_color - prior)[seen].abs() > 1e-3).float().mean() > 0.5
     torch.testing.assert_close(outside.base_color[~seen], prior[~seen], rtol=1e-2, atol=0.0)
@@ -159,7 +159,7 @@ def test_the_better_the_images_are_explained_the_less_is_left_to_guess(run: Run,
 
 def test_points_whose_pixels_are_not_explained_are_less_sure(run: Run, evidence):
     normal = on_sphere(60)
-    looks = evidence.views.sightings(run.model, SPHERE * normal, normal, 5).seen.sum(1)
+    looks = evidence.views.sightings(run.model, SPHERE * normal, normal, 5).visible.sum(1)
     usual, off = (
         material_deviation(run.model, replace(evidence, misfit=misfit), SPHERE * normal, normal).metallic[
             :, 0
@@ -220,7 +220,7 @@ def test_maps_lie_on_the_surface_and_a_step_repeats_pixels(run: Run, evidence):
 def test_the_surface_at_pixels_is_where_the_sphere_is(run: Run):
     view = render_test_views(run)[0]
     pixels = np.flatnonzero(view.maps["opacity"][..., 0] > 0.99)
-    points = shown_surface(run, view, pixels)
+    points = surface_at_pixels(run, view, pixels)
     torch.testing.assert_close(
         points.position.norm(dim=-1), torch.full((len(pixels),), SPHERE), rtol=1e-4, atol=0.0
     )

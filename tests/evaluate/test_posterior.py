@@ -11,10 +11,10 @@ import torch
 from neilfpp_method.evaluate.posterior import (
     ROUGHNESS_NODES,
     Deviation,
-    Looks,
-    Sights,
+    Observations,
+    RadianceParts,
     expected_error,
-    guessed_error,
+    prior_error,
 )
 from neilfpp_method.structures import Material
 
@@ -27,18 +27,18 @@ def material(base_color: float = 0.5, roughness: float = 0.5, metallic: float = 
     )
 
 
-def lambertian(views: int, diffuse: float = 1.0) -> Looks:
+def lambertian(views: int, diffuse: float = 1.0) -> RadianceParts:
     """Uniform light, such that D is `diffuse`, and no specular part."""
     nothing = torch.zeros(1, views, R, 3)
-    return Looks(torch.full((1, 3), diffuse), nothing, nothing)
+    return RadianceParts(torch.full((1, 3), diffuse), nothing, nothing)
 
 
-def sights(radiance: torch.Tensor, noise: float, shared: torch.Tensor | None = None) -> Sights:
+def sights(radiance: torch.Tensor, noise: float, shared: torch.Tensor | None = None) -> Observations:
     """Of one point, from all views, the same in all channels."""
     views = len(radiance)
     value = radiance[None, :, None].expand(1, views, 3)
     shared = torch.zeros(views, 1) if shared is None else shared
-    return Sights(
+    return Observations(
         torch.ones(1, views, dtype=torch.bool),
         value,
         torch.full_like(value, noise),
@@ -85,15 +85,15 @@ def test_an_error_that_is_shared_is_taken_out_of_what_does_not_follow_it():
 
 @pytest.mark.parametrize("estimate", [(0.5, 0.5, 0.5), (0.9, 0.1, 0.0)])
 def test_what_nobody_sees_has_the_deviation_from_the_prior(estimate):
-    seen = replace(sights(torch.full((3,), 0.4), 0.01), seen=torch.zeros(1, 3, dtype=torch.bool))
-    looks = Looks(torch.ones(1, 3), torch.rand(1, 3, R, 3), torch.rand(1, 3, R, 3))
+    seen = replace(sights(torch.full((3,), 0.4), 0.01), visible=torch.zeros(1, 3, dtype=torch.bool))
+    looks = RadianceParts(torch.ones(1, 3), torch.rand(1, 3, R, 3), torch.rand(1, 3, R, 3))
     base_color, roughness, metallic = numbers(expected_error(looks, seen, material(*estimate)))
     assert base_color == pytest.approx(math.sqrt(1 / 12 + (estimate[0] - 0.5) ** 2), rel=1e-2)
     assert roughness == pytest.approx(math.sqrt(1 / 12 + (estimate[1] - 0.5) ** 2), rel=1e-2)
     # The variance of the arcsine distribution is 1/8; on a grid that holds 0 and 1 themselves it is a little
     # more.
     assert 1 / 8 < metallic**2 - (estimate[2] - 0.5) ** 2 < 0.15
-    guess = numbers(guessed_error(material(*estimate)))
+    guess = numbers(prior_error(material(*estimate)))
     assert guess == pytest.approx(
         (base_color, roughness, math.hypot(math.sqrt(1 / 8), estimate[2] - 0.5)), rel=1e-2
     )
@@ -111,14 +111,14 @@ def test_base_color_stays_between_black_and_white():
 # ------------------------------------------------------------------------------------------------ brute force
 
 
-def random_point(views: int = 5) -> tuple[Looks, Sights]:
+def random_point(views: int = 5) -> tuple[RadianceParts, Observations]:
     torch.manual_seed(3)
     falling = torch.linspace(2.0, 0.1, R)[:, None] * (0.3 + torch.rand(1, views, 1, 1))
-    looks = Looks(
+    looks = RadianceParts(
         0.6 + 0.2 * torch.rand(1, 3), falling * torch.ones(3), 0.2 * falling.square() * torch.ones(3)
     )
     shared = 0.05 * torch.rand(1, views, 3, 2)
-    return looks, Sights(
+    return looks, Observations(
         torch.ones(1, views, dtype=torch.bool),
         0.3 + 0.3 * torch.rand(1, views, 3),
         torch.full((1, views, 3), 0.1),
@@ -164,7 +164,7 @@ def test_a_mirror_that_might_be_bright_paint_is_in_doubt():
     seen.
     """
     views = 8
-    same = Looks(torch.ones(1, 3), torch.ones(1, views, R, 3), torch.zeros(1, views, R, 3))
+    same = RadianceParts(torch.ones(1, 3), torch.ones(1, views, R, 3), torch.zeros(1, views, R, 3))
     highlight = torch.linspace(0.2, 4.0, views)[None, :, None, None].expand(1, views, R, 3)
     telling = replace(same, facing=highlight)
     alike = numbers(expected_error(same, sights(torch.full((views,), 0.5), 0.01), material(0.5, 0.5, 0.0)))
@@ -180,7 +180,7 @@ def test_roughness_is_known_from_views_that_the_lobe_moves_across_and_not_where_
     views = 6
     angle = torch.linspace(0, 1.2, views)[:, None]
     lobe = torch.exp(-angle.square() / (0.05 + nodes.square())) / (0.05 + nodes.square())
-    looks = Looks(
+    looks = RadianceParts(
         torch.zeros(1, 3), lobe[None, ..., None].expand(1, views, R, 3), torch.zeros(1, views, R, 3)
     )
     metal = material(0.8, 0.5, 1.0)

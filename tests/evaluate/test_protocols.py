@@ -21,8 +21,9 @@ from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.data.truth import LightField, Truth
 from neilfpp_method.errors import UserError
-from neilfpp_method.evaluate import protocols
-from neilfpp_method.evaluate.protocols import evaluate, light_metrics, protocol, write_metrics
+from neilfpp_method.evaluate import protocols, scene_metrics
+from neilfpp_method.evaluate.protocols import evaluate, protocol, write_metrics
+from neilfpp_method.evaluate.scene_metrics import light_metrics
 from neilfpp_method.evaluate.views import (
     known_test_views,
     mean_observed_color,
@@ -103,8 +104,8 @@ def captures(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def _few_points(monkeypatch):
-    monkeypatch.setattr(protocols, "SURFACE_POINTS", 20_000)
-    monkeypatch.setattr(protocols, "MESH_RESOLUTION", 64)
+    monkeypatch.setattr(scene_metrics, "SURFACE_POINTS", 20_000)
+    monkeypatch.setattr(scene_metrics, "MESH_RESOLUTION", 64)
     # The known sphere has no material to ask; what confidence is worth is tested in test_confidence.
     monkeypatch.setattr(protocols, "confidence_metrics", lambda run, pairs: {})
 

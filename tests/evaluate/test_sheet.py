@@ -16,7 +16,8 @@ import torch
 
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.errors import UserError
-from neilfpp_method.evaluate.panels import albedo_scale, light_sections, view_sections
+from neilfpp_method.evaluate.light_panels import light_sections
+from neilfpp_method.evaluate.panels import albedo_scale, view_sections
 from neilfpp_method.evaluate.pictures import display
 from neilfpp_method.evaluate.render_views import render_run, view_names
 from neilfpp_method.evaluate.sheet import write_contact_sheet, write_light_picture

@@ -15,7 +15,7 @@ from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.scaling import PIXELS_OF_A_VIEW, at_scale
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import metrics
-from neilfpp_method.evaluate.size import at_size, size_in_words
+from neilfpp_method.evaluate.size import at_size, describe_size
 from neilfpp_method.evaluate.views import known_test_views, render_test_views
 from neilfpp_method.train.run import Run
 from tests.data.large_capture import make_large_capture
@@ -34,10 +34,10 @@ def test_views_are_no_larger_than_it_takes_unless_asked_for(tmp_path: Path) -> N
     assert width / height == pytest.approx(4 / 3, abs=0.01)
     assert sizes(at_size(run, scale=1.0)) == {(800, 600)}
     assert sizes(at_size(run, width=100)) == {(100, 75)}
-    told = size_in_words(at_size(run, width=100))
-    assert told == "views of 100×75 pixels, files of 800×600; --width or --scale for another size"
-    assert size_in_words(run) is None
-    with pytest.raises(UserError, match="both say how large"):
+    told = describe_size(at_size(run, width=100))
+    assert told == "views have 100×75 pixels, the files 800×600; --width or --scale changes the size"
+    assert describe_size(run) is None
+    with pytest.raises(UserError, match="both set the size"):
         at_size(run, scale=1.0, width=100)
 
 

@@ -102,7 +102,7 @@ def test_a_fit_to_what_cannot_be(pixel, base_color, metallic):
     count = len(rough)
     material = Material(torch.full((count, 3), base_color), rough, torch.full((count, 1), metallic))
     sky = EnvironmentLight(4, 1.0)
-    carried = from_texels(sky, seen, rough, GGX, None).beside(
+    carried = from_texels(sky, seen, rough, GGX, None).concatenate(
         from_lamps(LAMPS, RADIUS, seen, rough, GGX, None)
     )
     start = Light(sky.log_radiance, torch.zeros(3, 3))

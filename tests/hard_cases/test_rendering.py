@@ -9,6 +9,7 @@ import torch
 from torch.nn.functional import normalize
 
 from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.train.optimizer import gradient_norms, make_optimizer, seed_step
 from tests.scenes import sphere_batch, sphere_model, tiny_config
 
 
@@ -64,3 +65,54 @@ def test_black_and_blinding_pixels(radiance):
         total.loss.backward()
         assert total.loss.isfinite()
         assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
+
+
+@pytest.mark.parametrize("odd", [65504.0, 1e-42, 0.0], ids=["firefly", "denormal", "black"])
+@pytest.mark.parametrize("rays", [1, 48])
+def test_one_odd_pixel_and_one_ray(odd, rays):
+    """A single firefly, the largest half-precision number, moves R no further than a step's rate allows."""
+    model = sphere_model()
+    batch = sphere_batch()[:rays]
+    color = batch.color.clone()
+    color[0] = odd
+    batch = dataclasses.replace(batch, color=color)
+    for stage in Stage:
+        model.freeze_for(stage)
+        optimizer = make_optimizer(model, model.config.optimizer)
+        before = [p.detach().clone() for p in model.parameters()]
+        total = weigh(model.losses(batch, stage), active_losses(stage, model.config))
+        total.loss.backward()
+        assert total.loss.isfinite()
+        optimizer.step()
+        # Adam's first step is the learning rate at most, whatever the gradient; 1e-6 for rounding.
+        for p, q in zip(model.parameters(), before, strict=True):
+            assert p.isfinite().all()
+            assert (p - q).abs().max() <= model.config.optimizer.light + 1e-6
+
+
+@pytest.mark.hard
+@pytest.mark.timeout(900)
+@pytest.mark.usefixtures("without_shape_checks")
+def test_ten_thousand_steps_with_beta_at_its_floor():
+    config = tiny_config()
+    model = sphere_model(
+        dataclasses.replace(config, volume=dataclasses.replace(config.volume, beta_init=1.0001e-4))
+    )
+    model.freeze_for(Stage.SDF_INIT)
+    optimizer = make_optimizer(model, config.optimizer)
+    beta = [group for group in optimizer.param_groups if group["name"] == "beta"]
+    assert beta
+    beta[0]["lr"] = 0.0  # it stays at the floor
+    batches = [sphere_batch(4, spread=0.05 + 0.1 * k) for k in range(8)]
+    for step in range(10_000):
+        seed_step(0, step)
+        terms = model.losses(batches[step % 8], Stage.SDF_INIT)
+        loss = weigh(terms, active_losses(Stage.SDF_INIT, config)).loss
+        optimizer.zero_grad()
+        loss.backward()
+        norms = torch.stack(list(gradient_norms(model).values()))
+        assert norms.isfinite().all(), step
+        optimizer.step()
+    assert 1e-4 <= model.host.density.beta().item() < 1.001e-4
+    # The images are of one colour, so R must have found it.
+    assert (model.host.render(batches[0].rays).color - 0.3).abs().mean() < 0.05

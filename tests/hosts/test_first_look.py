@@ -75,7 +75,8 @@ def test_no_hit_in_a_batch_is_said_once(caplog):
             neilf.losses(batch(away), "material_init")
     (record,) = (record for record in caplog.records if record.name == SAYS)
     assert (
-        "Ball: none of 64 rays meets a surface, so nothing is learned of them; is the frame" in record.message
+        "Ball: none of 64 rays hits a surface, so material and light are not trained; are the rays"
+        in record.message
     )
 
 
@@ -91,7 +92,7 @@ def test_a_scene_far_outside_the_unit_sphere_is_said_once(caplog):
         for _ in range(3):
             neilf.losses(batch(shifted(ball_rays(64), by)), "material_init")
     (record,) = (record for record in caplog.records if record.name == SAYS)
-    assert "half of its hits lie" in record.message
+    assert "half of its hits are" in record.message
     assert "move and scale cameras and host so that the object lies in the unit sphere" in record.message
 
 
@@ -99,7 +100,7 @@ def test_directions_that_are_not_unit_are_an_error():
     rays = ball_rays(8)
     neilf = attach_neilf(Ball(), tiny_config())
     with pytest.raises(
-        UserError, match=r"directions of rays are no unit vectors: the lengths go from 2 to 2; divide them"
+        UserError, match=r"ray directions are not unit vectors: their lengths are between 2 and 2; divide"
     ):
         neilf.losses(batch(RayBatch(rays.origins, 2.0 * rays.directions)), "joint")
 
@@ -115,7 +116,7 @@ def test_pixels_that_are_not_finite_are_an_error():
 
 def test_display_values_above_one_are_an_error_and_a_wrong_median_a_warning(caplog):
     with pytest.raises(
-        UserError, match=r"pixels reach 128, and display values end at 1; divide 8-bit pixels by 255"
+        UserError, match=r"pixels reach 128, but display values are at most 1; divide 8-bit pixels by 255"
     ):
         attach_neilf(Ball(), tiny_config(), response="srgb").losses(batch(ball_rays(8), 128.0), "joint")
     neilf = attach_neilf(Ball(), tiny_config())
@@ -123,7 +124,7 @@ def test_display_values_above_one_are_an_error_and_a_wrong_median_a_warning(capl
         for _ in range(2):
             neilf.losses(batch(ball_rays(8), 128.0), "material_init")
     (record,) = (record for record in caplog.records if record.name == SAYS)
-    assert "the median of the pixels is 128, median_radiance says 0.5" in record.message
+    assert "the median of the pixels is 128, but median_radiance means 0.5" in record.message
 
 
 @pytest.mark.parametrize(
@@ -135,12 +136,12 @@ def test_display_values_above_one_are_an_error_and_a_wrong_median_a_warning(capl
         ),
         (
             {"mask": torch.ones(4, 1)},
-            r"mask of the batch has the shape \(4, 1\); give \(4,\): a number per pixel",
+            r"mask of the batch has the shape \(4, 1\); give \(4,\): one number per pixel",
         ),
         ({"color": torch.zeros(4)}, r"color of the batch has the shape \(4,\); give \(4, 3\)"),
         (
             {"directions": torch.zeros(2, 2, 3)},
-            r"the shape \(2, 2, 3\); give \(4, 3\): a row per pixel, reshape\(-1, 3\)",
+            r"the shape \(2, 2, 3\); give \(4, 3\): one row per pixel, reshape\(-1, 3\)",
         ),
     ],
 )

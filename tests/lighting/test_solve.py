@@ -188,7 +188,7 @@ def test_hardly_any_points_speak_for_no_lamp(count):
     assert lamps.intensity.isfinite().all()
 
 
-def test_lamps_of_which_nothing_is_sure_stay_out_unless_they_have_the_benefit_of_the_doubt(monkeypatch):
+def test_lamps_without_a_significant_gain_are_lit_only_with_lamps_if_undecided(monkeypatch):
     unsure = Evidence(gain=0.006, deviation=0.005, points=200)
     monkeypatch.setattr("neilfpp_method.lighting.solve.evidence", lambda gains: unsure)
     seen, of = photographed(BULB)
@@ -197,7 +197,7 @@ def test_lamps_of_which_nothing_is_sure_stay_out_unless_they_have_the_benefit_of
         torch.manual_seed(0)
         light, unit = LightModel(EnvironmentLight(12, 0.7), Lamps(4, 0.06)), seen.pixel.median().item()
         objective = Objective("linear", unit, CONFIG.fit)
-        solve_light(light, seen, of, GGX, None, objective, CONFIG, first=False, benefit_of_doubt=doubt)
+        solve_light(light, seen, of, GGX, None, objective, CONFIG, first=False, lamps_if_undecided=doubt)
         lit.append(light.lamps.lit)
     assert lit[0] == 0
     assert lit[1] > 0

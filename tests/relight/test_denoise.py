@@ -8,7 +8,7 @@ import pytest
 
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight.denoise import check_denoiser, denoised
-from neilfpp_method.relight.film import Budget, take_picture
+from neilfpp_method.relight.film import Budget, render_picture
 from neilfpp_method.relight.path_tracer import Scene
 from tests.relight.test_film import camera
 from tests.relight.test_path_tracer import EVEN, ball, made_of
@@ -17,7 +17,7 @@ from tests.relight.test_path_tracer import EVEN, ball, made_of
 def test_noise_goes_and_light_stays():
     pytest.importorskip("pyoidn")
     close = dataclasses.replace(camera(64, 48), fx=200.0, fy=200.0)
-    picture = take_picture(Scene(ball(), made_of(0.6), None, EVEN), close, Budget(2), bounces=1)
+    picture = render_picture(Scene(ball(), made_of(0.6), None, EVEN), close, Budget(2), bounces=1)
     covered = picture.alpha[..., 0] == 1
     assert covered.all()
     clean = denoised(picture)

@@ -8,7 +8,7 @@ import torch
 
 from neilfpp_method.data.views import Camera
 from neilfpp_method.relight import film
-from neilfpp_method.relight.film import Budget, take_picture
+from neilfpp_method.relight.film import Budget, render_picture
 from neilfpp_method.relight.path_tracer import Scene
 from neilfpp_method.relight.sequence import Sequence
 from tests.relight.test_path_tracer import EVEN, ball, made_of
@@ -26,18 +26,18 @@ def scene() -> Scene:
 
 
 def test_a_picture_is_the_same_however_it_is_cut_up(scene, monkeypatch):
-    whole = take_picture(scene, camera(), Budget(8), bounces=2, seed=3)
+    whole = render_picture(scene, camera(), Budget(8), bounces=2, seed=3)
     assert whole.samples == 8
     monkeypatch.setattr(film, "PATHS_AT_ONCE", 50)
-    parts = take_picture(scene, camera(), Budget(8), bounces=2, seed=3)
+    parts = render_picture(scene, camera(), Budget(8), bounces=2, seed=3)
     assert torch.allclose(whole.radiance, parts.radiance, atol=1e-6)
-    other = take_picture(scene, camera(), Budget(8), bounces=2, seed=4)
+    other = render_picture(scene, camera(), Budget(8), bounces=2, seed=4)
     assert not torch.allclose(whole.radiance, other.radiance)
 
 
 def test_alpha_is_the_share_of_a_pixel_that_is_covered(scene):
     size = 40
-    picture = take_picture(scene, camera(size, size), Budget(64), bounces=1)
+    picture = render_picture(scene, camera(size, size), Budget(64), bounces=1)
     # A ball of radius 0.6 at the distance 3: its outline has the tangent r/√(d² − r²) = 0.2041, in pixels
     # 4.08.
     assert picture.alpha.sum().item() == pytest.approx(np.pi * (20 * 0.6 / np.sqrt(9 - 0.36)) ** 2, rel=0.02)
@@ -53,13 +53,13 @@ def test_the_time_ends_a_picture(scene):
     ticks = iter(range(10_000))
     shares: list[float] = []
     budget = Budget(None, seconds=10.0)
-    picture = take_picture(
+    picture = render_picture(
         scene, camera(64, 64), budget, 1, 0, shares.append, clock=lambda: float(next(ticks))
     )
     assert 1 <= picture.samples < 200
     assert shares == sorted(shares)
     assert shares[-1] == pytest.approx(1, abs=0.2)
-    rushed = take_picture(scene, camera(), Budget(None, seconds=1e-9), bounces=1)
+    rushed = render_picture(scene, camera(), Budget(None, seconds=1e-9), bounces=1)
     assert rushed.samples >= 1
 
 
@@ -68,7 +68,7 @@ def test_more_samples_are_closer(scene):
     exact = 0.6
 
     def error(samples: int) -> float:
-        picture = take_picture(scene, camera(6, 6), Budget(samples), bounces=1)
+        picture = render_picture(scene, camera(6, 6), Budget(samples), bounces=1)
         covered = picture.alpha[..., 0] == 1
         return (picture.radiance[covered] - exact).square().mean().sqrt().item()
 

@@ -58,7 +58,7 @@ def test_density_of_directions_that_meet_a_lamp():
     x = torch.zeros(5000, 3)
     drawn = pair.sample(x, u)
     for lamp in (0, 1):
-        distance, radiance = pair.meet(x, drawn.wi, lamp)
+        distance, radiance = pair.intersect(x, drawn.wi, lamp)
         mine = (distance == drawn.distance) & distance.isfinite()
         assert mine.sum() > 10
         assert torch.allclose(pair.pdf(x, lamp)[mine], drawn.pdf[mine], rtol=1e-4)

@@ -33,7 +33,7 @@ def with_spot(row: int, column: int, height: int = 16) -> np.ndarray:
 def brightest(path: Path, layout: str, rotate: float = 0.0) -> str:
     """The axis from which most light comes."""
     sky = read_map(path, layout, rotate).sky
-    light = sky.look(torch.tensor(list(AXES.values()), dtype=torch.float32)).sum(-1)
+    light = sky.lookup(torch.tensor(list(AXES.values()), dtype=torch.float32)).sum(-1)
     assert light.max() > 1
     return list(AXES)[int(light.argmax())]
 
@@ -130,7 +130,7 @@ def test_what_is_no_image_is_refused(tmp_path, name):
 def test_maps_are_told_apart():
     assert map_names([Path("a/sky.exr"), Path("b/dawn.hdr")]) == ["sky", "dawn"]
     assert map_names([Path("a/sky.exr"), Path("b/sky.exr"), Path("c/dawn.exr")]) == ["a-sky", "b-sky", "dawn"]
-    with pytest.raises(UserError, match="two maps"):
+    with pytest.raises(UserError, match="two maps have this name"):
         map_names([Path("a/sky.exr"), Path("a/sky.hdr")])
     with pytest.raises(UserError, match="cannot name a folder"):
         map_names([Path("a/..exr")])

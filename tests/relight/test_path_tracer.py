@@ -136,7 +136,7 @@ def quadrature(
     wi = wi[wi @ normal > 0]
     values = [np.array([v]) for v in (base, roughness, metallic)]
     diffuse, specular = oracles.brdf("ggx", *values, normal, wo, wi)
-    light = sky.look(torch.from_numpy(wi).float()).double().numpy()
+    light = sky.lookup(torch.from_numpy(wi).float()).double().numpy()
     return ((diffuse + specular) * light * (wi @ normal)[:, None]).sum(0) * 4 * np.pi / count
 
 
@@ -144,7 +144,7 @@ def quadrature(
 def test_a_ball_under_a_map_is_that_of_quadrature(gradient, roughness, metallic):
     surface, targets = ball(), scattered_targets(4, 0.35)
     rays = looking_at(targets)
-    met = surface.cross(rays.origins, rays.directions)
+    met = surface.intersect(rays.origins, rays.directions)
     found = trace(Scene(surface, made_of(0.6, roughness, metallic), GGX, gradient), rays, 4096, bounces=3)
     for k in range(len(rays)):
         normal, wo = met.flat[k].double().numpy(), -rays.directions[k].double().numpy()
@@ -173,7 +173,7 @@ def test_both_techniques_and_each_alone_agree(gradient, lobe, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(path_tracer, "power_heuristic", lambda own, other: torch.ones_like(own))
-        patch.setattr(path_tracer, "_met_light", silent_light)
+        patch.setattr(path_tracer, "_from_hit_lights", silent_light)
         found["by the light"] = trace(scene, rays, 512, bounces=3).mean(0)
     with monkeypatch.context() as patch:
         patch.setattr(path_tracer, "power_heuristic", lambda own, other: torch.ones_like(own))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from neilfpp_method.relight.scattering import Vertices, scatter, scattered, scattering_pdf, vertices
+from neilfpp_method.relight.scattering import Vertices, brdf_cosine, scatter, scattering_pdf, vertices
 from neilfpp_method.shading.brdf import GGX, LOBES, SPHERICAL_GAUSSIAN
 from neilfpp_method.structures import Material
 from tests import oracles
@@ -59,7 +59,7 @@ def test_weights_add_up_to_what_the_brdf_reflects(name, roughness, metallic, cos
     points = at(len(u), lobe, roughness, metallic, cosine)
     wi = scatter(points, u, lobe)
     # Far below the horizon a narrow lobe has no density in float32, and there is nothing to weigh.
-    weight = scattered(points, wi, lobe) / scattering_pdf(points, wi, lobe).clamp_min(1e-30)[:, None]
+    weight = brdf_cosine(points, wi, lobe) / scattering_pdf(points, wi, lobe).clamp_min(1e-30)[:, None]
     # By Gauss-Legendre nodes in the cosine and an even spread in azimuth, from the formula as it is printed.
     nodes, weights = np.polynomial.legendre.leggauss(200)
     azimuth = 2 * np.pi * (np.arange(400) + 0.5) / 400
@@ -76,7 +76,7 @@ def test_weights_add_up_to_what_the_brdf_reflects(name, roughness, metallic, cos
 def test_a_lambertian_surface_has_the_weight_of_its_colour():
     points = at(1000, None, 0.5, 0.9)
     wi = scatter(points, torch.rand(1000, 3), None)
-    weight = scattered(points, wi, None) / scattering_pdf(points, wi, None)[:, None]
+    weight = brdf_cosine(points, wi, None) / scattering_pdf(points, wi, None)[:, None]
     assert weight.numpy() == pytest.approx(0.7, rel=1e-4)  # metallic counts for nothing
 
 
@@ -87,5 +87,5 @@ def test_nothing_is_scattered_into_the_triangle(lobe):
     wi = torch.nn.functional.normalize(
         torch.tensor([[-1.0, 0.0, 0.5]]), dim=-1
     )  # above the normal, within the triangle
-    assert scattered(points, wi, lobe).amin() > 0
-    assert not scattered(tilted, wi, lobe).any()
+    assert brdf_cosine(points, wi, lobe).amin() > 0
+    assert not brdf_cosine(tilted, wi, lobe).any()

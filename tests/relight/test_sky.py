@@ -46,8 +46,8 @@ def test_directions_have_the_density_that_is_said(layout):
     assert torch.equal(drawn.pdf, sky.pdf(drawn.wi))
     # Importance sampling of a function that is not the radiance: ∫ (1 + z) L dw by light directions and by
     # even ones.
-    by_light = ((1 + drawn.wi[:, 2:]) * sky.look(drawn.wi) / drawn.pdf[:, None]).double().mean(0)
-    evenly = 4 * math.pi * ((1 + wi[:, 2:]) * sky.look(wi)).double().mean(0)
+    by_light = ((1 + drawn.wi[:, 2:]) * sky.lookup(drawn.wi) / drawn.pdf[:, None]).double().mean(0)
+    evenly = 4 * math.pi * ((1 + wi[:, 2:]) * sky.lookup(wi)).double().mean(0)
     assert by_light.numpy() == pytest.approx(evenly.numpy(), rel=0.03)
 
 
@@ -56,7 +56,7 @@ def test_every_direction_with_light_can_be_drawn():
     radiance[3, 0] = 1.0
     sky = Sky(radiance, False, 0.0)
     wi = directions()
-    assert (sky.pdf(wi)[sky.look(wi).amax(-1) > 0] > 0).all()
+    assert (sky.pdf(wi)[sky.lookup(wi).amax(-1) > 0] > 0).all()
     assert torch.isfinite(sky.sample(torch.rand(1000, 2)).wi).all()
 
 
@@ -64,8 +64,8 @@ def test_our_layout_is_that_of_the_light_that_is_fitted():
     light = EnvironmentLight(8, 1.0)
     light.show(uneven(8, 16).permute(2, 0, 1))
     wi = directions()
-    expected = light.radiance(wi[:1], wi[None])[0]
-    assert sky_of_run(light).look(wi).numpy() == pytest.approx(expected.detach().numpy(), rel=1e-3, abs=1e-4)
+    expected = light.radiance(wi[:1], wi[None])[0].detach().numpy()
+    assert sky_of_run(light).lookup(wi).numpy() == pytest.approx(expected, rel=1e-3, abs=1e-4)
 
 
 def blender_uv(wi: np.ndarray) -> np.ndarray:
@@ -85,7 +85,7 @@ def test_the_common_layout_is_that_of_blender():
     place = blender_uv(wi)
     np.testing.assert_allclose(place[:, 0], (column + 0.5) / width, atol=1e-9)
     np.testing.assert_allclose(place[:, 1], 1 - (row + 0.5) / height, atol=1e-9)
-    seen = sky.look(torch.from_numpy(wi).float())
+    seen = sky.lookup(torch.from_numpy(wi).float())
     np.testing.assert_allclose(seen.numpy(), radiance.reshape(-1, 3).numpy(), rtol=2e-3, atol=1e-3)
 
 
@@ -95,7 +95,7 @@ def test_the_mean_of_a_cell_is_that_of_its_bilinear_radiance():
     radiance[16, 20] = 1.0
     sky = Sky(radiance, False, 0.0)
     drawn = sky.sample(torch.rand(200_000, 2, generator=torch.Generator().manual_seed(0)))
-    ratio = sky.look(drawn.wi)[:, 0] / drawn.pdf
+    ratio = sky.lookup(drawn.wi)[:, 0] / drawn.pdf
     # Bilinear within a texel is no constant: the weight varies about its mean, 4/3 of an even cell at most
     # nine-fold.
     assert ratio.mean().item() == pytest.approx(math.pi / 32 * 2 * math.pi / 64, rel=0.02)

@@ -12,7 +12,7 @@ from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.images import write_png
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.errors import UserError
-from neilfpp_method.relight.stencil import painted, read_stencils
+from neilfpp_method.relight.stencil import masked_limit, read_stencils
 from neilfpp_method.relight.surface import Surface
 from tests.data.make_capture import RADIUS, SCALE, make_capture
 from tests.relight.test_path_tracer import ball
@@ -53,7 +53,7 @@ def test_what_a_view_sees_through_white_is_covered(capture, surface, tmp_path, e
     white = np.zeros((36, 48, 1))
     white[:, 24:] = 1.0
     big = white.repeat(enlarged, 0).repeat(enlarged, 1)
-    limit = painted(read_stencils([mask(tmp_path, "001", big)], capture), surface)
+    limit = masked_limit(read_stencils([mask(tmp_path, "001", big)], capture), surface)
     x, pixel = seen_points(capture, "001")
     rim = (pixel.view(-1, 1) == pixel.view(1, -1) + 1).any(1) & (
         pixel.view(-1, 1) == pixel.view(1, -1) - 1
@@ -64,7 +64,7 @@ def test_what_a_view_sees_through_white_is_covered(capture, surface, tmp_path, e
 
 
 def test_the_far_side_is_not_covered(capture, surface, tmp_path):
-    limit = painted(read_stencils([mask(tmp_path, "001", np.ones((36, 48, 1)))], capture), surface)
+    limit = masked_limit(read_stencils([mask(tmp_path, "001", np.ones((36, 48, 1)))], capture), surface)
     x, _ = seen_points(capture, "001")
     assert limit(x).float().mean() > 0.95
     assert not limit(-x).any()
@@ -74,8 +74,8 @@ def test_masks_of_two_views_add_up(capture, surface, tmp_path):
     every = np.ones((36, 48, 1))
     names = ("001", "004")
     paths = [mask(tmp_path, name, every) for name in names]
-    one, other = (painted(read_stencils([path], capture), surface) for path in paths)
-    both = painted(read_stencils(paths, capture), surface)
+    one, other = (masked_limit(read_stencils([path], capture), surface) for path in paths)
+    both = masked_limit(read_stencils(paths, capture), surface)
     x = torch.cat([seen_points(capture, name)[0] for name in names])
     assert (both(x) == one(x) | other(x)).all()
     assert (one(x) != other(x)).any()
@@ -84,7 +84,7 @@ def test_masks_of_two_views_add_up(capture, surface, tmp_path):
 def test_what_is_transparent_does_not_count(capture, surface, tmp_path):
     layer = np.ones((36, 48, 4))
     layer[:, :24, 3] = 0.0
-    limit = painted(read_stencils([mask(tmp_path, "001", layer)], capture), surface)
+    limit = masked_limit(read_stencils([mask(tmp_path, "001", layer)], capture), surface)
     x, pixel = seen_points(capture, "001")
     assert not limit(x[pixel % 48 < 24]).any()
     assert limit(x[pixel % 48 >= 24]).any()
@@ -94,8 +94,8 @@ def test_what_is_transparent_does_not_count(capture, surface, tmp_path):
     ("name", "pixels", "words"),
     [
         ("nobody", np.ones((36, 48, 1)), "no view 'nobody'; name the file as the view"),
-        ("001", np.ones((48, 48, 1)), "48×48 pixels over a view of 48×36"),
-        ("001", np.zeros((36, 48, 1)), "nothing in the mask is white"),
+        ("001", np.ones((48, 48, 1)), "48×48 pixels, but the view has 48×36"),
+        ("001", np.zeros((36, 48, 1)), "no pixel of the mask is white"),
     ],
 )
 def test_what_is_no_mask_is_refused(capture, tmp_path, name, pixels, words):

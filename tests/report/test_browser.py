@@ -73,7 +73,7 @@ def test_the_surface_is_drawn_layer_by_layer(page: Path):
           gl.readPixels(canvas.width / 2, canvas.height / 2, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
           found[layer.value] = [...pixel];
         }
-        return { found, said: document.getElementById("surface-said").textContent };
+        return { found, said: document.getElementById("surface-status").textContent };
         """,
     )
     assert "triangles" in said["said"]

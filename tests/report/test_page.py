@@ -121,7 +121,7 @@ def test_maps_stand_beside_their_truth(trained: Path):
         for layer in layers
         for cell in layer["cells"]
     )
-    assert "Views that were not trained on" in page.text
+    assert "These views were held out of training" in page.text
 
 
 def test_the_surface_is_that_of_the_run(trained: Path):
@@ -145,7 +145,7 @@ def test_the_surface_is_that_of_the_run(trained: Path):
 
 def test_figures_are_of_the_protocol_once_they_are_measured(run: Path):
     before = page_of(run).text
-    assert "not yet the figures of the protocol neilfpp" in before
+    assert "not the figures of the protocol neilfpp" in before
     figures = {"pbr_psnr": 12.34, "base_color_psnr": 9.87, "base_color_psnr_frame": 11.5}
     (run / "metrics.json").write_text(json.dumps(figures | {"health": "sound"}))
     (run / "metrics-protocol.json").write_text(json.dumps({"mask_source": "true depth"}))
@@ -236,7 +236,7 @@ def test_a_run_that_was_stopped_says_how_it_goes_on(run: Path):
     page = page_of(run)
     assert "stopped after step 4 of 12" in page.text
     assert "--resume" in page.text
-    assert "geometry alone" in page.text
+    assert "only the geometry is shown" in page.text
     assert "color" not in page.data["surface-data"]
     shutil.rmtree(run / "checkpoints")
     page = page_of(run)
@@ -302,7 +302,7 @@ def test_settings_are_compared_with_those_of_the_preset():
     assert changed_settings(preset("fast")) == []
     assert changed_settings(fixed_geometry(preset("fast"))) == []
     found = changed_settings(changed(preset("paper-ngp"), {"train.rays": 77}))
-    assert [(c.name, c.value, c.usual) for c in found] == [("train.rays", "77", "4096")]
+    assert [(c.name, c.value, c.preset_value) for c in found] == [("train.rays", "77", "4096")]
     assert changed_settings(changed(preset("fast"), {"preset": "mine"})) is None
 
 

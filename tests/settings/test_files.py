@@ -84,7 +84,7 @@ def test_the_file_of_a_run_folder_gives_its_settings(tmp_path, config):
         ("a.toml", "", "a.toml: not a .yaml, .yml or .json file"),
         ("a.yaml", "train.ray: 3", "a.yaml.train: unknown setting 'ray'; did you mean 'rays'?"),
         ("a.yaml", "preset: quick", "unknown preset 'quick'"),
-        ("a.yaml", "preset: 3", "a.yaml.preset: 3 where a name belongs"),
+        ("a.yaml", "preset: 3", "a.yaml.preset: 3 is not a name"),
         ("a.yaml", "x" * (1 << 21), "a.yaml: too large"),
     ],
 )
@@ -109,5 +109,5 @@ def test_a_binary_file_is_told(tmp_path):
 
 def test_a_host_that_contradicts_the_file_is_told(tmp_path):
     path = written(tmp_path, "host.kind: volsdf\n")
-    with pytest.raises(UserError, match="its host is volsdf, and --host mesh is given"):
+    with pytest.raises(UserError, match="its host is volsdf, but --host is mesh"):
         settings_of("--config", str(path), "--host", "mesh")

@@ -38,3 +38,38 @@ def test_a_step_of_every_stage(name):
         moving = [p for p in model.parameters() if p.requires_grad and p.grad is not None]
         assert moving
         assert all(p.grad.isfinite().all() for p in moving)
+
+
+def plain_settings(name: str) -> dict[str, object]:
+    """The settings of a preset by their paths."""
+
+    def leaves(part: object, path: str) -> dict[str, object]:
+        if not dataclasses.is_dataclass(part):
+            return {path: part}
+        return {
+            name: value
+            for field in dataclasses.fields(part)
+            for name, value in leaves(getattr(part, field.name), f"{path}.{field.name}").items()
+        }
+
+    return leaves(preset(name), name)
+
+
+@pytest.mark.parametrize(("smaller", "larger"), [("fast", "balanced"), ("balanced", "best")])
+def test_a_larger_preset_is_the_same_method_with_more_of_it(smaller, larger):
+    before = {path.split(".", 1)[1]: value for path, value in plain_settings(smaller).items()}
+    after = {path.split(".", 1)[1]: value for path, value in plain_settings(larger).items()}
+    assert before.keys() == after.keys()
+    changed = {path for path in before if before[path] != after[path]} - {"preset"}
+    assert {path.split(".")[0] for path in changed} <= {
+        "encoding",
+        "radiance",
+        "brdf",
+        "volume",
+        "shading",
+        "light",
+        "train",
+    }
+    assert all(type(before[path]) is int and before[path] < after[path] for path in changed)
+    stages = ("sdf_steps", "material_steps", "joint_steps")
+    assert {f"train.{name}" for name in (*stages, "rays")} <= changed

@@ -35,7 +35,7 @@ def test_a_second_call_goes_on_and_does_nothing_twice(tmp_path, words, clock, mo
     with monkeypatch.context() as patch:
         interrupt_at(patch, 12)
         assert main(words) == 130  # in the row of 2m, as that of 1s is too small
-    assert "left out: a budget of 1s is too small" in capsys.readouterr().out
+    assert "skipped: a budget of 1s is too small" in capsys.readouterr().out
     assert read_budget(out / "2m-seed0").took is None
     assert main(words) == 0
     assert "stopped" not in capsys.readouterr().err
@@ -55,16 +55,16 @@ def test_a_second_call_goes_on_and_does_nothing_twice(tmp_path, words, clock, mo
 
 def test_nothing_can_be_run(tmp_path, words, clock, capsys):
     assert main([*words, "--budgets", "1s"]) == 2
-    assert "no row could be run" in capsys.readouterr().err
+    assert "no run could be made" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
-        (["--budgets", "soon"], "no time"),
-        (["--budgets", "1m,60s"], "given twice"),
-        (["--budgets", ","], "the budgets are none"),
+        (["--budgets", "soon"], "not a duration"),
+        (["--budgets", "1m,60s"], "contains a budget twice"),
+        (["--budgets", ","], "--budgets is empty"),
         (["--seeds", "0"], "--seeds is 0"),
     ],
 )
@@ -78,5 +78,5 @@ def test_seeds_count_on(tmp_path):
     found = rows_of(tmp_path, tmp_path, small_config(seed=3), [180.0, 60.0], 2, "cpu")
     assert [row.name for row in found] == ["1m-seed3", "1m-seed4", "3m-seed3", "3m-seed4"]
     assert [row.config.train.seed for row in found] == [3, 4, 3, 4]
-    with pytest.raises(UserError, match="given twice"):
+    with pytest.raises(UserError, match="contains a budget twice"):
         rows.rows_of(tmp_path, tmp_path, small_config(), [60.0, 60.0], 1, "cpu")

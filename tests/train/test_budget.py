@@ -14,16 +14,19 @@ from neilfpp_method.budget.plan import Costs, StageCost
 from neilfpp_method.cli import main
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.effects.asked import Asked, read_asked
+from neilfpp_method.effects.looks import MOST_PIXELS, look_at_light
+from neilfpp_method.effects.plan import Plan
 from neilfpp_method.errors import Stopped, UserError
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.timing.ledger import Ledger
 from neilfpp_method.train import budgeted, command
-from neilfpp_method.train.budget_record import read_budget
+from neilfpp_method.train.budget_record import BudgetPlan, read_budget
+from neilfpp_method.train.budgeted import planned_effects
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.run import load_checkpoint, load_run
 from neilfpp_method.train.trial import Trial, try_out
 from tests.data.make_capture import make_capture
-from tests.train.small_runs import small_config, solved_light
+from tests.train.small_runs import small_config, small_training, solved_light
 from tests.train.test_resume import interrupt_at
 
 STEPS = {"sdf_steps": 40, "material_steps": 40, "joint_steps": 20}
@@ -48,7 +51,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> None:
     stages = {name.replace("steps", "init").replace("joint_init", "joint"): n for name, n in STEPS.items()}
     costs = Costs({stage: StageCost(steps=n, **cost) for stage, n in stages.items()}, reserve=0.0)
     monkeypatch.setattr(command, "Ledger", ticking)
-    monkeypatch.setattr(budgeted, "try_out", lambda *_: Trial(costs, places=0.0))
+    monkeypatch.setattr(budgeted, "try_out", lambda *_: Trial(costs, places=0.0, light_pixels=0))
 
 
 def run(data: Path | None, out: Path, resume: bool = False, **options) -> str:
@@ -78,7 +81,7 @@ def test_a_run_keeps_to_its_budget_though_steps_take_longer_than_the_trial_said(
     assert loaded.config.train.sdf_steps == last.steps["sdf_init"]
     assert loaded.config.train.joint_steps == last.steps["joint"]
     assert loaded.has_material
-    assert "budget 2m: steps planned: sdf init" in said
+    assert "budget 2m: planned steps: sdf init" in said
     assert f"budget: {plan.took:.1f} s of 120 s" in said
 
     # The trial found no time for evidence for metals, so there may be metals.
@@ -136,7 +139,14 @@ def test_a_trial_measures_every_stage_that_has_steps(capture):
     config = solved_light(small_config(sdf_steps=100, material_steps=0, joint_steps=50))
     state = load_capture(capture)
     trial = try_out(
-        state, config, Asked("auto"), torch.device("cpu"), limit=0.2, most_for_places=1e9, report=True
+        state,
+        config,
+        Asked("auto"),
+        torch.device("cpu"),
+        0.2,
+        most_for_places=1e9,
+        most_for_light=1e9,
+        report=True,
     )
     costs = trial.costs
     assert {stage: cost.steps for stage, cost in costs.stages.items()} == {"sdf_init": 100, "joint": 50}
@@ -151,21 +161,51 @@ def test_a_trial_measures_every_stage_that_has_steps(capture):
 def test_evidence_that_takes_too_long_is_not_looked_for(capture):
     config = solved_light(small_config(sdf_steps=0))
     trial = try_out(
-        load_capture(capture), config, Asked("auto"), torch.device("cpu"), 0.05, 1e-9, report=False
+        load_capture(capture), config, Asked("auto"), torch.device("cpu"), 0.05, 1e-9, 1e-9, report=False
     )
     assert trial.places == 0.0
     assert list(trial.costs.stages) == ["material_init", "joint"]
     assert trial.costs.stages["joint"].first_fit == 0.0  # it was in the stage before
 
 
+def test_the_first_light_is_part_of_the_plan_and_takes_as_many_pixels_as_there_is_time_for(tmp_path):
+    config = solved_light(small_config(sdf_steps=10))
+    many = load_capture(make_capture(tmp_path / "many", views=9))
+
+    def trial(most_for_light: float) -> Trial:
+        return try_out(
+            many, config, Asked("auto"), torch.device("cpu"), 0.05, 1e-9, most_for_light, report=False
+        )
+
+    whole = trial(1e9)
+    assert whole.light_pixels == MOST_PIXELS
+    first, later = whole.costs.stages["material_init"], whole.costs.stages["joint"]
+    assert first.first_fit == 0.0  # it ends the search
+    assert first.start > 100 * later.start
+    none = trial(1e-9)
+    assert none.light_pixels == 0
+    assert none.costs.stages["material_init"].first_fit > 0.0
+
+
+def test_without_time_for_the_first_light_training_starts_from_an_even_one(tmp_path):
+    capture = make_capture(tmp_path / "many", views=9)
+    training = small_training(capture, tmp_path / "run", solved_light(small_config(sdf_steps=0)))
+    plan = Plan.begin(read_asked("auto"), training.config)
+    assert look_at_light(plan, training.model, training.pixels, 0, most=0) == ([], None)
+    planned = BudgetPlan(60.0, "usual", Costs({}), places_looked_at=True, light_pixels=0)
+    planned_effects(planned, plan)
+    assert "20% of the budget" in plan.newest("long-tails").reason
+
+
 def test_what_settings_decide_is_not_tried(capture):
     config = small_config(joint_steps=0)
     trial = try_out(
-        load_capture(capture), config, Asked("as-set"), torch.device("cpu"), 0.05, 1.0, report=False
+        load_capture(capture), config, Asked("as-set"), torch.device("cpu"), 0.05, 1.0, 1.0, report=False
     )
     assert list(trial.costs.stages) == ["sdf_init", "material_init"]
     assert trial.costs.stages["material_init"].fit == 0.0  # a light that is free is not solved for
     assert trial.costs.reserve == trial.places == 0.0
+    assert trial.light_pixels is None
 
 
 @pytest.mark.parametrize(
@@ -175,6 +215,7 @@ def test_what_settings_decide_is_not_tried(capture):
         {"revisions": []},
         {"budget": None},
         {"size": "huge"},
+        {"light_pixels": -1},
         {"costs": {"stages": {"joint": {"steps": 1}}, "reserve": 0}},
         {"revisions": [{"seconds": 1, "step": 0, "steps": {"tea": 3}}]},
         {"revisions": [{"seconds": 1, "step": 0, "steps": {"joint": -3}}]},

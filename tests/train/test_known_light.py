@@ -138,15 +138,15 @@ def test_the_record_says_why():
     auto = MapLightConfig(kind="auto")
     assert (
         in_words(auto, FITS)
-        == "an environment map; lamps were not needed (error +0.1 ± 0.3 % at 204 points kept back)"
+        == "an environment map without lamps (error +0.1 ± 0.3 % at 204 held-back points with lamps)"
     )
     assert (
         in_words(auto, FITS[:1])
-        == "an environment map and 3 lamps before it (error −2.1 ± 0.4 % at 204 points kept back)"
+        == "an environment map and 3 near lamps (error −2.1 ± 0.4 % at 204 held-back points with lamps)"
     )
     given = dataclasses.replace(auto, map="sky.exr")
     assert in_words(given, [dataclasses.replace(FITS[0], lamps=1)]).startswith(
-        "the given environment map and 1 lamp before"
+        "the given environment map and 1 near lamp ("
     )
     assert in_words(auto, []) == "an environment map"
     assert in_words(FreeLightConfig(), []) == "a field that is free at every point"

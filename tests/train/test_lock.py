@@ -27,7 +27,7 @@ def test_the_second_is_refused_until_the_first_is_gone(tmp_path):
     folder = tmp_path / "run"
     with holder(folder) as process:
         with (
-            pytest.raises(UserError, match=rf"another training is at work .*\(process {process.pid}\)"),
+            pytest.raises(UserError, match=rf"another training is running .*\(process {process.pid}\)"),
             alone_in(folder),
         ):
             pytest.fail("two at once")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -16,6 +17,7 @@ import torch
 
 from neilfpp_method.cli import main
 from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.train.optimizer import seed_step
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import differences, small_config, small_training
@@ -118,6 +120,77 @@ def test_a_stop_stops_both_processes_after_the_same_step(tmp_path, capture):
     assert process.returncode == 130
     assert complaint.count("stopped after step") == 1
     assert complaint.endswith(f"continue with: neilfpp train --out {out} --resume --device cpu --devices 2\n")
+
+
+def test_two_nodes_end_with_one_model(tmp_path, capture):
+    """torchrun starts one process for each of two nodes, here on one machine."""
+    out, port = tmp_path / "run", free_port()
+    train = [
+        "train",
+        "--data",
+        str(capture),
+        "--out",
+        str(out),
+        "--preset",
+        "tiny",
+        "--device",
+        "cpu",
+        *STEPS,
+    ]
+    nodes = []
+    for rank in range(2):
+        records = tmp_path / f"node{rank}"
+        records.mkdir()
+        torchrun = [sys.executable, "-m", "torch.distributed.run", "--nnodes", "2", "--node-rank", str(rank)]
+        torchrun += ["--master-addr", "127.0.0.1", "--master-port", str(port), "--nproc-per-node", "1"]
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "TINY_RECORD": str(records)}
+        command = [*torchrun, "-m", "tests.tiny_command", *train, "--nodes", "2"]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        nodes.append(
+            subprocess.Popen(command, env=environment, cwd=REPOSITORY, start_new_session=True, **pipes)
+        )
+    try:
+        said = [node.communicate(timeout=240) for node in nodes]
+    finally:
+        for node in nodes:
+            with suppress(ProcessLookupError):
+                os.killpg(node.pid, signal.SIGKILL)
+    assert [node.returncode for node in nodes] == [0, 0], said
+    assert sum(words.count("run folder") for words, _ in said) == 1
+    first, second = (recorded(tmp_path / f"node{rank}", "parameters_0") for rank in range(2))
+    assert differences(first, second) == []
+    seen = [recorded(tmp_path / f"node{rank}", "gradients_0") for rank in range(2)]
+    assert differences(*seen) == []
+    assert torch.load(out / "checkpoints" / "last.pt", weights_only=True)["step"] == 6
+
+
+def free_port() -> int:
+    """A port of this machine that nobody listens to."""
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        return server.getsockname()[1]
+
+
+@pytest.mark.parametrize(
+    ("options", "started", "complaint"),
+    [
+        (["--nodes", "2"], None, "one command starts the processes of one machine only"),
+        (["--nodes", "2"], "4", "torchrun started 4 processes, and --devices 1 --nodes 2 make 2"),
+        ([], "2", "torchrun started 2 processes"),
+        (["--nodes", "0"], None, "--nodes is 0"),
+    ],
+)
+def test_processes_that_do_not_go_together_are_named(
+    tmp_path, capture, options, started, complaint, monkeypatch, capsys
+):
+    monkeypatch.setitem(PRESETS, "tiny", small_config)
+    if started is not None:
+        monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
+        monkeypatch.setenv("WORLD_SIZE", started)
+    words = ["train", "--data", str(capture), "--out", str(tmp_path / "run"), "--preset", "tiny"]
+    assert main([*words, "--device", "cpu", *options]) == 2
+    assert complaint in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
 
 
 def test_bad_input_is_told_once(tmp_path, capture):

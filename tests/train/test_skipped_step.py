@@ -149,7 +149,7 @@ def test_an_infinity_that_a_mask_takes_out_is_not_told():
 
 def test_a_step_that_was_not_kept(training, monkeypatch, capfd):
     monkeypatch.setitem(PRESETS, "tiny", small_config)
-    with pytest.raises(UserError, match="no skipped step 3 is kept; it has none"):
+    with pytest.raises(UserError, match="step 3 is not a stored skipped step; the run has skipped no step"):
         load_step(training.path, 3)
     assert main(["replay", str(training.path), "3"]) == 2
     (training.path / FOLDER).mkdir()

@@ -49,7 +49,7 @@ def test_the_page_is_served_until_it_is_ended(found, port):
 
     command.view(request(found, port), said.append, once)
     assert served == [200]
-    assert said == [f"open http://127.0.0.1:{port} in a browser; Ctrl-C ends"]
+    assert said == [f"open http://127.0.0.1:{port} in a browser; press Ctrl-C to stop"]
     check_free("127.0.0.1", port)  # nothing is left
 
 
@@ -78,7 +78,7 @@ def test_an_open_door_is_told(found, port):
     pytest.importorskip("viser")
     said = []
     command.view(request(found, port, host="0.0.0.0"), said.append, lambda _: True)
-    assert said[0].startswith("warning: anybody")
+    assert said[0].startswith("warning: everybody")
 
 
 def test_a_busy_port_is_one_line(capsys, found, port):

@@ -1,6 +1,6 @@
 import pytest
 
-from neilfpp_method.view.pace import AT_ONCE, CHECKED, Pace, sizes
+from neilfpp_method.view.pace import BATCH, FIRST_IMAGE, Pace, sizes
 
 
 def test_sizes_double_up_to_the_whole_window():
@@ -18,10 +18,10 @@ def test_the_first_picture_is_no_larger_than_can_be_there_at_once():
 def test_the_number_of_rays_follows_the_measured_speed():
     pace = Pace()
     pace.note("normal", 100_000, 1.0)
-    assert pace.at_once("normal") == int(100_000 * AT_ONCE)
+    assert pace.first_image("normal") == int(100_000 * FIRST_IMAGE)
     pace.note("normal", 300_000, 1.0)  # half of either: 200,000 a second
-    assert pace.at_once("normal") == int(200_000 * AT_ONCE)
-    assert pace.together("normal") == pytest.approx(200_000 * CHECKED)
+    assert pace.first_image("normal") == int(200_000 * FIRST_IMAGE)
+    assert pace.batch("normal") == pytest.approx(200_000 * BATCH)
     pace.note("radiance", 1, 1.0)  # of each layer by itself, and never nothing
-    assert pace.at_once("radiance") == 256
-    assert pace.at_once("normal") == int(200_000 * AT_ONCE)
+    assert pace.first_image("radiance") == 256
+    assert pace.first_image("normal") == int(200_000 * FIRST_IMAGE)

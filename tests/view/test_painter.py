@@ -47,7 +47,7 @@ def painting(seen):
 
 
 def test_pictures_come_in_order(seen, painting):
-    painting(lambda wish: iter([None, f"{wish} coarse", None, f"{wish} fine"])).ask("a")
+    painting(lambda wish: iter([None, f"{wish} coarse", None, f"{wish} fine"])).request("a")
     seen.wait(lambda: seen.shown == ["a coarse", "a fine"])
 
 
@@ -63,9 +63,9 @@ def test_a_newer_wish_ends_the_refinement_of_the_older(seen, painting):
             yield "old fine"
 
     painter = painting(frames)
-    painter.ask("old")
+    painter.request("old")
     assert reached.wait(WAIT)
-    painter.ask("new")
+    painter.request("new")
     newer.set()
     seen.wait(lambda: seen.shown[-1] == "new coarse")
     assert seen.shown == ["old coarse", "new coarse"]
@@ -82,10 +82,10 @@ def test_the_first_picture_is_finished_and_wishes_in_between_are_skipped(seen, p
         yield wish
 
     painter = painting(frames)
-    painter.ask(0)
+    painter.request(0)
     assert begun.wait(WAIT)
     for wish in (1, 2, 3):
-        painter.ask(wish)
+        painter.request(wish)
     asked.set()
     seen.wait(lambda: seen.shown[-1:] == [3])
     assert seen.shown == [0, 3]
@@ -98,7 +98,7 @@ def test_a_failure_is_told_and_the_next_wish_goes(seen, painting):
         yield wish
 
     painter = painting(frames)
-    painter.ask("bad")
+    painter.request("bad")
     seen.wait(lambda: seen.failures == ["no such thing"])
-    painter.ask("good")
+    painter.request("good")
     seen.wait(lambda: seen.shown == ["good"])

@@ -9,12 +9,12 @@ import trimesh
 
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.relight.cameras import turntable
-from neilfpp_method.relight.film import Budget, take_picture
+from neilfpp_method.relight.film import Budget, render_picture
 from neilfpp_method.relight.sky import Sky
 from neilfpp_method.train.run import load_run
 from neilfpp_method.view.incident_map import light_at, light_picture, point_under
 from neilfpp_method.view.pace import Pace
-from neilfpp_method.view.pictures import BOUNCES, FAR, Frame, Wish, frames
+from neilfpp_method.view.pictures import BOUNCES, FAR, Frame, Request, frames
 from neilfpp_method.view.subject import Lighting, own_light, scene_of, subject_of
 
 
@@ -28,7 +28,7 @@ def camera(subject):
     return turntable(subject.run.capture, 2, None, 40)[0].camera
 
 
-def pictures(wish: Wish, count: int = 99) -> list[Frame]:
+def pictures(wish: Request, count: int = 99) -> list[Frame]:
     made = []
     for frame in frames(wish, Pace({wish.layer: 2_000.0})):
         if frame is not None:
@@ -56,7 +56,7 @@ def srgb(linear):
 
 
 def test_pictures_become_finer_up_to_the_window(subject, camera):
-    made = pictures(Wish(subject, camera, "normal", own_light(subject.run)))
+    made = pictures(Request(subject, camera, "normal", own_light(subject.run)))
     assert [frame.share for frame in made] == sorted(frame.share for frame in made)
     assert made[0].share < 1 == made[-1].share
     assert made[-1].image.shape == (camera.height, camera.width, 3)
@@ -64,7 +64,7 @@ def test_pictures_become_finer_up_to_the_window(subject, camera):
 
 @pytest.mark.parametrize("layer", ["base_color", "roughness", "metallic"])
 def test_a_layer_is_the_material_of_what_a_pixel_sees(subject, camera, layer):
-    frame = pictures(Wish(subject, camera, layer, own_light(subject.run)))[-1]
+    frame = pictures(Request(subject, camera, layer, own_light(subject.run)))[-1]
     _, place, ray = cast(subject, camera)
     assert len(ray) > 100
     with torch.no_grad():
@@ -77,7 +77,7 @@ def test_a_layer_is_the_material_of_what_a_pixel_sees(subject, camera, layer):
 
 
 def test_depth_is_along_the_axis(subject, camera):
-    frame = pictures(Wish(subject, camera, "normal", own_light(subject.run)))[-1]
+    frame = pictures(Request(subject, camera, "normal", own_light(subject.run)))[-1]
     _, place, ray = cast(subject, camera)
     depth = (place @ camera.w2c[2, :3]) + camera.w2c[2, 3]
     assert np.percentile(np.abs(frame.depth.reshape(-1)[ray] - depth), 98) < 1e-3
@@ -87,9 +87,9 @@ def test_depth_is_along_the_axis(subject, camera):
 def test_pbr_comes_to_the_path_tracers_picture(subject, camera):
     """Many samples of either, by other random numbers."""
     light = own_light(subject.run)
-    made = [frame for frame in pictures(Wish(subject, camera, "pbr", light), 40) if frame.share == 1]
+    made = [frame for frame in pictures(Request(subject, camera, "pbr", light), 40) if frame.share == 1]
     assert [frame.samples for frame in made] == list(range(1, len(made) + 1))
-    picture = take_picture(scene_of(subject, light), camera, Budget(64), BOUNCES, seed=7)
+    picture = render_picture(scene_of(subject, light), camera, Budget(64), BOUNCES, seed=7)
     inside = (picture.alpha[..., 0] > 0.999).numpy()
     true = 255 * srgb(picture.radiance.numpy()).clip(0, 1)
     error = [np.abs(frame.image.astype(float) - true)[inside].mean() for frame in (made[0], made[-1])]
@@ -101,7 +101,7 @@ def test_twice_the_light_is_a_stop_more(subject, camera):
     light = own_light(subject.run)
     brighter = Lighting(replace(light.sky, radiance=2 * light.sky.radiance), None, own=False)
     last = [
-        pictures(Wish(subject, camera, "pbr", shone, exposure), 6)[-1].image
+        pictures(Request(subject, camera, "pbr", shone, exposure), 6)[-1].image
         for shone, exposure in ((brighter, 0.0), (light.with_lamps(None), 1.0))
     ]
     assert np.abs(last[0].astype(int) - last[1]).max() <= 1
@@ -110,7 +110,7 @@ def test_twice_the_light_is_a_stop_more(subject, camera):
 def test_a_free_light_shows_pbr_too(given, camera):
     subject = subject_of(load_run(given), 32)
     assert own_light(subject.run).sky is None
-    frame = pictures(Wish(subject, camera, "pbr", own_light(subject.run)))[-1]
+    frame = pictures(Request(subject, camera, "pbr", own_light(subject.run)))[-1]
     assert frame.share == 1
     assert frame.image.std() > 5
 
@@ -121,7 +121,7 @@ def test_a_run_without_a_surface_shows_r_and_says_so(found, camera):
     empty = subject_of(run, 32)
     assert empty.layers == ("radiance",)
     assert "no surface" in empty.note
-    assert pictures(Wish(empty, camera, "radiance", own_light(run)))[-1].share == 1
+    assert pictures(Request(empty, camera, "radiance", own_light(run)))[-1].share == 1
     assert point_under(empty, (3.0, 0.0, 0.0), (-1.0, 0.0, 0.0)) is None
 
 

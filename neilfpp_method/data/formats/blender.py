@@ -1,11 +1,11 @@
 """Reader of Blender's transforms_train.json and transforms_test.json (NeRF synthetic, Stanford-ORB).
 
-camera_angle_x                     radians, for all frames or in each frames[].file_path
-without suffix: .png with alpha, .exr, … frames[].transform_matrix          camera to world, 4×4, OpenGL axes
-<folder>_mask/<name>.png           optional: the masks of the images in <folder>; without them an alpha
-channel is the mask
+    camera_angle_x               horizontal field of view in radians, for all frames or in a frame
+    frames[].file_path           the image, without suffix: .png with alpha, .exr, …
+    frames[].transform_matrix    camera to world, 4×4, OpenGL axes (x right, y up, z back)
+    <folder>_mask/<name>.png     optional: masks of the images in <folder>; else the alpha channel is the mask
 
-Views of the test file are held out. Validation views and transforms_novel.json are left out.
+Views of the test file are held out. Validation views and transforms_novel.json are not read.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def recognise(root: Path) -> bool:
 
 
 def read(root: Path) -> CaptureFiles:
-    """The capture's files: the training views, then the test views.
+    """Read the files of the capture: the training views, then the test views.
 
     Raises:
         UserError: a file is malformed, or names an image that is missing or outside the folder.

@@ -1,12 +1,13 @@
-"""Reader of COLMAP models, text or binary, with rigs or from before them; any camera model but panoramas.
+"""Reader of COLMAP models, text or binary, with or without rigs, and with any camera model but panoramas.
 
-sparse/0, sparse, …, or the folder itself     cameras, images, points3D (.bin or .txt) images/
-the images, or beside the model; EXR files may stand for the listed ones masks/<image>.png, masks/<stem>.png
-optional fused.ply, dense/fused.ply                    optional: COLMAP's dense points with normals
-object_point_cloud.ply                        optional: points of the object alone, which tell where it is
-(NeRO's scenes)
+    sparse/0, sparse, … or the folder itself    cameras, images, points3D (.bin or .txt)
+    images/, or beside the model                the images; an EXR file may replace a listed image
+    masks/<image>.png or masks/<stem>.png       optional: masks
+    fused.ply or dense/fused.ply                optional: COLMAP's dense points with normals
+    object_point_cloud.ply                      optional: points of the object only, from which the scene box
+                                                  is computed (NeRO's scenes)
 
-The images are used as they are: a lens keeps its distortion, and its rays are bent instead of the image.
+Images are used as they are: a lens keeps its distortion, and rays are bent instead of the image.
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ FILES = ("cameras", "images", "points3D")
 
 
 def recognise(root: Path) -> bool:
-    """Whether the folder has a complete model where COLMAP's tools put it."""
+    """Whether the folder has a complete model in one of the places in which COLMAP's tools write it."""
     return model_folder(root) is not None
 
 
 def read(root: Path) -> CaptureFiles:
-    """The capture's files: one view for each registered image, in the order of their names.
+    """Read the files of the capture: one view for each registered image, in the order of their names.
 
     Raises:
         UserError: the model is malformed or empty, has a panorama, or an image is missing or outside the
@@ -56,7 +57,8 @@ def read(root: Path) -> CaptureFiles:
     registered = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
     if not registered:
         raise UserError(f"{folder}: the model has no registered image", "reconstruct the cameras again")
-    names = [image.name.replace("\\", "/") for image in registered]  # a model from Windows has its separators
+    # A model that was written on Windows may have its separators.
+    names = [image.name.replace("\\", "/") for image in registered]
     first = names[0]
     inputs = next((root / place for place in IMAGE_FOLDERS if stored(root, root / place / first)), None)
     if inputs is None:
@@ -70,20 +72,17 @@ def read(root: Path) -> CaptureFiles:
         camera = camera_of(image.camera, w2c, f"{folder}: {listed}")
         views.append(View(name, index, camera, file, _mask(root, listed)))
     check_masks(root / "masks", views)
-    known = (root / OBJECT).is_file()
-    points = (
-        read_positions(inside(root, root / OBJECT))
-        if known
-        else np.array([p.xyz for p in model.points3D.values()])
-    )
-    points = points.reshape(-1, 3)
+    if (root / OBJECT).is_file():
+        points = read_positions(inside(root, root / OBJECT))
+    else:
+        points = np.array([p.xyz for p in model.points3D.values()]).reshape(-1, 3)
     cloud = next((inside(root, root / place) for place in POINT_CLOUDS if (root / place).is_file()), None)
     box = find_box(views, points[np.isfinite(points).all(axis=1)])
     return CaptureFiles(inputs, tuple(views), box.normalisation, cloud, scene_from=box.source)
 
 
 def open_model(folder: Path) -> pycolmap.Reconstruction:
-    """A model as pycolmap reads it.
+    """Read a model with pycolmap.
 
     Raises:
         UserError: it is malformed or cut off.
@@ -103,10 +102,15 @@ def open_model(folder: Path) -> pycolmap.Reconstruction:
 
 
 def camera_of(camera: pycolmap.Camera, w2c: Float64[np.ndarray, "4 4"], where: str) -> Camera:
-    """pycolmap's camera with a pose; a lens that bends nothing becomes a pinhole.
+    """Convert a camera of pycolmap with a pose; a lens without distortion becomes a pinhole.
+
+    Args:
+        camera: a camera of any model but panoramas.
+        w2c: the pose, world to camera.
+        where: the image, for the message.
 
     Raises:
-        UserError: a panorama, which has no image plane; names `where`.
+        UserError: the camera is a panorama, which has no image plane.
     """
     if camera.model_name in PANORAMAS:
         raise UserError(
@@ -120,7 +124,7 @@ def camera_of(camera: pycolmap.Camera, w2c: Float64[np.ndarray, "4 4"], where: s
 
 
 def model_folder(root: Path) -> Path | None:
-    """Where the complete model lies; none: there is none."""
+    """Return the folder of the complete model; None if there is none."""
     for place in MODELS:
         folder = root / place
         if any(all((folder / f"{name}{suffix}").is_file() for name in FILES) for suffix in (".bin", ".txt")):
@@ -129,7 +133,7 @@ def model_folder(root: Path) -> Path | None:
 
 
 def _mask(root: Path, image: str) -> Path | None:
-    """COLMAP's own name for a mask adds .png to the image's; others put it in place of the suffix."""
+    """The mask of an image: <image>.png, COLMAP's own convention, or <stem>.png, that of other tools."""
     named = root / "masks" / f"{image}.png"
     return (
         named if inside(root, named).is_file() else stored(root, (root / "masks" / image).with_suffix(".png"))

@@ -1,7 +1,7 @@
-"""A walk through the binary files of a COLMAP model that only adds up lengths.
+"""Check of the lengths of the binary files of a COLMAP model.
 
-pycolmap believes the counts in a file: one damaged number has it loop for minutes, or ask for more memory
-than there is. What the counts announce has to be there before pycolmap may read it.
+pycolmap trusts the counts in a file: with one damaged number it loops for minutes, or allocates more memory
+than there is. This module checks that a file is long enough for its counts before pycolmap reads it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ __all__ = ["check_sizes"]
 COUNT, SMALL_COUNT = Struct("<Q"), Struct("<I")
 CAMERA_HEAD, PARAMETER = Struct("<iiQQ"), 8
 MIN_PARAMETERS = 2
-"""Of a camera: a focal length and at least one more."""
+"""Smallest number of parameters of a camera: a focal length and at least one more."""
 IMAGE_HEAD, POINT_IN_IMAGE = Struct("<I7dI"), 24
 POINT_HEAD, OBSERVATION = Struct("<Q3d3Bd"), 8
 RIG_ID, SENSOR, POSE = 4, 8, 56
@@ -23,7 +23,7 @@ FRAME_HEAD, DATA_ID = Struct("<II7d"), 16
 
 
 def check_sizes(folder: Path) -> None:
-    """Follow the counts of each binary file to its end.
+    """Check that each binary file of a model is as long as its counts say.
 
     Raises:
         ValueError: a file is shorter than it says.
@@ -50,7 +50,7 @@ def _camera(data: bytes, offset: int) -> int:
 
 
 def _image(data: bytes, offset: int) -> int:
-    end_of_name = data.index(b"\0", offset + IMAGE_HEAD.size) + 1  # a ValueError where there is none
+    end_of_name = data.index(b"\0", offset + IMAGE_HEAD.size) + 1
     (count,) = COUNT.unpack_from(data, end_of_name)
     return end_of_name + COUNT.size + count * POINT_IN_IMAGE
 

@@ -1,4 +1,4 @@
-"""Copies of a capture's images, masks and points, for the writers of other layouts."""
+"""Copy images, masks and points of a capture, for the writers of other layouts."""
 
 from __future__ import annotations
 
@@ -21,14 +21,15 @@ from neilfpp_method.shading.color import linear_to_srgb, srgb_to_linear
 __all__ = ["copy_file", "copy_view", "writing"]
 
 MASK_THRESHOLD = 0.5
-"""Interpolated mask above which a pixel is on the object."""
+"""Value of an interpolated mask above which a pixel is on the object: most of it is."""
 VALID_THRESHOLD = 0.9995
-"""Interpolated validity from which all neighbours are valid: OpenCV weighs them in steps of 1/1024."""
+"""Value of an interpolated validity mask above which all neighbours are valid. It is slightly below 1 because
+OpenCV's interpolation weights are multiples of 1/1024."""
 
 
 @contextmanager
 def writing(out: Path) -> Iterator[None]:
-    """Make a folder to write into; what the system refuses becomes a `UserError`."""
+    """Create the folder `out` and turn errors of the operating system in the block into a `UserError`."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         yield
@@ -39,20 +40,27 @@ def writing(out: Path) -> Iterator[None]:
 
 
 def copy_view(view: View, out: Path, hdr: bool, straight: bool) -> View:
-    """Copy a view's files to `out`/images, masks and valid, under the view's name; returns the new view.
+    """Copy the files of a view to `out`/images, `out`/masks and `out`/valid and return the new view.
 
-    The files are copied as they are where that says all. An exposure or white balance is divided out, as the
-    layouts know none: the image is then written as EXR. With `straight` a lens is undone: the image is
-    resampled as linear radiance and written as EXR, or as 16-bit PNG where it is not linear. A pixel is then
-    valid where all that it is made of is, and on the object where most of it is.
+    Files are copied unchanged if possible. An exposure or a white balance is divided out, because other
+    layouts have no such factors, and the image is written as EXR. If `straight` is true, the image is
+    resampled to a pinhole in linear radiance and written as EXR, or as 16-bit PNG if the capture is not
+    linear. A resampled pixel is valid if all pixels that it is interpolated from are valid, and on the object
+    if most of it is.
+
+    Args:
+        view: the view.
+        out: the target folder.
+        hdr: whether pixels are linear radiance.
+        straight: whether to remove lens distortion.
 
     Raises:
         UserError: an image cannot be read.
     """
     camera = straight_camera(view.camera) if straight else view.camera
     factor = view.exposure * np.array(view.white_balance, np.float32)
-    as_it_is = camera is view.camera and bool((factor == 1.0).all())
-    if as_it_is:
+    unchanged = camera is view.camera and bool((factor == 1.0).all())
+    if unchanged:
         image = copy_file(view.image, out / "images" / f"{view.name}{view.image.suffix.lower()}")
     else:
         image = _write_image(view, camera, factor, hdr, out / "images" / view.name)
@@ -69,7 +77,7 @@ def copy_view(view: View, out: Path, hdr: bool, straight: bool) -> View:
 
 
 def copy_file(source: Path, target: Path) -> Path:
-    """Copy a file under another name, in one step; returns the target."""
+    """Copy a file atomically and return the target."""
     with replacing(target) as temporary:
         shutil.copyfile(source, temporary)
     return target
@@ -86,22 +94,19 @@ def _write_image(
     if camera is not view.camera:
         layers = resample(layers, view.camera, camera)
     if hdr:
-        write_exr(
-            path := target.with_name(f"{target.name}.exr"),
-            {"RGB" if layers.shape[2] == 3 else "RGBA": layers},
-        )
+        path = target.with_name(f"{target.name}.exr")
+        write_exr(path, {"RGB" if layers.shape[2] == 3 else "RGBA": layers})
         return path
     layers[..., :3] = linear_to_srgb(torch.from_numpy(layers[..., :3])).numpy()
-    write_png(
-        path := target.with_name(f"{target.name}.png"), np.rint(layers.clip(0, 1) * 65_535).astype(np.uint16)
-    )
+    path = target.with_name(f"{target.name}.png")
+    write_png(path, np.rint(layers.clip(0, 1) * 65_535).astype(np.uint16))
     return path
 
 
 def _copy_mask(
     mask: Path | None, camera: Camera, straight: Camera, target: Path, least: float
 ) -> Path | None:
-    """Copy a mask; a resampled pixel is white where more than `least` of it was."""
+    """Copy a mask; a resampled pixel is white if its interpolated value is above `least`."""
     if mask is None:
         return None
     if camera is straight and mask.suffix.lower() == ".png":

@@ -1,10 +1,12 @@
 """Reader of DTU scans as IDR and NeuS distribute them, and of other scenes in their layout.
 
-cameras_sphere.npz, or cameras.npz      world_mat_<i>: image ← world, 4×4 (the first three rows count);
-                                        scale_mat_<i>: world ← unit sphere, a scale and a shift
-image/ or rgb/, mask/                   the i-th file belongs to camera i
+    cameras_sphere.npz or cameras.npz    world_mat_<i>: projection from world to image, 4×4; the last
+                                           row is not used;
+                                         scale_mat_<i>: from the unit sphere to the world, a scale and a shift
+    image/ or rgb/, and mask/            the i-th file in the order of the names belongs to camera i
 
-These files put pixel centres at whole numbers, we at +½, so principal points move by half a pixel.
+In these files pixel centres have integer coordinates, here they are at +½, so half a pixel is added to
+principal points.
 """
 
 from __future__ import annotations
@@ -28,9 +30,9 @@ CAMERAS = ("cameras_sphere.npz", "cameras.npz")
 IMAGES = ("image", "rgb", "images")
 MASKS = ("mask", "masks")
 MAX_BYTES = 2**26
-"""Unpacked size of a camera archive."""
+"""Largest unpacked size of a camera archive, in bytes."""
 MAX_SKEW = 0.05
-"""Sideways shift across the height of an image, pixels, that is taken for rounding."""
+"""Largest horizontal shift by skew across the height of an image, in pixels, that counts as rounding."""
 
 
 def recognise(root: Path) -> bool:
@@ -39,7 +41,7 @@ def recognise(root: Path) -> bool:
 
 
 def read(root: Path) -> CaptureFiles:
-    """The capture's files.
+    """Read the files of the capture.
 
     Raises:
         UserError: the archive is malformed, or images, masks and cameras do not match.

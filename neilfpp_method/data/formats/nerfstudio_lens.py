@@ -1,4 +1,4 @@
-"""Lenses by nerfstudio's names k1, k2, k3, k4, p1, p2, and by COLMAP's."""
+"""Conversion of lens coefficients between nerfstudio's names (k1 to k4, p1, p2) and COLMAP's models."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from neilfpp_method.errors import UserError
 __all__ = ["FISHEYE", "lens_from_nerfstudio", "nerfstudio_coefficients"]
 
 FISHEYE = "OPENCV_FISHEYE"
-# What COLMAP's models call their coefficients, in order; what follows has no name in nerfstudio.
 NAMES = {
     "SIMPLE_RADIAL": ("k1",),
     "RADIAL": ("k1", "k2"),
@@ -19,24 +18,25 @@ NAMES = {
     "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3"),
     FISHEYE: ("k1", "k2", "k3", "k4"),
 }
+"""Nerfstudio's names of the leading coefficients of COLMAP's models; the others have no name there."""
 
 
 def lens_from_nerfstudio(model: str, coefficients: Mapping[str, float], where: str) -> Lens | None:
-    """The lens of a camera model; none where it bends nothing.
+    """Return the lens of a camera model; None if it has no distortion.
 
     Args:
         model: `FISHEYE`, or any other name for a perspective camera.
-        coefficients: by name; those that are missing are 0.
-        where: whose lens it is.
+        coefficients: coefficients by name; missing ones are 0.
+        where: the camera, for the message.
 
     Raises:
-        UserError: a perspective camera has a k4, which stands for r⁸ in nerfstudio and has no place in
-            COLMAP's models.
+        UserError: a perspective camera has a k4. In nerfstudio it multiplies r⁸, which no model of COLMAP
+            has.
     """
     known = {name: coefficients.get(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
     if model != FISHEYE and known["k4"]:
         raise UserError(
-            f"{where}: k4 has a meaning for {FISHEYE} only", "undistort the images, or calibrate without it"
+            f"{where}: k4 is supported for {FISHEYE} only", "undistort the images, or calibrate without it"
         )
     if model != FISHEYE:
         model = "FULL_OPENCV" if known["k3"] else "OPENCV"
@@ -45,7 +45,7 @@ def lens_from_nerfstudio(model: str, coefficients: Mapping[str, float], where: s
 
 
 def nerfstudio_coefficients(camera: Camera) -> Mapping[str, float] | None:
-    """A camera's lens coefficients by name: empty for a pinhole, none for a lens nerfstudio lacks."""
+    """Return lens coefficients by name: empty for a pinhole, None for a lens that nerfstudio lacks."""
     if camera.lens is None:
         return {}
     names, coefficients = NAMES.get(camera.lens.model), camera.lens.coefficients

@@ -1,9 +1,11 @@
 """Reader of NeRO's glossy synthetic scenes.
 
-<i>-camera.pkl      a pickled pair of arrays: world to camera, 3×4, OpenCV axes; and the intrinsics, 3×3,
-pixel centres at +½ <i>.png             the image; 0, 1, …, without gaps
+    <i>-camera.pkl    a pickled pair of arrays: world to camera, 3×4, OpenCV axes; and the intrinsic matrix,
+                        3×3, with pixel centres at +½
+    <i>.png           the image; i is 0, 1, … without gaps
 
-The object lies in the unit sphere. NeRO's real scenes come as COLMAP models in colmap/sparse/0.
+The object lies in the unit sphere. NeRO's real scenes are COLMAP models in colmap/sparse/0, which `colmap`
+reads.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ __all__ = ["LAYOUT", "read", "recognise"]
 LAYOUT = "0-camera.pkl, 0.png and so on"
 SUFFIX = "-camera.pkl"
 MAX_SKEW = 1e-3
-"""Skew over focal length that is taken for rounding."""
+"""Largest ratio of skew to focal length that counts as rounding."""
 
 
 def recognise(root: Path) -> bool:
@@ -32,7 +34,7 @@ def recognise(root: Path) -> bool:
 
 
 def read(root: Path) -> CaptureFiles:
-    """The capture's files.
+    """Read the files of the capture.
 
     Raises:
         UserError: a camera or an image is missing, or a camera is malformed.

@@ -1,4 +1,4 @@
-"""Finding files: what several layouts need to get from listed names to files inside the capture."""
+"""Find the files of a capture by the names that its description lists; shared by several readers."""
 
 from __future__ import annotations
 
@@ -13,24 +13,26 @@ __all__ = ["check_masks", "stored", "stored_image", "view_names"]
 
 
 def stored(root: Path, path: Path) -> Path | None:
-    """The file, or the one of its name with another image suffix: scenes may list .png where files are .exr.
+    """Return the file, or the file of the same name with another image suffix; None if neither exists.
+
+    A scene may list 000.png although the file is 000.exr.
 
     Raises:
-        UserError: the path leads out of `root`, or two files could be meant.
+        UserError: the path leads out of `root`, or two files with other suffixes exist.
     """
     if inside(root, path).is_file():
         return path
     base = path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
     candidates = [base.with_name(base.name + suffix) for suffix in IMAGE_SUFFIXES]
-    found = [inside(root, file) for file in candidates if file.is_file()]
-    if len(found) > 1:
-        names = " and ".join(file.name for file in found)
+    existing = [inside(root, file) for file in candidates if file.is_file()]
+    if len(existing) > 1:
+        names = " and ".join(file.name for file in existing)
         raise UserError(f"{path}: not there, and {names} could both be meant", "keep one of them")
-    return found[0] if found else None
+    return existing[0] if existing else None
 
 
 def stored_image(root: Path, path: Path, where: str) -> Path:
-    """As `stored`, but the file has to be there; `where` says who lists it."""
+    """As `stored`, but a missing file is a `UserError`; `where` names the entry that lists it."""
     image = stored(root, path)
     if image is None:
         raise UserError(f"{where}: there is no {path}", "put the image there, or correct the path")
@@ -54,8 +56,9 @@ def check_masks(folder: Path, views: Sequence[View]) -> None:
 
 
 def view_names(listed: Sequence[str]) -> tuple[str, ...]:
-    """Names for views: the stems of the listed files, or where two are the same, of all with their folders:
-    "left-000".
+    """Return unique names for views: the stems of the listed files.
+
+    If two stems are equal, all names contain their folders as well: "left-000".
     """
     paths = [PurePosixPath(name.replace("\\", "/")) for name in listed]
     stems = tuple(path.stem for path in paths)

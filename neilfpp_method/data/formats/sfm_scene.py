@@ -1,13 +1,16 @@
-"""Reader of the layout of the published NeILF datasets: `inputs/sfm_scene.json` and files around it.
+"""Reader of the layout of the published NeILF datasets: `inputs/sfm_scene.json` and the files beside it.
 
-camera_track_map.images.<i>.flg                        2: the camera is valid; others are left out
-camera_track_map.images.<i>.size                       width, height
-camera_track_map.images.<i>.camera.intrinsic           focal (one number or two), ppt (principal point), in
-pixels camera_track_map.images.<i>.camera.extrinsic           world to camera, 4×4, row-major
-image_path.file_paths.<i>                              relative to the folder `inputs` bbox.transform
-4×4: full extents on the diagonal, centre in the last column inputs/masks/<stem>.*,
-inputs/model/oriented_pcd.ply   optional inputs/valid/<stem>.*                                  optional; the
-project's own writer adds it
+    camera_track_map.images.<i>.flg                 2 for a valid camera; others are left out
+    camera_track_map.images.<i>.size                width, height in pixels
+    camera_track_map.images.<i>.camera.intrinsic    focal (1 or 2 numbers), ppt (principal point), pixels
+    camera_track_map.images.<i>.camera.extrinsic    world to camera, 4×4, row-major
+    image_path.file_paths.<i>                       the image, relative to the folder `inputs`
+    bbox.transform                                  4×4: full extents on the diagonal, centre in column 4
+    inputs/masks/<stem>.*                           optional: masks
+    inputs/model/oriented_pcd.ply                   optional: oriented point cloud
+    inputs/valid/<stem>.*                           optional: validity masks, written by `write_sfm_scene`
+
+Other entries are ignored.
 """
 
 from __future__ import annotations
@@ -30,6 +33,7 @@ LAYOUT = "inputs/sfm_scene.json"
 PLACES = ("inputs/sfm_scene.json", "sfm_scene.json", "inputs/model/sfm_scene.json")
 POINT_CLOUD = "model/oriented_pcd.ply"
 VALID = 2
+"""Value of `flg` of a camera with a valid pose."""
 
 
 def recognise(root: Path) -> bool:
@@ -38,7 +42,7 @@ def recognise(root: Path) -> bool:
 
 
 def read(root: Path) -> CaptureFiles:
-    """The capture's files.
+    """Read the files of the capture.
 
     Raises:
         UserError: the scene file is malformed, or images and cameras do not match; names the file and the

@@ -1,16 +1,20 @@
-"""Reader of nerfstudio's transforms.json, and of what instant-ngp and others write under that name.
+"""Reader of nerfstudio's transforms.json, which instant-ngp and other programs write as well.
 
-camera_model                         OPENCV (also where missing), OPENCV_FISHEYE, or one of COLMAP's pinholes
-is_fisheye                           instant-ngp's word for OPENCV_FISHEYE, in the place of camera_model fl_x,
-fl_y, cx, cy, w, h, k1 … p2    for all frames, or in a frame for itself; camera_angle_x (radians) may stand
-for fl_x frames[].file_path, .mask_path       relative to the file; a mask is white on the object
-frames[].transform_matrix            camera to world, 4×4, OpenGL axes (x right, y up, z back)
-train_filenames, test_filenames, …   optional: the views held out are those that are not for training
-ply_file_path                        optional; used for its points, and where it has normals as oriented cloud
-scene, response, frames[].valid_path optional, as in capture.json: the project's own writer adds them
+    camera_model                      OPENCV (also if missing), OPENCV_FISHEYE, or one of COLMAP's pinholes
+    is_fisheye                        instant-ngp's entry for OPENCV_FISHEYE, if there is no camera_model
+    fl_x, fl_y, cx, cy, w, h,         for all frames, or in a frame for that frame;
+      k1 … k4, p1, p2                   camera_angle_x (radians) may replace fl_x
+    frames[].file_path                the image, relative to the file
+    frames[].mask_path                optional: the mask, white on the object
+    frames[].transform_matrix         camera to world, 4×4, OpenGL axes (x right, y up, z back)
+    train_filenames, test_filenames   optional: the split; without test_filenames, the test views are those
+                                        that train_filenames does not list
+    ply_file_path                     optional: points, which are the oriented cloud if they have normals
+    scene, response,                  optional, with the meaning of capture.json; written by
+      frames[].valid_path               `write_transforms`
 
-The world frame is that of the file's poses, in which its point cloud lies too. `applied_transform`, which
-says how that frame came from an older one, stays applied.
+The world frame is that of the poses in the file, which is also the frame of its point cloud.
+`applied_transform`, the transformation from an older frame to this one, is not undone.
 """
 
 from __future__ import annotations
@@ -36,8 +40,9 @@ __all__ = ["FLIP", "LAYOUT", "Frame", "read", "read_frames", "recognise"]
 
 LAYOUT = "transforms.json"
 FLIP = np.array([1.0, -1.0, -1.0, 1.0])
-"""From OpenCV's axes (x right, y down, z forward) to OpenGL's (x right, y up, z back), and back."""
+"""Signs that convert between OpenCV's (x right, y down, z forward) and OpenGL's axes (y up, z back)."""
 MODELS = ("OPENCV", FISHEYE, "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+"""Accepted values of `camera_model`."""
 
 
 def recognise(root: Path) -> bool:
@@ -46,7 +51,7 @@ def recognise(root: Path) -> bool:
 
 
 def read(root: Path) -> CaptureFiles:
-    """The capture's files, in the order of the frames.
+    """Read the files of the capture, in the order of the frames.
 
     Raises:
         UserError: the file is malformed, or names an image or a mask that is missing or outside the folder.
@@ -74,7 +79,7 @@ def read(root: Path) -> CaptureFiles:
 
 @dataclass(frozen=True)
 class Points:
-    """Where the scene is, and the file of its points where these have normals."""
+    """Positions of the points of `ply_file_path`, and its path if they have normals."""
 
     position: Float64[np.ndarray, "P 3"] | None
     oriented: Path | None
@@ -82,7 +87,15 @@ class Points:
 
 @dataclass(frozen=True)
 class Frame:
-    """An entry of `frames`: the path as listed, and what it leads to."""
+    """An entry of `frames`.
+
+    Attributes:
+        listed: its `file_path`, as it stands in the file.
+        image: the image.
+        mask: mask of the object; None if there is none.
+        valid: validity mask; None if there is none.
+        camera: the camera, in the world frame.
+    """
 
     listed: str
     image: Path
@@ -92,7 +105,7 @@ class Frame:
 
 
 def read_frames(root: Path, entry: Entry) -> tuple[Frame, ...]:
-    """The frames of a transforms file.
+    """Read the frames of a transforms file.
 
     Raises:
         UserError: as `read`.
@@ -117,11 +130,11 @@ def _named(root: Path, listed: Entry) -> Path:
 
 
 def _camera(entry: Entry, frame: Entry, image: Path) -> Camera:
-    """The camera of a frame; what the frame does not say, the file says for all."""
+    """The camera of a frame; entries that the frame lacks are those of the file."""
 
     def number(name: str) -> float | None:
-        found = frame.get(name) or entry.get(name)
-        return found and found.number()
+        value = frame.get(name) or entry.get(name)
+        return value and value.number()
 
     header = image_header(image)
     width, height = (frame.get(name) or entry.get(name) for name in ("w", "h"))
@@ -155,7 +168,7 @@ def _focal(angle: float | None, size: int) -> float | None:
 
 
 def _pose(entry: Entry) -> Float64[np.ndarray, "4 4"]:
-    """World to OpenCV camera, of camera to world with OpenGL axes; what is not rigid is refused."""
+    """Convert a rigid pose from camera to world with OpenGL axes into world to camera with OpenCV axes."""
     c2w = entry.numbers((4, 4), (3, 4))[:3]
     rotation = c2w[:, :3] * FLIP[:3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
@@ -168,7 +181,7 @@ def _pose(entry: Entry) -> Float64[np.ndarray, "4 4"]:
 
 
 def _held_out(root: Path, entry: Entry, views: Sequence[View]) -> frozenset[str] | None:
-    """The views that the file holds out: `test_filenames`, or else all that are in no list for training."""
+    """The names of the test views: those of `test_filenames`, else those that `train_filenames` lacks."""
     lists = {split: entry.get(f"{split}_filenames") for split in ("train", "test")}
     given = {
         split: {stored(root, root / name.text()) for name in names.items()}
@@ -180,7 +193,7 @@ def _held_out(root: Path, entry: Entry, views: Sequence[View]) -> frozenset[str]
     for split, files in given.items():
         if not files <= {view.image for view in views}:
             raise UserError(
-                f"{entry.name(f'{split}_filenames')}: names a file that is no frame", "correct the list"
+                f"{entry.name(f'{split}_filenames')}: names a file that no frame has", "correct the list"
             )
     train, test = given.get("train"), given.get("test")
     return frozenset(

@@ -14,9 +14,9 @@ __all__ = ["write_sfm_scene"]
 
 
 def write_sfm_scene(capture: Capture, out: Path) -> Path:
-    """Write a capture with copies of its images, masks and points; returns the folder.
+    """Write a capture with copies of its images, masks and points, and return the folder.
 
-    The layout knows pinholes only: images of a lens are resampled.
+    The layout has pinhole cameras only, so images of a lens are resampled.
 
     Raises:
         UserError: an image cannot be read, or the folder cannot be written.

@@ -18,11 +18,11 @@ __all__ = ["write_transforms"]
 
 
 def write_transforms(capture: Capture, out: Path) -> Path:
-    """Write a capture with copies of its images, masks and points; returns the folder.
+    """Write a capture with copies of its images, masks and points, and return the folder.
 
-    The frame stays the capture's own. Lenses that nerfstudio knows are kept; images of others, and of
-    fisheyes beside other cameras, are resampled. `scene`, `response` and `valid_path` are entries that
-    nerfstudio passes over.
+    The world frame does not change. Lenses that nerfstudio supports are kept. Images of other lenses, and of
+    fisheyes in a capture that has other cameras as well, are resampled. Nerfstudio ignores the entries
+    `scene`, `response` and `valid_path`.
 
     Raises:
         UserError: an image cannot be read, or the folder cannot be written.
@@ -44,7 +44,7 @@ def write_transforms(capture: Capture, out: Path) -> Path:
             cloud = copy_file(capture.point_cloud, out / "points.ply")
             description["ply_file_path"] = cloud.name
         if capture.test:
-            # Nerfstudio wants a list for every split where there is one for any.
+            # If there is a list for one split, nerfstudio requires one for every split.
             test = [_listed(out, view.image) for view in views if view.name in capture.test]
             train = [_listed(out, view.image) for view in views if view.name not in capture.test]
             description |= {"train_filenames": train, "val_filenames": test, "test_filenames": test}

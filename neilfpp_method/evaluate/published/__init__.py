@@ -1,4 +1,4 @@
-"""Protocols of published benchmarks, each computed as the official code of that benchmark computes it."""
+"""Evaluation protocols of published benchmarks, each computed as the official code computes it."""
 
 from __future__ import annotations
 
@@ -16,3 +16,4 @@ PROTOCOLS: dict[str, Protocol] = {
     protocol.name: protocol
     for protocol in (NEILF_SYNTHETIC, TENSOIR, STANFORD_ORB, SYNTHETIC4RELIGHT, DTU, SHINY_NORMALS)
 }
+"""All published protocols by the name that `neilfpp eval --protocol` takes."""

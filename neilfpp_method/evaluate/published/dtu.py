@@ -1,23 +1,24 @@
-"""The Chamfer distance of DTU: jzhangbs/DTUeval-python `eval.py`, which follows the Matlab code of the
-dataset.
+"""The Chamfer distance of DTU.
 
-The truth lies in the layout of the dataset's SampleSet, in the capture's folder or beside it; the scan's
-number is that in the name of the capture's folder:
+It is computed as in jzhangbs/DTUeval-python `eval.py`, which follows the Matlab code of the dataset. The
+truth is read from the capture's folder or its parent, in the layout of the dataset's SampleSet. The number of
+the scan is the last number in the name of the capture's folder:
 
     ObsMask/ObsMask<scan>_10.mat, ObsMask/Plane<scan>.mat, Points/stl/stl<scan, 3 digits>_total.ply
 
-What is particular about it:
+Details of the protocol:
 
-- The surface is sampled about every 0.2 mm, and of two points closer than that one is left out.
-- Points 20 mm away or farther are left out of the mean, not counted as 20 mm: a surface with far pieces does
-  not lose by them.
-- From the estimate, points count that lie in cells that the scanner observed. From the truth, points count
-  that lie above the ground plane; they look for their neighbour among all points of the estimate in the box.
-- The box of the observed cells is widened by 60 mm below, and by twice that above.
-- The order in which points are left out is random there; here it is always the same.
+- The surface is sampled about every 0.2 mm; of two points closer than that, one is removed.
+- Distances of 20 mm or more are left out of the mean, not counted as 20 mm. Parts of a surface that are far
+  from the truth therefore do not increase the figure.
+- From the estimate to the truth, only points in cells that the scanner observed count. From the truth to the
+  estimate, only points above the ground plane count; their nearest neighbour is searched among all points of
+  the estimate in the enlarged box.
+- The box of the observed cells is enlarged by 60 mm at its lower corner, and by 120 mm at its upper corner.
+- The official code removes points in random order; here the order is fixed by a seed.
 
-Papers cut the mesh with the dilated masks of the images before; this does not. It is in millimetres where
-the capture is in the frame of the dataset, as the reader `dtu` leaves it.
+Some papers cut the mesh with the dilated masks of the images first; this protocol does not. Figures are in
+millimetres if the capture is in the frame of the dataset, which the reader `dtu` keeps.
 """
 
 from __future__ import annotations
@@ -46,27 +47,32 @@ __all__ = ["DTU", "Observed", "chamfer_of_scan"]
 
 NAME = "dtu"
 RESOLUTION = 512
-"""Grid points along an edge of the scene, where the surface is extracted from a distance field."""
+"""Number of grid points along an edge of the scene when a surface is extracted from a distance field."""
 SPACING = 0.2
+"""Distance between surface samples, mm (official code)."""
 CAP = 20.0
+"""Distance from which points are left out of the mean, mm (official code)."""
 PATCH = 60.0
+"""Margin around the box of the observed cells, mm (official code)."""
 SEED = 0
+"""Seed of the order in which points are removed."""
 LARGEST_MASK = 2**30
-"""Cells of the observation mask; those of the dataset have up to 30 million."""
+"""Largest accepted number of cells of an observation mask; the dataset's masks have up to 30 million."""
 LARGEST_CLOUD = 2**31
-"""Bytes of the true points."""
+"""Largest accepted size of the file of true points, bytes."""
 
 
 @dataclass(frozen=True)
 class Observed:
-    """What the scanner saw of a scan.
+    """The scanner's data of one scan.
 
     Attributes:
-        mask: not 0 in cells that it observed.
-        low, high: the box of the cells, mm.
-        cell: size of a cell, mm.
-        plane: (a, b, c, d); points with a x + b y + c z + d > 0 are above the ground.
-        points: the true surface, mm.
+        mask: nonzero in cells that the scanner observed.
+        low: lower corner of the box of the cells, mm.
+        high: upper corner of the box of the cells, mm.
+        cell: edge length of a cell, mm.
+        plane: ground plane (a, b, c, d); points with a x + b y + c z + d > 0 are above the ground.
+        points: points of the true surface, mm.
     """
 
     mask: Integer[np.ndarray, "X Y Z"]
@@ -80,11 +86,18 @@ class Observed:
 def chamfer_of_scan(
     vertices: Float[np.ndarray, "V 3"], faces: Integer[np.ndarray, "F 3"], scan: Observed
 ) -> dict[str, float]:
-    """The distances from the estimate to the truth, the other way, and half their sum, mm.
+    """Compute the distances from the estimate to the truth, from the truth to the estimate, and their mean.
+
+    Args:
+        vertices: vertices of the estimate, mm, frame of the dataset.
+        faces: triangles of the estimate.
+        scan: the scanner's data.
+
+    Returns:
+        chamfer_mm, chamfer_accuracy_mm and chamfer_completeness_mm.
 
     Raises:
-        UserError: nothing of the estimate lies where the scanner looked, or nothing within 20 mm of the
-        truth.
+        UserError: no point of the estimate lies in an observed cell, or none within 20 mm of the truth.
     """
     points = thinned(surface_samples(vertices, faces, SPACING), SPACING, SEED)
     inside = ((points >= scan.low - PATCH) & (points < scan.high + 2 * PATCH)).all(-1)
@@ -95,7 +108,7 @@ def chamfer_of_scan(
     above = scan.points[scan.points @ scan.plane[:3] + scan.plane[3] > 0]
     if not len(observed) or not len(above):
         raise UserError(
-            f"the protocol {NAME}: no point of the surface lies where the scanner looked",
+            f"the protocol {NAME}: no point of the surface lies in the region that the scanner observed",
             "give the capture in the frame of the dataset, millimetres",
         )
     accuracy = capped_mean(observed, scan.points, CAP)
@@ -113,7 +126,7 @@ def chamfer_of_scan(
 
 
 def read_scan(capture: Capture) -> Observed:
-    """The truth of the scan that a capture is of.
+    """Read the scanner's data for the scan of a capture.
 
     Raises:
         UserError: a file is missing, damaged, or too large.
@@ -122,8 +135,8 @@ def read_scan(capture: Capture) -> Observed:
     mask = _matrices(mask_file, {"ObsMask": 3, "BB": 2, "Res": 2})
     plane = _matrices(plane_file, {"P": 2})["P"].reshape(-1).astype(np.float64)
     box, cell = mask["BB"].astype(np.float64), mask["Res"].reshape(-1).astype(np.float64)
-    good = box.shape == (2, 3) and cell.shape == (1,) and plane.shape == (4,)
-    if not good or not np.isfinite([*box.flat, *cell, *plane]).all() or cell[0] <= 0:
+    shapes_fit = box.shape == (2, 3) and cell.shape == (1,) and plane.shape == (4,)
+    if not shapes_fit or not np.isfinite([*box.flat, *cell, *plane]).all() or cell[0] <= 0:
         raise UserError(f"{mask_file}: not an observation mask of DTU", "download the SampleSet again")
     return Observed(mask["ObsMask"], box[0], box[1], float(cell[0]), plane, _points(cloud_file))
 
@@ -132,8 +145,8 @@ def _files(capture: Capture) -> tuple[Path, Path, Path]:
     scans = re.findall(r"\d+", capture.root.resolve().name)
     if not scans:
         raise UserError(
-            f"{capture.root}: the protocol {NAME} takes the number of the scan from the folder's name, which "
-            "has none",
+            f"{capture.root}: the protocol {NAME} takes the number of the scan from the name of the folder, "
+            "which has no number",
             "name the folder scan24, for instance",
         )
     scan = int(scans[-1])
@@ -142,34 +155,35 @@ def _files(capture: Capture) -> tuple[Path, Path, Path]:
         f"ObsMask/Plane{scan}.mat",
         f"Points/stl/stl{scan:03d}_total.ply",
     )
-    found = []
-    above = capture.root.resolve().parent
+    paths = []
+    parent = capture.root.resolve().parent
     for name in names:
-        path = existing(above, capture.root.resolve() / name, above / name)
+        path = existing(parent, capture.root.resolve() / name, parent / name)
         if path is None:
             raise UserError(
-                f"{capture.root}: the protocol {NAME} needs the scanner's truth, and {name} is neither in "
-                "this folder nor beside it",
+                f"{capture.root}: the protocol {NAME} needs the scanner's data, and {name} is neither in "
+                "this folder nor in its parent",
                 "put ObsMask and Points of the dataset's SampleSet there",
             )
-        found.append(path)
-    return found[0], found[1], found[2]
+        paths.append(path)
+    return paths[0], paths[1], paths[2]
 
 
 def _matrices(path: Path, wanted: Mapping[str, int]) -> dict[str, np.ndarray]:
-    """Arrays of numbers by name, each of so many axes, from a Matlab file; sizes are looked at first."""
+    """Read arrays of numbers from a Matlab file; `wanted` maps names to numbers of axes.
+
+    Shapes are checked before any array is loaded.
+    """
     try:
         shapes = {name: (shape, kind) for name, shape, kind in whosmat(str(path))}
         for name, axes in wanted.items():
             shape, kind = shapes[name]
-            if (
-                len(shape) != axes
-                or np.prod(shape, dtype=float) > LARGEST_MASK
-                or kind in ("cell", "struct", "object")
-            ):
+            too_large = np.prod(shape, dtype=float) > LARGEST_MASK
+            if len(shape) != axes or too_large or kind in ("cell", "struct", "object"):
                 raise ValueError(f"{name} is {kind} of shape {shape}")
         return {name: np.asarray(loadmat(str(path), variable_names=[name])[name]) for name in wanted}
-    except Exception as error:  # a damaged or forged file can fail anywhere in the reader
+    # A damaged or forged file can raise any exception in the reader.
+    except Exception as error:
         raise UserError(f"{path}: cannot be read ({error})", "download the SampleSet again") from error
 
 
@@ -178,10 +192,11 @@ def _points(path: Path) -> Float[np.ndarray, "P 3"]:
         raise UserError(f"{path}: larger than 2 GiB", "give the points of the dataset's SampleSet")
     try:
         points = np.asarray(trimesh.load(path, process=False).vertices, dtype=np.float64)
-    except Exception as error:  # as above
+    # A damaged or forged file can raise any exception in the reader.
+    except Exception as error:
         raise UserError(f"{path}: cannot be read ({error})", "download the SampleSet again") from error
     if not len(points) or not np.isfinite(points).all():
-        raise UserError(f"{path}: no points, or some that are not finite", "download the SampleSet again")
+        raise UserError(f"{path}: no points, or points that are not finite", "download the SampleSet again")
     return points
 
 
@@ -203,7 +218,7 @@ def _measure(run: Run, rendered: Sequence[RenderedView]) -> dict[str, float]:
 DTU = Protocol(
     name=NAME,
     source="jzhangbs/DTUeval-python eval.py",
-    left_out="nothing; the mesh is not cut with the images' masks, as some papers do before",
+    left_out="nothing; the mesh is not cut with the masks of the images first, as in some papers",
     check=_check,
     measure=_measure,
     needs_views=False,

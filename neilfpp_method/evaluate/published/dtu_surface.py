@@ -1,6 +1,4 @@
-"""Points of a surface, and their distances, as jzhangbs/DTUeval-python `eval.py` takes them; all in
-millimetres.
-"""
+"""Surface samples and distances between point sets as in jzhangbs/DTUeval-python `eval.py`; millimetres."""
 
 from __future__ import annotations
 
@@ -11,17 +9,17 @@ from scipy.spatial import cKDTree
 __all__ = ["capped_mean", "surface_samples", "thinned"]
 
 AT_ONCE = 50_000
-"""Points whose neighbours are asked together: bounds the memory."""
+"""Number of points per neighbour query, which bounds the memory."""
 
 
 def surface_samples(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], spacing: float
 ) -> Float[np.ndarray, "P 3"]:
-    """The vertices, and a lattice of points on each triangle.
+    """Return the vertices and a lattice of points on each triangle.
 
-    A triangle of area A with edges of lengths l₁, l₂ from its first corner has ⌊l₁/t⌋ by ⌊l₂/t⌋ cells,
-    t = spacing √(l₁ l₂ / 2A). Points at i + ½ cells, i up to and including their number, count where they lie
-    inside of it. Triangles without an area have none.
+    A triangle of area A whose first two edges have lengths l₁ and l₂ gets ⌊l₁/t⌋ by ⌊l₂/t⌋ cells with
+    t = spacing √(l₁ l₂ / 2A). Lattice points lie at i + ½ cells, for i from 0 to the number of cells
+    inclusive; those outside of the triangle are dropped. A triangle with zero area gets no points.
     """
     corners = vertices[faces].astype(np.float64)
     along = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -34,21 +32,22 @@ def surface_samples(
     samples = [vertices.astype(np.float64)]
     kinds, kind_of = np.unique(counts, axis=0, return_inverse=True)
     for i, (across, down) in enumerate(kinds):
-        if across and down:  # without a cell along an edge, no point lies inside
+        # Without a cell along an edge, no lattice point lies inside of the triangle.
+        if across and down:
             u, v = (np.mgrid[: across + 1, : down + 1] + 0.5).reshape(2, -1)
             u, v = u / across, v / down
             inside = u + v < 1
-            here = kind_of.reshape(-1) == i
-            points = (
-                start[here, None] + first[here, None] * u[inside, None] + second[here, None] * v[inside, None]
-            )
+            u, v = u[inside, None], v[inside, None]
+            same = kind_of.reshape(-1) == i
+            points = start[same, None] + first[same, None] * u + second[same, None] * v
             samples.append(points.reshape(-1, 3))
     return np.concatenate(samples)
 
 
 def thinned(points: Float[np.ndarray, "P 3"], spacing: float, seed: int) -> Float[np.ndarray, "Q 3"]:
-    """Points of which no two are closer than the spacing: in random order, each that is kept removes the
-    others within that distance.
+    """Remove points until no two are closer than the spacing.
+
+    Points are visited in random order; each point that is kept removes all others within the spacing.
     """
     order = np.random.default_rng(seed).permutation(len(points))
     shuffled = points[order]
@@ -66,8 +65,9 @@ def thinned(points: Float[np.ndarray, "P 3"], spacing: float, seed: int) -> Floa
 def capped_mean(
     points: Float[np.ndarray, "P 3"], surface: Float[np.ndarray, "Q 3"], cap: float
 ) -> float | None:
-    """The mean distance to the nearest point of the surface; points at the cap or beyond are left out of it.
-    None where no point is nearer.
+    """Mean distance to the nearest point of `surface` over the points that are nearer than `cap`.
+
+    None if there is no such point.
     """
     distance = cKDTree(surface).query(points)[0]
     near = distance[distance < cap]

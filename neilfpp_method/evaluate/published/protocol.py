@@ -1,4 +1,4 @@
-"""What a published protocol is, what it is given, and how it says that a capture lacks something."""
+"""The interface of a published protocol, and what several protocols share."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ import numpy as np
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
-from neilfpp_method.evaluate.size import what_is_measured
+from neilfpp_method.evaluate.size import measured_views
 from neilfpp_method.evaluate.views import RenderedView
 from neilfpp_method.train.run import Run, write_json
 
-__all__ = ["Protocol", "decibels", "missing", "write_figures"]
+__all__ = ["Protocol", "decibels", "missing", "no_surface", "require_material", "write_figures"]
 
 PERFECT = 1e-10
-"""Least mean squared error: a perfect estimate is 100 dB here, infinite (not JSON) in official code."""
+"""Lower bound of the mean squared error. A perfect estimate has 100 dB here; it has infinity, which JSON
+cannot hold, in the official code.
+"""
 
 
 @dataclass(frozen=True)
@@ -26,14 +28,14 @@ class Protocol:
     """A published protocol.
 
     Attributes:
-        name: as `neilfpp eval --protocol` has it.
+        name: the name that `neilfpp eval --protocol` takes.
         source: repository and file of the official code.
-        left_out: what the official code reports and this does not, with the reason.
-        check: raises a `UserError` where the capture lacks what the protocol needs; called before views are
-            rendered.
-        measure: figures by name, from the test views in order.
-        needs_views: whether views are rendered for it; if not, `measure` is given none.
-        side: width in pixels at which views are rendered; none: that of their files.
+        left_out: figures that the official code reports and this implementation does not, with the reason.
+        check: raises a `UserError` if the run or its capture lacks what the protocol needs; called before
+            views are rendered.
+        measure: computes figures by name from the rendered test views, in order.
+        needs_views: whether the test views must be rendered; if False, `measure` gets an empty sequence.
+        side: width at which views are rendered, pixels; None for the width of their files.
     """
 
     name: str
@@ -46,19 +48,38 @@ class Protocol:
 
 
 def decibels(squared_error: float) -> float:
-    """PSNR of a mean squared error, peak 1; at most 100."""
+    """PSNR of a mean squared error for a peak of 1; at most 100 dB."""
     return float(-10.0 * np.log10(max(squared_error, PERFECT)))
 
 
 def missing(protocol: str, capture: Capture, view: View, what: str, place: str) -> UserError:
-    """The error that says what a protocol needs of a view, and where it was looked for."""
+    """The error for a test view that lacks a file which the protocol needs.
+
+    Args:
+        protocol: name of the protocol.
+        capture: the capture.
+        view: the test view.
+        what: what is missing.
+        place: the path, relative to the capture, at which it is expected.
+    """
     return UserError(
         f"{capture.root}: the protocol {protocol} needs {what} of every test view; view {view.name} has none",
         f"put it at {place}",
     )
 
 
+def require_material(run: Run) -> None:
+    """Raise a `UserError` if no stage of the run has estimated the material yet."""
+    if not run.has_material:
+        raise UserError(f"{run.path}: the run has no material at step {run.step}", "train the next stage")
+
+
+def no_surface(run: Run) -> UserError:
+    """The error for a run of which no test view shows a surface."""
+    return UserError(f"{run.path}: no test view shows a surface", "train longer, or check the run's report")
+
+
 def write_figures(path: Path, protocol: Protocol, run: Run, figures: Mapping[str, float]) -> None:
-    """Write the figures of one protocol, with its name, its source, and what was measured."""
+    """Write the figures of one protocol as JSON, with its name, its source, and the views measured."""
     described = {"protocol": protocol.name, "source": protocol.source, "left_out": protocol.left_out}
-    write_json(path, {**described, "measured": what_is_measured(run), "figures": dict(figures)})
+    write_json(path, {**described, "measured": measured_views(run), "figures": dict(figures)})

@@ -1,13 +1,13 @@
-"""Normals as Ref-NeRF measures them on Shiny Blender: google-research/multinerf, `ref_utils.py`.
+"""The error of normals of Ref-NeRF on Shiny Blender: google-research/multinerf, `ref_utils.py`.
 
-What is particular about it:
+Details of the protocol:
 
-- A pixel weighs as much as the estimate's opacity times the alpha of the true image; there is no hard mask.
-- Cosines are clipped to ±(1 − 2⁻²³), so a perfect estimate has 0.028°, not 0.
-- The mean is taken per view and averaged over the views.
-- True normals are 8-bit pictures, 2 p / 255 − 1, in the world frame, beside the images as
-  `<image>_normal.png`. A capture in the layout of the NeILF datasets has float normals instead, and its depth
-  maps tell the alpha.
+- The weight of a pixel is the estimate's opacity times the alpha of the true image; there is no hard mask.
+- Cosines are clipped to ±(1 − 2⁻²³), so a perfect estimate has an error of 0.028°, not 0.
+- The mean is computed per view and averaged over the views.
+- True normals are 8-bit images beside the photographs, `<image>_normal.png`, with n = 2 p / 255 − 1 in the
+  world frame. A capture in the layout of the NeILF datasets has float normals instead, and its depth maps
+  define the alpha.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from neilfpp_method.data.scaling import file_size
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import View, inside
 from neilfpp_method.errors import UserError
-from neilfpp_method.evaluate.published.protocol import Protocol, missing
+from neilfpp_method.evaluate.published.protocol import Protocol, missing, no_surface
 from neilfpp_method.evaluate.views import RenderedView
 from neilfpp_method.train.run import Run
 
@@ -31,13 +31,13 @@ __all__ = ["SHINY_NORMALS", "weighted_angle"]
 
 NAME = "shiny-normals"
 MAX_COSINE = 1 - 2.0**-23
-"""One less the spacing of float32 at 1."""
+"""1 minus the spacing of float32 at 1."""
 
 
 def weighted_angle(
     estimate: Float[np.ndarray, "H W 3"], truth: Float[np.ndarray, "H W 3"], weight: Float[np.ndarray, "H W"]
 ) -> float:
-    """Weighted mean angle between normals, degrees (`compute_weighted_mae`); NaN without any weight."""
+    """Weighted mean angle between normals, degrees (`compute_weighted_mae`); NaN if all weights are 0."""
     cosine = (_unit(estimate) * _unit(truth)).sum(-1).clip(-MAX_COSINE, MAX_COSINE)
     total = weight.sum(dtype=np.float64)
     return float(np.degrees((weight * np.arccos(cosine)).sum() / total)) if total > 0 else float("nan")
@@ -51,18 +51,18 @@ def _unit(normal: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
 def _true_normal(
     capture: Capture, view: View
 ) -> tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W"]] | None:
-    """The true normals of a view and the alpha of its image; none where there are no normals."""
+    """The true normals of a view and the alpha of its image; None if there are no true normals."""
     width, height = view.camera.width, view.camera.height
     path = view.image.with_name(f"{view.image.stem}_normal.png")
     if inside(capture.root, path).is_file():
         if (width, height) != file_size(view):
             raise UserError(
-                f"{path}: true normals in 8 bits cannot be scaled", "leave --scale and --width out"
+                f"{path}: true normals in 8 bits cannot be resized", "leave --scale and --width out"
             )
         pixels, alpha = read_image(path).pixels, read_image(view.image).alpha
         if pixels.shape != (height, width, 3):
             raise UserError(
-                f"{path}: the shape {pixels.shape}, where the view needs {(height, width, 3)}",
+                f"{path}: has shape {pixels.shape}, but the view needs {(height, width, 3)}",
                 "render it again",
             )
         return 2 * pixels - 1, np.ones((height, width)) if alpha is None else alpha
@@ -78,28 +78,26 @@ def _check(run: Run) -> None:
         if _true_normal(run.capture, view) is None:
             beside = view.image.with_name(f"{view.image.stem}_normal.png").relative_to(run.capture.root)
             neilf = f"inputs/normal_maps/{view.name}.exr and inputs/depth_maps/{view.name}.exr"
-            raise missing(
-                NAME, run.capture, view, "true normals", f"{beside}, or in the NeILF layout at {neilf}"
-            )
+            place = f"{beside}, or in the NeILF layout at {neilf}"
+            raise missing(NAME, run.capture, view, "true normals", place)
 
 
 def _measure(run: Run, rendered: Sequence[RenderedView]) -> dict[str, float]:
     angles = []
-    for view, shown in zip(run.capture.test_views, rendered, strict=True):
+    for view, estimate in zip(run.capture.test_views, rendered, strict=True):
         normal, alpha = _true_normal(run.capture, view)
-        angles.append(weighted_angle(shown.maps["normal"], normal, shown.maps["opacity"][..., 0] * alpha))
+        weight = estimate.maps["opacity"][..., 0] * alpha
+        angles.append(weighted_angle(estimate.maps["normal"], normal, weight))
     angles = [angle for angle in angles if not np.isnan(angle)]
     if not angles:
-        raise UserError(
-            f"{run.path}: no test view shows a surface", "train longer, or look at the run's report"
-        )
+        raise no_surface(run)
     return {"normal_mae_deg": float(np.mean(angles))}
 
 
 SHINY_NORMALS = Protocol(
     name=NAME,
     source="google-research/multinerf eval.py",
-    left_out="figures of images, as LPIPS needs weights that are downloaded",
+    left_out="figures of images; LPIPS among them needs weights that must be downloaded",
     check=_check,
     measure=_measure,
 )

@@ -1,6 +1,4 @@
-"""Structural similarity as published evaluations compute it: they differ in the window, and in what lies
-beyond the border.
-"""
+"""Structural similarity (SSIM) with the window and border that published evaluations differ in."""
 
 from __future__ import annotations
 
@@ -13,7 +11,9 @@ from scipy.ndimage import correlate1d
 __all__ = ["ssim_map"]
 
 SIGMA = 1.5
+"""Standard deviation of the Gaussian window, pixels (Wang et al. 2004)."""
 C1, C2 = 0.01**2, 0.03**2
+"""Constants of SSIM for values in [0, 1] (Wang et al. 2004)."""
 
 
 def ssim_map(
@@ -22,13 +22,16 @@ def ssim_map(
     window: int = 11,
     border: Literal["zero", "mirror"] = "zero",
 ) -> Float[np.ndarray, "H W C"]:
-    """The similarity of every pixel and channel, values in [0, 1] (Wang et al. 2004).
+    """Compute the SSIM of every pixel and channel of images with values in [0, 1] (Wang et al. 2004).
 
-    Windows are Gaussian with σ = 1.5 pixels, `window` pixels wide. What lies beyond the border is 0, or the
-    image mirrored at its outermost pixels.
+    Args:
+        estimate: the estimate.
+        truth: the truth.
+        window: width of the Gaussian window, pixels.
+        border: how images continue beyond their border: as 0, or mirrored at the outermost pixels.
     """
-    place = np.arange(window) - (window - 1) / 2
-    weight = np.exp(-0.5 * (place / SIGMA) ** 2)
+    offset = np.arange(window) - (window - 1) / 2
+    weight = np.exp(-0.5 * (offset / SIGMA) ** 2)
     weight /= weight.sum()
     mode = "constant" if border == "zero" else "mirror"
 

@@ -1,26 +1,27 @@
-"""The protocol of Stanford-ORB: StanfordORB/Stanford-ORB, `orb/utils/metrics.py`, `orb/utils/test.py` and
-`orb/utils/preprocess.py`.
+"""The protocol of Stanford-ORB.
 
-The capture is one of `blender_HDR`, and the other truth lies where the dataset has it: masks of the test
-views in `test_mask`, and `ground_truth/<capture>` two folders above the capture, with
-`pseudo_gt_albedo/<view>.png`, `surface_normal/<view>.npy` and `z_depth/<view>.npy`. What is not there is not
-measured.
+Source: StanfordORB/Stanford-ORB, `orb/utils/metrics.py`, `orb/utils/test.py` and `orb/utils/preprocess.py`.
 
-What is particular about it:
+The capture is a folder of `blender_HDR`; masks of the test views are in its `test_mask`. The other truth is
+in `ground_truth/<capture>`, two folders above the capture: `pseudo_gt_albedo/<view>.png`,
+`surface_normal/<view>.npy` and `z_depth/<view>.npy`. Figures whose truth is missing are left out.
 
-- Everything is measured at a quarter of the size of the files, 512² of 2048², the truth averaged over areas.
-- Masks are eroded by a window of 5 pixels, and the error is of the whole frame, black outside of the mask.
-- PSNR-H: the truth's negative values are 0; both are multiplied by mean sRGB of the truth over its mean,
-  taken over the frame with values clipped to [0, 1], and clipped to [0, 4]. PSNR-L: both clipped to [0, 1]
-  and in sRGB.
-- No PSNR is below that of an image of 0.5 everywhere in the mask.
-- New views are compared as they are. Albedo takes the best factor per image and channel in least squares, is
-  clipped to [0, 1], and compared in linear values; the true albedo is a picture in sRGB.
-- SSIM is 1 − 2 · mean((1 − s)/2, clipped to [0, 1]) with windows of 3 pixels and a mirrored border.
-- The error of normals is 1 − cosine, of normals in the frame of the camera: x right, y up, z towards the
-  viewer.
-- Depth, along the axis of the camera, takes one factor for all views in least squares; its squared error is
-  of the whole frame, in the unit of the true depth.
+Details of the protocol:
+
+- Everything is measured at a quarter of the size of the files, 512² instead of 2048²; the truth is averaged
+  over areas.
+- Masks are eroded with a window of 5 × 5 pixels. Images are black outside of the mask, and the error is
+  averaged over the whole frame.
+- PSNR-H: negative values of the truth are set to 0. Both images are multiplied by (mean of the sRGB-encoded
+  truth) / (mean of the truth), both means over the frame with values clipped to [0, 1], and then clipped to
+  [0, 4]. PSNR-L: both images are clipped to [0, 1] and encoded as sRGB.
+- A PSNR is at least that of an image which is 0.5 everywhere in the mask.
+- New views are compared without alignment. Albedo is multiplied by the least-squares factor per image and
+  channel, clipped to [0, 1], and compared in linear values; the file of the true albedo is sRGB-encoded.
+- SSIM is 1 − 2 · mean(clip((1 − s)/2, 0, 1)), with a window of 3 pixels and a mirrored border.
+- The error of normals is 1 − cosine, with normals in the camera frame: x right, y up, z towards the viewer.
+- Depth along the axis of the camera is multiplied by one least-squares factor for all views; its squared
+  error is averaged over the whole frame, in the unit of the true depth.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from neilfpp_method.data.scaling import file_size
 from neilfpp_method.data.views import View, camera_rays
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.metrics import align_scale
-from neilfpp_method.evaluate.published.protocol import Protocol, decibels, missing
+from neilfpp_method.evaluate.published.protocol import Protocol, decibels, missing, require_material
 from neilfpp_method.evaluate.published.similarity import ssim_map
 from neilfpp_method.evaluate.published.truth_files import existing, read_map
 from neilfpp_method.evaluate.views import RenderedView
@@ -50,9 +51,13 @@ __all__ = ["STANFORD_ORB", "albedo_scores", "eroded", "image_scores", "normal_di
 
 NAME = "stanford-orb"
 SIDE = 512
+"""Width and height at which views are measured, pixels (official code)."""
 LARGEST_HDR = 4.0
+"""Value at which PSNR-H clips (official code)."""
 GREY = 0.5
+"""Value of the constant image whose PSNR is the lower bound (official code)."""
 EPSILON = 1e-6
+"""Smallest length of a normal, and smallest energy of a depth map (official code)."""
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0])
 """Camera axes of OpenGL from those of OpenCV."""
 
@@ -61,19 +66,22 @@ Mask = Float[np.ndarray, "H W"]
 
 
 def eroded(mask: Mask) -> Mask:
-    """1 where every pixel of the 5 by 5 around is in the mask, else 0; beyond the border all is."""
+    """1 if all pixels of the surrounding 5 × 5 window are in the mask, else 0.
+
+    Pixels beyond the border of the image count as in the mask.
+    """
     bits = np.where(mask > 0.5, 255, 0).astype(np.uint8)
     return (cv2.erode(bits, np.ones((5, 5), np.uint8)) > 127).astype(np.float32)
 
 
 def image_scores(name: str, estimate: Image, truth: Image, mask: Mask) -> dict[str, float]:
-    """PSNR-H, PSNR-L and SSIM of linear images, without alignment; the mask is not eroded yet."""
+    """PSNR-H, PSNR-L and SSIM of linear images without alignment. The mask is eroded here."""
     inner = eroded(mask)[..., None]
-    shown, true = estimate * inner, np.maximum(truth * inner, 0)
+    image, true = estimate * inner, np.maximum(truth * inner, 0)
     low = true.clip(0, 1)
     gain = _srgb(low).mean() / low.mean() if low.mean() > 1e-8 else 1.0
-    hdr = _floored((shown * gain).clip(0, LARGEST_HDR), (true * gain).clip(0, LARGEST_HDR), inner)
-    display, true_display = _srgb(shown.clip(0, 1)), _srgb(low)
+    hdr = _floored((image * gain).clip(0, LARGEST_HDR), (true * gain).clip(0, LARGEST_HDR), inner)
+    display, true_display = _srgb(image.clip(0, 1)), _srgb(low)
     return {
         f"{name}_psnr_h": hdr,
         f"{name}_psnr_l": _floored(display, true_display, inner),
@@ -82,24 +90,24 @@ def image_scores(name: str, estimate: Image, truth: Image, mask: Mask) -> dict[s
 
 
 def albedo_scores(estimate: Image, truth: Image, mask: Mask) -> dict[str, float]:
-    """PSNR and SSIM of linear albedo after the best factor per channel; the mask is not eroded yet."""
+    """PSNR and SSIM of linear albedo after the least-squares factor per channel. The mask is eroded here."""
     inner = eroded(mask)[..., None]
-    shown, true = estimate * inner, np.maximum(truth * inner, 0)
+    albedo, true = estimate * inner, np.maximum(truth * inner, 0)
     pixels = inner[..., 0] > 0.5
-    aligned = (shown * align_scale(shown[pixels], true[pixels])).clip(0, 1)
+    aligned = (albedo * align_scale(albedo[pixels], true[pixels])).clip(0, 1)
     true = true.clip(0, 1)
     return {"albedo_psnr": _floored(aligned, true, inner), "albedo_ssim": _ssim(aligned, true)}
 
 
 def normal_distance(estimate: Image, truth: Image, mask: Mask) -> float:
-    """The mean of 1 − cosine over the eroded mask."""
+    """Mean of 1 − cosine over the eroded mask."""
     a, b = (v / (np.linalg.norm(v, axis=-1, keepdims=True) + EPSILON) for v in (estimate, truth))
     inner = eroded(mask)
     return float(((1 - (a * b).sum(-1)) * inner).sum() / inner.sum())
 
 
 def _floored(estimate: Image, truth: Image, inner: Float[np.ndarray, "H W 1"]) -> float:
-    """PSNR over the frame, and no less than that of grey in the mask."""
+    """PSNR over the frame, at least that of a grey image in the mask."""
     error, grey = (np.square(e - truth, dtype=np.float64).mean() for e in (estimate, GREY * inner))
     return decibels(float(min(error, grey)))
 
@@ -131,11 +139,11 @@ def _quarter(values: Float[np.ndarray, "_ _ ..."]) -> Float[np.ndarray, "_ _ ...
 
 
 def _picture(path: Path, view: View) -> Float[np.ndarray, "H W C"]:
-    """An image of the size of the view's files, averaged down."""
+    """Read an image that must have the size of the view's files, and reduce it to `SIDE` by area averages."""
     pixels = read_image(path).pixels
     if pixels.shape[1::-1] != file_size(view):
         raise UserError(
-            f"{path}: {pixels.shape[1]}×{pixels.shape[0]} pixels, another size than the view's image",
+            f"{path}: {pixels.shape[1]}×{pixels.shape[0]} pixels, a different size than the view's image",
             "download it again",
         )
     smaller = _quarter(pixels)
@@ -143,8 +151,7 @@ def _picture(path: Path, view: View) -> Float[np.ndarray, "H W C"]:
 
 
 def _check(run: Run) -> None:
-    if not run.has_material:
-        raise UserError(f"{run.path}: there is no material at step {run.step}", "train the next stage")
+    require_material(run)
     if not run.capture.hdr:
         raise UserError(f"the protocol {NAME} is for linear images", "train on a folder of blender_HDR")
     for view in run.capture.test_views:
@@ -167,45 +174,48 @@ def _measure(run: Run, rendered: Sequence[RenderedView]) -> dict[str, float]:
     capture = run.capture
     scores: dict[str, list[float]] = {}
     depths: list[tuple[Mask, Mask, Mask]] = []
-    for view, shown in zip(capture.test_views, rendered, strict=True):
+    for view, estimate in zip(capture.test_views, rendered, strict=True):
         mask = (_picture(_mask_file(view), view)[..., 0] > 0.5).astype(np.float32)
         if not eroded(mask).any():
-            raise UserError(f"{_mask_file(view)}: nothing is left of the mask", "download it again")
-        opacity = shown.maps["opacity"]
-        found = image_scores("render", shown.maps["rgb"], _picture(view.image, view)[..., :3], mask)
+            raise UserError(f"{_mask_file(view)}: the eroded mask is empty", "download it again")
+        opacity = estimate.maps["opacity"]
+        figures = image_scores("render", estimate.maps["rgb"], _picture(view.image, view)[..., :3], mask)
         if path := _ground_truth(capture, "pseudo_gt_albedo", f"{view.image.stem}.png"):
             truth = srgb_to_linear(torch.from_numpy(_picture(path, view)[..., :3])).numpy()
-            found |= albedo_scores(shown.maps["base_color"], truth, mask)
+            figures |= albedo_scores(estimate.maps["base_color"], truth, mask)
         full = file_size(view)[::-1]
         rotation = GL_FROM_CV @ view.camera.w2c[:3, :3]
         if path := _ground_truth(capture, "surface_normal", f"{view.image.stem}.npy"):
-            normal = (shown.maps["normal"] * opacity) @ rotation.T
-            found["normal_distance"] = normal_distance(normal, _quarter(read_map(path, (*full, 3))), mask)
+            normal = (estimate.maps["normal"] * opacity) @ rotation.T
+            figures["normal_distance"] = normal_distance(normal, _quarter(read_map(path, (*full, 3))), mask)
         if path := _ground_truth(capture, "z_depth", f"{view.image.stem}.npy"):
-            depths.append((_along_axis(capture, view, shown), _quarter(read_map(path, full)), eroded(mask)))
-        for name, value in found.items():
+            depth = _along_axis(capture, view, estimate)
+            depths.append((depth, _quarter(read_map(path, full)), eroded(mask)))
+        for name, value in figures.items():
             scores.setdefault(name, []).append(value)
-    figures = {name: float(np.mean(values)) for name, values in scores.items()}
-    return figures | ({"depth_mse": scene_depth_error(depths)} if depths else {})
+    means = {name: float(np.mean(values)) for name, values in scores.items()}
+    return means | ({"depth_mse": scene_depth_error(depths)} if depths else {})
 
 
-def _along_axis(capture: Capture, view: View, shown: RenderedView) -> Mask:
-    """Depth along the axis of the camera, scene units, from that along the rays."""
+def _along_axis(capture: Capture, view: View, rendered: RenderedView) -> Mask:
+    """Depth along the axis of the camera, scene units, from the depth along the rays."""
     camera = capture.normalisation.camera(view.camera)
     cosine = camera_rays(camera).directions.double().numpy() @ camera.w2c[2, :3]
-    return shown.maps["depth"][..., 0] * cosine.reshape(SIDE, SIDE).astype(np.float32)
+    return rendered.maps["depth"][..., 0] * cosine.reshape(SIDE, SIDE).astype(np.float32)
 
 
 def scene_depth_error(depths: Sequence[tuple[Mask, Mask, Mask]]) -> float:
-    """The mean over views of the squared error of depth over the frame, from estimate, truth and eroded mask
-    of each.
+    """Mean over views of the squared error of depth, averaged over the frame of each.
 
-    An estimate that is 0 in all of a mask is 1 there.
+    An estimate that is 0 in the whole mask of a view is replaced by 1, as in the official code.
+
+    Args:
+        depths: estimate, truth and eroded mask of each view.
     """
     filled = [(np.ones_like(e) if np.square(e[m > 0.5]).sum() <= EPSILON else e, t, m) for e, t, m in depths]
-    above = sum(float((t * e)[m > 0.5].sum(dtype=np.float64)) for e, t, m in filled)
-    below = sum(float(np.square(e)[m > 0.5].sum(dtype=np.float64)) for e, _, m in filled)
-    factor = above / below
+    product = sum(float((t * e)[m > 0.5].sum(dtype=np.float64)) for e, t, m in filled)
+    energy = sum(float(np.square(e)[m > 0.5].sum(dtype=np.float64)) for e, _, m in filled)
+    factor = product / energy
     return float(np.mean([(np.square(factor * e - t) * m).mean(dtype=np.float64) for e, t, m in filled]))
 
 
@@ -213,7 +223,7 @@ STANFORD_ORB = Protocol(
     name=NAME,
     source="StanfordORB/Stanford-ORB orb/utils/metrics.py",
     left_out=(
-        "LPIPS, whose weights are downloaded; relit images, which neilfpp relight --truth measures; "
+        "LPIPS, whose weights must be downloaded; relit images, which neilfpp relight --truth measures; "
         "the Chamfer distance of the scan"
     ),
     check=_check,

@@ -1,21 +1,24 @@
-"""The protocol of Synthetic4Relight, the dataset of InvRender (zju3dv/InvRender, which has no script that
-measures), as TCZ-Tao/IRGS computes its figures: `eval_material_syn4.py` and `compute_albedo_scale_syn4.py`.
+"""The protocol of Synthetic4Relight, the dataset of InvRender.
 
-The layout is that of the dataset: beside `<view>_rgba.png` lie `<view>_albedo.png`, and `<view>_rough.png` or
-`<view>_roughness.png`.
+zju3dv/InvRender has no evaluation script. The figures are computed as in TCZ-Tao/IRGS,
+`eval_material_syn4.py` and `compute_albedo_scale_syn4.py`.
 
-What is particular about it:
+The layout is that of the dataset: `<view>_albedo.png`, and `<view>_rough.png` or `<view>_roughness.png`,
+beside `<view>_rgba.png`.
 
-- The true albedo is in sRGB, multiplied with its alpha, and then made linear. Everything is compared in
-  linear values.
-- Albedo takes a factor per channel: the median, over the pixels of all test views where the truth has any
-  alpha, of truth over estimate; of an even number of values the lower of the middle two. Nothing is clipped.
-- Estimate and truth are multiplied with the alpha of the image, and the errors are of the whole frame.
-- PSNR is taken per channel and averaged over channels and views, so a channel with a small error counts as
-  much as one with a large error.
-- SSIM has windows of 11 pixels, and zeros beyond the border.
-- Roughness is a mean squared error, averaged over views. A truth of one channel counts three times, which
-  changes nothing.
+Details of the protocol:
+
+- The true albedo, in sRGB, is multiplied by its alpha and then converted to linear values. Everything is
+  compared in linear values.
+- Albedo is multiplied by a factor per channel: the median of truth / estimate over the pixels of all test
+  views at which the truth has an alpha above 0; of an even number of values, the lower of the middle two.
+  Nothing is clipped.
+- Estimate and truth are multiplied by the alpha of the image, and errors are averaged over the whole frame.
+- PSNR is computed per channel and averaged over channels and views, so a channel with a small error has as
+  much weight as one with a large error.
+- SSIM has a window of 11 pixels, and zeros beyond the border.
+- The error of roughness is the mean squared error, averaged over views. The official code repeats the channel
+  three times, which does not change the mean.
 """
 
 from __future__ import annotations
@@ -31,7 +34,7 @@ from jaxtyping import Float
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
-from neilfpp_method.evaluate.published.protocol import Protocol, decibels, missing
+from neilfpp_method.evaluate.published.protocol import Protocol, decibels, missing, require_material
 from neilfpp_method.evaluate.published.similarity import ssim_map
 from neilfpp_method.evaluate.published.tensoir import albedo_factor
 from neilfpp_method.evaluate.published.truth_files import alpha_of, check_full_size, existing, read_beside
@@ -46,7 +49,14 @@ NAME = "synthetic4relight"
 
 @dataclass(frozen=True)
 class _True:
-    """The truth of a view: albedo, linear, and roughness, multiplied with their alphas; two of the alphas."""
+    """The truth of a view.
+
+    Attributes:
+        albedo: linear albedo times its alpha.
+        roughness: roughness times its alpha.
+        albedo_alpha: alpha of the file of the albedo.
+        alpha: alpha of the image.
+    """
 
     albedo: Float[np.ndarray, "H W 3"]
     roughness: Float[np.ndarray, "H W 1"]
@@ -72,8 +82,7 @@ def _true(capture: Capture, view: View) -> _True:
 
 
 def _check(run: Run) -> None:
-    if not run.has_material:
-        raise UserError(f"{run.path}: there is no material at step {run.step}", "train the next stage")
+    require_material(run)
     root = run.capture.root
     for view in run.capture.test_views:
         check_full_size(NAME, view)
@@ -88,19 +97,20 @@ def _measure(run: Run, rendered: Sequence[RenderedView]) -> dict[str, float]:
     true = [_true(run.capture, view) for view in run.capture.test_views]
     covered = [t.albedo_alpha[..., 0] > 0 for t in true]
     if not any(mask.any() for mask in covered):
-        raise UserError(f"the protocol {NAME}: no pixel of the true albedo has alpha", "render it again")
-    estimate = np.concatenate(
-        [view.maps["base_color"][mask] for view, mask in zip(rendered, covered, strict=True)]
-    )
+        raise UserError(
+            f"the protocol {NAME}: no pixel of the true albedo has an alpha above 0", "render it again"
+        )
+    albedo = [view.maps["base_color"] for view in rendered]
     factor = albedo_factor(
-        estimate, np.concatenate([t.albedo[mask] for t, mask in zip(true, covered, strict=True)])
+        np.concatenate([a[mask] for a, mask in zip(albedo, covered, strict=True)]),
+        np.concatenate([t.albedo[mask] for t, mask in zip(true, covered, strict=True)]),
     )
     scores: dict[str, list[float]] = {"albedo_psnr": [], "albedo_ssim": [], "roughness_mse": []}
     for view, t in zip(rendered, true, strict=True):
-        shown, truth = view.maps["base_color"] * factor * t.alpha, t.albedo * t.alpha
-        squared = np.square(shown.astype(np.float64) - truth).mean((0, 1))
+        estimate, truth = view.maps["base_color"] * factor * t.alpha, t.albedo * t.alpha
+        squared = np.square(estimate.astype(np.float64) - truth).mean((0, 1))
         scores["albedo_psnr"].append(float(np.mean([decibels(error) for error in squared])))
-        scores["albedo_ssim"].append(float(ssim_map(shown, truth).mean()))
+        scores["albedo_ssim"].append(float(ssim_map(estimate, truth).mean()))
         rough = (view.maps["roughness"] - t.roughness) * t.alpha
         scores["roughness_mse"].append(float(np.square(rough, dtype=np.float64).mean()))
     return {name: float(np.mean(values)) for name, values in scores.items()}
@@ -110,7 +120,8 @@ SYNTHETIC4RELIGHT = Protocol(
     name=NAME,
     source="TCZ-Tao/IRGS eval_material_syn4.py",
     left_out=(
-        "LPIPS, whose weights are downloaded; new views; relit images, which neilfpp relight --truth measures"
+        "LPIPS, whose weights must be downloaded; new views; relit images, which neilfpp relight --truth "
+        "measures"
     ),
     check=_check,
     measure=_measure,

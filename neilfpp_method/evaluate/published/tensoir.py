@@ -1,22 +1,25 @@
-"""The protocol of TensoIR on TensoIR-Synthetic: Haian-Jin/TensoIR, `renderer.py` (`evaluation_iter_TensoIR`,
-`compute_rescale_ratio`), `dataLoader/tensoIR_rotation_setting.py` and `utils.py` (`rgb_ssim`).
+"""The protocol of TensoIR on TensoIR-Synthetic.
+
+Source: Haian-Jin/TensoIR, `renderer.py` (`evaluation_iter_TensoIR`, `compute_rescale_ratio`),
+`dataLoader/tensoIR_rotation_setting.py` and `utils.py` (`rgb_ssim`).
 
 The layout is that of the dataset: a folder for each view with `rgba_<light>.png`, `albedo.png` and
 `normal.png`.
 
-What is particular about it:
+Details of the protocol:
 
-- Images and albedo are blended over white by their alpha, the estimate's by its opacity, and PSNR and SSIM
-  are of the whole frame. White background is free of error, and a small object scores higher.
-- Albedo takes a factor per channel: the median, over the pixels with any alpha of 20 views, of truth over
-  estimate. Views are k · ⌊n/20⌋, so fewer than 20 test views give the first alone. The median of an even
-  number of values is the lower of the middle two. `_single` uses the factor of red for all channels.
-- The scaled albedo is clipped to [0, 1]; where the truth has no alpha it is white.
-- PSNR of albedo is of one squared error over all views at once, both raised to 1/2.2. Its SSIM is per view,
-  without that power.
-- The background counts in the error of normals: there the truth is (0, 0, 1), and so is the estimate as far
-  as it is transparent. The mean is over all pixels of all views.
-- SSIM leaves out the 5 pixels at the border, where its window of 11 reaches beyond the image.
+- Images and albedo are composited over white, the truth with its alpha and the estimate with its opacity.
+  PSNR and SSIM are over the whole frame. White background is free of error, so a small object scores higher.
+- Albedo is multiplied by a factor per channel: the median of truth / estimate over the pixels of 20 views at
+  which the truth has an alpha above 0. The views are k · ⌊n/20⌋; with fewer than 20 test views, only the
+  first is used. The median of an even number of values is the lower of the middle two. `_single` uses the
+  factor of red for all channels.
+- The scaled albedo is clipped to [0, 1]; pixels at which the truth has alpha 0 are white.
+- PSNR of albedo is that of one squared error over all views, with both raised to the power 1/2.2. SSIM of
+  albedo is computed per view, without that power.
+- The background counts in the error of normals: the truth is (0, 0, 1) there, and the estimate is blended
+  with (0, 0, 1) according to its transparency. The mean is over all pixels of all views.
+- SSIM leaves out the 5 pixels at the border, at which its window of 11 pixels reaches beyond the image.
 """
 
 from __future__ import annotations
@@ -31,7 +34,7 @@ from jaxtyping import Bool, Float
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
-from neilfpp_method.evaluate.published.protocol import Protocol, decibels, missing
+from neilfpp_method.evaluate.published.protocol import Protocol, decibels, missing, require_material
 from neilfpp_method.evaluate.published.similarity import ssim_map
 from neilfpp_method.evaluate.published.truth_files import alpha_of, check_full_size, existing, read_beside
 from neilfpp_method.evaluate.views import RenderedView
@@ -42,17 +45,20 @@ __all__ = ["TENSOIR", "albedo_factor", "over_white"]
 
 NAME = "tensoir"
 GAMMA = 1 / 2.2
+"""Exponent for the PSNR of albedo (official code)."""
 VIEWS_OF_THE_FACTOR = 20
+"""Number of views from which the factor of albedo is computed (official code)."""
 LEAST = 1e-6
-"""The estimate is divided by no less."""
+"""Lower bound of the estimated albedo in a division (official code)."""
 BORDER = 5
-BEHIND = (0.0, 0.0, 1.0)
-"""The normal of the background."""
+"""Width of the border that SSIM leaves out, pixels: half of its window."""
+BACKGROUND = (0.0, 0.0, 1.0)
+"""Normal of the background (official code)."""
 
 
 @dataclass(frozen=True)
 class _True:
-    """The truth of a view; images and albedo over white, normals of unit length."""
+    """The truth of a view: image and albedo over white, unit normals, and the mask of alpha above 0."""
 
     image: Float[np.ndarray, "H W 3"]
     albedo: Float[np.ndarray, "H W 3"]
@@ -63,16 +69,14 @@ class _True:
 def over_white(
     color: Float[np.ndarray, "H W 3"], alpha: Float[np.ndarray, "H W 1"]
 ) -> Float[np.ndarray, "H W 3"]:
-    """The colour where it is opaque, white where it is not."""
+    """Composite a colour over white."""
     return color * alpha + (1 - alpha)
 
 
 def albedo_factor(
     estimate: Float[np.ndarray, "P 3"], truth: Float[np.ndarray, "P 3"]
 ) -> Float[np.ndarray, " 3"]:
-    """The median of truth over estimate per channel; of an even number of values the lower of the middle
-    two.
-    """
+    """Median of truth / estimate per channel; of an even number of values, the lower of the middle two."""
     ratio = np.sort(truth / np.maximum(estimate, LEAST), axis=0)
     return ratio[(len(ratio) - 1) // 2]
 
@@ -86,7 +90,7 @@ def _true(capture: Capture, view: View) -> _True:
     albedo, normal = (read_beside(path, view) for path in files if path is not None)
     image = read_beside(view.image, view)
     covered = alpha_of(normal)
-    directions = (2 * normal.pixels[..., :3] - 1) * covered + np.array(BEHIND) * (1 - covered)
+    directions = (2 * normal.pixels[..., :3] - 1) * covered + np.array(BACKGROUND) * (1 - covered)
     return _True(
         image=over_white(image.pixels, alpha_of(image)),
         albedo=over_white(albedo.pixels, alpha_of(albedo)),
@@ -96,8 +100,7 @@ def _true(capture: Capture, view: View) -> _True:
 
 
 def _check(run: Run) -> None:
-    if not run.has_material:
-        raise UserError(f"{run.path}: there is no material at step {run.step}", "train the next stage")
+    require_material(run)
     if run.capture.hdr:
         raise UserError(
             f"the protocol {NAME} is for display values, and the images are linear", "use --protocol neilfpp"
@@ -112,26 +115,27 @@ def _check(run: Run) -> None:
 
 def _measure(run: Run, rendered: Sequence[RenderedView]) -> dict[str, float]:
     true = [_true(run.capture, view) for view in run.capture.test_views]
-    shown = [
+    images = [
         over_white(tone_map(torch.from_numpy(view.maps["rgb"])).numpy(), view.maps["opacity"])
         for view in rendered
     ]
     albedo = [over_white(view.maps["base_color"], view.maps["opacity"]) for view in rendered]
-    three = _factor(albedo, true)
-    figures = _of_images("render", shown, [t.image for t in true])
-    for name, factor in (("albedo", three), ("albedo_single", np.repeat(three[0], 3))):
+    per_channel = _factor(albedo, true)
+    true_images, true_albedo = [t.image for t in true], [t.albedo for t in true]
+    figures = {
+        "render_psnr": float(np.mean([decibels(error) for error in _squared_errors(images, true_images)])),
+        "render_ssim": _mean_ssim(images, true_images),
+    }
+    for name, factor in (("albedo", per_channel), ("albedo_single", np.repeat(per_channel[0], 3))):
         aligned = [
             np.where(t.mask[..., None], (factor * a).clip(0, 1), 1.0)
             for a, t in zip(albedo, true, strict=True)
         ]
         error = np.mean(
-            [
-                np.square(a**GAMMA - t.albedo.astype(np.float64) ** GAMMA).mean()
-                for a, t in zip(aligned, true, strict=True)
-            ]
+            _squared_errors([a**GAMMA for a in aligned], [t.astype(np.float64) ** GAMMA for t in true_albedo])
         )
-        similar = _of_images(name, aligned, [t.albedo for t in true])
-        figures |= {f"{name}_psnr": decibels(float(error)), f"{name}_ssim": similar[f"{name}_ssim"]}
+        figures[f"{name}_psnr"] = decibels(float(error))
+        figures[f"{name}_ssim"] = _mean_ssim(aligned, true_albedo)
     return figures | {"normal_mae_deg": _normal_error(rendered, true)}
 
 
@@ -141,26 +145,31 @@ def _factor(albedo: Sequence[np.ndarray], true: Sequence[_True]) -> Float[np.nda
     rows = [k * interval for k in range(VIEWS_OF_THE_FACTOR)] if interval else [0]
     if not any(true[row].mask.any() for row in rows):
         raise UserError(
-            f"the protocol {NAME}: no pixel of its views has alpha", "give images with an alpha channel"
+            f"the protocol {NAME}: no pixel of the views has an alpha above 0",
+            "give images with an alpha channel",
         )
     estimate = np.concatenate([albedo[row][true[row].mask] for row in rows])
     return albedo_factor(estimate, np.concatenate([true[row].albedo[true[row].mask] for row in rows]))
 
 
-def _of_images(name: str, estimate: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> dict[str, float]:
-    """Means over views of PSNR and SSIM of the whole frame; views must have the same size."""
-    pairs = list(zip(estimate, truth, strict=True))
+def _squared_errors(estimate: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> list[float]:
+    """Mean squared error over the whole frame of each view."""
+    return [float(np.square(e.astype(np.float64) - t).mean()) for e, t in zip(estimate, truth, strict=True)]
+
+
+def _mean_ssim(estimate: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> float:
+    """SSIM without the border, averaged over views."""
     inner = slice(BORDER, -BORDER)
-    psnr = [decibels(np.square(e.astype(np.float64) - t).mean()) for e, t in pairs]
-    ssim = [ssim_map(e, t)[inner, inner].mean() for e, t in pairs]
-    return {f"{name}_psnr": float(np.mean(psnr)), f"{name}_ssim": float(np.mean(ssim))}
+    views = zip(estimate, truth, strict=True)
+    return float(np.mean([ssim_map(e, t)[inner, inner].mean() for e, t in views]))
 
 
 def _normal_error(rendered: Sequence[RenderedView], true: Sequence[_True]) -> float:
+    """Mean angle between normals over all pixels of all views, degrees."""
     angles = []
     for view, t in zip(rendered, true, strict=True):
         opacity = view.maps["opacity"].astype(np.float64)
-        normal = _unit(view.maps["normal"] * opacity + np.array(BEHIND) * (1 - opacity))
+        normal = _unit(view.maps["normal"] * opacity + np.array(BACKGROUND) * (1 - opacity))
         angles.append(np.degrees(np.arccos((normal * t.normal).sum(-1).clip(-1, 1))).mean())
     return float(np.mean(angles))
 
@@ -168,7 +177,7 @@ def _normal_error(rendered: Sequence[RenderedView], true: Sequence[_True]) -> fl
 TENSOIR = Protocol(
     name=NAME,
     source="Haian-Jin/TensoIR renderer.py",
-    left_out="LPIPS, whose weights are downloaded; relit images, which neilfpp relight --truth measures",
+    left_out="LPIPS, whose weights must be downloaded; relit images, which neilfpp relight --truth measures",
     check=_check,
     measure=_measure,
 )

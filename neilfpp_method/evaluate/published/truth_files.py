@@ -1,4 +1,4 @@
-"""Files of the truth as published datasets lay them out beside the images of a capture."""
+"""Read files of the truth that published datasets store beside the images of a capture."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ __all__ = ["alpha_of", "check_full_size", "existing", "read_beside", "read_map"]
 
 
 def check_full_size(protocol: str, view: View) -> None:
-    """That a view has the size of its files, as the truth beside them has.
+    """Check that a view has the size of its image file, which is the size of the truth.
 
     Raises:
-        UserError: it was scaled.
+        UserError: the view was resized.
     """
     if (view.camera.width, view.camera.height) != file_size(view):
         raise UserError(
@@ -28,7 +28,7 @@ def check_full_size(protocol: str, view: View) -> None:
 
 
 def existing(root: Path, *paths: Path) -> Path | None:
-    """The first of the paths that is a file; none of them: none.
+    """Return the first of the paths that is a file, or None.
 
     Raises:
         UserError: a path leads out of `root`.
@@ -37,16 +37,16 @@ def existing(root: Path, *paths: Path) -> Path | None:
 
 
 def read_beside(path: Path, view: View) -> ImageFile:
-    """An image of the truth, of the size of the view.
+    """Read an image of the truth that must have the size of the view.
 
     Raises:
-        UserError: it cannot be read, is of another size, or has a value that is not finite.
+        UserError: it cannot be read, has a different size, or has a value that is not finite.
     """
     image = read_image(path)
     height, width, _ = image.pixels.shape
     if (width, height) != (view.camera.width, view.camera.height):
         raise UserError(
-            f"{path}: {width}×{height} pixels where the view has {view.camera.width}×{view.camera.height}",
+            f"{path}: {width}×{height} pixels, but the view has {view.camera.width}×{view.camera.height}",
             "render it again in the size of the view",
         )
     if not np.isfinite(image.pixels).all():
@@ -55,25 +55,25 @@ def read_beside(path: Path, view: View) -> ImageFile:
 
 
 def alpha_of(image: ImageFile) -> Float[np.ndarray, "H W 1"]:
-    """The alpha of an image; 1 where it has none."""
+    """The alpha of an image; 1 if the file has no alpha channel."""
     alpha = np.ones(image.pixels.shape[:2], np.float32) if image.alpha is None else image.alpha
     return alpha[..., None]
 
 
 def read_map(path: Path, shape: tuple[int, ...]) -> Float[np.ndarray, "*shape"]:
-    """An array of numbers from a `.npy` file, of the shape that it must have.
+    """Read an array of numbers with a given shape from a `.npy` file.
 
     Raises:
-        UserError: it cannot be read, holds anything but numbers, or has another shape.
+        UserError: it cannot be read, holds anything but numbers, or has a different shape.
     """
     try:
-        # Mapped, so that its shape is known before any of it is in memory; a pickle is refused.
+        # Memory-mapped, so that the shape is checked before data is loaded. Pickles are refused.
         values = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise UserError(f"{path}: cannot be read as an array", "download it again") from error
     if values.shape != shape or values.dtype.kind not in "fiu":
         raise UserError(
-            f"{path}: {values.dtype} of shape {values.shape}, where numbers of shape {shape} are needed",
+            f"{path}: {values.dtype} of shape {values.shape}, but numbers of shape {shape} are needed",
             "download it again",
         )
     return np.asarray(values, dtype=np.float32)

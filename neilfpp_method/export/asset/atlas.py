@@ -1,4 +1,4 @@
-"""A surface cut open and laid out on one square texture (xatlas)."""
+"""Unwrap a surface onto one square texture (xatlas)."""
 
 from __future__ import annotations
 
@@ -14,16 +14,22 @@ from neilfpp_method.export.asset.surface import Surface
 __all__ = ["Unwrapped", "unwrap"]
 
 GAP = 6
-"""Texels that are asked for between charts."""
+"""Requested distance between charts, texels."""
 MIN_GAP = 2.0
-"""Texels that must be left between them, so that bilinear look-ups keep to their chart."""
+"""Least distance between charts, texels, so that a bilinear look-up does not read from another chart."""
 
 
 @dataclass(frozen=True)
 class Unwrapped:
-    """Triangles whose vertices have one normal and one place in the texture each.
+    """A mesh in which every vertex has one normal and one texture coordinate.
 
-    `uv` is in [0, 1], v upwards. `gap` is the distance between charts, texels.
+    Attributes:
+        vertices: positions.
+        normals: unit normals at the vertices.
+        uv: texture coordinates in [0, 1], v upwards.
+        faces: triangles.
+        charts: number of charts.
+        gap: distance between charts, texels.
     """
 
     vertices: Float[np.ndarray, "V 3"]
@@ -35,12 +41,12 @@ class Unwrapped:
 
 
 def unwrap(surface: Surface, size: int) -> Unwrapped:
-    """Lay the triangles out, each once, on a texture of size × size texels.
+    """Unwrap the triangles without overlap onto a texture of size × size texels.
 
     Raises:
         UserError: the charts do not fit with two texels between them.
     """
-    # A vertex on an edge has several normals: it is one vertex for each.
+    # A vertex on a crease has several normals and becomes one vertex for each of them.
     corners = np.concatenate([surface.faces[..., None], surface.normals], axis=-1).reshape(-1, 4)
     wedges, wedge = np.unique(corners, axis=0, return_inverse=True)
     vertices, normals = surface.vertices[wedges[:, 0].astype(np.int64)], wedges[:, 1:]
@@ -51,7 +57,7 @@ def unwrap(surface: Surface, size: int) -> Unwrapped:
     )
     atlas.generate(xatlas.ChartOptions(), packing)
     source, faces, uv = atlas.get_mesh(0)
-    # The resolution is a wish; what came out is scaled to the texture.
+    # xatlas does not always keep the requested resolution, so its result is scaled to the texture.
     extent = np.array([atlas.width, atlas.height])
     gap = GAP * size / extent.max()
     if atlas.atlas_count != 1 or gap < MIN_GAP:

@@ -1,4 +1,4 @@
-"""Textures of an asset: the material at the surface point of each texel, and the fine surface's normal."""
+"""Bake the textures of an asset: the material at the surface point of each texel, and the fine normals."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ CHANNELS = {
     "metallic": slice(4, 5),
     "normal": slice(5, 8),
 }
+"""Channels of the array that all textures are baked into; expected errors follow after them."""
 
 
 @dataclass(frozen=True)
 class Textures:
-    """8 bits a channel, the first row at v = 1.
+    """Textures with 8 bits per channel; the first row is at v = 1.
 
     Attributes:
-        base_color: sRGB-encoded.
-        roughness: linear.
-        metallic: linear.
-        normal: 127.5 + 127.5 · (x along the tangent, y along the bitangent, z along the normal): "OpenGL",
-            green up.
-        covered: the share of the texels that show the surface.
-        deviation: how far off base colour, roughness and metallic may be, 255 for 1; none where that was not
-            asked for.
+        base_color: base colour, sRGB-encoded.
+        roughness: roughness, linear.
+        metallic: metallic, linear.
+        normal: 127.5 + 127.5 · (x along the tangent, y along the bitangent, z along the normal), the OpenGL
+            convention with green up.
+        covered: fraction of the texels that show the surface.
+        deviation: expected errors of base colour, roughness and metallic, 255 for 1; None if not computed.
     """
 
     base_color: UInt8[np.ndarray, "S S 3"]
@@ -50,7 +50,7 @@ class Textures:
     deviation: UInt8[np.ndarray, "S S 3"] | None
 
     def metallic_roughness(self) -> UInt8[np.ndarray, "S S 3"]:
-        """As glTF packs it: roughness in green, metallic in blue; red (occlusion elsewhere) is white."""
+        """Pack as in glTF: roughness in green, metallic in blue. Red, which may hold occlusion, is white."""
         return np.concatenate([np.full_like(self.roughness, 255), self.roughness, self.metallic], axis=-1)
 
 
@@ -64,19 +64,19 @@ def bake(
     deviation: Float[np.ndarray, "V 3"] | None = None,
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> Textures:
-    """Ask the run at every texel.
+    """Evaluate the material and the normal of a run at every texel.
 
-    A texel's point of the coarse surface is moved along the normal onto the fine one, where that is near;
-    there the material is asked for, and there the normal is taken.
+    The point of a texel on the coarse surface is moved along the normal onto the fine surface, if that is
+    within `reach`. Material and normal are taken at the moved point.
 
     Args:
-        run: knows the material.
-        mesh: the coarse surface on its texture.
-        fine: the surface that the run has.
-        reach: how far that may be from the coarse one, scene units.
-        size: of the textures.
-        deviation: at the vertices; none: no such texture.
-        on_progress: told the share that is done.
+        run: the run.
+        mesh: the coarse surface, unwrapped.
+        fine: the fine surface of the run.
+        reach: largest distance between both surfaces, scene units.
+        size: width and height of the textures.
+        deviation: expected errors at the vertices of `mesh`; None for no such texture.
+        on_progress: called with the fraction of the work that is done.
     """
     device = next(run.model.parameters()).device
     tracer, tangents = first_hits(fine), vertex_tangents(mesh)
@@ -87,39 +87,44 @@ def bake(
         normal = texels.interpolate(mesh.normals, mesh.faces)
         tangent = texels.interpolate(tangents[:, :3], mesh.faces)
         sign = tangents[mesh.faces[texels.face, 0], 3:]
-        straight = normal / np.linalg.norm(normal, axis=-1, keepdims=True).clip(1e-12)
-        footing = meet_along(fine, tracer, position, straight, reach)
-        place = torch.as_tensor(footing.position, dtype=torch.float32, device=device)
-        material = materials_in_parts(run, place)
+        unit_normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True).clip(1e-12)
+        hits = meet_along(fine, tracer, position, unit_normal, reach)
+        points = torch.as_tensor(hits.position, dtype=torch.float32, device=device)
+        material = materials_in_parts(run, points)
         values = [
             tone_map(material.base_color).cpu().numpy(),
             material.roughness.cpu().numpy(),
             material.metallic.cpu().numpy(),
-            0.5 + 0.5 * in_frame(footing.normal, tangent, sign * np.cross(normal, tangent), normal),
+            0.5 + 0.5 * tangent_space(hits.normal, tangent, sign * np.cross(normal, tangent), normal),
             *([] if deviation is None else [texels.interpolate(deviation, mesh.faces)]),
         ]
         texture[texels.number] = np.rint(255 * np.concatenate(values, axis=1).clip(0, 1)).astype(np.uint8)
         covered[texels.number] = True
         on_progress((texels.number[-1] + 1) / size**2 if len(texels.number) else 0.0)
     on_progress(1.0)
-    full = dilate(texture.reshape(size, size, -1), covered.reshape(size, size))
-    textures = {name: full[..., channels] for name, channels in CHANNELS.items()}
+    dilated = dilate(texture.reshape(size, size, -1), covered.reshape(size, size))
     return Textures(
-        **textures, covered=float(covered.mean()), deviation=None if deviation is None else full[..., 8:]
+        **{name: dilated[..., channels] for name, channels in CHANNELS.items()},
+        covered=float(covered.mean()),
+        deviation=None if deviation is None else dilated[..., 8:],
     )
 
 
-def in_frame(
+def tangent_space(
     vector: Float[np.ndarray, "N 3"],
     tangent: Float[np.ndarray, "N 3"],
     bitangent: Float[np.ndarray, "N 3"],
     normal: Float[np.ndarray, "N 3"],
 ) -> Float[np.ndarray, "N 3"]:
-    """The unit (x, y, z) for which x · tangent + y · bitangent + z · normal points along the vector:
-    renderers interpolate the frame and leave it as it is, neither orthogonal nor of unit length."""
+    """Express directions in the tangent frame that a renderer interpolates.
+
+    That frame is neither orthogonal nor normalised, so the result solves
+    x · tangent + y · bitangent + z · normal ∝ vector and is then normalised. It is (0, 0, 1) if the frame is
+    singular.
+    """
     frame = np.stack([tangent, bitangent, normal], axis=-1)
     singular = np.abs(np.linalg.det(frame)) < 1e-6
     frame[singular] = np.eye(3)
-    inside = np.linalg.solve(frame, vector[..., None])[..., 0]
-    inside[singular] = [0.0, 0.0, 1.0]
-    return inside / np.linalg.norm(inside, axis=-1, keepdims=True).clip(1e-12)
+    local = np.linalg.solve(frame, vector[..., None])[..., 0]
+    local[singular] = [0.0, 0.0, 1.0]
+    return local / np.linalg.norm(local, axis=-1, keepdims=True).clip(1e-12)

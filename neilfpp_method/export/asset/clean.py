@@ -1,4 +1,4 @@
-"""What of a surface is worth keeping: what cameras saw, without crumbs, and without small holes."""
+"""Clean a surface: keep what cameras see, remove small components, and close small holes."""
 
 from __future__ import annotations
 
@@ -9,56 +9,56 @@ from jaxtyping import Bool, Int
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.asset.surface import Surface, creased
 
-__all__ = ["HOLE", "clean", "close_holes", "keep_seen", "without_crumbs"]
+__all__ = ["HOLE", "clean", "close_holes", "keep_visible", "remove_small_components"]
 
 HOLE = 0.05
-"""Scene units: holes of this size and smaller are closed, and unseen patches of this size stay."""
-CRUMB = 0.002
-"""A component with a smaller share of the largest one's area is left out."""
+"""Largest extent, scene units, of holes that are closed, and of invisible patches that are kept."""
+MIN_COMPONENT = 0.002
+"""A component whose area is a smaller fraction of that of the largest component is removed."""
 
 
-def clean(surface: Surface, seen: Bool[np.ndarray, " F"]) -> Surface:
-    """The part that was seen, without crumbs, its small holes closed.
+def clean(surface: Surface, visible: Bool[np.ndarray, " F"]) -> Surface:
+    """Keep the visible part of a surface, remove small components, and close small holes.
 
     Raises:
-        UserError: nothing was seen.
+        UserError: no triangle is visible.
     """
-    if not seen.any():
+    if not visible.any():
         raise UserError(
-            "no training camera sees the surface", "train the run for longer, and look at its previews"
+            "no training camera sees the surface", "train the run for longer, and check its previews"
         )
-    return close_holes(without_crumbs(keep_seen(surface, seen)))
+    return close_holes(remove_small_components(keep_visible(surface, visible)))
 
 
-def keep_seen(surface: Surface, seen: Bool[np.ndarray, " F"]) -> Surface:
-    """What was seen, a ring of triangles around it, and unseen patches that are too small to be holes."""
-    touched = np.zeros(len(surface.vertices), dtype=bool)
-    touched[surface.faces[seen]] = True
-    kept = touched[surface.faces].any(axis=1)
-    left = np.flatnonzero(~kept)
-    component = _components(surface.part(left))
+def keep_visible(surface: Surface, visible: Bool[np.ndarray, " F"]) -> Surface:
+    """Keep visible triangles, the triangles that touch them, and invisible patches of at most `HOLE`."""
+    on_visible = np.zeros(len(surface.vertices), dtype=bool)
+    on_visible[surface.faces[visible]] = True
+    kept = on_visible[surface.faces].any(axis=1)
+    invisible = np.flatnonzero(~kept)
+    component = _components(surface.part(invisible))
     for number in np.unique(component):
-        patch = left[component == number]
+        patch = invisible[component == number]
         if _width(surface, surface.faces[patch]) <= HOLE:
             kept[patch] = True
     return surface.part(kept)
 
 
-def without_crumbs(surface: Surface) -> Surface:
-    """The components that are not much smaller than the largest one."""
+def remove_small_components(surface: Surface) -> Surface:
+    """Remove components whose area is below `MIN_COMPONENT` of the largest one's."""
     component = _components(surface)
     area = np.bincount(component, surface.mesh().area_faces)
-    return surface.part((area >= CRUMB * area.max())[component])
+    return surface.part((area >= MIN_COMPONENT * area.max())[component])
 
 
 def close_holes(surface: Surface) -> Surface:
-    """Borders of up to `HOLE` get a fan of triangles about their middle, wound as their neighbours."""
+    """Close each border of at most `HOLE` by a fan of triangles around its centre, oriented consistently."""
     vertices, fans = [surface.vertices], []
     count = len(surface.vertices)
     for loop in _borders(surface):
         if np.ptp(surface.vertices[loop], axis=0).max() > HOLE:
             continue
-        # A border runs as its triangles do, so the fan runs against it.
+        # A border has the orientation of its triangles, so the fan must have the opposite one.
         fans.append(np.stack([np.roll(loop, -1), loop, np.full(len(loop), count)], axis=1))
         vertices.append(surface.vertices[loop].mean(axis=0, keepdims=True))
         count += 1
@@ -70,7 +70,7 @@ def close_holes(surface: Surface) -> Surface:
 
 
 def _components(surface: Surface) -> Int[np.ndarray, " F"]:
-    """A number for each triangle: the same for those that are joined by edges."""
+    """Label the triangles by connected component; triangles are connected by shared edges."""
     if not len(surface.faces):
         return np.zeros(0, dtype=np.int64)
     adjacency, count = surface.mesh().face_adjacency, len(surface.faces)
@@ -79,25 +79,28 @@ def _components(surface: Surface) -> Int[np.ndarray, " F"]:
 
 
 def _width(surface: Surface, faces: Int[np.ndarray, "K 3"]) -> float:
+    """Longest side of the bounding box of some triangles."""
     return float(np.ptp(surface.vertices[faces].reshape(-1, 3), axis=0).max())
 
 
 def _borders(surface: Surface) -> list[Int[np.ndarray, " L"]]:
-    """Closed loops of edges that belong to one triangle each, in the direction of that triangle. A vertex at
-    which two loops touch ends the walk; such loops stay open."""
+    """Closed loops of border edges, in the direction of the triangles that they belong to.
+
+    Loops that touch at a vertex are ambiguous and are left out.
+    """
     edges = np.concatenate([surface.faces[:, [0, 1]], surface.faces[:, [1, 2]], surface.faces[:, [2, 0]]])
-    number = np.sort(edges, axis=1) @ np.array([len(surface.vertices), 1])
-    _, index, times = np.unique(number, return_index=True, return_counts=True)
-    starts, ends = edges[index[times == 1]].T
-    once = np.bincount(starts, minlength=len(surface.vertices)) == 1
-    after = {int(a): int(b) for a, b in zip(starts, ends, strict=True) if once[a]}
+    edge_id = np.sort(edges, axis=1) @ np.array([len(surface.vertices), 1])
+    _, index, count = np.unique(edge_id, return_index=True, return_counts=True)
+    starts, ends = edges[index[count == 1]].T
+    unique_start = np.bincount(starts, minlength=len(surface.vertices)) == 1
+    following = {int(a): int(b) for a, b in zip(starts, ends, strict=True) if unique_start[a]}
     loops = []
-    while after:
-        first, place = after.popitem()
+    while following:
+        first, vertex = following.popitem()
         loop = [first]
-        while place != first and place in after:
-            loop.append(place)
-            place = after.pop(place)
-        if place == first:
+        while vertex != first and vertex in following:
+            loop.append(vertex)
+            vertex = following.pop(vertex)
+        if vertex == first:
             loops.append(np.array(loop))
     return loops

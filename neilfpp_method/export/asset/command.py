@@ -1,4 +1,4 @@
-"""`neilfpp export --what asset`: a textured surface, the light, and scripts that open both elsewhere."""
+"""`neilfpp export --what asset`: a textured surface, the light, and scripts for other programs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from neilfpp_method.export.asset.files import write_asset
 from neilfpp_method.export.asset.simplify import MIN_FACES, simplified
 from neilfpp_method.export.asset.surface import fine_surface
 from neilfpp_method.export.asset.usd import has_usd
-from neilfpp_method.export.asset.visible import seen_faces
+from neilfpp_method.export.asset.visible import visible_faces
 from neilfpp_method.export.mesh import has_surface
 from neilfpp_method.structures import OrientedPoints
 from neilfpp_method.train.run import Run
@@ -28,23 +28,29 @@ from neilfpp_method.train.run import Run
 __all__ = ["AssetOptions", "Bar", "Deviations", "check_asset", "export_asset"]
 
 MIN_TEXTURE, MAX_TEXTURE = 64, 8192
-"""Texels along an edge of the textures."""
+"""Smallest and largest width of the textures, texels."""
 MAX_FACES = 200_000
-"""Beyond which xatlas takes minutes."""
+"""Largest number of triangles; with more, xatlas takes minutes."""
 REACH_FACTOR = 2.0
-"""The fine surface is looked for within so many times the distance that 99 of 100 of its points keep."""
+"""The fine surface is searched within this multiple of the distance below which 99 % of its points are."""
 MIN_REACH = 1e-3
-"""Scene units."""
+"""Least distance within which the fine surface is searched, scene units."""
 
 Bar = Callable[[str], AbstractContextManager[Callable[[float], None]]]
-"""A progress bar of this title, which takes the share that is done."""
+"""Opens a progress bar with a title; the function it yields takes the fraction that is done."""
 Deviations = Callable[[Run, OrientedPoints], Float[Tensor, "N 3"]]
-"""How far off base colour, roughness and metallic may be at points of the surface."""
+"""Computes the expected errors of base colour, roughness and metallic at points of the surface."""
 
 
 @dataclass(frozen=True)
 class AssetOptions:
-    """What an asset should be like; see the options of `neilfpp export`."""
+    """Options of an asset.
+
+    Attributes:
+        texture_size: width and height of the textures, texels.
+        faces: largest number of triangles.
+        error: largest distance, scene units, that simplification below `faces` may cause.
+    """
 
     texture_size: int
     faces: int
@@ -52,27 +58,29 @@ class AssetOptions:
 
 
 def check_asset(run: Run, options: AssetOptions) -> None:
-    """That there is what `export_asset` is asked for.
+    """Check that `export_asset` is possible.
 
     Raises:
-        UserError: no surface, no material yet, or options out of range.
+        UserError: the run has no surface or no material yet, or an option is out of range.
     """
     if not has_surface(run):
         raise UserError(
             f"{run.path}: the host of this run has no surface to export", "export from a run of another host"
         )
-    if run.step <= run.config.train.sdf_steps:
+    if not run.has_material:
         raise UserError(f"{run.path}: there is no material yet at step {run.step}", "train the next stage")
     if not MIN_TEXTURE <= options.texture_size <= MAX_TEXTURE:
         raise UserError(
-            f"a texture of {options.texture_size} texels a side", f"ask for {MIN_TEXTURE} to {MAX_TEXTURE}"
+            f"a texture cannot have {options.texture_size} texels per side",
+            f"give {MIN_TEXTURE} to {MAX_TEXTURE} with --texture-size",
         )
     if not MIN_FACES <= options.faces <= MAX_FACES:
         raise UserError(
-            f"an asset of {options.faces} triangles", f"ask for {MIN_FACES} to {MAX_FACES} with --faces"
+            f"an asset cannot have {options.faces} triangles",
+            f"give {MIN_FACES} to {MAX_FACES} with --faces",
         )
     if not options.error >= 0:
-        raise UserError(f"--error {options.error:g}", "give a length in scene units, from 0 on")
+        raise UserError(f"--error cannot be {options.error:g}", "give a length in scene units, 0 or larger")
 
 
 @torch.no_grad()
@@ -85,42 +93,42 @@ def export_asset(
     bar: Bar,
     deviations: Deviations | None,
 ) -> None:
-    """Write the asset of a run into a folder; lengths are those of the capture's world.
+    """Write the asset of a run into a folder. Lengths are in world units.
 
     Args:
-        run: the run; `check_asset` has passed.
-        out: the folder.
-        resolution: of the fine surface (`extract_mesh`).
-        options: see there.
-        console: is told what comes out.
-        bar: shows how far the baking is.
-        deviations: for a texture of them; none: no such texture.
+        run: the run, for which `check_asset` has succeeded.
+        out: the folder to write.
+        resolution: resolution of the fine surface (`extract_mesh`).
+        options: options of the asset.
+        console: receives messages for the user.
+        bar: shows the progress of baking.
+        deviations: computes expected errors for an additional texture; None for no such texture.
 
     Raises:
-        UserError: no surface, none that a camera sees, an atlas that does not fit, or a folder that cannot be
-            written.
+        UserError: there is no surface, no camera sees it, the charts do not fit on the texture, or the folder
+            cannot be written.
     """
-    whole = fine_surface(run, resolution)
+    full = fine_surface(run, resolution)
     cameras = [run.capture.normalisation.camera(view.camera) for view in run.capture.train_views]
-    fine = clean(whole, seen_faces(whole, cameras))
-    console.print(f"surface: {len(fine.faces)} of {len(whole.faces)} triangles were seen and stay")
+    fine = clean(full, visible_faces(full, cameras))
+    console.print(f"surface: kept {len(fine.faces)} of {len(full.faces)} triangles, which cameras see")
     coarse = simplified(fine, options.faces, options.error)
     distance = coarse.distance
     near = f"99 % of the surface within {distance.near:.2g} scene units"
-    lost = f", {100 * distance.missed:.1f} % lost" if distance.missed > 0 else ""
-    console.print(f"simplified: {len(coarse.surface.faces)} triangles, {near}{lost}")
+    missed = f", {100 * distance.missed:.1f} % missing" if distance.missed > 0 else ""
+    console.print(f"simplified: {len(coarse.surface.faces)} triangles, {near}{missed}")
     mesh = unwrap(coarse.surface, options.texture_size)
-    unsure = None if deviations is None else deviations(run, _points(run, mesh)).double().cpu().numpy()
+    expected = None if deviations is None else deviations(run, _points(run, mesh)).double().cpu().numpy()
     with bar("textures") as advance:
         reach = max(REACH_FACTOR * distance.near, MIN_REACH)
-        textures = bake(run, mesh, fine, reach, options.texture_size, unsure, advance)
+        textures = bake(run, mesh, fine, reach, options.texture_size, expected, advance)
     console.print(
         f"textures: {mesh.charts} charts on {100 * textures.covered:.0f} % of {options.texture_size}² texels"
     )
     vertices = run.capture.normalisation.to_world(torch.from_numpy(mesh.vertices)).numpy()
     write_asset(run, replace(mesh, vertices=vertices), textures, out)
     if not has_usd():
-        console.print("no USD file: `pip install neilfpp-method[usd]` adds what writes it")
+        console.print("no USD file was written, because usd-core is missing: pip install neilfpp-method[usd]")
     console.print(f"written to {out}", soft_wrap=True)
 
 

@@ -1,7 +1,8 @@
-"""Environment maps as other programs lay them out (docs/assets.md).
+"""Environment maps in the layouts of other programs (docs/assets.md).
 
-Ours: row j is at the angle πj/(h − 1) from +Z of the world, column i at the azimuth φ = 2π(i + ½)/w from +Y
-towards +X. Theirs have their rows at π(j + ½)/h, and the middle of the picture looks along another axis.
+In this project, row j has the angle πj/(h − 1) from +Z of the world, and column i has the azimuth
+φ = 2π(i + ½)/w from +Y towards +X. In other programs, row j has the angle π(j + ½)/h, and the centre of the
+image looks along a different axis.
 """
 
 from __future__ import annotations
@@ -18,23 +19,26 @@ from neilfpp_method.fields.direction_map import interpolate
 __all__ = ["equirectangular"]
 
 LEFT_EDGE: dict[str, float] = {"blender": -0.25, "unreal": 0.5}
-"""Our azimuth at the left edge of the picture, in turns. Blender and three.js: the middle looks along +X, +Y
-is a quarter to its left (Cycles, `direction_to_equirectangular`). Unreal: its +X, which is ours, is three
-quarters from the left, and its −Y, our +Y, in the middle (`LookupLongLat` of the texture compressor)."""
+"""Azimuth of this project at the left edge of the image, in turns.
+
+Blender and three.js: the centre looks along +X, and +Y is a quarter of the width to its left (Cycles,
+`direction_to_equirectangular`). Unreal: its +X, which is +X here, is at three quarters of the width, and its
+−Y, which is +Y here, is in the centre (`LookupLongLat` of the texture compressor).
+"""
 FINER, ENOUGH = 4, 512
-"""Four times our rows, at most this many unless ours are more: bilinear values between texels stay so."""
+"""Number of rows relative to the original map, and the number above which no rows are added. The finer grid
+preserves the bilinear interpolation between the original texels.
+"""
 
 
 def equirectangular(
     radiance: Float[Tensor, "3 H W"], program: Literal["blender", "unreal"]
 ) -> Float[Tensor, "h w 3"]:
-    """A map of ours, resampled, linear RGB as before; twice as many columns as rows."""
+    """Resample an environment map to the layout of a program; linear RGB, width = 2 · height."""
     height = max(radiance.shape[1], min(FINER * radiance.shape[1], ENOUGH))
+    width = 2 * height
     theta = math.pi * (torch.arange(height, dtype=torch.float64)[:, None] + 0.5) / height
-    phi = (
-        2
-        * math.pi
-        * ((torch.arange(2 * height, dtype=torch.float64) + 0.5) / (2 * height) + LEFT_EDGE[program])
-    )
-    axes = (phi.sin() * theta.sin(), phi.cos() * theta.sin(), theta.cos().expand(-1, 2 * height))
+    turns = (torch.arange(width, dtype=torch.float64) + 0.5) / width + LEFT_EDGE[program]
+    phi = 2 * math.pi * turns
+    axes = (phi.sin() * theta.sin(), phi.cos() * theta.sin(), theta.cos().expand(-1, width))
     return interpolate(radiance, torch.stack(axes, dim=-1).to(radiance))

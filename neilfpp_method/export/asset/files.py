@@ -1,4 +1,4 @@
-"""The files of an asset (docs/assets.md)."""
+"""Write the files of an asset (docs/assets.md)."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import trimesh
 from neilfpp_method.data.images import write_exr, write_png
 from neilfpp_method.export.asset.atlas import Unwrapped
 from neilfpp_method.export.asset.bake import Textures
-from neilfpp_method.export.asset.described import describe_scene
 from neilfpp_method.export.asset.environment import equirectangular
 from neilfpp_method.export.asset.folder import filling
 from neilfpp_method.export.asset.glb import glb_bytes
+from neilfpp_method.export.asset.scene_file import describe_scene
 from neilfpp_method.export.asset.usd import has_usd, usd_text
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.train.run import Run, write_json
@@ -25,20 +25,20 @@ SCRIPTS = ("open_in_blender.py", "open_in_mitsuba.py")
 
 
 def write_asset(run: Run, mesh: Unwrapped, textures: Textures, out: Path) -> None:
-    """Write everything, or nothing.
+    """Write all files of an asset atomically.
 
     Args:
-        run: knows light, cameras and the frame.
-        mesh: vertices and normals in the world frame.
-        textures: of its atlas.
-        out: the folder.
+        run: the run, for light and cameras.
+        mesh: the unwrapped surface, with vertices and normals in the world frame.
+        textures: the textures of `mesh`.
+        out: the folder to write.
 
     Raises:
-        UserError: it cannot be written.
+        UserError: the folder cannot be written.
     """
     light = run.model.light
     radiance = light.log_radiance.exp().cpu() if isinstance(light, EnvironmentLight) else None
-    described = describe_scene(run, environment=radiance is not None)
+    scene = describe_scene(run, environment=radiance is not None)
     pictures = {
         "base_color": textures.base_color,
         "metallic_roughness": textures.metallic_roughness(),
@@ -50,24 +50,23 @@ def write_asset(run: Run, mesh: Unwrapped, textures: Textures, out: Path) -> Non
     with filling(out) as folder:
         for name, picture in pictures.items():
             write_png(folder / "textures" / f"{name}.png", picture)
-        (folder / "asset.glb").write_bytes(glb_bytes(mesh, textures, described["lamps"]))
+        (folder / "asset.glb").write_bytes(glb_bytes(mesh, textures, scene["lamps"]))
         if has_usd():
-            (folder / "asset.usda").write_text(usd_text(mesh, described["lamps"]))
+            (folder / "asset.usda").write_text(usd_text(mesh, scene["lamps"]))
         (folder / "mesh.ply").write_bytes(_ply(mesh))
         if radiance is not None:
             write_exr(folder / "environment.exr", {"RGB": radiance.permute(1, 2, 0).numpy()})
             for program in ("blender", "unreal"):
-                write_exr(
-                    folder / f"environment_{program}.exr", {"RGB": equirectangular(radiance, program).numpy()}
-                )
-        write_json(folder / "scene.json", described)
+                resampled = equirectangular(radiance, program).numpy()
+                write_exr(folder / f"environment_{program}.exr", {"RGB": resampled})
+        write_json(folder / "scene.json", scene)
         for name in SCRIPTS:
             source = resources.files("neilfpp_method.export.asset.scripts") / name
             (folder / name).write_text(source.read_text("utf-8"), "utf-8")
 
 
 def _ply(mesh: Unwrapped) -> bytes:
-    """With texture places u and v, v upwards, for programs that read no glTF."""
+    """The mesh as PLY with texture coordinates u and v, v upwards, for programs that do not read glTF."""
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.normals, process=False)
     u, v = mesh.uv.astype(np.float32).T
     shape.vertex_attributes.update(u=u, v=v)

@@ -1,4 +1,4 @@
-"""A folder that appears when all of its files are there."""
+"""Write several files into a folder atomically."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ __all__ = ["filling"]
 
 @contextmanager
 def filling(path: Path) -> Iterator[Path]:
-    """A temporary folder beside `path`; when the block ends its files move into `path`; always removed.
+    """Yield a temporary folder beside `path`, and move its files into `path` when the block succeeds.
 
-    Moving takes no room, so a full disk shows before anything is there. What else `path` holds stays.
+    The temporary folder is always removed. Moving needs no disk space, so a full disk is noticed before any
+    file of `path` changes. Other files in `path` are kept.
 
     Raises:
-        UserError: the system does not let it be written.
+        UserError: a file cannot be written.
     """
     temporary = path.parent / f".{path.name}.{os.getpid()}"
     try:
@@ -31,7 +32,7 @@ def filling(path: Path) -> Iterator[Path]:
             target.parent.mkdir(parents=True, exist_ok=True)
             os.replace(file, target)
     except OSError as error:
-        remedy = "make room there, or choose a folder that can be written"
+        remedy = "free disk space there, or choose a folder that can be written"
         raise UserError(f"{path}: cannot be written ({error.strerror or error})", remedy) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""An asset as binary glTF: Y up, metres, textures inside, lamps by KHR_lights_punctual."""
+"""Encode an asset as binary glTF: Y up, metres, embedded textures, lamps as KHR_lights_punctual."""
 
 from __future__ import annotations
 
@@ -21,18 +21,21 @@ from neilfpp_method.export.asset.tangents import vertex_tangents
 __all__ = ["WORLD_TO_GLTF", "glb_bytes"]
 
 WORLD_TO_GLTF = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""(x, y, z) → (x, z, −y): Z is up in a capture's world and Y in glTF. Blender turns it back."""
+"""Rotation (x, y, z) → (x, z, −y): Z is up in a capture's world, Y is up in glTF. Blender's importer inverts
+it.
+"""
 EXTENSION = "KHR_lights_punctual"
+"""Name of the glTF extension for lights."""
 
 
 def glb_bytes(mesh: Unwrapped, textures: Textures, lamps: Sequence[Mapping[str, Any]]) -> bytes:
-    """The file's contents.
+    """Return the contents of a .glb file.
 
     Args:
-        mesh: vertices and normals in the world frame.
-        textures: of its atlas.
-        lamps: as `lamps_in_world` has them. Intensities become candela, as they are: glTF's factors from watt
-            to lumen know nothing of the units of a capture.
+        mesh: the unwrapped surface, with vertices and normals in the world frame.
+        textures: the textures of `mesh`.
+        lamps: the lamps in the format of `lamps.json`. Intensities are written as candela without conversion,
+            because the radiance of a capture has no physical unit.
     """
     material = PBRMaterial(
         name="recovered",
@@ -42,39 +45,40 @@ def glb_bytes(mesh: Unwrapped, textures: Textures, lamps: Sequence[Mapping[str, 
         baseColorFactor=[255, 255, 255, 255],
         metallicFactor=1.0,
         roughnessFactor=1.0,
-        # Where nobody looked the surface is open, and shows its inside.
+        # The surface is open at parts that no camera sees, so its inside can be visible.
         doubleSided=True,
     )
     tangents = vertex_tangents(mesh)
-    turned = np.concatenate([tangents[:, :3] @ WORLD_TO_GLTF.T, tangents[:, 3:]], axis=1)
+    rotated = np.concatenate([tangents[:, :3] @ WORLD_TO_GLTF.T, tangents[:, 3:]], axis=1)
     shape = trimesh.Trimesh(
         mesh.vertices @ WORLD_TO_GLTF.T,
         mesh.faces,
         vertex_normals=mesh.normals @ WORLD_TO_GLTF.T,
         visual=TextureVisuals(uv=mesh.uv, material=material),
-        vertex_attributes={"_TANGENT": turned.astype(np.float32)},
+        # trimesh writes custom attributes with a leading underscore, which is removed below.
+        vertex_attributes={"_TANGENT": rotated.astype(np.float32)},
         process=False,
     )
 
-    def finish(tree: dict[str, Any]) -> None:
-        for part in (primitive for written in tree["meshes"] for primitive in written["primitives"]):
-            part["attributes"]["TANGENT"] = part["attributes"].pop("_TANGENT")
+    def postprocess(tree: dict[str, Any]) -> None:
+        for primitive in (primitive for part in tree["meshes"] for primitive in part["primitives"]):
+            primitive["attributes"]["TANGENT"] = primitive["attributes"].pop("_TANGENT")
         if lamps:
             _add_lamps(tree, lamps)
 
-    return export_glb(trimesh.Scene({"surface": shape}), include_normals=True, tree_postprocessor=finish)
+    scene = trimesh.Scene({"surface": shape})
+    return export_glb(scene, include_normals=True, tree_postprocessor=postprocess)
 
 
 def _add_lamps(tree: dict[str, Any], lamps: Sequence[Mapping[str, Any]]) -> None:
     lights = []
     for number, lamp in enumerate(lamps):
         brightest = max(lamp["intensity"])
+        color = [channel / brightest if brightest > 0 else 1.0 for channel in lamp["intensity"]]
         light = {
             "name": f"lamp {number}",
             "type": "point" if lamp["axis"] is None else "spot",
-            "color": [channel / brightest for channel in lamp["intensity"]]
-            if brightest > 0
-            else [1.0, 1.0, 1.0],
+            "color": color,
             "intensity": brightest,
         }
         node = {
@@ -83,9 +87,9 @@ def _add_lamps(tree: dict[str, Any], lamps: Sequence[Mapping[str, Any]]) -> None
             "extensions": {EXTENSION: {"light": number}},
         }
         if lamp["axis"] is not None:
-            # The widest cone: cos² θ by the specification's own falloff, where ours is cos θ.
+            # The widest cone that the extension allows. Its falloff is cos² θ; that of a panel is cos θ.
             light["spot"] = {"innerConeAngle": 0.0, "outerConeAngle": math.pi / 2}
-            node["rotation"] = _turn_from_minus_z(WORLD_TO_GLTF @ np.array(lamp["axis"]))
+            node["rotation"] = _rotation_from_minus_z(WORLD_TO_GLTF @ np.array(lamp["axis"]))
         lights.append(light)
         tree["scenes"][tree.get("scene", 0)]["nodes"].append(len(tree["nodes"]))
         tree["nodes"].append(node)
@@ -93,8 +97,9 @@ def _add_lamps(tree: dict[str, Any], lamps: Sequence[Mapping[str, Any]]) -> None
     tree.setdefault("extensions", {})[EXTENSION] = {"lights": lights}
 
 
-def _turn_from_minus_z(axis: Float[np.ndarray, " 3"]) -> list[float]:
-    """The quaternion (x, y, z, w) of a turn that takes −Z, where a spot looks, to a unit axis."""
-    half = np.array([axis[1], -axis[0], 0.0, 1.0 - axis[2]])  # −Z × axis, and 1 + −Z · axis
-    length = np.linalg.norm(half)
-    return [1.0, 0.0, 0.0, 0.0] if length < 1e-6 else (half / length).tolist()
+def _rotation_from_minus_z(axis: Float[np.ndarray, " 3"]) -> list[float]:
+    """Quaternion (x, y, z, w) of a rotation from −Z, the direction of a spot, to a unit axis."""
+    # The vector part is −Z × axis, the scalar part 1 + (−Z · axis), before normalisation.
+    quaternion = np.array([axis[1], -axis[0], 0.0, 1.0 - axis[2]])
+    length = np.linalg.norm(quaternion)
+    return [1.0, 0.0, 0.0, 0.0] if length < 1e-6 else (quaternion / length).tolist()

@@ -1,4 +1,4 @@
-"""A surface with fewer triangles, as near to the fine one as is asked for."""
+"""Simplify a surface within a given distance."""
 
 from __future__ import annotations
 
@@ -13,20 +13,27 @@ from neilfpp_method.export.asset.surface import Surface, creased, first_hits, me
 __all__ = ["Distance", "Simplified", "distance_between", "simplified"]
 
 SAMPLES = 20_000
-"""Points of the fine surface whose distance is measured."""
-SHARE = 99.0
-"""Per cent of them that are at most at the distance that is reported."""
+"""Number of points of the fine surface at which the distance is measured."""
+PERCENTILE = 99.0
+"""Percentile of the distances that is reported."""
 MAX_MISSED = 0.02
-"""Share of points that may have nothing near: beside borders, and where decimation folds a plane."""
+"""Largest accepted fraction of points without a coarse surface nearby. Such points occur at borders, and at
+planes that the decimation folds.
+"""
 MIN_FACES = 100
-"""Triangles below which nothing is gained."""
+"""Least number of triangles; fewer would save nothing."""
 REACH = 0.1
-"""Scene units, beyond which nothing is near."""
+"""Largest distance at which the coarse surface is searched, scene units."""
 
 
 @dataclass(frozen=True)
 class Distance:
-    """How far a fine surface is from a coarse one near it, scene units, and the share that has none near."""
+    """Distance from a fine surface to a coarse one.
+
+    Attributes:
+        near: 99th percentile of the distances, scene units.
+        missed: fraction of points without a coarse surface within `REACH`.
+    """
 
     near: float
     missed: float
@@ -34,19 +41,19 @@ class Distance:
 
 @dataclass(frozen=True)
 class Simplified:
-    """The coarse surface, and how far the fine one is from it."""
+    """A coarse surface, and the distance from the fine surface to it."""
 
     surface: Surface
     distance: Distance
 
 
 def simplified(fine: Surface, most_faces: int, error: float) -> Simplified:
-    """A copy of at most so many triangles, and half as many, a quarter, … as long as it stays near.
+    """Reduce the number of triangles to `most_faces`, then halve it while the distance stays within `error`.
 
     Args:
         fine: the surface.
-        most_faces: a limit that holds whatever the error.
-        error: the largest distance that fewer triangles than that may cause, scene units.
+        most_faces: largest number of triangles, whatever the distance.
+        error: largest distance that a further reduction may cause, scene units.
     """
     count = min(most_faces, len(fine.faces))
     best = _with_faces(fine, count)
@@ -60,17 +67,17 @@ def simplified(fine: Surface, most_faces: int, error: float) -> Simplified:
 
 
 def distance_between(fine: Surface, coarse: Surface) -> Distance:
-    """Along the normals of the fine surface, at points that are spread evenly over it."""
+    """Measure the distance along the normals of the fine surface, at points spread uniformly over it."""
     points, face = trimesh.sample.sample_surface(fine.mesh(), SAMPLES, seed=0)
     normals = fine.mesh().face_normals[face]
-    footing = meet_along(coarse, first_hits(coarse), np.asarray(points), normals, REACH)
-    found = footing.distance[footing.found]
-    near = float(np.percentile(found, SHARE)) if len(found) else REACH
-    return Distance(near, 1 - len(found) / SAMPLES)
+    hits = meet_along(coarse, first_hits(coarse), np.asarray(points), normals, REACH)
+    distances = hits.distance[hits.valid]
+    near = float(np.percentile(distances, PERCENTILE)) if len(distances) else REACH
+    return Distance(near, 1 - len(distances) / SAMPLES)
 
 
 def _with_faces(fine: Surface, count: int) -> Simplified:
-    """Quadric error decimation (Garland and Heckbert 1997)."""
+    """Decimate by quadric errors (Garland and Heckbert 1997)."""
     if count >= len(fine.faces):
         mesh = fine.mesh()
     else:

@@ -1,4 +1,4 @@
-"""The fine surface of a run, of which an asset is a coarser copy; and where rays along normals meet it."""
+"""The fine surface of a run, from which an asset is simplified, and intersections of normals with it."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_trac
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.train.run import Run
 
-__all__ = ["Footing", "Surface", "creased", "fine_surface", "first_hits", "meet_along"]
+__all__ = ["NormalHits", "Surface", "creased", "fine_surface", "first_hits", "meet_along"]
 
 POINTS_AT_ONCE = 2**14
-"""Points whose normals are smoothed together: each asks 32 neighbours."""
+"""Number of points per call of the host's normal smoothing, which reads 32 neighbours of each."""
 STEP_BACK = 1e-4
-"""Scene units that a ray starts behind its point, so that a surface through the point itself is met."""
+"""Distance that a ray starts behind its point, scene units, so that it hits a surface through the point."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Triangles of the scene frame, wound outwards, with a unit normal at each of their corners."""
+    """Triangles in the scene frame, oriented outwards, with a unit normal at each corner."""
 
     vertices: Float[np.ndarray, "V 3"]
     faces: Int[np.ndarray, "F 3"]
     normals: Float[np.ndarray, "F 3 3"]
 
     def part(self, chosen: Shaped[np.ndarray, " K"]) -> Surface:
-        """Some of the triangles, by number or by mask; all vertices stay."""
+        """Select triangles by index or mask; all vertices are kept."""
         return replace(self, faces=self.faces[chosen], normals=self.normals[chosen])
 
     def mesh(self) -> trimesh.Trimesh:
-        """The triangles for trimesh, number by number."""
+        """The same triangles, in the same order, as a trimesh mesh."""
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
     def triangles(self) -> Float[Tensor, "F 3 3"]:
@@ -49,10 +49,10 @@ class Surface:
 
 @torch.no_grad()
 def fine_surface(run: Run, resolution: int) -> Surface:
-    """The surface that `export --what mesh` writes, with the normals that the run shades it with.
+    """Return the surface that `export --what mesh` writes, with the normals that the run uses for shading.
 
     Raises:
-        UserError: see `surface_mesh`.
+        UserError: `surface_mesh` fails.
     """
     mesh, host = surface_mesh(run, resolution), run.model.host
     faces, vertices = np.array(mesh.faces), np.array(mesh.vertices, dtype=np.float64)
@@ -68,7 +68,7 @@ def fine_surface(run: Run, resolution: int) -> Surface:
 
 
 def creased(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Surface:
-    """A surface with the normals that its triangles give: smooth, but for edges (`corner_normals`)."""
+    """Build a surface with normals from its triangles: smooth, except at creases (`corner_normals`)."""
     mesh = Mesh(torch.from_numpy(vertices).float(), torch.from_numpy(faces).long())
     triangles = mesh.vertices[mesh.faces]
     across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -76,17 +76,23 @@ def creased(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -
 
 
 def first_hits(surface: Surface) -> FirstHits:
-    """Which triangle a ray meets first: Embree, or a tree where Embree is not installed."""
+    """Build a function that returns the first triangle hit by each ray; uses Embree if it is installed."""
     triangles = surface.triangles()
     return embree_tracer(triangles) or tree_tracer(build_tree(triangles))
 
 
 @dataclass(frozen=True)
-class Footing:
-    """Where points come down on a surface along their normals: whether at all, how far, and the place and the
-    unit normal there. Where not, the place and the normal are those of the point."""
+class NormalHits:
+    """Intersections of the normals of N points with a surface.
 
-    found: Bool[np.ndarray, " N"]
+    Attributes:
+        valid: whether there is an intersection.
+        distance: distance from the point, scene units.
+        position: the intersection; the point itself if there is none.
+        normal: unit normal there; that of the point if there is none.
+    """
+
+    valid: Bool[np.ndarray, " N"]
     distance: Float[np.ndarray, " N"]
     position: Float[np.ndarray, "N 3"]
     normal: Float[np.ndarray, "N 3"]
@@ -98,20 +104,23 @@ def meet_along(
     position: Float[np.ndarray, "N 3"],
     normal: Float[np.ndarray, "N 3"],
     reach: float,
-) -> Footing:
-    """The nearer hit of a point's normal and its opposite, within a distance, on a side facing the same way.
+) -> NormalHits:
+    """Intersect the line through each point along its normal with a surface, and keep the nearest hit.
+
+    Only hits within `reach`, on parts of the surface that face the same way as the normal, count.
 
     Args:
-        surface: where the points come down.
-        tracer: its `first_hits`.
+        surface: the surface.
+        tracer: `first_hits` of the surface.
         position: points, scene frame.
-        normal: unit; the line to look along.
-        reach: the largest distance, scene units.
+        normal: unit normals.
+        reach: largest distance, scene units.
     """
     origin, along = torch.from_numpy(position).float(), torch.from_numpy(normal).float()
     triangles, corners = surface.triangles(), torch.from_numpy(surface.normals).float()
     nearest = torch.full_like(origin[:, 0], reach)
-    place, turned, found = origin.clone(), along.clone(), torch.zeros(len(origin), dtype=torch.bool)
+    hit_position, hit_normal = origin.clone(), along.clone()
+    valid = torch.zeros(len(origin), dtype=torch.bool)
     for direction in (along, -along):
         start = origin - STEP_BACK * direction
         face = tracer(start, direction)
@@ -121,16 +130,17 @@ def meet_along(
         hit = meet(start[rows], direction[rows], triangles[face[rows]])
         shaded = safe_normalize((hit.weights.clamp(0, 1)[..., None] * corners[face[rows]]).sum(1))
         distance = (hit.distance - STEP_BACK).abs()
-        good = (distance < nearest[rows]) & ((shaded * along[rows]).sum(-1) > 0)
-        rows, distance = rows[good], distance[good]
-        nearest[rows], found[rows], turned[rows] = distance, True, shaded[good]
-        place[rows] = start[rows] + hit.distance[good, None] * direction[rows]
-    return Footing(found.numpy(), nearest.numpy(), place.numpy(), turned.numpy())
+        nearer = (distance < nearest[rows]) & ((shaded * along[rows]).sum(-1) > 0)
+        rows, distance = rows[nearer], distance[nearer]
+        nearest[rows], valid[rows], hit_normal[rows] = distance, True, shaded[nearer]
+        hit_position[rows] = start[rows] + hit.distance[nearer, None] * direction[rows]
+    return NormalHits(valid.numpy(), nearest.numpy(), hit_position.numpy(), hit_normal.numpy())
 
 
 def _shading_normals(
     host: object, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
 ) -> Float[np.ndarray, "N 3"]:
+    """Normals that the host uses for shading, smoothed if it smooths them."""
     if isinstance(host, SmoothsNormals):
         pairs = zip(position.split(POINTS_AT_ONCE), normal.split(POINTS_AT_ONCE), strict=True)
         normal = torch.cat([host.smooth_normals(places, normals) for places, normals in pairs])

@@ -1,4 +1,4 @@
-"""Which point of a surface each texel shows; and what texels hold that show none."""
+"""Find the surface point of each texel, and fill the texels that show no surface."""
 
 from __future__ import annotations
 
@@ -16,11 +16,18 @@ from neilfpp_method.hosts.mesh_tracing import build_tree, embree_tracer, meet, t
 __all__ = ["Texels", "covered_texels", "dilate"]
 
 TEXELS_AT_ONCE = 2**19
+"""Number of texels per batch, which bounds the memory."""
 
 
 @dataclass(frozen=True)
 class Texels:
-    """Texels by number, row by row from the top, the triangle at each middle, and its corner weights."""
+    """Texels whose centres lie in a triangle.
+
+    Attributes:
+        number: row-major index of the texel, from the top.
+        face: index of the triangle.
+        weights: barycentric coordinates of the texel's centre.
+    """
 
     number: Int[np.ndarray, " T"]
     face: Int[np.ndarray, " T"]
@@ -29,14 +36,14 @@ class Texels:
     def interpolate(
         self, values: Float[np.ndarray, "V C"], faces: Int[np.ndarray, "F 3"]
     ) -> Float[np.ndarray, "T C"]:
-        """Values at vertices, at the texels."""
+        """Interpolate values at vertices to the texels."""
         return (values[faces[self.face]] * self.weights[..., None]).sum(axis=1)
 
 
 def covered_texels(mesh: Unwrapped, size: int) -> Iterator[Texels]:
-    """The texels of a size × size texture whose middle lies in a triangle, in parts of bounded size.
+    """Yield batches of the texels of a size × size texture whose centres lie in a triangle.
 
-    The atlas is a flat surface at z = 0, looked at from above: a ray per texel.
+    The triangles in texture space form a flat surface at z = 0, and one ray per texel is traced onto it.
     """
     flat = torch.from_numpy(np.pad(mesh.uv, ((0, 0), (0, 1)))).float()[torch.from_numpy(mesh.faces)]
     tracer = embree_tracer(flat) or tree_tracer(build_tree(flat))
@@ -55,7 +62,9 @@ def covered_texels(mesh: Unwrapped, size: int) -> Iterator[Texels]:
 def dilate(
     texture: UInt8[np.ndarray, "S S C"], covered: Bool[np.ndarray, "S S"]
 ) -> UInt8[np.ndarray, "S S C"]:
-    """The texture with what the nearest covered texel holds in every other, so that no look-up between texels
-    or in a smaller copy of the texture meets a colour that is not of the surface."""
+    """Fill every uncovered texel with the value of the nearest covered texel.
+
+    A bilinear or mip-mapped look-up then never reads a value that does not belong to the surface.
+    """
     rows, columns = distance_transform_edt(~covered, return_distances=False, return_indices=True)
     return texture[rows, columns]

@@ -1,4 +1,4 @@
-"""An asset as USD text: UsdPreviewSurface with the textures beside it, Z up, metres, lamps by UsdLux."""
+"""Encode an asset as USD text: UsdPreviewSurface with external textures, Z up, metres, lamps as UsdLux."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from neilfpp_method.export.asset.atlas import Unwrapped
 
 try:
     from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, Vt
-except ImportError:  # the extra `usd`
+# usd-core is optional: the extra `usd`.
+except ImportError:
     Usd = None
 
 __all__ = ["has_usd", "usd_text"]
@@ -23,11 +24,12 @@ def has_usd() -> bool:
 
 
 def usd_text(mesh: Unwrapped, lamps: Sequence[Mapping[str, Any]]) -> str:
-    """The contents of a .usda file in the folder of `textures/`.
+    """Return the contents of a .usda file, which refers to the textures in `./textures/`.
 
     Args:
-        mesh: vertices and normals in the world frame.
-        lamps: as `lamps_in_world` has them. Radiance is the luminance of the lights, as it is.
+        mesh: the unwrapped surface, with vertices and normals in the world frame.
+        lamps: the lamps in the format of `lamps.json`. Their radiance becomes the luminance of the lights
+            without conversion.
     """
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
@@ -41,13 +43,12 @@ def usd_text(mesh: Unwrapped, lamps: Sequence[Mapping[str, Any]]) -> str:
     shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     shape.CreateDoubleSidedAttr(True)
-    shape.CreateExtentAttr(
-        Vt.Vec3fArray.FromNumpy(np.stack([mesh.vertices.min(0), mesh.vertices.max(0)]).astype(np.float32))
-    )
-    place = UsdGeom.PrimvarsAPI(shape).CreatePrimvar(
+    extent = np.stack([mesh.vertices.min(0), mesh.vertices.max(0)]).astype(np.float32)
+    shape.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent))
+    texture_coordinates = UsdGeom.PrimvarsAPI(shape).CreatePrimvar(
         "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex
     )
-    place.Set(Vt.Vec2fArray.FromNumpy(mesh.uv.astype(np.float32)))
+    texture_coordinates.Set(Vt.Vec2fArray.FromNumpy(mesh.uv.astype(np.float32)))
     UsdShade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(_material(stage))
     for number, lamp in enumerate(lamps):
         _lamp(stage, f"/asset/lamp_{number}", lamp)
@@ -58,24 +59,22 @@ def _material(stage: Any) -> Any:
     material = UsdShade.Material.Define(stage, "/asset/material")
     surface = UsdShade.Shader.Define(stage, "/asset/material/surface")
     surface.CreateIdAttr("UsdPreviewSurface")
-    reader = UsdShade.Shader.Define(stage, "/asset/material/place")
+    reader = UsdShade.Shader.Define(stage, "/asset/material/texture_coordinates")
     reader.CreateIdAttr("UsdPrimvarReader_float2")
     reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
-    place = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
+    coordinates = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
 
     def texture(name: str, space: str) -> Any:
         shader = UsdShade.Shader.Define(stage, f"/asset/material/{name}")
         shader.CreateIdAttr("UsdUVTexture")
         shader.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(f"./textures/{name}.png")
         shader.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set(space)
-        shader.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(place)
+        shader.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(coordinates)
         return shader
 
     def connect(name: str, kind: Any, shader: Any, channel: str) -> None:
-        source = shader.CreateOutput(
-            channel, Sdf.ValueTypeNames.Float3 if channel == "rgb" else Sdf.ValueTypeNames.Float
-        )
-        surface.CreateInput(name, kind).ConnectToSource(source)
+        output = Sdf.ValueTypeNames.Float3 if channel == "rgb" else Sdf.ValueTypeNames.Float
+        surface.CreateInput(name, kind).ConnectToSource(shader.CreateOutput(channel, output))
 
     packed, normal = texture("metallic_roughness", "raw"), texture("normal", "raw")
     normal.CreateInput("scale", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(2, 2, 2, 1))
@@ -91,7 +90,7 @@ def _material(stage: Any) -> Any:
 
 
 def _lamp(stage: Any, path: str, lamp: Mapping[str, Any]) -> None:
-    """A bulb is a sphere; a panel a disk that sends along −Z with the cosine's falloff, as ours does."""
+    """Add a bulb as a sphere, or a panel as a disk, which emits along −Z with constant radiance."""
     panel = lamp["axis"] is not None
     light = (UsdLux.DiskLight if panel else UsdLux.SphereLight).Define(stage, path)
     brightest = max(lamp["radiance"])
@@ -103,5 +102,5 @@ def _lamp(stage: Any, path: str, lamp: Mapping[str, Any]) -> None:
     pose = UsdGeom.Xformable(light)
     pose.AddTranslateOp().Set(Gf.Vec3d(*lamp["position"]))
     if panel:
-        turn = Gf.Rotation(Gf.Vec3d(0, 0, -1), Gf.Vec3d(*lamp["axis"])).GetQuat()
-        pose.AddOrientOp().Set(Gf.Quatf(turn))
+        rotation = Gf.Rotation(Gf.Vec3d(0, 0, -1), Gf.Vec3d(*lamp["axis"])).GetQuat()
+        pose.AddOrientOp().Set(Gf.Quatf(rotation))

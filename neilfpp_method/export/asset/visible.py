@@ -1,4 +1,4 @@
-"""Which triangles of a surface the cameras saw."""
+"""Find the triangles of a surface that cameras see."""
 
 from __future__ import annotations
 
@@ -12,48 +12,53 @@ from jaxtyping import Bool
 from neilfpp_method.data.views import Camera, CameraRays, project
 from neilfpp_method.export.asset.surface import Surface, first_hits
 
-__all__ = ["seen_faces"]
+__all__ = ["visible_faces"]
 
 MAX_RAYS = 2**24
-"""Rays through pixels of all cameras together: 15 s with Embree. Faces they miss are tested alone."""
+"""Largest number of rays through pixels, over all cameras; it takes 15 s with Embree. Triangles that these
+rays miss are tested separately.
+"""
 RAYS_AT_ONCE = 2**20
+"""Number of rays per batch, which bounds the memory."""
 NEAR = 1e-3
-"""Scene units that may lie between a triangle's middle and what a ray towards it meets."""
+"""Largest distance, scene units, between the centres of a triangle and of the one that a ray towards it hits,
+for the triangle to count as visible.
+"""
 
 
 @torch.no_grad()
-def seen_faces(surface: Surface, cameras: Sequence[Camera]) -> Bool[np.ndarray, " F"]:
-    """The triangles whose outside a ray through a pixel meets first, or whose middle a camera has in view.
+def visible_faces(surface: Surface, cameras: Sequence[Camera]) -> Bool[np.ndarray, " F"]:
+    """Find the triangles whose outside is the first hit of a ray through a pixel, or whose centre is visible.
 
-    Large triangles are found by the pixels, triangles smaller than a pixel by their middles.
+    Rays through pixels find large triangles; rays to the centres find triangles smaller than a pixel.
 
     Args:
-        surface: triangles.
-        cameras: in the scene frame.
+        surface: the surface.
+        cameras: cameras in the scene frame.
     """
     tracer, mesh = first_hits(surface), surface.mesh()
     outward = torch.from_numpy(np.array(mesh.face_normals)).float()
-    middle = torch.from_numpy(np.array(mesh.triangles_center)).float()
-    seen = torch.zeros(len(surface.faces), dtype=torch.bool)
+    centre = torch.from_numpy(np.array(mesh.triangles_center)).float()
+    visible = torch.zeros(len(surface.faces), dtype=torch.bool)
     stride = math.ceil(sum(camera.width * camera.height for camera in cameras) / MAX_RAYS)
     for camera in cameras:
         rays = CameraRays([camera])
         for pixel in torch.arange(0, camera.width * camera.height, stride).split(RAYS_AT_ONCE):
             batch = rays(torch.zeros_like(pixel), pixel)
             face = tracer(batch.origins, batch.directions)
-            met = face >= 0
-            face, directions = face[met], batch.directions[met]
-            seen[face[(outward[face] * directions).sum(-1) < 0]] = True
+            is_hit = face >= 0
+            face, directions = face[is_hit], batch.directions[is_hit]
+            visible[face[(outward[face] * directions).sum(-1) < 0]] = True
     for camera in cameras:
         eye = torch.from_numpy(camera.c2w[:, 3]).float()
-        rows = torch.nonzero(~seen & (((eye - middle) * outward).sum(-1) > 0))[:, 0]
-        shown = project(camera, middle[rows])
-        size = shown.pixel.new_tensor([camera.width, camera.height])
-        rows = rows[(shown.depth > 0) & (shown.pixel >= 0).all(-1) & (shown.pixel < size).all(-1)]
-        for part in rows.split(RAYS_AT_ONCE):
-            towards = middle[part] - eye
-            face = tracer(eye.expand_as(towards), torch.nn.functional.normalize(towards, dim=-1))
-            # Next to an edge the ray may meet the neighbour.
-            beside = (middle[face.clamp_min(0)] - middle[part]).norm(dim=-1) < NEAR
-            seen[part[(face == part) | ((face >= 0) & beside)]] = True
-    return seen.numpy()
+        rows = torch.nonzero(~visible & (((eye - centre) * outward).sum(-1) > 0))[:, 0]
+        projected = project(camera, centre[rows])
+        size = projected.pixel.new_tensor([camera.width, camera.height])
+        in_image = (projected.depth > 0) & ((projected.pixel >= 0) & (projected.pixel < size)).all(-1)
+        for part in rows[in_image].split(RAYS_AT_ONCE):
+            direction = centre[part] - eye
+            face = tracer(eye.expand_as(direction), torch.nn.functional.normalize(direction, dim=-1))
+            # Near an edge the ray may hit the neighbouring triangle instead.
+            neighbour = (centre[face.clamp_min(0)] - centre[part]).norm(dim=-1) < NEAR
+            visible[part[(face == part) | ((face >= 0) & neighbour)]] = True
+    return visible.numpy()

@@ -13,19 +13,19 @@
 
   function show() {
     const view = +chosen("view"), layer = +chosen("layer");
-    const about = data.layers[layer], cell = about.cells[view];
-    const beside = { truth: cell.truth, photograph: data.photographs[view], error: cell.error };
-    for (const input of document.querySelectorAll("input[name=beside]")) input.disabled = !beside[input.value];
+    const { title, note, largest, cells } = data.layers[layer], cell = cells[view];
+    const pictures = { truth: cell.truth, photograph: data.photographs[view], error: cell.error };
+    for (const input of document.querySelectorAll("input[name=beside]")) input.disabled = !pictures[input.value];
     let kind = chosen("beside");
-    if (!beside[kind]) kind = "photograph";
-    before.src = beside[kind];
-    before.alt = `${about.title}, ${kind}, view ${data.names[view]}`;
+    if (!pictures[kind]) kind = "photograph";
+    before.src = pictures[kind];
+    before.alt = `${title}, ${kind}, view ${data.names[view]}`;
     after.src = strips[view].querySelectorAll("img")[layer].src;
-    after.alt = `${about.title}, estimate, view ${data.names[view]}`;
+    after.alt = `${title}, estimate, view ${data.names[view]}`;
     left.textContent = kind;
     right.textContent = "estimate";
-    const scale = kind === "error" ? ` The brightest error is ${about.largest} or more.` : "";
-    caption.textContent = `${about.title} (${about.note}), view ${data.names[view]}: ${kind} on the left, estimate on the right.${scale}`;
+    const scale = kind === "error" ? ` The brightest colour is an error of ${largest} or more.` : "";
+    caption.textContent = `${title} (${note}), view ${data.names[view]}: ${kind} on the left, estimate on the right.${scale}`;
     strips.forEach((strip, i) => { strip.hidden = i !== view; });
   }
   slider.addEventListener("input", () => stage.style.setProperty("--at", `${slider.value}%`));

@@ -2,10 +2,10 @@
 (() => {
   const block = document.getElementById("surface-data");
   if (!block) return;
-  const canvas = document.getElementById("surface-canvas"), said = document.getElementById("surface-said");
+  const canvas = document.getElementById("surface-canvas"), status = document.getElementById("surface-status");
   const gl = canvas.getContext("webgl2", { antialias: true, alpha: true });
   if (!gl) {
-    said.textContent = "This browser shows no WebGL 2, so the surface cannot be drawn here; neilfpp export writes it as a file.";
+    status.textContent = "This browser does not support WebGL 2, so the surface cannot be drawn here. neilfpp export writes it to a file.";
     return;
   }
   const data = JSON.parse(block.textContent);
@@ -14,7 +14,7 @@
     in vec3 position, normal, color; in vec2 material; uniform mat4 all; uniform vec3 low, high;
     out vec3 place, n, c; out vec2 m;
     void main() { place = mix(low, high, position); n = normal; c = color; m = material; gl_Position = all * vec4(place, 1.0); }`;
-  // "lit" is a preview under a light at the camera and a pale sky, no result of the run.
+  // "lit" is a preview under a light at the camera and a grey sky; it does not use the light of the run.
   const fragment = `#version 300 es
     precision highp float; in vec3 place, n, c; in vec2 m; uniform vec3 eye; uniform int layer; out vec4 shown;
     void main() {
@@ -35,7 +35,7 @@
   }
   gl.linkProgram(program);
   if (!gl.getProgramParameter(program, gl.LINK_STATUS)) {
-    said.textContent = `The surface cannot be drawn here: ${gl.getProgramInfoLog(program)}`;
+    status.textContent = `The surface cannot be drawn here: ${gl.getProgramInfoLog(program)}`;
     return;
   }
   gl.useProgram(program);
@@ -57,13 +57,13 @@
   const centre = data.low.map((low, i) => (low + data.high[i]) / 2);
   const radius = Math.hypot(...data.low.map((low, i) => data.high[i] - low)) / 2;
   const start = { turn: 0.6, lift: 0.45, far: 2.7 };
-  let state = { ...start }, turning = !matchMedia("(prefers-reduced-motion: reduce)").matches, visible = false, asked = false;
+  let state = { ...start }, turning = !matchMedia("(prefers-reduced-motion: reduce)").matches, visible = false, scheduled = false;
 
   const minus = (a, b) => a.map((x, i) => x - b[i]), dot = (a, b) => a.reduce((s, x, i) => s + x * b[i], 0);
   const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
   const unit = (a) => a.map((x) => x / Math.hypot(...a));
   function draw() {
-    asked = false;
+    scheduled = false;
     const ratio = Math.min(devicePixelRatio || 1, 2), width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
     if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
     const far = state.far * radius, { turn, lift } = state;
@@ -81,11 +81,11 @@
     gl.uniform3fv(place("low"), data.low); gl.uniform3fv(place("high"), data.high); gl.uniform3fv(place("eye"), eye);
     gl.uniform1i(place("layer"), +document.querySelector("input[name=surface-layer]:checked").value);
     gl.drawElements(gl.TRIANGLES, 3 * data.faces, gl.UNSIGNED_INT, 0);
-    if (turning && visible) { state.turn += 0.006; ask(); }
+    if (turning && visible) { state.turn += 0.006; schedule(); }
   }
-  function ask() { if (!asked) { asked = true; requestAnimationFrame(draw); } }
+  function schedule() { if (!scheduled) { scheduled = true; requestAnimationFrame(draw); } }
   const pause = document.getElementById("surface-pause");
-  function turn(on) { turning = on; pause.textContent = on ? "Stop turning" : "Turn"; ask(); }
+  function turn(on) { turning = on; pause.textContent = on ? "Stop rotation" : "Rotate"; schedule(); }
   function move(turned, lifted, zoom = 1) {
     state.turn += turned;
     state.lift = Math.min(1.5, Math.max(-1.5, state.lift + lifted));
@@ -95,17 +95,18 @@
   canvas.addEventListener("pointerdown", (event) => canvas.setPointerCapture(event.pointerId));
   canvas.addEventListener("pointermove", (event) => { if (event.buttons) move(-0.008 * event.movementX, 0.008 * event.movementY); });
   canvas.addEventListener("wheel", (event) => {
-    if (!event.ctrlKey && document.activeElement !== canvas) return; // the page scrolls until the surface is chosen
+    // Until the canvas has the focus, the wheel scrolls the page.
+    if (!event.ctrlKey && document.activeElement !== canvas) return;
     event.preventDefault();
     move(0, 0, Math.exp(0.001 * event.deltaY));
   }, { passive: false });
   const keys = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1], "+": [0, 0, 0.9], "-": [0, 0, 1.1] };
   canvas.addEventListener("keydown", (event) => { if (keys[event.key]) { event.preventDefault(); move(...keys[event.key]); } });
-  document.getElementById("surface").addEventListener("change", ask);
+  document.getElementById("surface").addEventListener("change", schedule);
   pause.addEventListener("click", () => turn(!turning));
-  document.getElementById("surface-reset").addEventListener("click", () => { state = { ...start }; ask(); });
-  new ResizeObserver(ask).observe(canvas);
-  new IntersectionObserver((entries) => { visible = entries[0].isIntersecting; ask(); }).observe(canvas);
+  document.getElementById("surface-reset").addEventListener("click", () => { state = { ...start }; schedule(); });
+  new ResizeObserver(schedule).observe(canvas);
+  new IntersectionObserver((entries) => { visible = entries[0].isIntersecting; schedule(); }).observe(canvas);
   turn(turning);
-  said.textContent = `${data.faces.toLocaleString("en")} triangles. Drag or use the arrow keys to turn, + and − to come nearer.`;
+  status.textContent = `${data.faces.toLocaleString("en")} triangles. Drag or press the arrow keys to rotate; press + or − to zoom.`;
 })();

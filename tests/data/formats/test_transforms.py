@@ -244,7 +244,7 @@ def frame(content: dict) -> dict:
         (lambda c: c.update(w=1e400), ["w: not a finite number"]),
         (lambda c: c.update(w=48), ["24×18 pixels where the camera has 48×18"]),
         (lambda c: c.update(camera_model="EQUIRECTANGULAR"), ["camera_model: not OPENCV or"]),
-        (lambda c: c.update(k4=0.1), ["k4 has a meaning for OPENCV_FISHEYE only"]),
+        (lambda c: c.update(k4=0.1), ["k4 is supported for OPENCV_FISHEYE only"]),
         (lambda c: c["frames"].append(frame(c)), ["have the same name"]),
     ],
 )

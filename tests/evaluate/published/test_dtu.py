@@ -133,7 +133,7 @@ def test_the_mask_the_box_and_the_plane_choose_the_points():
 
 
 def test_nothing_where_the_scanner_looked_is_told():
-    with pytest.raises(UserError, match="where the scanner looked"):
+    with pytest.raises(UserError, match="that the scanner observed"):
         chamfer_of_scan(triangle() + 1000, FACE, scan(triangle()))
     with pytest.raises(UserError, match="within 20 mm"):
         chamfer_of_scan(triangle(), FACE, scan(triangle() + np.array([0, 0, 400])))
@@ -175,11 +175,11 @@ def test_damaged_and_missing_files_are_named(capture, tmp_path):
     with pytest.raises(UserError, match=r"Plane24\.mat: cannot be read"):
         read_scan(capture)
     plane.unlink()
-    with pytest.raises(UserError, match=r"ObsMask/Plane24\.mat is neither in this folder nor beside it"):
+    with pytest.raises(UserError, match=r"ObsMask/Plane24\.mat is neither in this folder nor in its parent"):
         PROTOCOLS["dtu"].check(make_run(capture))
 
 
 def test_a_folder_without_a_number_is_refused(tmp_path):
     capture = load_capture(make_capture(tmp_path / "ball"))
-    with pytest.raises(UserError, match="number of the scan from the folder's name"):
+    with pytest.raises(UserError, match="number of the scan from the name of the folder"):
         PROTOCOLS["dtu"].check(make_run(capture))

@@ -114,7 +114,7 @@ def test_neilf_synthetic_is_the_official_formula(run, root):
 def test_known_answers():
     assert median_gamma(np.full((4, 3), 0.5), np.full((4, 3), 0.25)) == pytest.approx(2.0)  # 0.5² = 0.25
     assert aces(np.full((1, 1, 3), 1.0)) == pytest.approx(2.54 / 3.16)
-    with pytest.raises(UserError, match="no gamma"):
+    with pytest.raises(UserError, match="needs a median base colour"):
         median_gamma(np.full((4, 3), 0.5), np.zeros((4, 3)))
 
 

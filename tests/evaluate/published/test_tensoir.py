@@ -138,5 +138,5 @@ def test_what_is_missing_is_named(tmp_path, truth):
         PROTOCOL.check(run)
     assert "test_002/normal.png" in told.value.remedy
     write_png(tmp_path / "c" / "test_002" / "normal.png", np.zeros((3, 4, 3), np.uint8))
-    with pytest.raises(UserError, match="4×3 pixels where the view has 16×14"):
+    with pytest.raises(UserError, match="4×3 pixels, but the view has 16×14"):
         PROTOCOL.measure(run, [random_view(name, HEIGHT, WIDTH, i) for i, name in enumerate(truth)])

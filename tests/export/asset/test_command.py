@@ -55,7 +55,7 @@ def test_an_asset_of_a_given_mesh(given, tmp_path, capfd):
     said = capfd.readouterr()
     assert said.err == ""
     for words in (
-        "triangles were seen and stay",
+        "triangles, which cameras see",
         "simplified: ",
         "charts on",
         f"written to {tmp_path / 'asset'}",
@@ -90,11 +90,11 @@ def test_an_asset_of_a_given_mesh(given, tmp_path, capfd):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--texture-size", "32"], ("a texture of 32 texels", "64 to 8192")),
-        (["--texture-size", "100000"], ("a texture of 100000 texels",)),
-        (["--faces", "3"], ("an asset of 3 triangles", "--faces")),
-        (["--error", "-1"], ("--error -1",)),
-        (["--error", "nan"], ("--error nan",)),
+        (["--texture-size", "32"], ("a texture cannot have 32 texels", "64 to 8192")),
+        (["--texture-size", "100000"], ("a texture cannot have 100000 texels",)),
+        (["--faces", "3"], ("an asset cannot have 3 triangles", "--faces")),
+        (["--error", "-1"], ("--error cannot be -1",)),
+        (["--error", "nan"], ("--error cannot be nan",)),
         (["--out", "FILE/out"], ("cannot be written",)),
     ],
 )

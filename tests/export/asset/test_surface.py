@@ -9,10 +9,10 @@ import trimesh
 
 from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
-from neilfpp_method.export.asset.clean import HOLE, clean, close_holes, keep_seen, without_crumbs
+from neilfpp_method.export.asset.clean import HOLE, clean, close_holes, keep_visible, remove_small_components
 from neilfpp_method.export.asset.simplify import distance_between, simplified
 from neilfpp_method.export.asset.surface import Surface, creased, first_hits, meet_along
-from neilfpp_method.export.asset.visible import seen_faces
+from neilfpp_method.export.asset.visible import visible_faces
 
 
 def surface(*shapes: trimesh.Trimesh) -> Surface:
@@ -40,7 +40,7 @@ def ball(centre: tuple[float, float, float], radius: float, subdivisions: int = 
 def test_a_camera_above_sees_the_upper_part(size):
     """Also where triangles are far smaller than its pixels."""
     shape = surface(ball((0, 0, 0), 0.5))
-    seen = seen_faces(shape, [camera(2.0, size)])
+    seen = visible_faces(shape, [camera(2.0, size)])
     # From 2 the horizon of a ball of radius 0.5 is at z = 0.5² / 2; triangles are 0.08 across.
     middle = shape.mesh().triangles_center[:, 2]
     assert seen[middle > 0.125 + 0.04].all()
@@ -49,7 +49,7 @@ def test_a_camera_above_sees_the_upper_part(size):
 
 def test_what_stands_behind_or_beside_the_picture_is_not_seen():
     near, behind, beside = ball((0, 0, 0), 0.5), ball((0, 0, -0.9), 0.2), ball((3, 0, 0), 0.2)
-    seen = seen_faces(surface(near, behind, beside), [camera(2.0)])
+    seen = visible_faces(surface(near, behind, beside), [camera(2.0)])
     first, second, third = np.split(seen, np.cumsum([len(near.faces), len(behind.faces)]))
     assert first.any()
     assert not second.any()
@@ -59,7 +59,7 @@ def test_what_stands_behind_or_beside_the_picture_is_not_seen():
 def test_the_inside_of_a_surface_is_not_seen():
     turned = ball((0, 0, 0), 0.5)
     turned.invert()
-    assert not seen_faces(surface(turned), [camera(2.0)]).any()
+    assert not visible_faces(surface(turned), [camera(2.0)]).any()
 
 
 # ----------------------------------------------------------------------------------------------- what is kept
@@ -71,14 +71,14 @@ def test_unseen_patches_go_unless_they_are_small():
     # A cap of 0.04 across that nobody saw stays; all below the equator goes, but for a ring.
     top = shape.mesh().triangles_center[z.argmax()]
     seen = (z > 0) & (np.linalg.norm(shape.mesh().triangles_center - top, axis=1) > 0.4 * HOLE)
-    kept = keep_seen(shape, seen).mesh()
+    kept = keep_visible(shape, seen).mesh()
     assert kept.triangles_center[:, 2].min() > -0.1
     assert 2 * np.pi * 0.25 < kept.area < 2 * np.pi * 0.25 + 2 * np.pi * 0.5 * 0.06
     assert (np.linalg.norm(kept.triangles_center - top, axis=1) < 1e-9).any()
 
 
 def test_crumbs_go():
-    kept = without_crumbs(surface(ball((0, 0, 0), 0.5), ball((1, 0, 0), 0.1), ball((0, 1, 0), 0.01)))
+    kept = remove_small_components(surface(ball((0, 0, 0), 0.5), ball((1, 0, 0), 0.1), ball((0, 1, 0), 0.01)))
     assert kept.mesh().bounds[:, 0] == pytest.approx([-0.5, 1.1], abs=0.01)
     assert kept.mesh().bounds[1, 1] < 0.6
 
@@ -99,7 +99,7 @@ def test_small_holes_are_closed_and_large_ones_stay():
         found = meet_along(
             closed, tracer, np.array([[0.004, 0.003, height]]), np.array([[0.0, 0.0, np.sign(height)]]), 0.7
         )
-        assert found.found[0] == met
+        assert found.valid[0] == met
 
 
 def test_nothing_seen_is_an_error():
@@ -119,14 +119,14 @@ def test_points_come_down_on_the_surface_that_faces_their_way():
     found = meet_along(
         shape, first_hits(shape), np.array([[0.1, 0.2, 0.03]]), np.array([[0.0, 0.0, 1.0]]), 0.2
     )
-    assert found.found.all()
+    assert found.valid.all()
     np.testing.assert_allclose(found.position, [[0.1, 0.2, 0.01]], atol=1e-6)
     np.testing.assert_allclose(found.distance, 0.02, atol=1e-6)
     np.testing.assert_allclose(found.normal, [[0, 0, 1]], atol=1e-6)
     short = meet_along(
         shape, first_hits(shape), np.array([[0.1, 0.2, 0.03]]), np.array([[0.0, 0.0, 1.0]]), 0.015
     )
-    assert not short.found.any()
+    assert not short.valid.any()
     np.testing.assert_allclose(short.position, [[0.1, 0.2, 0.03]], atol=1e-6)
 
 

@@ -2,8 +2,8 @@
 
     python open_in_mitsuba.py 003.exr --camera 003 --samples 256
 
-`scene(camera)` is the dictionary for `mitsuba.load_dict`. Choose a variant first, such as
-`mitsuba.set_variant("llvm_ad_rgb")`.
+As a module: `scene(camera)` returns the dictionary for `mitsuba.load_dict`. Set a variant first, for example
+with `mitsuba.set_variant("llvm_ad_rgb")`.
 """
 
 import argparse
@@ -20,34 +20,34 @@ def main():
     parser = argparse.ArgumentParser(
         prog="open_in_mitsuba.py", description="Render an exported asset with Mitsuba 3."
     )
-    parser.add_argument("out", type=Path, help="EXR file, linear")
-    parser.add_argument("--camera", help="name of a view; the first one where none is given")
+    parser.add_argument("out", type=Path, help="EXR file to write (linear)")
+    parser.add_argument("--camera", help="name of a view (default: the first one)")
     parser.add_argument("--samples", type=int, default=128, help="samples per pixel")
-    parser.add_argument("--variant", default="scalar_rgb", help="of Mitsuba")
+    parser.add_argument("--variant", default="scalar_rgb", help="variant of Mitsuba")
     options = parser.parse_args()
-    names = [camera["name"] for camera in described()["cameras"]]
+    names = [camera["name"] for camera in read_scene_file()["cameras"]]
     if options.camera not in [None, *names]:
         parser.error(f"no camera {options.camera!r}; there are {', '.join(names)}")
     mi.set_variant(options.variant)
-    picture = mi.render(mi.load_dict(scene(options.camera or names[0])), spp=options.samples)
-    mi.Bitmap(picture).write(str(options.out))
+    image = mi.render(mi.load_dict(scene(options.camera or names[0])), spp=options.samples)
+    mi.Bitmap(image).write(str(options.out))
 
 
-def described():
+def read_scene_file():
     return json.loads((HERE / "scene.json").read_text())
 
 
 def scene(camera):
-    """Everything, and the view of this name."""
-    contents = described()
+    """Return the scene with the camera of the given name."""
+    contents = read_scene_file()
     parts = {"type": "scene", "integrator": {"type": "path", "max_depth": 8}, "surface": surface()}
     if contents["environment"]:
-        # Mitsuba lays maps out as we do, about an axis that is Y until it is turned.
-        turn = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+        # Mitsuba's layout of environment maps is the same, but its up axis is Y.
+        y_to_z = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
         parts["environment"] = {
             "type": "envmap",
             "filename": str(HERE / contents["environment"]["ours"]),
-            "to_world": turn,
+            "to_world": y_to_z,
         }
     for number, lamp in enumerate(contents["lamps"]):
         parts[f"lamp_{number}"] = lamp_shape(lamp)
@@ -63,13 +63,13 @@ def surface():
         "metallic": {"type": "bitmap", "filename": texture("metallic"), "raw": True},
     }
     normals = {"type": "bitmap", "filename": texture("normal"), "raw": True}
-    bumpy = {"type": "normalmap", "normalmap": normals, "bsdf": bsdf}
-    # Where nobody looked the surface is open, and shows its inside.
+    normal_mapped = {"type": "normalmap", "normalmap": normals, "bsdf": bsdf}
+    # The surface is open at parts that no camera sees, so its inside can be visible.
     return {
         "type": "ply",
         "filename": str(HERE / "mesh.ply"),
         "flip_tex_coords": True,
-        "bsdf": {"type": "twosided", "nested": bumpy},
+        "bsdf": {"type": "twosided", "nested": normal_mapped},
     }
 
 
@@ -78,7 +78,7 @@ def texture(name):
 
 
 def lamp_shape(lamp):
-    """A bulb is a sphere of this radiance, a panel a disk, whose light falls with the cosine."""
+    """Return a bulb as a sphere or a panel as a disk, with constant radiance."""
     emitter = {"type": "area", "radiance": {"type": "rgb", "value": lamp["radiance"]}}
     if lamp["axis"] is None:
         return {"type": "sphere", "center": lamp["position"], "radius": lamp["radius"], "emitter": emitter}
@@ -90,8 +90,11 @@ def lamp_shape(lamp):
 
 
 def sensor(camera):
-    """Mitsuba's cameras have x to the left and y up. Its pixels are square: where the capture's are not, the
-    picture has another number of rows for the same view. A lens is left out."""
+    """Return a camera without lens distortion. Mitsuba's cameras have x to the left and y up.
+
+    Mitsuba's pixels are square. If those of the capture are not, the number of rows is changed so that the
+    field of view stays the same.
+    """
     flip = mi.ScalarTransform4f().scale([-1, -1, 1])
     width, height = camera["width"], round(camera["height"] * camera["fx"] / camera["fy"])
     return {

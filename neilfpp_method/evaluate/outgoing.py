@@ -1,4 +1,4 @@
-"""Radiance that surface points send to their viewers by a model: as found, and with other materials."""
+"""Outgoing radiance of surface points towards their viewers, for the estimated material and for any other."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.evaluate.patches import PatchLight, by_patch, patch_count
-from neilfpp_method.evaluate.posterior import ROUGHNESS_NODES, Looks
+from neilfpp_method.evaluate.posterior import ROUGHNESS_NODES, RadianceParts
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading.brdf import Cosines, cosines, diffuse_reflectance, normal_reflectance
 from neilfpp_method.structures import Material
 
-__all__ = ["possible_looks", "sent_by_patch"]
+__all__ = ["radiance_parts", "sent_by_patch"]
 
 
 @torch.no_grad()
@@ -25,7 +25,18 @@ def sent_by_patch(
     normal: Float[Tensor, "N 3"],
     wo: Float[Tensor, "N V 3"],
 ) -> Float[Tensor, "N V 3 K"]:
-    """The radiance that leaves each point towards each viewer, by the patch that it came from."""
+    """Compute the radiance that leaves each point towards each viewer, split by the patch it came from.
+
+    Args:
+        model: supplies the BRDF lobe and the number of patches K.
+        incident: light that arrives at the N points.
+        material: material of the points.
+        normal: unit normals.
+        wo: unit directions to V viewers.
+
+    Returns:
+        Linear radiance; the sum over the last axis is the outgoing radiance.
+    """
     specular, patches = model.config.shading.specular, patch_count(model)
     kd, f0 = diffuse_reflectance(material, specular)[:, None], normal_reflectance(material)[:, None]
     sent = []
@@ -33,40 +44,40 @@ def sent_by_patch(
         reflected = kd / math.pi
         if specular:
             cos = cosines(normal, direction, incident.wi)
-            steep = _steepness(cos)[..., None]
-            reflected = reflected + _lobe(model, cos, material.roughness)[..., None] * (
-                f0 * (1 - steep) + steep
-            )
+            schlick = _schlick(cos)[..., None]
+            fresnel = f0 * (1 - schlick) + schlick
+            reflected = reflected + _lobe(model, cos, material.roughness)[..., None] * fresnel
         sent.append(by_patch(incident.light * reflected, incident.patch, patches))
     return torch.stack(sent, 1)
 
 
 @torch.no_grad()
-def possible_looks(
+def radiance_parts(
     model: NeilfModel, incident: PatchLight, normal: Float[Tensor, "N 3"], wo: Float[Tensor, "N V 3"]
-) -> Looks:
-    """What points would send whatever they are made of; no specular part where the model has none."""
+) -> RadianceParts:
+    """Compute the parts from which `posterior` composes the outgoing radiance for any material.
+
+    The specular parts are zero if the model's shading is Lambertian.
+    """
     diffuse = incident.light.sum(1) / math.pi
     nodes = diffuse.new_tensor(ROUGHNESS_NODES)[:, None, None].expand(-1, len(diffuse), 1)
     facing = diffuse.new_zeros(len(diffuse), wo.shape[1], len(nodes), 3)
     grazing = torch.zeros_like(facing)
     for v, direction in enumerate(wo.unbind(1) if model.config.shading.specular else ()):
         cos = cosines(normal, direction, incident.wi)
-        steep = _steepness(cos)[..., None]
-        toward = torch.cat((incident.light * (1 - steep), incident.light * steep), -1)
+        schlick = _schlick(cos)[..., None]
+        light = torch.cat((incident.light * (1 - schlick), incident.light * schlick), -1)
         lobes = torch.stack([_lobe(model, cos, roughness) for roughness in nodes], 1)
-        facing[:, v], grazing[:, v] = (lobes @ toward).split(3, -1)
-    return Looks(diffuse, facing, grazing)
+        facing[:, v], grazing[:, v] = (lobes @ light).split(3, -1)
+    return RadianceParts(diffuse, facing, grazing)
 
 
 def _lobe(model: NeilfModel, cos: Cosines, roughness: Float[Tensor, "N 1"]) -> Float[Tensor, "N S"]:
-    """D V of a microfacet lobe."""
-    lobe = model.lobe
-    return lobe.distribution(cos.h, roughness) * lobe.visibility(
-        cos.i.clamp_min(0), cos.o.clamp_min(0), roughness
-    )
+    """Microfacet distribution times visibility term, D V."""
+    distribution = model.lobe.distribution(cos.h, roughness)
+    return distribution * model.lobe.visibility(cos.i.clamp_min(0), cos.o.clamp_min(0), roughness)
 
 
-def _steepness(cos: Cosines) -> Float[Tensor, "N S"]:
+def _schlick(cos: Cosines) -> Float[Tensor, "N S"]:
     """(1 − ωo·h)⁵ of Schlick's Fresnel term."""
     return (1 - cos.d).pow(5)

@@ -1,4 +1,4 @@
-"""An asset's scene as JSON for the scripts that open it: files, cameras, lamps, in the capture's world."""
+"""The description of an asset's scene that its scripts read: files, cameras and lamps, in the world frame."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from neilfpp_method.train.run import Run
 __all__ = ["describe_scene"]
 
 FORMAT = 1
+"""Version of the format of scene.json."""
 
 
 def describe_scene(run: Run, environment: bool) -> dict[str, Any]:
-    """`scene.json`: see docs/assets.md.
+    """Build the contents of `scene.json` (docs/assets.md).
 
     Args:
         run: the run.
@@ -39,7 +40,10 @@ def describe_scene(run: Run, environment: bool) -> dict[str, Any]:
 
 
 def _camera(view: View, split: str) -> dict[str, Any]:
-    """Focal lengths and principal point in pixels; OpenCV axes; what a lens bends is left out."""
+    """A camera with focal lengths and principal point in pixels and OpenCV axes.
+
+    The distortion of a lens is not described; only the name of its model is.
+    """
     camera = view.camera
     return {
         "name": view.name,

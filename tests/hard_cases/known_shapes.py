@@ -1,0 +1,113 @@
+"""Shapes that are hard to find, as exact distances in float64 NumPy, and pixels that see them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+Array = np.ndarray
+Distance = Callable[[Array], Array]
+
+CAMERAS = 3.0
+"""Distance of the cameras from the origin, scene units; the shapes lie in the unit ball."""
+STEPS, CLOSE = 128, 1e-5
+"""Steps of the sphere tracing, and the distance at which a ray has met the surface."""
+LIGHT = np.array([0.48, 0.6, 0.64])
+
+
+def box(x: Array, half: tuple[float, float, float], centre: tuple[float, float, float] = (0, 0, 0)) -> Array:
+    beyond = np.abs(x - np.array(centre)) - np.array(half)
+    return np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(-1), 0)
+
+
+def ball(x: Array, radius: float, centre: tuple[float, float, float] = (0, 0, 0)) -> Array:
+    return np.linalg.norm(x - np.array(centre), axis=-1) - radius
+
+
+def plate(x: Array) -> Array:
+    """A square plate, 1.2 wide and 0.06 thick."""
+    return box(x, (0.6, 0.6, 0.03))
+
+
+def wire(x: Array) -> Array:
+    """A straight wire, 1.2 long and 0.08 thick."""
+    along = np.clip(x[..., :1], -0.6, 0.6) * np.array([1.0, 0.0, 0.0])
+    return np.linalg.norm(x - along, axis=-1) - 0.04
+
+
+def crevice(x: Array) -> Array:
+    """Two boxes with a gap of 0.1 between them."""
+    return np.minimum(box(x, (0.25, 0.5, 0.4), (-0.3, 0, 0)), box(x, (0.25, 0.5, 0.4), (0.3, 0, 0)))
+
+
+def two_balls(x: Array) -> Array:
+    """Two balls that touch at the origin."""
+    return np.minimum(ball(x, 0.4, (-0.4, 0, 0)), ball(x, 0.4, (0.4, 0, 0)))
+
+
+def bowl(x: Array) -> Array:
+    """Half a shell, 0.12 thick, open above: the intersection's distance is exact but for its rim."""
+    return np.maximum(np.abs(ball(x, 0.6)) - 0.06, x[..., 2])
+
+
+def small(x: Array) -> Array:
+    """A ball that fills a twentieth of the frame of `photograph`."""
+    return ball(x, 0.23)
+
+
+SHAPES: Mapping[str, Distance] = {
+    "thin plate": plate,
+    "wire": wire,
+    "crevice": crevice,
+    "two touching balls": two_balls,
+    "concave bowl": bowl,
+    "a twentieth of the frame": small,
+}
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Rays (N, 3) and what they meet: `hit`, `position`, `normal`, and the linear radiance that they see."""
+
+    origins: Array
+    directions: Array
+    hit: Array
+    position: Array
+    normal: Array
+    color: Array
+
+
+def photograph(shape: Distance, count: int, views: int = 24, seed: int = 0) -> Seen:
+    """Random pixels of so many cameras around a shape, each with a frame 2 wide at the origin.
+
+    What the surface sends to every viewer changes with position and normal; beside it there is nothing.
+    """
+    rng = np.random.default_rng(seed)
+    turn = np.arange(views) * np.pi * (3 - np.sqrt(5))
+    height = 0.9 * (1 - (2 * np.arange(views) + 1) / views)
+    around = np.stack((np.cos(turn), np.sin(turn), height / np.sqrt(1 - height**2)), -1)
+    around /= np.linalg.norm(around, axis=-1, keepdims=True)
+    view = rng.integers(views, size=count)
+    origins = CAMERAS * around[view]
+    right = np.cross(around, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    across, up = rng.uniform(-1, 1, (2, count, 1))
+    directions = across * right[view] + up * np.cross(right, around)[view] - origins
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    distance = np.full(count, CAMERAS - 1.5)
+    for _ in range(STEPS):
+        distance = distance + np.minimum(shape(origins + distance[:, None] * directions), 0.5)
+    position = origins + distance[:, None] * directions
+    hit = np.abs(shape(position)) < 100 * CLOSE
+    normal = np.where(hit[:, None], gradient(shape, position), 0.0)
+    color = (0.5 + 0.3 * np.sin(5 * position)) * (0.4 + 0.6 * np.maximum(normal @ LIGHT, 0))[:, None]
+    return Seen(origins, directions, hit, position, normal, np.where(hit[:, None], color, 0.0))
+
+
+def gradient(shape: Distance, position: Array) -> Array:
+    """The unit gradient by central differences."""
+    step = CLOSE * np.eye(3)
+    slope = np.stack([shape(position + axis) - shape(position - axis) for axis in step], -1)
+    return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-12)

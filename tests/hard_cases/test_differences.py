@@ -1,0 +1,125 @@
+"""Forward and backward of whole renders and whole steps against finite differences, in float64.
+
+Where rays are sampled, and from where light arrives, follows the parameters without gradient; samples are
+therefore drawn once and kept while the parameters move. Directions of the space of all parameters of a field
+are drawn at random: the slope along each by autograd agrees with the difference of two renders.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from types import ModuleType
+
+import pytest
+import torch
+from torch import Tensor
+
+import neilfpp_method.hosts.volsdf as volsdf_module
+import neilfpp_method.model as model_module
+from neilfpp_method.model import NeilfModel
+from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.structures import PixelBatch
+from tests.scenes import sphere_batch, sphere_model, tiny_config
+from tests.train.small_runs import solved_light
+
+STEP = 1e-6
+"""Length of the step in the parameters: rounding of float64 then changes a slope of 1 by 1e-9."""
+
+
+def keep_first(monkeypatch: pytest.MonkeyPatch, module: ModuleType, name: str) -> None:
+    """A function returns at every call what it returned first."""
+    function, kept = getattr(module, name), []
+
+    def once(*args, **kwargs):
+        if not kept:
+            kept.append(function(*args, **kwargs))
+        return kept[0]
+
+    monkeypatch.setattr(module, name, once)
+
+
+@pytest.fixture
+def samples_stay(monkeypatch):
+    keep_first(monkeypatch, volsdf_module, "error_bounded_samples")
+    keep_first(monkeypatch, model_module, "draw_directions")
+
+
+def small_model(light: str) -> NeilfModel:
+    """Gradients are not scaled, and a ray counts as a hit if it meets anything."""
+    config = tiny_config() if light == "free" else solved_light(tiny_config())
+    config = dataclasses.replace(
+        config,
+        # L_Hess is computed about hits that count as constants, so its slope is not that of a difference.
+        loss=dataclasses.replace(
+            config.loss, position_gradient=1.0, normal_gradient=1.0, hessian=0.0, hessian_joint=0.0
+        ),
+        volume=dataclasses.replace(config.volume, normal_radius=0.0),
+        inter_reflection=dataclasses.replace(config.inter_reflection, mode="off"),
+        shading=dataclasses.replace(config.shading, hit_share=0.3),
+    )
+    model = sphere_model(config).double().train()
+    with torch.no_grad():  # away from the start, where weights are exactly 0
+        for parameters in model.parameter_groups().values():
+            for p in parameters:
+                p.add_(0.01 * torch.randn_like(p))
+    return model
+
+
+def pixels() -> PixelBatch:
+    batch = sphere_batch(24)
+    floats = {f.name: getattr(batch, f.name) for f in dataclasses.fields(batch) if f.name != "view"}
+    return dataclasses.replace(batch, **{name: value.double() for name, value in floats.items()})
+
+
+def assert_slopes(model: NeilfModel, value: Callable[[], Tensor], moves: frozenset[str]) -> None:
+    """The slope of `value` along random directions of each field's parameters, both ways."""
+    groups = {name: p for name, p in model.parameter_groups().items() if name in moves}
+    slopes = {}
+    for name, parameters in groups.items():
+        gradient = torch.autograd.grad(value(), parameters, allow_unused=True, materialize_grads=True)
+        torch.manual_seed(7)
+        direction = [torch.randn_like(p) for p in parameters]
+        along = sum((g * d).sum() for g, d in zip(gradient, direction, strict=True)).item()
+        ends = []
+        for sign in (1.0, -1.0):
+            with torch.no_grad():
+                for p, d in zip(parameters, direction, strict=True):
+                    p.add_(sign * STEP * d)
+                ends.append(value().item())
+                for p, d in zip(parameters, direction, strict=True):
+                    p.sub_(sign * STEP * d)
+        slopes[name] = (along, (ends[0] - ends[1]) / (2 * STEP))
+    assert any(abs(along) > 1e-4 for along, _ in slopes.values()), slopes
+    for name, (along, difference) in slopes.items():
+        assert along == pytest.approx(difference, rel=1e-3, abs=1e-6), (name, slopes)
+
+
+@pytest.mark.parametrize("output", ["color", "position", "normal", "opacity"])
+def test_renders_of_the_host(samples_stay, output):
+    model, batch = small_model("free"), pixels()
+    torch.manual_seed(3)
+    weight = torch.randn_like(getattr(model.host.render(batch.rays), output))
+
+    def value() -> Tensor:
+        return (weight * getattr(model.host.render(batch.rays), output)).sum()
+
+    moves = frozenset(model.parameter_groups()) - {"brdf", "light"}
+    assert_slopes(model, value, moves)
+
+
+@pytest.mark.parametrize("light", ["free", "map"])
+@pytest.mark.parametrize("stage", list(Stage))
+def test_losses_of_a_step(samples_stay, light, stage):
+    """All losses of a stage together, with their weights, and all fields that the stage moves."""
+    model, batch = small_model(light), pixels()
+    model.freeze_for(stage)
+    weights = active_losses(stage, model.config, model.stages)
+
+    def value() -> Tensor:
+        torch.manual_seed(5)
+        return weigh(model.losses(batch, stage), weights).loss
+
+    moves = model.stages[stage].moves & set(model.parameter_groups())
+    moves = frozenset(name for name in moves if model.parameter_groups()[name])
+    assert_slopes(model, value, moves)

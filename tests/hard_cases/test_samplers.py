@@ -1,0 +1,57 @@
+"""Every sampler against the density that it reports, with a million samples each (χ², Šidák-corrected)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from neilfpp_method.fields.direction_map import texels_of
+from neilfpp_method.fields.environment import EnvironmentLight
+from neilfpp_method.shading import sample_directions
+from neilfpp_method.shading.brdf import LOBES
+from tests import oracles
+from tests.hard_cases.known_ball import sky
+from tests.shading.test_sampling import NORMALS, density, points
+
+POINTS, PER_POINT = 100_000, 10
+CASES = [
+    ("fibonacci", "ggx"),
+    ("cosine", "ggx"),
+    *((kind, lobe) for kind in ("lobe", "mis") for lobe in LOBES),
+]
+TESTS = len(CASES) * len(NORMALS) + 1
+"""Tests of this module: all of them together fail by chance once in a hundred times."""
+ROUGHNESS = 0.35
+
+
+@pytest.mark.hard
+@pytest.mark.parametrize("view", NORMALS)
+@pytest.mark.parametrize(("kind", "lobe"), CASES)
+def test_a_million_directions(kind, lobe, view):
+    torch.manual_seed(11)
+    many = points(NORMALS[view], (0.0, 0.0, 1.0), POINTS, ROUGHNESS)
+    one = tuple(t[:1] for t in many)
+    result = oracles.chi2_test(
+        lambda: sample_directions(kind, *many, PER_POINT, LOBES[lobe], True).wi.reshape(-1, 3).numpy(),
+        lambda wi: density(kind, LOBES[lobe], torch.from_numpy(wi)[None], *one)[0].numpy(),
+        tests=TESTS,
+    )
+    assert result.passed, result
+
+
+@pytest.mark.hard
+def test_a_million_directions_of_a_map():
+    """The cells are the texels of the map, on each of which the density is constant."""
+    torch.manual_seed(12)
+    light = EnvironmentLight(16, 1.0)
+    light.show(torch.from_numpy(sky()).float().permute(2, 0, 1))
+    middle = light.texel_directions(torch.zeros(1, 3))
+    share = (light.pdf(middle.wi)[0] * middle.solid_angle).double().numpy()
+    assert share.sum() == pytest.approx(1, abs=1e-4)
+    drawn = light.sample(torch.zeros(POINTS, 3), PER_POINT, stochastic=True).wi
+    counted = np.bincount(texels_of(drawn, 16, 32).reshape(-1).numpy(), minlength=512)
+    expected = share / share.sum() * counted.sum()
+    p_value = stats.chisquare(counted, expected).pvalue
+    assert p_value > 1 - 0.99 ** (1 / TESTS)
