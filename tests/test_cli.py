@@ -497,6 +497,18 @@ def test_a_place_that_cannot_be_written(tmp_path, capfd, capture, trained, name)
 
 
 @pytest.mark.parametrize(
+    ("command", "is_file"),
+    [(["export", "--what", "asset"], True), (["render"], True), (["eval"], False), (["report"], False)],
+)
+def test_a_file_where_a_folder_is_wanted_and_the_reverse(tmp_path, capfd, trained, command, is_file):
+    out = tmp_path / "out"
+    out.write_text("") if is_file else out.mkdir()
+    complaint = "is a file; name a folder" if is_file else "is a folder; name a file"
+    name, *rest = command
+    refused(capfd, [name, trained, "--out", out, "--device", "cpu", *rest], out, complaint, leaves=tmp_path)
+
+
+@pytest.mark.parametrize(
     ("options", "words"),
     [
         (["export", "--what", "mesh", "light"], ("no light yet at step 4",)),

@@ -15,6 +15,8 @@ __all__ = ["Checkpoint", "Command", "Device", "duration", "progress_bar", "termi
 
 SOON = 10.0
 """Estimated time above which a progress bar announces it, in seconds."""
+MEASURED = 2.0
+"""Seconds of progress from which the time of the whole work is estimated."""
 
 Device = Annotated[str, tyro.conf.arg(metavar="cpu|cuda|cuda:N|auto")]
 """Type of an option that names a device."""
@@ -54,25 +56,58 @@ def terminal() -> Console:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
-    """Show a progress bar; yields a function that takes the share of the work done.
+    """A progress bar of the share done. Once the pace is known, it prints how long the whole work takes.
 
-    At the first call with a positive share, the estimated time of the whole work is printed if it is long.
+    If the work fails, the bar is removed: the error is then all that the command prints.
     """
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     share = TextColumn("{task.percentage:3.0f} %")
-    began = time.monotonic()
-    with Progress(TextColumn(title), BarColumn(), share, TimeRemainingColumn()) as progress:
-        task = progress.add_task(title, total=1.0)
+    pace = _Pace(time.monotonic())
+    progress = Progress(TextColumn(title), BarColumn(), share, TimeRemainingColumn())
+    task = progress.add_task(title, total=1.0)
 
-        def advance(done: float) -> None:
-            if progress.tasks[0].completed == 0 < done:
-                total = (time.monotonic() - began) / done
-                if total > SOON:
-                    progress.console.print(f"{title} takes about {duration(total)}")
-            progress.update(task, completed=done)
+    def advance(done: float) -> None:
+        takes = pace.total(time.monotonic(), done)
+        if takes is not None and takes > SOON:
+            progress.console.print(f"{title} takes about {duration(takes)}")
+        progress.update(task, completed=done)
 
+    progress.start()
+    stop = progress.stop
+    try:
         yield advance
+    except Exception:
+        progress.live.transient = True
+        stop = progress.live.stop  # `Progress.stop` would print an empty line.
+        raise
+    finally:
+        stop()
+
+
+@dataclass
+class _Pace:
+    """Estimates once how long work takes that began at the time `began`.
+
+    The first share is not counted, because loading and compiling go before it.
+    """
+
+    began: float
+    first: tuple[float, float] | None = None
+    said: bool = False
+
+    def total(self, now: float, done: float) -> float | None:
+        """Return the seconds of the whole work, once `MEASURED` seconds lie between two shares, else None."""
+        if self.said or done <= 0:
+            return None
+        if self.first is None:
+            self.first = now, done
+            return None
+        since, at = self.first
+        if now - since < MEASURED or done <= at:
+            return None
+        self.said = True
+        return now - self.began + (1 - done) * (now - since) / (done - at)
 
 
 def duration(seconds: float) -> str:

@@ -58,7 +58,8 @@ def _published(options: Eval) -> None:
     from neilfpp_method.evaluate.views import render_test_views
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.device import pick_device
-    from neilfpp_method.train.run import check_writable, load_run
+    from neilfpp_method.train.output import check_writable
+    from neilfpp_method.train.run import load_run
 
     protocol = PROTOCOLS[options.protocol]
     scale, width = options.scale, options.width
@@ -88,7 +89,8 @@ def _own(options: Eval) -> None:
     from neilfpp_method.evaluate.size import at_size, describe_size
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.device import pick_device
-    from neilfpp_method.train.run import check_writable, load_run
+    from neilfpp_method.train.output import check_writable
+    from neilfpp_method.train.run import load_run
 
     run = at_size(
         load_run(options.run, pick_device(options.device), options.checkpoint), options.scale, options.width

@@ -35,8 +35,11 @@ class Relight:
     ] = ()
     """Move a lamp of the run (0=1,0.5,2, in the capture's world frame) or switch it off (1=off), and keep the
     others; numbers as in lamps.json; repeatable."""
-    views: Literal["test", "train", "all", "turntable"] = "test"
-    """Views of the capture, or a circle around the scene, which is also written as turntable.mp4."""
+    views: Annotated[tuple[str, ...], tyro.conf.arg(metavar="test|train|all|turntable|VIEW [VIEW ...]")] = (
+        "test",
+    )
+    """Views of the capture, as a set or by name; or a circle around the scene, which is also
+    written as turntable.mp4."""
     frames: int = 96
     """Number of frames of a turntable."""
     edits: Annotated[

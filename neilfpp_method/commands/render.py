@@ -49,13 +49,14 @@ def run(options: Render) -> None:
     from neilfpp_method.evaluate.size import at_size, describe_size
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.device import pick_device
-    from neilfpp_method.train.run import check_writable, load_run
+    from neilfpp_method.train.output import check_folder
+    from neilfpp_method.train.run import load_run
 
     run = at_size(
         load_run(options.run, pick_device(options.device), options.checkpoint), options.scale, options.width
     )
     out = options.out or options.run / "renders"
-    check_writable(out)
+    check_folder(out)
     if size := describe_size(run):
         terminal().print(size, soft_wrap=True)
     if "maps" in options.what:

@@ -37,7 +37,7 @@ def run(options: Report) -> None:
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.report.write import REPORT, ReportOptions, write_report
     from neilfpp_method.train.device import pick_device
-    from neilfpp_method.train.run import check_writable
+    from neilfpp_method.train.output import check_writable
 
     contents = ReportOptions(options.views, options.size, options.confidence)
     contents.check()

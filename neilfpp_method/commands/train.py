@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -61,6 +63,8 @@ class Train:
     """Time for the whole command, such as 90s, 10m or 1h; the steps are planned for it (docs/budget.md).
     Default: no limit.
     """
+    view: bool = False
+    """Serve the viewer in the browser while the run trains (docs/viewer.md); needs the extra `view`."""
     strict: bool = False
     """Exit with status 1 if the result is unusable (docs/health.md)."""
     device: Device = "auto"
@@ -77,6 +81,8 @@ class TrainWithSettings(Train):
 
     config: NeilfConfig = field(default_factory=NeilfConfig)
     """Individual settings, which override those of the preset."""
+    view_port: int = 8080
+    """Port of --view."""
     report: bool = True
     """Write RUN/report.html at the end (docs/report.md)."""
 
@@ -97,7 +103,7 @@ def run(options: TrainWithSettings) -> None:
         if options.resume and options.effects is None
         else read_asked(options.effects or ("as-set" if published else "auto"))
     )
-    with computing_fast():
+    with computing_fast(), _viewer(options, config):
         run_training(
             data=options.data,
             out=options.out,
@@ -116,6 +122,21 @@ def run(options: TrainWithSettings) -> None:
             console=terminal(),
             at_end=(lambda path: after_training(path, options.device)) if options.report else None,
         )
+
+
+def _viewer(options: TrainWithSettings, config: NeilfConfig) -> AbstractContextManager[object]:
+    """The viewer beside the training, if requested; only the first of several processes starts one."""
+    from neilfpp_method.train.output import default_folder
+    from neilfpp_method.view.beside import viewer_beside
+
+    if not options.view or os.environ.get("LOCAL_RANK", "0") != "0":
+        return nullcontext()
+    out = options.out or (options.data and default_folder(options.data, config))
+    if out is None:
+        return nullcontext()  # `run_training` names the missing option.
+    return viewer_beside(
+        out, options.view_port, options.device, lambda text: terminal().print(text, soft_wrap=True)
+    )
 
 
 def _with_files(options: TrainWithSettings) -> NeilfConfig:
@@ -200,6 +221,7 @@ COMMAND = Command(
         "neilfpp train --data captures/teapot --config settings.yaml",
         "neilfpp train --data captures/teapot --host mesh --mesh scans/teapot.ply",
         "neilfpp train --data captures/teapot --budget 10m   (as many steps as fit in ten minutes)",
+        "neilfpp train --data captures/teapot --view   (in the browser while it trains)",
         "neilfpp train --out runs/teapot --resume",
         "neilfpp train --data captures/teapot --effects auto,-lamps   (without lamps)",
     ],

@@ -87,7 +87,8 @@ def light_sections(
     for first in range(0, len(points), POINTS_PER_SECTION):
         groups, pictures = [], []
         for i, point in list(enumerate(points))[first : first + POINTS_PER_SECTION]:
-            groups.append(Group("Light at ({:.2f}, {:.2f}, {:.2f})".format(*point.position), tuple(titles)))
+            x, y, z = point.position.round(2) + 0.0  # no "-0.00"
+            groups.append(Group(f"Light at ({x:.2f}, {y:.2f}, {z:.2f})", tuple(titles)))
             for title, column in zip(titles, columns, strict=True):
                 picture = cut_out(display_color(column[i], exposure), above[i], SHADE)
                 pictures.append(picture if title == "truth" else ring(picture, _lamps_above(run, point)))

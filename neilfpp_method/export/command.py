@@ -11,7 +11,8 @@ from neilfpp_method.export.asset.command import AssetOptions, Bar, Deviations, c
 from neilfpp_method.export.light import check_light, export_light
 from neilfpp_method.export.mesh import export_mesh, has_surface
 from neilfpp_method.train.device import pick_device
-from neilfpp_method.train.run import check_writable, load_run
+from neilfpp_method.train.output import check_folder
+from neilfpp_method.train.run import load_run
 
 __all__ = ["run_export"]
 
@@ -52,7 +53,7 @@ def run_export(
     """
     trained = load_run(run, pick_device(device), checkpoint)
     out = out or run / "export"
-    check_writable(out)
+    check_folder(out)
     available = {"mesh": has_surface(trained), "light": trained.has_material}
     what = what or [name for name, exists in available.items() if exists] or ["mesh"]
     if "light" in what:

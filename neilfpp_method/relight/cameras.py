@@ -16,7 +16,7 @@ from neilfpp_method.data.views import Camera, View
 from neilfpp_method.errors import UserError
 from neilfpp_method.structures import RayBatch
 
-__all__ = ["MAX_WIDTH", "Shot", "rays_through", "resized", "turntable", "view_shots"]
+__all__ = ["MAX_WIDTH", "Shot", "chosen_views", "rays_through", "resized", "turntable", "view_shots"]
 
 MAX_WIDTH = 800
 """Largest default width, pixels, because a path-traced image of the size of a photograph takes long."""
@@ -41,6 +41,22 @@ class Shot:
     name: str
     camera: Camera
     view: View | None = None
+
+
+def chosen_views(capture: Capture, words: Sequence[str]) -> list[View]:
+    """The views that are named, in the capture's order; "test", "train" and "all" are sets of views.
+
+    Raises:
+        UserError: a word is neither a set nor the name of a view.
+    """
+    sets = {"test": capture.test_views, "train": capture.train_views, "all": capture.views}
+    by_name = {view.name: (view,) for view in capture.views}
+    for word in words:
+        if word not in sets and word not in by_name:
+            example = f"name views as {capture.views[0].name}, or give {', '.join(sets)} or turntable"
+            raise UserError(f"--views {word}: the capture has no view of this name", example)
+    chosen = {view.name for word in words for view in (sets.get(word) or by_name.get(word, ()))}
+    return [view for view in capture.views if view.name in chosen]
 
 
 def view_shots(capture: Capture, views: Sequence[View], scale: float | None, width: int | None) -> list[Shot]:

@@ -24,7 +24,7 @@ import torch
 
 from neilfpp_method.errors import UserError
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.relight.cameras import Shot, rays_through, turntable, view_shots
+from neilfpp_method.relight.cameras import Shot, chosen_views, rays_through, turntable, view_shots
 from neilfpp_method.relight.comparison import compare, find_truth, read_truth
 from neilfpp_method.relight.denoise import check_denoiser, denoised
 from neilfpp_method.relight.edits import parse_edits, scene_box, with_edits
@@ -39,12 +39,15 @@ from neilfpp_method.relight.recovered import check_material, surface_of_run
 from neilfpp_method.relight.sky import Sky, sky_of_run
 from neilfpp_method.relight.stencil import masked_limit, read_stencils
 from neilfpp_method.train.device import pick_device
-from neilfpp_method.train.run import Run, check_writable, load_run, write_json
+from neilfpp_method.train.output import check_folder
+from neilfpp_method.train.run import Run, load_run, write_json
 
 __all__ = ["Request", "relight"]
 
 OWN = "own"
 """Name of the run's estimated light in paths and records."""
+TURNTABLE = "turntable"
+"""The word for a circle of cameras in place of views."""
 SAMPLES = 64
 """Default number of samples per pixel, if neither --spp nor --seconds is given."""
 MAX_BOUNCES = 64
@@ -64,7 +67,7 @@ class Request:
     exposure: float
     lamps: str
     lamp_edits: tuple[str, ...]
-    views: str
+    views: tuple[str, ...]
     frames: int
     edits: tuple[str, ...]
     box: tuple[float, ...] | None
@@ -106,7 +109,7 @@ def relight(
     run = load_run(request.run, pick_device(request.device), request.checkpoint)
     check_material(run)
     out = request.out or request.run / "relit"
-    check_writable(out)
+    check_folder(out)
     shots = _shots(request, run)
     lights = _lights(request, run, say)
     lamps = _lamps(request, run)
@@ -124,7 +127,7 @@ def relight(
         scenes = {name: Scene(surface, materials, run.model.lobe, sky, lamps) for name, sky in lights.items()}
         _render(request, scenes, folders, missing, on_progress)
     for k, folder in enumerate(folders.values()):
-        if request.views == "turntable":
+        if TURNTABLE in request.views:
             write_movie(folder.path / "turntable.mp4", [folder.png(shot) for shot in shots])
         if truths:
             say(_measure(run, folder, shots, truths[k]))
@@ -164,8 +167,10 @@ def _check(request: Request) -> None:
             )
     if request.lamp_edits and request.lamps == "drop":
         raise UserError("--lamp changes lamps, but --lamps drop removes all of them", "give only one of both")
+    if TURNTABLE in request.views and len(request.views) > 1:
+        raise UserError("--views turntable is a circle, and no other views go with it", "give one of them")
     if request.truth:
-        if request.views == "turntable" or request.scale is not None or request.width is not None:
+        if TURNTABLE in request.views or request.scale is not None or request.width is not None:
             raise UserError(
                 "true images can only be compared with views in full size",
                 "leave --views turntable, --scale and --width out",
@@ -186,9 +191,9 @@ def _check(request: Request) -> None:
 
 def _shots(request: Request, run: Run) -> list[Shot]:
     capture = run.capture
-    if request.views == "turntable":
+    if TURNTABLE in request.views:
         return turntable(capture, request.frames, request.scale, request.width)
-    views = {"test": capture.test_views, "train": capture.train_views, "all": capture.views}[request.views]
+    views = chosen_views(capture, request.views)
     return view_shots(capture, views, 1.0 if request.truth else request.scale, request.width)
 
 
@@ -208,7 +213,8 @@ def _lights(request: Request, run: Run, say: Callable[[str], None]) -> dict[str,
     for name, path in zip(map_names(request.env), request.env, strict=True):
         light_map = read_map(path, request.env_layout, request.rotate, request.exposure)
         if light_map.negative:
-            say(f"{path}: {light_map.negative} texels are slightly negative and are set to 0")
+            texels = "texel is" if light_map.negative == 1 else "texels are"
+            say(f"{path}: {light_map.negative} {texels} slightly negative; set to 0")
         lights[name] = dataclasses.replace(light_map.sky, radiance=light_map.sky.radiance.to(device))
     return lights
 

@@ -53,7 +53,12 @@ class PictureFolder:
         stored = read_json(record)
         for key, value in self._record(shot).items():
             if stored.get(key) != value:
-                problem = f"{record}: the image was rendered with {key} {stored.get(key)}, not {value}"
+                other = (
+                    "another map of this name"
+                    if key == "map_sha256"
+                    else f"{key} {stored.get(key)}, not {value}"
+                )
+                problem = f"{record}: the image was rendered with {other}"
                 raise UserError(problem, "choose another --out, or render again with --force")
         return all(self._file(shot, suffix).is_file() for suffix in (".exr", ".png"))
 

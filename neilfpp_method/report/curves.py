@@ -19,6 +19,8 @@ BAR, GAP = 22.0, 14.0
 """Height of a bar and distance between bars, pixels."""
 STAGE_WIDTH, SECONDS_WIDTH = 110.0, 60.0
 """Space for the name of a stage left of its bar, and for its seconds right of it, pixels."""
+LABEL_HEIGHT = 14.0
+"""Smallest vertical distance between two labels, pixels."""
 TICKS = 5
 """Approximate number of intervals between axis labels."""
 COLORS = (
@@ -61,13 +63,17 @@ def quality_curve(looks: Sequence[Look]) -> Html | None:
         height = to_pixels(0.0, y)[1]
         grid.append(_line(LEFT, height, WIDTH - RIGHT, height))
         grid.append(_text(LEFT - 6, height + 4, f"{y:g}", "end"))
-    lines = []
+    lines, labels = [], []
     for name, points, color in (("R", radiance, COLORS[0]), ("PBR", physical, COLORS[3])):
         if points:
             pixels = [to_pixels(*point) for point in points]
             x, y = pixels[-1]
             lines.append(_curve(pixels, color))
-            lines.append(_text(x + 8, y + 4, f"{name} {points[-1][1]:.1f} dB", "start"))
+            labels.append((x + 8, y + 4, f"{name} {points[-1][1]:.1f} dB"))
+    previous = -math.inf
+    for x, y, text in sorted(labels, key=lambda label: label[1]):
+        previous = max(y, previous + LABEL_HEIGHT)
+        lines.append(_text(x, previous, text, "start"))
     caption = _text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 4, "seconds of the run", "middle")
     return _svg(HEIGHT, "PSNR of held-back pixels over seconds", *grid, *lines, caption)
 

@@ -6,7 +6,7 @@ import json
 from html import escape
 from typing import Any
 
-__all__ = ["Html", "cell", "data_block", "element", "joined", "table"]
+__all__ = ["Html", "cell", "data_block", "element", "joined", "table", "with_code"]
 
 VOID = frozenset({"br", "hr", "img", "input", "link", "meta"})
 """Elements without content and end tag."""
@@ -53,6 +53,16 @@ def table(head: tuple[str, ...], *rows: Html, class_: str | None = None) -> Html
     titles = element("tr", *(element("th", title, scope="col") for title in head))
     inside = (element("thead", titles) if head else None, element("tbody", *rows))
     return element("div", element("table", *inside, class_=class_), class_="wide")
+
+
+def with_code(text: str) -> Html:
+    """Text in which words between backticks are code.
+
+    >>> with_code("By `neilfpp eval`.")
+    'By <code>neilfpp eval</code>.'
+    """
+    parts = text.split("`")
+    return joined(*(element("code", part) if k % 2 else part for k, part in enumerate(parts)))
 
 
 def cell(text: str) -> Html:

@@ -9,7 +9,7 @@ from neilfpp_method.evaluate.glossary import explain
 from neilfpp_method.health.cases import Finding, verdict_of
 from neilfpp_method.report.curves import quality_curve, work_bars
 from neilfpp_method.report.files import Changed
-from neilfpp_method.report.markup import Html, cell, element, joined, table
+from neilfpp_method.report.markup import Html, cell, element, joined, table, with_code
 from neilfpp_method.train.quality import Look
 
 __all__ = [
@@ -93,15 +93,16 @@ def figures_section(metrics: Mapping[str, float], description: str) -> Html:
     if not metrics:
         return element("p", description)
     companions = {name: (f"{name}_frame", f"baseline_{name}") for name in metrics}
+    titles = ("whole frame", "naive baseline")
+    filled = [k for k in range(len(titles)) if any(pair[k] in metrics for pair in companions.values())]
     in_other_rows = {companion for pair in companions.values() for companion in pair}
     rows = []
     for name in metrics:
         if name in in_other_rows:
             continue
         entry = explain(name)
-        value, frame, baseline = (
-            entry.format(metrics[key]) if key in metrics else "–" for key in (name, *companions[name])
-        )
+        keys = (name, *(companions[name][k] for k in filled))
+        value, *others = (entry.format(metrics[key]) if key in metrics else "–" for key in keys)
         symbol = {"higher": "↑", "lower": "↓"}.get(entry.better)
         arrow = (" ", element("span", symbol, title=f"{entry.better} is better")) if symbol else ()
         rows.append(
@@ -109,13 +110,12 @@ def figures_section(metrics: Mapping[str, float], description: str) -> Html:
                 "tr",
                 element("th", entry.title, element("br"), element("code", name), scope="row"),
                 element("td", element("b", value), *arrow, class_="number"),
-                element("td", frame, class_="number"),
-                element("td", baseline, class_="number"),
+                *(element("td", other, class_="number") for other in others),
                 element("td", entry.meaning),
             )
         )
-    names = ("figure", "this run", "whole frame", "naive baseline", "meaning")
-    return joined(element("p", description, class_="pale"), table(names, *rows))
+    names = ("figure", "this run", *(titles[k] for k in filled), "meaning")
+    return joined(element("p", with_code(description), class_="pale"), table(names, *rows))
 
 
 def time_section(

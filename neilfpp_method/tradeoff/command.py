@@ -14,7 +14,8 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.tradeoff.files import write_tradeoff
 from neilfpp_method.tradeoff.frontier import FIGURES, Point, frontier
 from neilfpp_method.tradeoff.rows import Row, measured, rows_of, run_row
-from neilfpp_method.train.run import check_writable, read_description
+from neilfpp_method.train.output import check_folder
+from neilfpp_method.train.run import read_description
 
 __all__ = ["run_tradeoff"]
 
@@ -55,7 +56,7 @@ def run_tradeoff(
     rows = rows_of(data, out, config, budgets, seeds, device)
     # Errors in the capture are raised before anything is written.
     load_capture(data)
-    check_writable(out)
+    check_folder(out)
     for row in rows:
         _check_same(row)
     refused = ""

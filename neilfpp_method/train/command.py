@@ -56,6 +56,7 @@ from neilfpp_method.train.lock import alone_in
 from neilfpp_method.train.loop import train
 from neilfpp_method.train.memory import check_training_memory
 from neilfpp_method.train.optimizer import seed_step
+from neilfpp_method.train.output import default_folder
 from neilfpp_method.train.pace import Pace
 from neilfpp_method.train.preview import write_preview
 from neilfpp_method.train.progress import Reporter, reporting
@@ -162,8 +163,7 @@ def run_training(
         check_asked(asked, config)
         _check(Plan.begin(asked, config).config)
         source = CaptureSource(str(data.resolve()), test_every, response, format)
-        out = out or Path("runs") / f"{data.resolve().name}-{config.preset}"
-        check_free(out)
+        check_free(out := out or default_folder(data, config))
     capture = source.load_again(out) if resume else source.load()
     if not resume:
         planned = None

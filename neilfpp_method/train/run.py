@@ -47,6 +47,7 @@ from neilfpp_method.train.build import build_model
 from neilfpp_method.train.effects_record import read_plan
 from neilfpp_method.train.json_files import read_json, write_json
 from neilfpp_method.train.lock import LOCK
+from neilfpp_method.train.output import check_folder
 
 __all__ = [
     "BESIDE_NERFSTUDIO",
@@ -55,7 +56,6 @@ __all__ = [
     "Description",
     "Run",
     "check_free",
-    "check_writable",
     "create_run",
     "load_checkpoint",
     "load_run",
@@ -194,25 +194,12 @@ def check_free(path: Path) -> None:
     """
     if path.exists() and (not path.is_dir() or any(not _of_no_run(inner.name) for inner in path.iterdir())):
         raise UserError(f"{path}: exists already", "choose another --out, or continue it with --resume")
-    check_writable(path)
+    check_folder(path)
 
 
 def _of_no_run(name: str) -> bool:
     """Whether a file is left over from a training that was killed before the run existed."""
     return name in (PIXELS, LOCK, *DESCRIBING) or bool(HALF_WRITTEN.fullmatch(name))
-
-
-def check_writable(path: Path) -> None:
-    """Check before any work is done that a file or folder can be created.
-
-    Raises:
-        UserError: if it cannot.
-    """
-    above = next(folder for folder in path.absolute().parents if folder.exists())
-    if not above.is_dir() or not os.access(above, os.W_OK):
-        raise UserError(
-            f"{path}: cannot be written, because {above} is not a writable folder", "choose another --out"
-        )
 
 
 def create_run(path: Path, config: NeilfConfig, source: CaptureSource, facts: SceneFacts) -> None:

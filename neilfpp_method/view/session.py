@@ -33,6 +33,9 @@ from neilfpp_method.view.subject import LAYERS, Lighting, Subject, own_light
 
 __all__ = ["Session", "Shared"]
 
+MAP_SCALE = 3
+"""Pixels of the page along an edge of each pixel of the map of incident light."""
+
 OWN = "the run's own"
 """Name of the run's light in the list of environments."""
 PHOTOGRAPH = 320
@@ -257,7 +260,8 @@ class Session:
         with self.shared.lock:
             radiance = light_at(self.subject, self.light, point)
         position, normal = point.position.cpu().numpy(), point.normal.cpu().numpy()
-        self.point_light.image = light_picture(radiance, normal)
+        picture = light_picture(radiance, normal)
+        self.point_light.image = picture.repeat(MAP_SCALE, axis=0).repeat(MAP_SCALE, axis=1)
         material = point.material
         color = ", ".join(f"{value:.2f}" for value in material.base_color[0].tolist())
         roughness, metallic = material.roughness.item(), material.metallic.item()

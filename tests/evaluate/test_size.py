@@ -66,17 +66,25 @@ def test_a_true_estimate_is_true_at_half_the_size(tmp_path: Path) -> None:
         assert np.abs(view.maps["depth"][..., 0] > 0)[known.mask].all()
 
 
-def test_the_first_part_tells_how_long_all_takes(monkeypatch, capsys) -> None:
-    times = iter([100.0, 102.0])
+def test_the_time_of_the_work_is_estimated_without_its_start(monkeypatch, capsys) -> None:
+    # Loading takes until 150, and 1 % of the work takes 2 seconds from then on.
+    times = iter([100.0, 150.0, 151.0, 152.0, 153.0])
     monkeypatch.setattr(
         command, "time", SimpleNamespace(monotonic=lambda: next(times))
     )  # rich's threads read the clock, too
     monkeypatch.setattr(rich, "_console", None)  # the console that others share may write elsewhere
     with progress_bar("evaluating") as advance:
-        advance(0.0)
-        advance(0.01)
-        advance(0.02)
-    assert capsys.readouterr().out.count("evaluating takes about 3 min") == 1
+        for done in (0.01, 0.015, 0.02, 0.025):
+            advance(done)
+    # 52 s have passed, and 98 % are left.
+    assert capsys.readouterr().out.count(f"evaluating takes about {duration(52 + 0.98 * 200)}") == 1
+
+
+def test_work_that_fails_leaves_no_bar_behind(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(rich, "_console", None)
+    with pytest.raises(UserError), progress_bar("evaluating"):
+        raise UserError("no such map", "check the path")
+    assert capsys.readouterr().out == ""
 
 
 def test_durations_are_for_people() -> None:

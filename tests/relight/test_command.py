@@ -150,6 +150,22 @@ def test_what_is_there_is_not_made_again(given, sky, tmp_path, capfd):
     assert picture.stat().st_mtime_ns > before
 
 
+def test_views_are_chosen_by_name(given, sky, tmp_path):
+    assert relit(given, "--env", sky, "--out", tmp_path, "--views", "002", "000") == 0
+    assert {path.stem for path in (tmp_path / "studio").iterdir()} == {"000", "002"}
+
+
+def test_another_map_of_the_same_name_is_told_apart(given, sky, tmp_path, capfd):
+    options = ("--width", 6, "--out", tmp_path / "out", "--env")
+    assert relit(given, *options, sky) == 0
+    write_exr(tmp_path / sky.name, {"RGB": np.ones((8, 16, 3), np.float32)})
+    capfd.readouterr()
+    assert relit(given, *options, tmp_path / sky.name) == 2
+    said = capfd.readouterr().err
+    assert "another map of this name" in said
+    assert "sha256" not in said
+
+
 def test_an_edit_changes_what_is_seen(given, sky, tmp_path):
     def mean(name: str, *options: object) -> np.ndarray:
         assert relit(given, "--env", sky, "--out", tmp_path / name, *options) == 0
@@ -261,6 +277,8 @@ def test_a_time_per_view_is_kept(given, sky, tmp_path):
         (["--views", "turntable", "--frames", "1"], ("1 frames",)),
         (["--width", "100000"], ("100000×75000",)),
         (["--views", "turntable", "--truth", "x"], ("true images",)),
+        (["--views", "nobody"], ("--views nobody", "no view of this name", "000")),
+        (["--views", "turntable", "000"], ("--views turntable",)),
         (["--checkpoint", "sdf_init"], ("no material",)),
         (["--rotate", "nan"], ("--rotate",)),
     ],
@@ -284,6 +302,7 @@ def test_a_light_that_is_no_map_needs_one(given, capfd):
 def test_a_folder_that_cannot_be_written(found, sky, tmp_path, capfd):
     (tmp_path / "file").write_text("")
     refused(capfd, found, "--env", sky, "--out", tmp_path / "file" / "relit", words=("cannot be written",))
+    refused(capfd, found, "--env", sky, "--out", tmp_path / "file", words=("is a file",))
 
 
 def test_a_full_disk_leaves_no_half_picture(given, sky, tmp_path, capfd):

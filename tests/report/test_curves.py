@@ -6,7 +6,17 @@ import re
 
 import pytest
 
-from neilfpp_method.report.curves import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, quality_curve, work_bars
+from neilfpp_method.report.curves import (
+    BOTTOM,
+    HEIGHT,
+    LABEL_HEIGHT,
+    LEFT,
+    RIGHT,
+    TOP,
+    WIDTH,
+    quality_curve,
+    work_bars,
+)
 from neilfpp_method.train.quality import Look
 
 
@@ -43,3 +53,10 @@ def test_bars_are_as_long_as_the_work_took():
     assert "Joint" in svg
     assert "rendering" not in svg
     assert work_bars({}, {}) is None
+
+
+def test_labels_of_curves_that_end_at_one_place_do_not_overlap():
+    svg = quality_curve([Look(10, "material_init", 5.0, 22.3, 22.4, 0.1)])
+    heights = [float(y) for y in re.findall(r'y="([^"]*)"[^>]*>(?:R|PBR) [0-9.]+ dB<', svg)]
+    assert len(heights) == 2
+    assert abs(heights[0] - heights[1]) >= LABEL_HEIGHT

@@ -1,0 +1,62 @@
+"""The viewer beside a training: a process of its own that follows the run's checkpoints."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from neilfpp_method.view.address import check_free
+from neilfpp_method.view.command import check_viser
+
+__all__ = ["viewer_beside"]
+
+HOST = "127.0.0.1"
+ENDED = (0, 130)
+"""Exit statuses of a viewer that was ended: Ctrl-C reaches both processes."""
+PATIENCE = 10.0
+"""Seconds that the viewer has to end before it is killed."""
+
+
+@contextmanager
+def viewer_beside(
+    run: Path, port: int, device: str, say: Callable[[str], None]
+) -> Iterator[subprocess.Popen]:
+    """Serve `neilfpp view RUN --follow` while the body trains, and end it afterwards. Yields its process.
+
+    The viewer reads files only: what it does, and whether it fails, changes nothing of the training.
+
+    Args:
+        run: the run's folder, which need not exist yet.
+        port: on this machine.
+        device: where the viewer computes.
+        say: prints a line.
+
+    Raises:
+        UserError: viser is not installed, or the port is not free.
+    """
+    check_viser()
+    check_free(HOST, port)
+    words = ["view", str(run), "--follow", "--host", HOST, "--port", str(port), "--device", device]
+    with tempfile.TemporaryFile() as errors:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "neilfpp_method.cli", *words], stdout=subprocess.DEVNULL, stderr=errors
+        )
+        say(f"open http://{HOST}:{port} in a browser to see the run from its first checkpoint on")
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                process.terminate()
+                try:
+                    process.wait(PATIENCE)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
+            elif process.returncode not in ENDED:
+                errors.seek(0)
+                lines = errors.read().decode(errors="replace").strip().splitlines()
+                say(f"the viewer ended early: {lines[-1] if lines else process.returncode}")

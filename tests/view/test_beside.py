@@ -1,0 +1,67 @@
+"""The viewer beside a training, as the process that it is."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import socket
+import time
+import urllib.request
+
+import pytest
+
+from neilfpp_method.cli import main
+from neilfpp_method.view.address import check_free
+from neilfpp_method.view.beside import viewer_beside
+
+pytest.importorskip("viser")
+PATIENCE = 120.0
+"""Seconds for a process to import torch and to load a run, on a busy machine."""
+
+
+@pytest.fixture
+def port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
+def served(port: int) -> bool:
+    with contextlib.suppress(OSError), urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=5) as page:
+        return page.status == 200
+    return False
+
+
+def test_the_page_is_there_while_the_body_runs(tmp_path, port):
+    said = []
+    with viewer_beside(tmp_path / "run", port, "cpu", said.append):
+        ends = time.monotonic() + PATIENCE
+        while not served(port):
+            assert time.monotonic() < ends
+            time.sleep(0.2)
+    assert len(said) == 1
+    assert f"http://127.0.0.1:{port}" in said[0]
+    check_free("127.0.0.1", port)
+
+
+def test_a_viewer_that_fails_is_told_and_harms_nothing(found, tmp_path, port):
+    run, said = tmp_path / "run", []
+    shutil.copytree(found, run)
+    (run / "checkpoints" / "last.pt").write_bytes(b"not a checkpoint")
+    with viewer_beside(run, port, "cpu", said.append) as viewer:
+        viewer.wait(PATIENCE)
+    assert "the viewer ended early: error: " in said[-1]
+    assert "last.pt" in said[-1]
+
+
+def test_training_beside_a_busy_port_is_one_line(tmp_path, capture, capsys):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        words = ["train", "--data", str(capture), "--out", str(tmp_path / "run"), "--device", "cpu"]
+        assert main([*words, "--view", "--view-port", str(port)]) == 2
+    said = capsys.readouterr()
+    assert said.err.startswith(f"error: port {port} of 127.0.0.1:")
+    assert said.err.count("\n") == 1
+    assert not (tmp_path / "run").exists()
