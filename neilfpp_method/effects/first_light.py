@@ -25,14 +25,12 @@ from neilfpp_method.effects.place_fit import (
     PlaceFit,
     fit_places,
     place_errors,
-    place_transport,
     seconds_of_step,
 )
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.direction_map import interpolate, map_directions
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.shading.brdf import Lobe
-from neilfpp_method.structures import Material, Observed, SceneTracer
+from neilfpp_method.structures import Material, Observed
 
 __all__ = ["MIN_PLACES", "FirstLight", "find_first_light", "seconds_of_pixel", "start_with"]
 
@@ -93,16 +91,12 @@ class FirstLight:
 
 
 @torch.no_grad()
-def find_first_light(
-    places: Places, lobe: Lobe, scene: SceneTracer | None, typical: float, metals: bool
-) -> FirstLight | None:
+def find_first_light(places: Places, transport: Transport, typical: float, metals: bool) -> FirstLight | None:
     """Fit a map together with the materials of places.
 
     Args:
         places: places with their pixels in the training views, in linear radiance.
-        lobe: the specular lobe.
-        scene: traces rays from the places through the scene, which blocks light and emits its own radiance;
-            None if inter-reflection is off.
+        transport: transport to the same pixels (`place_fit.place_transport`).
         typical: radiance of a typical pixel.
         metals: whether metallic may be greater than 0.
 
@@ -112,7 +106,6 @@ def find_first_light(
     numbers = places.place.unique()
     if len(numbers) < MIN_PLACES:
         return None
-    transport = place_transport(places, lobe, scene)
     is_held_back = places.view % FOLDS == 0
     fitted, held_back = torch.nonzero(~is_held_back)[:, 0], torch.nonzero(is_held_back)[:, 0]
     known = places.where(fitted), transport[fitted]

@@ -10,7 +10,8 @@ import torch
 from neilfpp_method.effects.first_light import MIN_PLACES, FirstLight, _lowest, find_first_light, start_with
 from neilfpp_method.effects.lobes import lobe_evidence
 from neilfpp_method.effects.measurement import Measurement
-from neilfpp_method.effects.place_fit import ROWS
+from neilfpp_method.effects.metals import metals_evidence
+from neilfpp_method.effects.place_fit import ROWS, place_transport
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.settings.presets import preset
@@ -41,7 +42,7 @@ def log_distance(log_radiance: torch.Tensor) -> float:
 def test_scale_and_map_are_found_together():
     places, lobe = patched("ggx"), LOBES["ggx"]
     typical = places.observed.pixel.median().item()
-    found = find_first_light(places, lobe, None, typical, metals=True)
+    found = find_first_light(places, place_transport(places, lobe, None), typical, metals=True)
     torch.manual_seed(1)
     truth = (0.2 + 0.6 * torch.rand(COUNT, 3)).log().mean().exp().item()
     assert abs(math.log(found.scale / truth)) < math.log(1.35)
@@ -66,10 +67,28 @@ def test_views_kept_back_tell_the_lobe_that_the_images_were_made_with():
     assert of_gaussian.value < 0
 
 
+def test_metals_are_told_from_paint_in_held_back_views():
+    lobe = LOBES["ggx"]
+
+    def gain(places: Places) -> Measurement:
+        return metals_evidence(
+            places, place_transport(places, lobe, None), places.observed.pixel.median().item()
+        )
+
+    mixed = gain(patched("ggx"))
+    assert mixed.favours(chosen=True)
+    assert mixed.value > 2 * mixed.deviation
+    torch.manual_seed(1)
+    color, roughness = 0.2 + 0.6 * torch.rand(COUNT, 3), torch.full((COUNT, 1), 0.36)
+    paint = gain(ball(color, roughness, torch.zeros(COUNT, 1), lobe, VIEWS))
+    # Either no place is taken for metal, or metals explain other views no better.
+    assert paint.favours(chosen=True) is not True
+
+
 def test_a_handful_of_places_is_no_ground_for_a_light():
     places = patched("ggx")
     few = places.where(torch.nonzero(places.place < MIN_PLACES - 1)[:, 0])
-    assert find_first_light(few, LOBES["ggx"], None, 1.0, metals=True) is None
+    assert find_first_light(few, place_transport(few, LOBES["ggx"], None), 1.0, metals=True) is None
 
 
 def test_lowest_is_the_foot_of_the_parabola_over_the_logarithm():
