@@ -229,7 +229,8 @@ def surface_width_limit(config: VolumeConfig, position: StagePosition) -> float:
     if config.beta_final == 0.0:
         return math.inf
     share = position.share if position.stage is Stage.SDF_INIT else 1.0
-    return config.beta_init * (config.beta_final / config.beta_init) ** share
+    first = max(config.beta_init, config.beta_final)
+    return first * (config.beta_final / first) ** share
 
 
 def active_losses(

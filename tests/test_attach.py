@@ -324,7 +324,7 @@ def test_a_colour_may_be_cut_off_where_nothing_trains_it():
 
 def test_bad_normals_of_a_host_object_are_named():
     for spoil, message in (
-        (lambda rays, o: {"normal": 0.0 * o["normal"]}, "BallHost: its normal is no unit vector"),
+        (lambda rays, o: {"normal": 0.0 * o["normal"]}, "BallHost: its normal is not a unit vector"),
         (
             lambda rays, o: {"normal": o["normal"] / 0.0},
             "BallHost: its normal is not finite for 64 of 64 rays; divide by",
@@ -348,7 +348,7 @@ def test_normals_are_looked_at_until_the_first_hit_and_shapes_always():
     away = dataclasses.replace(batch, directions=-batch.directions)
     neilf.losses(away, Stage.MATERIAL_INIT)
     spoil["normal"] = lambda n: 2.0 * n
-    with pytest.raises(UserError, match="no unit vector"):
+    with pytest.raises(UserError, match="not a unit vector"):
         neilf.losses(batch, Stage.MATERIAL_INIT)
     spoil.clear()
     neilf.losses(batch, Stage.MATERIAL_INIT)

@@ -36,15 +36,15 @@ class Train:
     out: Path | None = None
     """The run folder; default: runs/CAPTURE-PRESET."""
     preset: str | None = None
-    """fast (minutes on a laptop's CPU), balanced or best (more steps, more rays and finer grids:
-    docs/budget.md), or paper-mlp, paper-ngp, paper-ngp-hdr (the published settings); default: fast.
+    """fast (minutes on a CPU), balanced or best (hours: docs/budget.md), or the published settings paper-mlp,
+    paper-ngp, paper-ngp-hdr; default: fast.
     """
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
-    """Settings from a .yaml or .json file, such as a run folder's config.json; other options override it."""
+    """Settings from a .yaml or .json file; other options override it."""
     host: Literal["volsdf", "mesh"] = "volsdf"
     """Source of geometry: recovered from the images (volsdf), or a given mesh."""
     mesh: Path | None = None
-    """Mesh for --host mesh, in the capture's world frame; default: the capture's inputs/model/mesh.ply."""
+    """Mesh in the capture's world frame; default: that of the capture."""
     light: Path | None = None
     """A known environment map (linear EXR, docs/light.md); default: recovered."""
     resume: bool = False
@@ -60,11 +60,9 @@ class Train:
     effects: str | None = None
     """Effects to simulate: auto, all, none, as-set, or a list such as auto,-lamps (docs/effects.md)."""
     budget: str | None = None
-    """Time for the whole command, such as 90s, 10m or 1h; the steps are planned for it (docs/budget.md).
-    Default: no limit.
-    """
+    """Time for the whole command: 90s, 10m or 1h (docs/budget.md); default: no limit."""
     view: bool = False
-    """Serve the viewer in the browser while the run trains (docs/viewer.md); needs the extra `view`."""
+    """Serve the viewer while the run trains (docs/viewer.md)."""
     strict: bool = False
     """Exit with status 1 if the result is unusable (docs/health.md)."""
     device: Device = "auto"
@@ -72,7 +70,7 @@ class Train:
     devices: int = 1
     """Number of processes on this machine, each on its own GPU, or all on the CPU."""
     nodes: int = 1
-    """Number of machines, each with --devices processes that torchrun starts (docs/performance.md)."""
+    """Number of machines, started by torchrun (docs/machines.md)."""
 
 
 @dataclass
@@ -217,7 +215,6 @@ COMMAND = Command(
     run,
     [
         "neilfpp train --data captures/teapot",
-        "neilfpp train --data captures/teapot --preset paper-ngp --out runs/teapot",
         "neilfpp train --data captures/teapot --config settings.yaml",
         "neilfpp train --data captures/teapot --host mesh --mesh scans/teapot.ply",
         "neilfpp train --data captures/teapot --budget 10m   (as many steps as fit in ten minutes)",

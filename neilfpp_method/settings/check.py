@@ -16,11 +16,9 @@ def check_config(config: NeilfConfig) -> None:
     """
     if not 0 < config.train.fresh <= 1:
         raise UserError(f"--config.train.fresh is {config.train.fresh}", "set it above 0 and at most to 1")
-    volume = config.volume
-    if not 0 <= volume.beta_final <= volume.beta_init:
+    if config.volume.beta_final < 0:
         raise UserError(
-            f"--config.volume.beta-final is {volume.beta_final}",
-            f"set it between 0 (no bound) and beta_init, {volume.beta_init}",
+            f"--config.volume.beta-final is {config.volume.beta_final}", "set it to 0 (no bound) or more"
         )
     rates = config.optimizer
     if min(rates.final) <= 0 or min(rates.drops) < 0 or rates.warm_up < 0:

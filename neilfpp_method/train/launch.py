@@ -54,7 +54,7 @@ def _check_torchrun(devices: int, nodes: int) -> None:
     if started is None and nodes > 1:
         raise UserError(
             f"--nodes {nodes}: one command starts the processes of one machine only",
-            "start it with torchrun on each machine (docs/performance.md)",
+            "start it with torchrun on each machine (docs/machines.md)",
         )
     if started is not None and started != devices * nodes:
         raise UserError(

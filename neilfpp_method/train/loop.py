@@ -105,7 +105,6 @@ def _train_stage(
             seed_step(settings.seed, step, run.fabric.global_rank)
             at = StagePosition(stage, number, length)
             set_rates(optimizer, run.config.optimizer, at, background_waits=not run.model.facts.far_points)
-            limit_surface_width(model.host, run.config.volume, at)
             with doing("data"):
                 batch = run.pixels.sample(settings.rays, gradients)
             moment = Moment.before_step(model, batch, at)
@@ -172,6 +171,7 @@ def _update(
     loss, decibels, stopping, *mean_norms = means
     if all(math.isfinite(value) for value in (loss, *mean_norms)):
         optimizer.step()
+        limit_surface_width(model.host, run.config.volume, moment.position)
         run.skipped_in_a_row = 0
     else:
         named_norms = dict(zip(norms, mean_norms, strict=True))

@@ -20,7 +20,7 @@ from scipy.ndimage import binary_erosion
 
 from benchmarks.blender import blender_picture, shown_psnr
 from neilfpp_method.errors import UserError
-from neilfpp_method.relight.film import Budget, take_picture
+from neilfpp_method.relight.film import Budget, render_picture
 from neilfpp_method.relight.path_tracer import Scene
 from neilfpp_method.relight.sky import sky_of_run
 from neilfpp_method.relight.surface import Surface
@@ -62,7 +62,7 @@ def own_picture(run: Run) -> tuple[np.ndarray, np.ndarray]:
     surface = Surface(triangles, torch.nn.functional.normalize(triangles, dim=-1))
     camera = next(view.camera for view in run.capture.views if view.name == VIEW)
     scene = Scene(surface, rough_paint, GGX, sky_of_run(run.model.light))
-    picture = take_picture(scene, run.capture.normalisation.camera(camera), Budget(256), bounces=1)
+    picture = render_picture(scene, run.capture.normalisation.camera(camera), Budget(256), bounces=1)
     return picture.radiance.numpy(), binary_erosion(picture.alpha[..., 0].numpy() == 1)
 
 

@@ -10,7 +10,7 @@ import pytest
 from benchmarks import relight
 from benchmarks.mitsuba_scene import load_mitsuba, render
 from neilfpp_method.errors import UserError
-from neilfpp_method.relight.film import Budget, take_picture
+from neilfpp_method.relight.film import Budget, render_picture
 from neilfpp_method.relight.sky import Sky
 
 
@@ -23,7 +23,7 @@ def test_a_picture_of_the_corner_is_mitsubas(tmp_path):
     radiance[:, 8:] *= 0.2  # from the left, where x is below 0, comes little
     camera = relight.corner_camera(12)
     scene = relight.scene_of(relight.corner_parts(), Sky(radiance, rows_at_poles=True, start=0.0))
-    ours = take_picture(scene, camera, Budget(256), bounces=3).radiance.numpy()
+    ours = render_picture(scene, camera, Budget(256), bounces=3).radiance.numpy()
     theirs = render(
         mi, relight.corner_parts(), radiance.numpy(), camera, tmp_path, samples=64, bounces=3, seed=1
     )
@@ -31,7 +31,7 @@ def test_a_picture_of_the_corner_is_mitsubas(tmp_path):
     assert ours.mean() == pytest.approx(mean, rel=0.015)
     assert np.abs(ours - theirs).mean() < 0.1 * mean
     turned = dataclasses.replace(scene, sky=Sky(radiance, rows_at_poles=True, start=1.5))
-    other = take_picture(turned, camera, Budget(64), bounces=3).radiance.numpy()
+    other = render_picture(turned, camera, Budget(64), bounces=3).radiance.numpy()
     assert np.abs(other - theirs).mean() > 0.2 * mean
 
 

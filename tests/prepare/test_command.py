@@ -26,7 +26,9 @@ DATA = Path(os.environ.get("NEILFPP_DATA", Path(__file__).parents[2].parent / "s
 
 
 def prepare(images: Path, out: Path, *options: str) -> int:
-    return main(["prepare", str(images), "--out", str(out), *options])
+    """Run the command; without a dense cloud, which takes most of the time, unless a test asks for it."""
+    cloud = () if "--cloud" in options else ("--cloud", "sparse")
+    return main(["prepare", str(images), "--out", str(out), *cloud, *options])
 
 
 @pytest.fixture(scope="module")

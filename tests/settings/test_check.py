@@ -23,7 +23,7 @@ def with_setting(config: NeilfConfig, room: str, **settings: object) -> NeilfCon
 WRONG = {
     "no rays are fresh": (preset("fast"), "train", {"fresh": 0.0}, "train.fresh is 0"),
     "more than all are fresh": (preset("fast"), "train", {"fresh": 1.5}, "train.fresh is 1.5"),
-    "a surface that becomes softer": (preset("fast"), "volume", {"beta_final": 0.2}, "beta-final is 0.2"),
+    "a surface of negative width": (preset("fast"), "volume", {"beta_final": -0.1}, "beta-final is -0.1"),
     "a map that L_ref cannot teach": (preset("fast"), "inter_reflection", {"mode": "soft"}, "L_ref"),
 }
 

@@ -188,7 +188,7 @@ def test_a_second_ctrl_c_does_not_wait(tmp_path, capture, whole, monkeypatch):
     original, out = loop.seed_step, tmp_path / "run"
     with monkeypatch.context() as patch:
         patch.setattr(loop, "seed_step", seed_step)
-        with pytest.raises(Stopped, match="stopped at once; continue from its last checkpoint with: neilfpp"):
+        with pytest.raises(Stopped, match="stopped at once; continue from the last checkpoint with: neilfpp"):
             run(capture, out, small_config())
     assert state(out)["step"] == 4
     run(None, out, resume=True)
