@@ -15,7 +15,6 @@ from neilfpp_method.structures import LossTerm, Material
 __all__ = [
     "eikonal",
     "exposure",
-    "free_space",
     "hessian",
     "inter_reflection",
     "lambertian",
@@ -65,15 +64,6 @@ def mask(
         known: 1 where the mask is known; the loss is 0 elsewhere.
     """
     return LossTerm(known * (object_mask * (1 - opacity) + (1 - object_mask) * depth.log1p()))
-
-
-def free_space(depth: Float[Tensor, " S"]) -> LossTerm:
-    """ln(1 + τ) of lines of sight that are known to be empty, as of `mask` off the object.
-
-    Args:
-        depth: optical depth τ of each line.
-    """
-    return LossTerm(depth.log1p())
 
 
 def exposure(drift: Float[Tensor, "V 3"]) -> LossTerm:

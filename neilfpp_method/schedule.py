@@ -101,7 +101,6 @@ STAGES: StageTable = {
         weights={
             "volume": "volume",
             "mask": "mask",
-            "free_space": "mask",
             "eikonal": "eikonal",
             "hessian": "hessian",
             "surface": "surface",
@@ -115,7 +114,6 @@ STAGES: StageTable = {
         weights={
             "volume": "volume",
             "mask": "mask",
-            "free_space": "mask",
             "eikonal": "eikonal",
             "hessian": "hessian_joint",
             "surface": "surface_joint",

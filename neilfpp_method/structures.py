@@ -31,7 +31,6 @@ __all__ = [
     "RayBatch",
     "SceneLight",
     "SceneTracer",
-    "Segments",
     "Shading",
     "Source",
     "StepResult",
@@ -114,19 +113,6 @@ class OrientedPoints(Indexable):
 
     position: Float[Tensor, "P 3"]
     normal: Float[Tensor, "P 3"]
-
-
-@dataclass(frozen=True)
-class Segments(Indexable):
-    """Line segments, in the scene frame."""
-
-    start: Float[Tensor, "S 3"]
-    end: Float[Tensor, "S 3"]
-
-    @property
-    def length(self) -> Float[Tensor, " S"]:
-        """Length of each segment, scene units."""
-        return (self.end - self.start).norm(dim=-1)
 
 
 @dataclass(frozen=True)

@@ -64,12 +64,6 @@ def test_mask_counts_where_it_is_known():
     assert term.values.tolist() == pytest.approx([0.25, 1.0, 0.0, 0.625])
 
 
-def test_free_space_is_the_mask_loss_of_an_empty_ray():
-    depth = torch.tensor([0.0, 0.1, 10.0])
-    off = losses.mask(-torch.expm1(-depth), depth, torch.zeros(3), torch.ones(3))
-    torch.testing.assert_close(losses.free_space(depth).values, off.values)
-
-
 def test_a_mask_pulls_at_what_is_opaque_and_never_without_bound():
     depth = torch.tensor([0.0, 0.1, 10.0, 1e4], requires_grad=True)
     opacity = -torch.expm1(-depth)

@@ -17,22 +17,14 @@ from neilfpp_method.hosts.base import RegularisedHits
 from neilfpp_method.hosts.smooth_normals import smooth_normals
 from neilfpp_method.settings.types import NeilfConfig, VolumeConfig
 from neilfpp_method.shading.frame import safe_normalize
-from neilfpp_method.structures import (
-    LossTerm,
-    OrientedPoints,
-    PixelBatch,
-    RayBatch,
-    SceneLight,
-    Segments,
-    SurfaceHits,
-)
+from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayBatch, SceneLight, SurfaceHits
 from neilfpp_method.timing.ledger import doing
 from neilfpp_method.volume.compositing import Weights, composite, depth_weights, sample_weights, share_near
-from neilfpp_method.volume.density import LaplaceDensity, laplace_density, laplace_depth
+from neilfpp_method.volume.density import LaplaceDensity, laplace_depth
 from neilfpp_method.volume.distance_grid import GRID_RESOLUTION, cell_size, sample_grid, trace_grid
 from neilfpp_method.volume.empty_space import EmptySpace
 from neilfpp_method.volume.free_space import FreeSpace, cameras_within
-from neilfpp_method.volume.intersect import Interval, clip_to_sphere, sphere_interval
+from neilfpp_method.volume.intersect import Interval, sphere_interval
 from neilfpp_method.volume.samplers import error_bounded_samples
 
 __all__ = ["VolSdfHost"]
@@ -91,7 +83,6 @@ class VolSdfHost(nn.Module):
         points: OrientedPoints | None = None,
         radiance_start: float = MID_GREY,
         cameras: Float[Tensor, "V 3"] | None = None,
-        sight_lines: Segments | None = None,
     ) -> None:
         super().__init__()
         self.config = config
@@ -100,9 +91,6 @@ class VolSdfHost(nn.Module):
         # Buffers follow the host to its device. They are not in checkpoints, as the capture has them.
         self.register_buffer("point_position", None if points is None else points.position, persistent=False)
         self.register_buffer("point_normal", None if points is None else points.normal, persistent=False)
-        empty = None if sight_lines is None else clip_to_sphere(sight_lines, config.volume.radius)
-        self.register_buffer("sight_start", empty.start if empty else None, persistent=False)
-        self.register_buffer("sight_end", empty.end if empty else None, persistent=False)
         radius = config.volume.radius
         sdf = config.host.sdf
         self.sdf_field = SdfField(sdf, config.encoding, radius)
@@ -360,8 +348,6 @@ class VolSdfHost(nn.Module):
             terms["point_cloud"] = losses.point_cloud(
                 sample.distance, sample.gradient, self.point_normal[rows]
             )
-        if "free_space" in names and self.sight_start is not None:
-            terms["free_space"] = losses.free_space(self._depth_of_sight_lines(len(batch)))
         if "mask" in names:
             terms["mask"] = losses.mask(
                 march.hits.opacity, self._depth_of_object(march), batch.mask, batch.mask_known
@@ -372,14 +358,6 @@ class VolSdfHost(nn.Module):
         """Optical depth of rays, with β detached: the mask loss must move surfaces, not widen them."""
         distance = march.surface.distance.view_as(march.distances)
         return laplace_depth(distance, march.distances, self.density.beta().detach()).sum(-1)
-
-    def _depth_of_sight_lines(self, count: int) -> Float[Tensor, " count"]:
-        """Optical depth of random lines of sight, estimated at one random point of each; β is detached."""
-        rows = torch.randint(len(self.sight_start), (count,), device=self.sight_start.device)
-        start, end = self.sight_start[rows], self.sight_end[rows]
-        point = torch.lerp(start, end, torch.rand(count, 1, device=start.device))
-        density = laplace_density(self.sdf(point), self.density.beta().detach())
-        return density * (end - start).norm(dim=-1)
 
     def _places(self, march: March) -> Places:
         """Points of the regularisers of G (`loss.points`)."""

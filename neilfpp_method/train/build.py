@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +14,8 @@ from neilfpp_method.data.environment_map import read_environment
 from neilfpp_method.data.mesh import read_mesh
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.point_cloud import load_point_cloud
-from neilfpp_method.data.sight_lines import find_sight_lines
 from neilfpp_method.data.truth import Truth
-from neilfpp_method.data.views import Camera, camera_rays
+from neilfpp_method.data.views import camera_rays
 from neilfpp_method.effects.exposure import Exposures, measure_exposures
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.base import Host
@@ -25,7 +24,7 @@ from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.structures import OrientedPoints, Segments
+from neilfpp_method.structures import OrientedPoints
 
 __all__ = ["build_model", "cloud_in_words", "exposures_of", "scene_facts", "show_known_light"]
 
@@ -114,17 +113,10 @@ def show_known_light(model: NeilfModel) -> None:
 
 
 def _volsdf(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> VolSdfHost:
-    cameras = [capture.normalisation.camera(view.camera) for view in capture.train_views]
-    return VolSdfHost(
-        config,
-        facts.radiance_scale,
-        facts.background,
-        facts.background_color,
-        points=_points(capture, config),
-        radiance_start=facts.median_radiance,
-        cameras=torch.from_numpy(np.stack([camera.c2w for camera in cameras])[:, :, 3]).float(),
-        sight_lines=_sight_lines(capture, config, cameras),
-    )
+    scale, start, points = facts.radiance_scale, facts.median_radiance, _points(capture, config)
+    poses = [capture.normalisation.camera(view.camera).c2w for view in capture.train_views]
+    cameras = torch.from_numpy(np.stack(poses)[:, :, 3]).float()
+    return VolSdfHost(config, scale, facts.background, facts.background_color, points, start, cameras)
 
 
 def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
@@ -166,14 +158,6 @@ def _check_seen(host: MeshHost, capture: Capture, path: str) -> None:
         raise UserError(
             f"{path}: the cameras see the inside of this mesh", "reverse the orientation of its faces"
         )
-
-
-def _sight_lines(capture: Capture, config: NeilfConfig, cameras: Sequence[Camera]) -> Segments | None:
-    """Lines of sight to the point cloud; None if the settings use none, or if there is no cloud."""
-    if config.loss.mask == 0.0 or config.loss.point_cloud == 0.0 or capture.point_cloud is None:
-        return None
-    points = load_point_cloud(capture.point_cloud, capture.normalisation)
-    return find_sight_lines(cameras, points)
 
 
 def _points(capture: Capture, config: NeilfConfig) -> OrientedPoints | None:

@@ -8,9 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.structures import Segments
-
-__all__ = ["Interval", "clip_to_sphere", "sphere_interval"]
+__all__ = ["Interval", "sphere_interval"]
 
 
 @dataclass(frozen=True)
@@ -41,15 +39,3 @@ def sphere_interval(
     perpendicular = origins + closest[:, None] * directions
     half = (radius**2 - perpendicular.square().sum(dim=-1)).clamp_min(0.0).sqrt()
     return Interval((closest - half).clamp_min(0.0), (closest + half).clamp_min(0.0))
-
-
-@torch.no_grad()
-def clip_to_sphere(segments: Segments, radius: float) -> Segments:
-    """The parts of segments inside the sphere of `radius` around the origin; other segments are left out."""
-    length = segments.length
-    direction = (segments.end - segments.start) / length.clamp_min(1e-12)[:, None]
-    inside = sphere_interval(segments.start, direction, radius)
-    far = torch.minimum(inside.far, length)
-    kept = far > inside.near
-    start, direction = segments.start[kept], direction[kept]
-    return Segments(start + inside.near[kept, None] * direction, start + far[kept, None] * direction)

@@ -13,7 +13,7 @@ from neilfpp_method.fields.sdf import SdfSample
 from neilfpp_method.hosts.base import HasParameterGroups, HasSurfaceWidth, Host, Regularised
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.settings.presets import preset
-from neilfpp_method.structures import OrientedPoints, RayBatch, Segments
+from neilfpp_method.structures import OrientedPoints, RayBatch
 from neilfpp_method.volume.density import laplace_density
 from tests.scenes import sphere_batch, sphere_model, tiny_config
 
@@ -180,33 +180,6 @@ def test_a_cloud_on_the_surface_costs_little_and_one_off_it_its_distance():
         )
         term = host.render_regularised(sphere_batch(8), ["point_cloud"]).terms["point_cloud"]
         assert term.mean().item() == pytest.approx(expected, abs=0.15)  # the field starts as a rough sphere
-
-
-def test_a_line_of_sight_through_the_surface_pushes_it_away():
-    # From outside the scene to its middle, through the sphere that the field starts as.
-    start = torch.tensor([[0.0, 0.0, -5.0]]).expand(64, 3)
-    host = VolSdfHost(
-        tiny_config(), 3.0, "constant", sight_lines=Segments(start, torch.zeros_like(start))
-    ).train()
-    torch.testing.assert_close(host.sight_start.norm(dim=-1).max().item(), host.config.volume.radius)
-    inside = torch.tensor([[0.0, 0.0, -0.5]])
-    optimizer = torch.optim.SGD(host.sdf_field.parameters(), lr=1e-3)
-    before, depths = host.sdf(inside).item(), []
-    for _ in range(20):
-        term = host.render_regularised(sphere_batch(64), ["free_space"]).terms["free_space"]
-        depths.append(term.mean().item())
-        optimizer.zero_grad()
-        term.mean().backward()
-        optimizer.step()
-    assert host.sdf(inside).item() > before + 0.01
-    assert sum(depths[-5:]) < sum(depths[:5])
-    # The scale of the density is a constant here: it must not widen to make a line transparent.
-    assert host.density.above_floor.grad is None
-
-
-def test_without_lines_of_sight_nothing_is_known_to_be_empty():
-    host = sphere_model().host
-    assert "free_space" not in host.render_regularised(sphere_batch(8), ["free_space"]).terms
 
 
 def test_the_background_field_moves_only_where_it_is_the_background():

@@ -7,8 +7,7 @@ import math
 import pytest
 import torch
 
-from neilfpp_method.structures import Segments
-from neilfpp_method.volume.intersect import clip_to_sphere, sphere_interval
+from neilfpp_method.volume.intersect import sphere_interval
 
 X = [1.0, 0.0, 0.0]
 
@@ -45,13 +44,3 @@ def test_the_ends_lie_on_the_sphere_for_far_cameras():
     for distance in (interval.near, interval.far):
         ends = inside.double() + (distance.double() - 1000.0)[:, None] * directions.double()
         assert (ends.norm(dim=-1) - 2.0).abs().max() < 2e-3  # a float32 at 1000 is good to 6e-5
-
-
-def test_segments_are_clipped_to_the_sphere():
-    start = torch.tensor([[-5.0, 0.0, 0.0], [-5.0, 0.0, 0.0], [-5.0, 0.0, 0.0], [-5.0, 3.0, 0.0]])
-    end = torch.tensor([[5.0, 0.0, 0.0], [1.0, 0.0, 0.0], [-3.0, 0.0, 0.0], [5.0, 3.0, 0.0]])
-    clipped = clip_to_sphere(Segments(start, end), 2.0)
-    # Through, into, up to before, and past the sphere.
-    assert clipped.start.tolist() == [[-2.0, 0.0, 0.0], [-2.0, 0.0, 0.0]]
-    assert clipped.end.tolist() == [[2.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
-    assert clipped.length.tolist() == [4.0, 3.0]
