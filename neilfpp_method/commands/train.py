@@ -56,7 +56,7 @@ class Train:
     response: Literal["auto", "linear", "srgb"] = "auto"
     """What the pixels hold: linear radiance (HDR) or sRGB (LDR); auto: as the files say."""
     scale: float | None = None
-    """Image size relative to the files; default: as large as the training can use."""
+    """Image size relative to the files; default: as training can use."""
     effects: str | None = None
     """Effects to simulate: auto, all, none, as-set, or a list such as auto,-lamps (docs/effects.md)."""
     budget: str | None = None

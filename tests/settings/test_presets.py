@@ -12,7 +12,7 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import PRESETS, preset
-from neilfpp_method.structures import OrientedPoints, Segments
+from neilfpp_method.structures import OrientedPoints
 from tests.scenes import sphere_batch
 
 
@@ -25,11 +25,7 @@ def test_a_step_of_every_stage(name):
     facts = SceneFacts("linear", 0.2, 3.0, "constant", log_gains=(0.1, 0.0, 0.0, -0.1, 0.0, 0.0))
     direction = torch.nn.functional.normalize(torch.randn(50, 3), dim=-1)
     host = VolSdfHost(
-        config,
-        facts.radiance_scale,
-        facts.background,
-        points=OrientedPoints(0.6 * direction, direction),
-        sight_lines=Segments(2.0 * direction, 0.7 * direction),
+        config, facts.radiance_scale, facts.background, points=OrientedPoints(0.6 * direction, direction)
     )
     model = NeilfModel(host, config, facts)
     batch = sphere_batch(6, spread=0.3)
