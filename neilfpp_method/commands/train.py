@@ -48,7 +48,7 @@ class Train:
     light: Path | None = None
     """A known environment map (linear EXR, docs/light.md); default: recovered."""
     resume: bool = False
-    """Continue the run in --out from its last checkpoint, with the same result as without a stop."""
+    """Continue the run in --out from its last checkpoint."""
     format: str | None = None
     """Format of the capture (see docs/captures.md); default: recognised from the files."""
     test_every: int | None = None
