@@ -269,7 +269,7 @@ class AttachedNeilf(nn.Module):
 
 def attach_neilf(
     host: Any,
-    config: NeilfConfig | None = None,
+    config: NeilfConfig | str = "fast",
     *,
     response: str = "linear",
     median_radiance: float = 0.5,
@@ -286,8 +286,8 @@ def attach_neilf(
             SurfaceHits` that draws whole images; a function (origins, directions) → (color, position,
             normal); or a nerfstudio model. The object must lie in the unit sphere of the host's frame.
             docs/hosts.md has a recipe for each.
-        config: the settings. None: the preset `fast`; for a borrowed host (without `parameter_groups`)
-            without its first stage, so that the material starts at step 0.
+        config: the settings, or the name of a preset. A preset is used without its first stage for a
+            borrowed host (one without `parameter_groups`), so that the material starts at step 0.
         response: meaning of pixel values: "linear" (HDR) or "srgb" (LDR).
         median_radiance: median linear luminance of the object in the images; sets the initial light.
         radiance_scale: largest radiance of the host. None: 3 for HDR, 1 for LDR.
@@ -298,8 +298,8 @@ def attach_neilf(
         A module with the losses, maps and parameters of material and light.
 
     Raises:
-        UserError: the host has none of these forms, an argument is out of range, or the environment map that
-            the settings name cannot be used.
+        UserError: the host has none of these forms, no preset has this name, an argument is out of range, or
+            the environment map that the settings name cannot be used.
     """
     if response not in RADIANCE_SCALE:
         raise UserError(
@@ -314,8 +314,8 @@ def attach_neilf(
     if not 0 < scale < math.inf:
         raise UserError(f"radiance_scale is {scale}", "give the largest radiance of the host, above 0")
     borrowed = not isinstance(host, HasParameterGroups)
-    if config is None:
-        config = preset("fast")
+    if isinstance(config, str):
+        config = preset(config)
         config = replace(config, train=replace(config.train, sdf_steps=0)) if borrowed else config
     adapted = _adapt(host, response)
     facts = SceneFacts(response, median_radiance, scale, "inverted_sphere" if open_scene else "constant")

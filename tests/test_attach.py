@@ -128,6 +128,16 @@ def test_gradients_reach_a_borrowed_host_in_the_joint_stage_alone():
     assert all(p.grad.abs().max() > 0 for p in host.paint.parameters())  # by way of the colour
 
 
+def test_a_preset_can_be_named():
+    torch.manual_seed(0)
+    named = attach_neilf(BallHost(), "fast").model.config
+    assert named.preset == "fast"
+    assert named.train.sdf_steps == 0
+    assert attach_neilf(BallHost()).model.config == named
+    with pytest.raises(UserError, match="unknown preset 'quick'"):
+        attach_neilf(BallHost(), "quick")
+
+
 def test_a_host_that_offers_its_parameters_is_trained_with_the_rest():
     config = tiny_config()
     torch.manual_seed(0)
