@@ -32,9 +32,9 @@ class Train:
     """Recover geometry, material and light from posed images."""
 
     data: Path | None = None
-    """The folder of the capture. Not needed with --resume."""
+    """Folder of the capture; not with --resume."""
     out: Path | None = None
-    """The run folder; default: runs/CAPTURE-PRESET."""
+    """Run folder; default: runs/CAPTURE-PRESET."""
     preset: str | None = None
     """fast (minutes on a CPU), balanced or best (hours: docs/budget.md), or the published settings paper-mlp,
     paper-ngp, paper-ngp-hdr; default: fast.
@@ -60,17 +60,17 @@ class Train:
     effects: str | None = None
     """Effects to simulate: auto, all, none, as-set, or a list such as auto,-lamps (docs/effects.md)."""
     budget: str | None = None
-    """Time for the whole command: 90s, 10m or 1h (docs/budget.md); default: no limit."""
+    """Time of the command, such as 10m; default: no limit."""
     view: bool = False
     """Serve the viewer while the run trains (docs/viewer.md)."""
     strict: bool = False
-    """Exit with status 1 if the result is unusable (docs/health.md)."""
+    """Exit status 1 if the result is unusable."""
     device: Device = "auto"
     """Device to train on; auto selects a GPU if there is one."""
     devices: int = 1
-    """Number of processes on this machine, each on its own GPU, or all on the CPU."""
+    """Processes on this machine, one per GPU."""
     nodes: int = 1
-    """Number of machines, started by torchrun (docs/machines.md)."""
+    """Machines, by torchrun (docs/machines.md)."""
 
 
 @dataclass

@@ -136,7 +136,7 @@ def test_a_stopped_command_says_how_it_continues_and_does(photos, tmp_path, monk
         patch.setattr(command, "map_scene", stop)
         assert prepare(photos, out, "--undistort", "--test-every", "3") == 130
     assert (
-        f"neilfpp prepare {photos} --out {out} --undistort --test-every 3"
+        f"neilfpp prepare {photos} --out {out} --undistort --cloud sparse --test-every 3"
         in capfd.readouterr().err.replace("\n", "")
     )
     assert not (out / "capture.json").exists()
