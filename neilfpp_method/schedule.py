@@ -213,7 +213,7 @@ def rate_factor(config: OptimizerConfig, position: StagePosition) -> float:
 
 
 def surface_width_limit(config: VolumeConfig, position: StagePosition) -> float:
-    """The largest β of a step, scene units: it falls from `beta_init` to `beta_final` in SDF init.
+    """The largest β after a step, scene units: it falls from `beta_init` to `beta_final` in SDF init.
 
     Photographs that the radiance field cannot explain sharply are explained best by fog, and a β that is
     only learned then stays large. BakedSDF (Yariv et al. 2023) prescribes β; here it is bounded, so a
@@ -224,7 +224,8 @@ def surface_width_limit(config: VolumeConfig, position: StagePosition) -> float:
         >>> round(surface_width_limit(VolumeConfig(beta_init=0.04, beta_final=0.01), halfway), 6)
         0.02
     """
-    if config.beta_final == 0.0:
+    if config.beta_final == 0.0 or position.stage is Stage.MATERIAL_INIT:
+        # Geometry does not move in material init.
         return math.inf
     share = position.share if position.stage is Stage.SDF_INIT else 1.0
     first = max(config.beta_init, config.beta_final)

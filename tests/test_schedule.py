@@ -144,4 +144,5 @@ def test_the_surface_is_bound_to_become_thin_in_sdf_init_and_to_stay_so():
     assert widths[1] == pytest.approx(math.sqrt(fast.beta_init * fast.beta_final))
     assert widths[1] > widths[2] > fast.beta_final
     assert surface_width_limit(fast, StagePosition(Stage.JOINT, 0, 100)) == fast.beta_final
+    assert surface_width_limit(fast, StagePosition(Stage.MATERIAL_INIT, 0, 100)) == math.inf
     assert surface_width_limit(preset("paper-mlp").volume, StagePosition(Stage.SDF_INIT, 99, 100)) == math.inf

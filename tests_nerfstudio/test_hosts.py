@@ -120,7 +120,7 @@ def test_a_gradient_reaches_the_model_but_not_what_it_never_trains() -> None:
 @pytest.mark.parametrize(
     ("outputs", "remedy"),
     [
-        ("rgb", "renders a colour"),
+        ("rgb", "renders a color"),
         ("accumulation", "sum of its weights"),
         ("depth", "depth"),
         ("normal", "predict_normals"),
@@ -236,7 +236,7 @@ def test_a_foreign_host_says_what_traces_its_rays_and_where_neilfpp_cannot_follo
     data = make_capture(tmp_path / "capture", size=(8, 6), test=(0, 1))
     run = ns_train(trainer_config(data, tmp_path / "run", settings, host="neus"))
     said = " ".join(capsys.readouterr().out.split())
-    assert "a proxy of its surface, gathered from the training rays" in said
-    assert "no run folder for neilfpp's own commands: the host neus is nerfstudio's own" in said
+    assert "a proxy of its surface that is built from the training rays" in said
+    assert "no run folder for the neilfpp commands: the host neus belongs to nerfstudio" in said
     with pytest.raises(UserError, match="no run folder neilfpp/ beside it"):
         run_folder(run / "config.yml")
