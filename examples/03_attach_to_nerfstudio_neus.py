@@ -2,8 +2,7 @@
 
     python examples/03_attach_to_nerfstudio_neus.py [steps]
 
-`steps` is the number of steps of each of the two loops (default 2000). The hash grid of NeuS comes from
-tiny-cuda-nn, so this example needs a GPU.
+`steps`: of each of the two loops (default 2000). NeuS needs tiny-cuda-nn, and that a GPU.
 """
 
 from __future__ import annotations

@@ -195,7 +195,6 @@ class NeilfMethod(Model):
         for optimizer in optimizers.optimizers.values():
             far_points = self.neilf.facts.far_points
             set_rates(optimizer, self.rates, position, background_waits=not far_points)
-        limit_surface_width(self.neilf.host, self.config.neilf.volume, position)
         seed_step(settings.seed, step)
 
     def _start_light(self, step: int) -> None:
@@ -210,7 +209,9 @@ class NeilfMethod(Model):
             self.light_solver.start(first.observed, first.material, self.neilf.scene)
 
     def _solve_light(self, step: int) -> None:
-        """Fit the light after the optimizer step if that is due, as in the standalone loop."""
+        """After the optimizer step, keep the surface thin and fit the light if due, as in the standalone loop."""
+        settings = self.config.neilf
+        limit_surface_width(self.neilf.host, settings.volume, stage_at(step, settings.train))
         if self.computed is None:
             return
         self.light_solver.observe(self.computed)
