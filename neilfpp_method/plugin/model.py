@@ -209,7 +209,7 @@ class NeilfMethod(Model):
             self.light_solver.start(first.observed, first.material, self.neilf.scene)
 
     def _solve_light(self, step: int) -> None:
-        """After the optimizer step, keep the surface thin and fit the light if due, as in the standalone loop."""
+        """Bound β and fit the light if due, after the optimizer step as in the standalone loop."""
         settings = self.config.neilf
         limit_surface_width(self.neilf.host, settings.volume, stage_at(step, settings.train))
         if self.computed is None:
