@@ -53,9 +53,7 @@ def small_settings(**steps: int) -> NeilfConfig:
     fit = LightFitConfig(points=48, every=3, steps=5)
     return dataclasses.replace(
         config,
-        # With a bound on β, R of a run that is continued outside of nerfstudio differs by up to 1e-4, for a
-        # reason that is not known yet.
-        volume=dataclasses.replace(config.volume, beta_final=0.0),
+        volume=dataclasses.replace(config.volume, beta_final=usual.volume.beta_final),
         light=dataclasses.replace(usual.light, environment_height=8, fit=fit),
         inter_reflection=dataclasses.replace(config.inter_reflection, mode=usual.inter_reflection.mode),
     )

@@ -19,6 +19,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from neilfpp_method.data.images import write_exr
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.protocols import evaluate
+from neilfpp_method.kernels.process import computing_fast
 from neilfpp_method.schedule import STAGES, Stage, stage_steps
 from neilfpp_method.settings.presets import fixed_geometry, free_light
 from neilfpp_method.settings.types import NeilfConfig
@@ -126,7 +127,8 @@ def test_the_same_scene_seed_and_steps_give_the_same_weights_in_both_loops(
 ) -> None:
     inside = ns_train(trainer_config(data, tmp_path / "inside", settings))
     standalone = small_training(data, tmp_path / "standalone", settings, patches=0)
-    train(standalone)
+    with computing_fast():
+        train(standalone)
     assert differences(weights(inside), dict(standalone.model.state_dict())) == []
 
 
@@ -136,7 +138,8 @@ def test_the_same_scene_seed_and_steps_give_the_same_quality_in_both_loops(
     settings = with_steps(SETTINGS, sdf_steps=60, material_steps=20, joint_steps=5)
     ns = evaluated(ns_train(trainer_config(data, tmp_path / "inside", settings)), tmp_path)
     standalone = small_training(data, tmp_path / "standalone", settings, patches=0)
-    train(standalone)
+    with computing_fast():
+        train(standalone)
     capture, steps = standalone.pixels.capture, sum(stage_steps(settings.train).values())
     own = evaluate(Run(tmp_path, settings, capture, standalone.model.facts, standalone.model.eval(), steps))
     for theirs, ours in {"psnr": "pbr_psnr", "volume_psnr": "volume_psnr"}.items():
