@@ -184,7 +184,9 @@ class NeilfMethod(Model):
             TrainingCallback(after, self._solve_light),
             TrainingCallback(after, self._look_and_save, args=[trainer]),
             TrainingCallback(after, self._end_after_last, args=[trainer]),
-            TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self.while_training.close()),
+            TrainingCallback(
+                [TrainingCallbackLocation.AFTER_TRAIN], lambda step: self.while_training.close()
+            ),
         ]
 
     def _begin_step(self, optimizers: Optimizers, step: int) -> None:

@@ -10,6 +10,7 @@ import pytest
 from neilfpp_method.cli import main
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings import presets
+from neilfpp_method.settings.plain import changed
 from neilfpp_method.tradeoff import rows
 from neilfpp_method.tradeoff.rows import rows_of
 from neilfpp_method.train.budget_record import read_budget
@@ -53,6 +54,34 @@ def test_a_second_call_goes_on_and_does_nothing_twice(tmp_path, words, clock, mo
     assert "another capture or with other settings" in capsys.readouterr().err
 
 
+def test_a_row_that_differs_in_any_setting_is_refused_by_name(tmp_path, words, clock, monkeypatch, capsys):
+    assert main([*words, "--budgets", "2m"]) == 0
+    run = tmp_path / "out" / "2m-seed0"
+    assert main([*words, "--budgets", "2m"]) == 0
+
+    wider = changed(small_config(**STEPS), {"brdf.width": 24})
+    with monkeypatch.context() as patch:
+        patch.setitem(presets.PRESETS, "fast", lambda: wider)
+        capsys.readouterr()
+        assert main([*words, "--budgets", "2m"]) == 2
+        before = small_config().brdf.width
+        assert f"brdf.width is {before}, not 24; choose another --out" in capsys.readouterr().err
+
+    for name, key, value, message in (
+        ("effects.json", "asked", "none", "--effects is none, not auto"),
+        ("plan.json", "budget", 119.0, "the budget in seconds is 119.0, not 120.0"),
+        ("capture.json", "response", "srgb", "capture.response is srgb, not auto"),
+    ):
+        text = (run / name).read_text()
+        (run / name).write_text(json.dumps({**json.loads(text), key: value}))
+        assert main([*words, "--budgets", "2m"]) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+        (run / name).write_text(text)
+    assert main([*words, "--budgets", "2m"]) == 0
+
+
 def test_nothing_can_be_run(tmp_path, words, clock, capsys):
     assert main([*words, "--budgets", "1s"]) == 2
     assert "no run could be made" in capsys.readouterr().err
@@ -64,6 +93,7 @@ def test_nothing_can_be_run(tmp_path, words, clock, capsys):
     [
         (["--budgets", "soon"], "not a duration"),
         (["--budgets", "1m,60s"], "contains a budget twice"),
+        (["--budgets", "60s,60.2s"], "contains a budget twice"),  # both would be 1m-seed0
         (["--budgets", ","], "--budgets is empty"),
         (["--seeds", "0"], "--seeds is 0"),
     ],
