@@ -14,6 +14,7 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.protocols import evaluate, write_metrics
 from neilfpp_method.evaluate.size import at_size
 from neilfpp_method.report.files import flat_settings
+from neilfpp_method.report.measured import is_outdated
 from neilfpp_method.settings.plain import to_dict
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.tradeoff.frontier import FIGURES, Measured
@@ -139,7 +140,7 @@ def run_row(row: Row, console: Console, at_end: Callable[[Path], None] | None = 
             budget=row.budget,
             at_end=at_end,
         )
-    if not (row.out / METRICS).is_file():
+    if not _has_metrics(row.out):
         run = at_size(load_run(row.out, pick_device(row.device)), None, None)
         if run.capture.test_views:
             write_metrics(row.out / METRICS, run, evaluate(run))
@@ -154,10 +155,15 @@ def measured(row: Row) -> Measured | None:
     plan = read_budget(row.out)
     if plan is None or plan.took is None:
         return None
-    known = read_json(row.out / METRICS) if (row.out / METRICS).is_file() else {}
+    known = read_json(row.out / METRICS) if _has_metrics(row.out) else {}
     figures = {name: float(known[name]) for name in FIGURES if isinstance(known.get(name), int | float)}
     looks = read_looks(row.out)
     if looks:
         last = looks[-1]
         figures["held_back_psnr"] = last.radiance if last.physical is None else last.physical
     return Measured(row.budget, row.config.train.seed, plan.took, figures)
+
+
+def _has_metrics(run: Path) -> bool:
+    """Whether a run has metrics that are not older than its last checkpoint."""
+    return (run / METRICS).is_file() and not is_outdated(run / METRICS, run)

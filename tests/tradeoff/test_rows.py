@@ -38,12 +38,15 @@ def test_a_second_call_goes_on_and_does_nothing_twice(tmp_path, words, clock, mo
         assert main(words) == 130  # in the row of 2m, as that of 1s is too small
     assert "skipped: a budget of 1s is too small" in capsys.readouterr().out
     assert read_budget(out / "2m-seed0").took is None
+    # `neilfpp eval` has measured the stopped run.
+    (out / "2m-seed0" / "metrics.json").write_text('{"pbr_psnr": 99.0}')
     assert main(words) == 0
     assert "stopped" not in capsys.readouterr().err
     points = json.loads((out / "tradeoff.json").read_text())["points"]
     assert [point["budget"] for point in points] == [120.0, 180.0]
     assert points[0]["seconds"] == pytest.approx(120.0, rel=0.1)
     assert {"base_color_psnr_scaled", "pbr_psnr", "held_back_psnr"} <= set(points[0]["figures"])
+    assert points[0]["figures"]["pbr_psnr"] < 99.0
     assert not (out / "1s-seed0").exists()
 
     before = files(out / "2m-seed0") | files(out / "3m-seed0")
