@@ -15,6 +15,7 @@ __all__ = ["rows", "table"]
 OPEN = "open"
 """Value of `decision` for an effect on which nothing has been decided yet."""
 
+
 def rows(plan: Plan) -> list[dict[str, Any]]:
     """A row for each effect with its newest decision, in the order of the catalogue.
 
@@ -50,7 +51,9 @@ def rows(plan: Plan) -> list[dict[str, Any]]:
 
 def table(plan: Plan) -> Table:
     """A table of the effects for the terminal. From 80 columns on, lines break between words only."""
-    result = Table(title=f"effects ({plan.asked})", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    result = Table(
+        title=f"effects ({plan.asked})", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
+    )
     result.add_column("effect", no_wrap=True)
     result.add_column("decision", no_wrap=True)
     for heading in ("reason", "cost when on", "risk when off"):

@@ -332,7 +332,9 @@ def test_a_full_disk_leaves_no_half_picture(given, sky, tmp_path, capfd):
 
 def test_without_a_denoiser_it_says_so(found, sky, capfd, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyoidn", None)
-    refused(capfd, found, "--env", sky, "--denoise", words=("pyoidn", "neilfpp-method[denoise]"))
+    refused(
+        capfd, found, "--env", sky, "--denoise", words=("pyoidn", "pip install 'neilfpp-method[denoise]'")
+    )
 
 
 def test_truths_for_each_map(found, sky, capfd):
