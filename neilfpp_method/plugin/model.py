@@ -22,8 +22,8 @@ from torch import Tensor, nn
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.asked import Asked
 from neilfpp_method.effects.first_light import start_with
-from neilfpp_method.effects.looks import look_at_light
 from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.review import review_light
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.health.cases import Health
@@ -184,7 +184,9 @@ class NeilfMethod(Model):
             TrainingCallback(after, self._solve_light),
             TrainingCallback(after, self._look_and_save, args=[trainer]),
             TrainingCallback(after, self._end_after_last, args=[trainer]),
-            TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self.while_training.close()),
+            TrainingCallback(
+                [TrainingCallbackLocation.AFTER_TRAIN], lambda step: self.while_training.close()
+            ),
         ]
 
     def _begin_step(self, optimizers: Optimizers, step: int) -> None:
@@ -209,7 +211,7 @@ class NeilfMethod(Model):
         settings = self.config.neilf
         seed_step(settings.train.seed, -4 - step)
         plan, pixels = Plan.begin(Asked("as-set"), settings), self.pixels.on(self.device)
-        _, first = look_at_light(plan, self.neilf, pixels, step)
+        _, first = review_light(plan, self.neilf, pixels, step)
         if first is not None:
             CONSOLE.log(first.in_words())
             start_with(self.neilf, first)

@@ -20,8 +20,8 @@ from neilfpp_method.data.held_back import PATCHES, hold_back
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import at_scale, scale_for_rays
 from neilfpp_method.effects.asked import Asked, check_asked
-from neilfpp_method.effects.looks import note_exposures, note_facts
 from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.review import record_exposures, record_facts
 from neilfpp_method.effects.table import table
 from neilfpp_method.errors import Unsound, UserError
 from neilfpp_method.health.cases import verdict_of
@@ -197,7 +197,7 @@ def run_training(
         else:
             gains = _log_gains(plan, capture, pixels)
             facts = scene_facts(capture, pixels, config, gains)
-        note_facts(plan, facts)
+        record_facts(plan, facts)
         config = plan.config_of_model
         seed_step(config.train.seed, step=-1)
         model = build_model(capture, facts, config)
@@ -282,7 +282,7 @@ def _log_gains(plan: Plan, capture: Capture, pixels: PixelDataset) -> Tensor | N
     if not plan.is_on("exposure"):
         return None
     exposures = exposures_of(capture, pixels)
-    note_exposures(plan, exposures)
+    record_exposures(plan, exposures)
     if not plan.is_on("exposure"):
         return None
     return torch.zeros(len(pixels.views), 3) if exposures is None else exposures.log_gain

@@ -31,7 +31,7 @@ from neilfpp_method.settings.facts import RadianceUnits
 from neilfpp_method.structures import LossTerms
 from neilfpp_method.timing.ledger import doing
 from neilfpp_method.train.effects_record import read_plan, write_plan
-from neilfpp_method.train.evidence import apply_plan, look_before_stage, solve_light
+from neilfpp_method.train.evidence import apply_plan, review_before_stage, solve_light
 from neilfpp_method.train.health_record import read_findings, write_findings
 from neilfpp_method.train.light_record import read_fits, write_fits
 from neilfpp_method.train.optimizer import (
@@ -67,7 +67,7 @@ def train(run: Training) -> None:
     step = _restore(run, optimizer)
     optimizer = run.fabric.setup_optimizers(optimizer)
     if step == 0:
-        look_before_stage(run, model, 0)
+        review_before_stage(run, model, 0)
     while step < total_steps(run.config.train):
         position = stage_at(step, run.config.train)
         step = _train_stage(run, model, optimizer, step, position)
@@ -76,7 +76,7 @@ def train(run: Training) -> None:
                 run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
         if step < total_steps(run.config.train):
             with doing("looks", apart=True):
-                look_before_stage(run, model, step)
+                review_before_stage(run, model, step)
         _save(run, optimizer, step, also=position.stage.value)
         with doing("looks", apart=True):
             model.eval()

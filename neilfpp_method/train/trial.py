@@ -20,15 +20,15 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import PIXELS_OF_A_VIEW, at_scale, scale_for_pixels
 from neilfpp_method.effects.asked import Asked
 from neilfpp_method.effects.first_light import seconds_of_pixel
-from neilfpp_method.effects.looks import (
-    FEWEST_PIXELS,
-    MIN_PHOTOGRAPHS,
-    MOST_PIXELS,
-    look_at_surface,
-    note_facts,
-)
 from neilfpp_method.effects.material import JUDGED, seconds_of_evidence
 from neilfpp_method.effects.plan import Decision, Plan
+from neilfpp_method.effects.review import (
+    FEWEST_PIXELS,
+    MIN_TRAIN_VIEWS,
+    MOST_PIXELS,
+    record_facts,
+    review_surface,
+)
 from neilfpp_method.health.look import look
 from neilfpp_method.health.watch import LOOKED_AT
 from neilfpp_method.lighting.solver import LightSolver, NothingToSolve
@@ -126,7 +126,7 @@ def try_out(
     pixels = PixelDataset(small, small.train_views, device)
     plan = Plan.begin(asked, config)
     facts = scene_facts(small, pixels, config)
-    note_facts(plan, facts)
+    record_facts(plan, facts)
     config = plan.config_of_model
     trial_config, fit_scale = changed(config, {"shading.hit_share": LOOSE}), 1.0
     if config.light.kind != "free":
@@ -146,7 +146,7 @@ def try_out(
     if place_look * len(with_material) > most_for_places:
         place_look = 0.0
     light_pixels, light = None, 0.0
-    if solver.seeks_start and len(capture.train_views) >= MIN_PHOTOGRAPHS and with_material:
+    if solver.seeks_start and len(capture.train_views) >= MIN_TRAIN_VIEWS and with_material:
         rate = seconds_of_pixel(device, plan.is_open("long-tails"))
         light_pixels = min(MOST_PIXELS, int(most_for_light / rate))
         light_pixels = 0 if light_pixels < FEWEST_PIXELS else light_pixels
@@ -237,7 +237,7 @@ def _look_at_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset) -> Non
     excluded = [Decision(0, name, plan.is_on(name), "settings", "not part of a trial") for name in JUDGED]
     decided = [*plan.decisions, *excluded]
     if plan.is_open("inter-reflection"):
-        look_at_surface(Plan(plan.asked, plan.settings, decided), model, pixels, 0)
+        review_surface(Plan(plan.asked, plan.settings, decided), model, pixels, 0)
 
 
 def _picture_seconds(

@@ -11,11 +11,11 @@ import torch
 from neilfpp_method.cli import main
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.asked import check_asked, read_asked
-from neilfpp_method.effects.disagreement import ShownSurface, shading_disagreement
-from neilfpp_method.effects.looks import _shown_surface, after_fit, look_at_surface
+from neilfpp_method.effects.disagreement import RenderedSurface, shading_disagreement
 from neilfpp_method.effects.material import JUDGED
 from neilfpp_method.effects.measurement import Measurement, mean_of
 from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.review import _rendered_surface, record_lamps, review_surface
 from neilfpp_method.effects.visibility import self_visibility
 from neilfpp_method.errors import UserError
 from neilfpp_method.fields import environment
@@ -71,7 +71,7 @@ def test_a_ball_sees_nothing_of_itself_so_nothing_is_traced():
     named = "auto," + ",".join(f"+{name}" for name in (*JUDGED, "joint-stage"))
     model, plan = sphere_model(config), Plan.begin(read_asked(named), config)
     torch.manual_seed(0)
-    (decision,) = look_at_surface(plan, model, OnePicture(), step=4)
+    (decision,) = review_surface(plan, model, OnePicture(), step=4)
     assert not decision.on
     assert decision.evidence.samples > 100
 
@@ -188,15 +188,17 @@ def test_nothing_varies_so_no_slope_is_asked():
 
 def test_shading_that_is_as_good_as_r_leaves_nothing_to_the_joint_stage():
     model = sphere_model(tiny_config()).eval()
-    seen = _shown_surface(model, sphere_batch(400))
+    seen = _rendered_surface(model, sphere_batch(400))
     observed, radiance = seen.observed, seen.radiance
     assert len(radiance) > 50
     material = model.materials(observed.position)
     samples = model.config.shading.eval_samples
     shaded = model.shade(observed.position, observed.normal, observed.wo, material, samples).color.detach()
-    same = ShownSurface(dataclasses.replace(observed, pixel=shaded), shaded)
+    same = RenderedSurface(dataclasses.replace(observed, pixel=shaded), shaded)
     assert shading_disagreement(model, same).value == 0
-    worse = shading_disagreement(model, ShownSurface(dataclasses.replace(observed, pixel=radiance), radiance))
+    worse = shading_disagreement(
+        model, RenderedSurface(dataclasses.replace(observed, pixel=radiance), radiance)
+    )
     off = (shaded - radiance).abs() / (radiance + 0.1 * model.units.physical)
     assert worse.value == pytest.approx(off.clamp_max(1).mean().item(), rel=1e-4)
 
@@ -218,13 +220,13 @@ def test_evidence_is_revised_and_said():
 
 def test_lamps_are_noted_when_the_choice_changes():
     plan = Plan.begin(read_asked("auto"), preset("fast"))
-    assert after_fit(plan, Evidence(0.001, 0.002, 200), 0, 5)[0].on is False
-    assert after_fit(plan, Evidence(0.001, 0.002, 200), 0, 9) == []
-    (found,) = after_fit(plan, Evidence(0.1, 0.002, 200), 2, 14)
+    assert record_lamps(plan, Evidence(0.001, 0.002, 200), 0, 5)[0].on is False
+    assert record_lamps(plan, Evidence(0.001, 0.002, 200), 0, 9) == []
+    (found,) = record_lamps(plan, Evidence(0.1, 0.002, 200), 2, 14)
     assert found.on
     assert found.reason.startswith("revised")
     assert plan.config.light.kind == "auto"  # the solver goes on choosing
-    assert after_fit(Plan.begin(read_asked("-lamps"), preset("fast")), Evidence(0.1, 0.0, 200), 1, 5) == []
+    assert record_lamps(Plan.begin(read_asked("-lamps"), preset("fast")), Evidence(0.1, 0.0, 200), 1, 5) == []
 
 
 def test_the_standard_error_is_that_of_the_mean():

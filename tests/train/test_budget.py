@@ -14,8 +14,8 @@ from neilfpp_method.budget.plan import Costs, StageCost
 from neilfpp_method.cli import main
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.effects.asked import Asked, read_asked
-from neilfpp_method.effects.looks import MOST_PIXELS, look_at_light
 from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.review import MOST_PIXELS, review_light
 from neilfpp_method.errors import Stopped, UserError
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.timing.ledger import Ledger
@@ -191,7 +191,7 @@ def test_without_time_for_the_first_light_training_starts_from_an_even_one(tmp_p
     capture = make_capture(tmp_path / "many", views=9)
     training = small_training(capture, tmp_path / "run", solved_light(small_config(sdf_steps=0)))
     plan = Plan.begin(read_asked("auto"), training.config)
-    assert look_at_light(plan, training.model, training.pixels, 0, most=0) == ([], None)
+    assert review_light(plan, training.model, training.pixels, 0, most=0) == ([], None)
     planned = BudgetPlan(60.0, "usual", Costs({}), places_looked_at=True, light_pixels=0)
     planned_effects(planned, plan)
     assert "20% of the budget" in plan.newest("long-tails").reason
