@@ -50,7 +50,7 @@ def rows(plan: Plan) -> list[dict[str, Any]]:
 
 def table(plan: Plan) -> Table:
     """A table of the effects for the terminal."""
-    result = Table(title=f"effects ({plan.asked})", title_justify="left", show_lines=False)
+    result = Table(title=f"effects ({plan.request})", title_justify="left", show_lines=False)
     for heading in ("effect", "decision", "reason", "cost when on", "risk when off"):
         result.add_column(heading, overflow="fold")
     for row in rows(plan):

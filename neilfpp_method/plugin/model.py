@@ -20,9 +20,9 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.effects.asked import Asked
 from neilfpp_method.effects.first_light import start_with
 from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.effects.review import review_light
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import metrics
@@ -210,7 +210,7 @@ class NeilfMethod(Model):
         """Set the initial light before material is trained, as in the standalone loop."""
         settings = self.config.neilf
         seed_step(settings.train.seed, -4 - step)
-        plan, pixels = Plan.begin(Asked("as-set"), settings), self.pixels.on(self.device)
+        plan, pixels = Plan.begin(EffectRequest("as-set"), settings), self.pixels.on(self.device)
         _, first = review_light(plan, self.neilf, pixels, step)
         if first is not None:
             CONSOLE.log(first.in_words())

@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from neilfpp_method.budget.durations import in_words
-from neilfpp_method.effects.asked import read_asked
+from neilfpp_method.effects.request import parse_effects
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.protocols import evaluate, write_metrics
 from neilfpp_method.evaluate.size import at_size
@@ -94,7 +94,7 @@ def run_row(row: Row, console: Console, at_end: Callable[[Path], None] | None = 
             device=row.device,
             devices=1,
             console=console,
-            effects=None if exists else read_asked(row.effects),
+            effects=None if exists else parse_effects(row.effects),
             budget=row.budget,
             at_end=at_end,
         )

@@ -12,9 +12,9 @@ from neilfpp_method.budget.durations import in_words
 from neilfpp_method.budget.plan import MIN_SHARE, share_for, smallest_budget, steps_for
 from neilfpp_method.budget.sizes import Size, next_size, sized
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.effects.asked import Asked
 from neilfpp_method.effects.material import JUDGED
 from neilfpp_method.effects.plan import Decision, Plan
+from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.timing.ledger import Ledger
@@ -44,7 +44,7 @@ def plan_budget(
     budget: float,
     capture: Capture,
     config: NeilfConfig,
-    asked: Asked,
+    request: EffectRequest,
     device: torch.device,
     devices: int,
     ledger: Ledger,
@@ -57,7 +57,7 @@ def plan_budget(
         budget: time of the whole command, in seconds.
         capture: the capture, with views of the size of their files.
         config: the settings; the steps of its stages are used as proportions.
-        asked: the value of `--effects`.
+        request: the value of `--effects`.
         device: the device of the training.
         devices: number of processes of the training, which must be 1.
         ledger: the clock; time that has already passed is part of the budget.
@@ -78,7 +78,7 @@ def plan_budget(
             limit = min(TRIAL_SHARE * budget, MAX_TRIAL)
             changed = sized(config, size)
             places, light = PLACES_SHARE * budget, LIGHT_SHARE * budget
-            trials[size] = try_out(capture, changed, asked, device, limit, places, light, report, wait)
+            trials[size] = try_out(capture, changed, request, device, limit, places, light, report, wait)
         return share_for(trials[size].costs, budget, ledger.total)
 
     size: Size = "usual"

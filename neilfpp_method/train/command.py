@@ -19,8 +19,8 @@ from neilfpp_method.data.environment_map import check_environment
 from neilfpp_method.data.held_back import PATCHES, hold_back
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import at_scale, scale_for_rays
-from neilfpp_method.effects.asked import Asked, check_asked
 from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.request import EffectRequest, check_effects
 from neilfpp_method.effects.review import record_exposures, record_facts
 from neilfpp_method.effects.table import table
 from neilfpp_method.errors import Unsound, UserError
@@ -94,7 +94,7 @@ def run_training(
     format: str | None = None,
     scale: float | None = None,
     strict: bool = False,
-    effects: Asked | None = None,
+    effects: EffectRequest | None = None,
     budget: float | None = None,
     command: str = "neilfpp train",
     at_end: Callable[[Path], None] | None = None,
@@ -116,7 +116,7 @@ def run_training(
         scale: size of the images relative to their files; None for the largest that the rays of the training
             can use.
         strict: whether to raise `Unsound` if the result is unusable.
-        effects: the value of `--effects` (`effects.asked`); None for the effects of the settings or, with
+        effects: the value of `--effects` (`effects.request`); None for the effects of the settings or, with
             `resume`, of the run.
         budget: time of everything from here to the end of `at_end`, in seconds; None to train as many steps
             as the settings say or, with `resume`, to keep the budget of the run.
@@ -141,9 +141,9 @@ def run_training(
         described = read_description(out)
         _refuse_changes(out, described, data, config, test_every, response, format, scale)
         plan, source = read_plan(out, described.config), described.source
-        if effects not in (None, plan.asked):
+        if effects not in (None, plan.request):
             raise UserError(
-                f"{out}: its effects are '{plan.asked}'", "leave --effects out, or start a new run"
+                f"{out}: its effects are '{plan.request}'", "leave --effects out, or start a new run"
             )
         config, planned = plan.config_of_model, read_budget(out)
         if budget not in (None, planned and planned.budget):
@@ -159,9 +159,9 @@ def run_training(
     else:
         if data is None or config is None:
             raise UserError("no capture given", "name its folder with --data DIR")
-        asked = effects or Asked("as-set")
-        check_asked(asked, config)
-        _check(Plan.begin(asked, config).config)
+        request = effects or EffectRequest("as-set")
+        check_effects(request, config)
+        _check(Plan.begin(request, config).config)
         source = CaptureSource(str(data.resolve()), test_every, response, format)
         check_free(out := out or default_folder(data, config))
     capture = source.load_again(out) if resume else source.load()
@@ -173,7 +173,7 @@ def run_training(
                 budget,
                 capture,
                 config,
-                asked,
+                request,
                 torch_device,
                 devices * nodes,
                 ledger,
@@ -181,7 +181,7 @@ def run_training(
                 console.print,
             )
             config = planned_settings(planned, config)
-        settings, plan = config, Plan.begin(asked, config)
+        settings, plan = config, Plan.begin(request, config)
         if planned is not None:
             planned_effects(planned, plan)
         config = plan.config
@@ -259,7 +259,7 @@ def run_training(
         write_work(out, ledger)
     if fabric.is_global_zero and training.fits:
         console.print(f"light: {in_words(config.light, training.fits)}", soft_wrap=True)
-    if fabric.is_global_zero and training.plan.asked.base != "as-set":
+    if fabric.is_global_zero and training.plan.request.base != "as-set":
         console.print(table(training.plan))
     findings = list(watch.findings.values())
     if fabric.is_global_zero:

@@ -18,10 +18,10 @@ from neilfpp_method.budget.plan import Costs, StageCost
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import PIXELS_OF_A_VIEW, at_scale, scale_for_pixels
-from neilfpp_method.effects.asked import Asked
 from neilfpp_method.effects.first_light import seconds_of_pixel
 from neilfpp_method.effects.material import JUDGED, seconds_of_evidence
 from neilfpp_method.effects.plan import Decision, Plan
+from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.effects.review import (
     FEWEST_PIXELS,
     MIN_TRAIN_VIEWS,
@@ -97,7 +97,7 @@ class _Seconds:
 def try_out(
     capture: Capture,
     config: NeilfConfig,
-    asked: Asked,
+    request: EffectRequest,
     device: torch.device,
     limit: float,
     most_for_places: float,
@@ -111,7 +111,7 @@ def try_out(
         capture: the capture. Large views are read at a smaller size, which does not affect the time of a
             step.
         config: the settings; the steps of its stages are used as proportions.
-        asked: the value of `--effects`.
+        request: the value of `--effects`.
         device: the device of the training.
         limit: approximate time that the steps of all stages may take together, in seconds.
         most_for_places: maximum time of the measurements at places, in seconds. If they would take more they
@@ -124,7 +124,7 @@ def try_out(
     small = replace(capture, views=_some(capture))
     small = at_scale(small, scale_for_pixels(small.views, PIXELS_OF_A_VIEW * len(small.views)))
     pixels = PixelDataset(small, small.train_views, device)
-    plan = Plan.begin(asked, config)
+    plan = Plan.begin(request, config)
     facts = scene_facts(small, pixels, config)
     record_facts(plan, facts)
     config = plan.config_of_model
@@ -237,7 +237,7 @@ def _look_at_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset) -> Non
     excluded = [Decision(0, name, plan.is_on(name), "settings", "not part of a trial") for name in JUDGED]
     decided = [*plan.decisions, *excluded]
     if plan.is_open("inter-reflection"):
-        review_surface(Plan(plan.asked, plan.settings, decided), model, pixels, 0)
+        review_surface(Plan(plan.request, plan.settings, decided), model, pixels, 0)
 
 
 def _picture_seconds(
