@@ -154,7 +154,7 @@ class Plan:
         favoured = measured.favours(before and not must_be_earned)
         advised = EFFECTS[name].advised
         on = before if favoured is None or advised else favoured
-        reason = f"{measured.in_words()}; shown as advice only" if advised else measured.in_words()
+        reason = f"{measured.summary()}; shown as advice only" if advised else measured.summary()
         if favoured is None:
             reason = f"not decided: only {measured.samples} samples of the {measured.what}"
         elif self.newest(name) is not None and on != before:

@@ -88,7 +88,7 @@ def record_exposures(plan: Plan, found: Exposures | None) -> None:
         reason = "not measured: this needs a point cloud"
         plan.decisions.append(Decision(0, "exposure", False, "files", reason))
         return
-    on, reason = found.measured.favours(chosen=False) is True, found.measured.in_words()
+    on, reason = found.measured.favours(chosen=False) is True, found.measured.summary()
     plan.decisions.append(Decision(0, "exposure", on, "files", reason, found.measured))
 
 
@@ -192,7 +192,7 @@ def record_lamps(plan: Plan, found: Evidence | None, lit: int, step: int) -> lis
         MIN_GAIN,
         found.points,
     )
-    reason = measured.in_words() if before is None else f"revised: {measured.in_words()}"
+    reason = measured.summary() if before is None else f"revised: {measured.summary()}"
     plan.decisions.append(Decision(step, "lamps", on, "evidence", reason, measured))
     return plan.decisions[-1:]
 

@@ -213,7 +213,7 @@ class NeilfMethod(Model):
         plan, pixels = Plan.begin(EffectRequest("as-set"), settings), self.pixels.on(self.device)
         _, first = review_light(plan, self.neilf, pixels, step)
         if first is not None:
-            CONSOLE.log(first.in_words())
+            CONSOLE.log(first.summary())
             start_with(self.neilf, first)
             self.light_solver.start(first.observed, first.material, self.neilf.scene)
 

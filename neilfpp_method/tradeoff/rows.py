@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from neilfpp_method.budget.durations import in_words
+from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.effects.request import parse_effects
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.protocols import evaluate, write_metrics
@@ -71,7 +71,9 @@ def rows_of(
     for budget in sorted(budgets):
         for seed in range(config.train.seed, config.train.seed + seeds):
             seeded = replace(config, train=replace(config.train, seed=seed))
-            rows.append(Row(data, out / f"{in_words(budget)}-seed{seed}", seeded, effects, budget, device))
+            rows.append(
+                Row(data, out / f"{format_duration(budget)}-seed{seed}", seeded, effects, budget, device)
+            )
     return rows
 
 

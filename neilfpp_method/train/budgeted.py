@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from neilfpp_method.budget.durations import in_words
+from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.budget.plan import MIN_SHARE, share_for, smallest_budget, steps_for
 from neilfpp_method.budget.sizes import Size, next_size, sized
 from neilfpp_method.data.capture import Capture
@@ -89,13 +89,15 @@ def plan_budget(
     if affordable < MIN_SHARE:
         needed = smallest_budget(trial.costs, ledger.total)
         raise UserError(
-            f"a budget of {in_words(budget)} is too small: {in_words(ledger.total)} of it have passed, and "
-            f"{in_words(trial.costs.once)} are needed for work that does not depend on the number of steps",
-            f"the smallest usable budget on this machine at its present load is --budget {in_words(needed)}",
+            f"a budget of {format_duration(budget)} is too small: {format_duration(ledger.total)} of it have "
+            f"passed, and {format_duration(trial.costs.once)} are needed for work that does not depend on "
+            "the number of steps",
+            "the smallest usable budget on this machine at its present load is --budget "
+            f"{format_duration(needed)}",
         )
     plan = BudgetPlan(budget, size, trial.costs, trial.places > 0.0, trial.light_pixels)
     plan.revisions.append(Revision(ledger.total, 0, steps_for(trial.costs, affordable)))
-    say(_in_words(plan))
+    say(_plan_summary(plan))
     return plan
 
 
@@ -116,13 +118,13 @@ def planned_effects(plan: BudgetPlan, effects: Plan) -> None:
         effects.decisions.append(Decision(0, LONG_TAILS, effects.is_on(LONG_TAILS), "settings", reason))
 
 
-def _in_words(plan: BudgetPlan) -> str:
+def _plan_summary(plan: BudgetPlan) -> str:
     """One line for the console, before the training."""
     steps = ", ".join(f"{stage.replace('_', ' ')} {count}" for stage, count in plan.steps.items())
     return (
-        f"budget {in_words(plan.budget)}: planned steps: {steps}; step size: {plan.size}; "
-        f"{in_words(plan.costs.once)} for measurements, previews and the report. The accuracy of the result "
-        "cannot be predicted"
+        f"budget {format_duration(plan.budget)}: planned steps: {steps}; step size: {plan.size}; "
+        f"{format_duration(plan.costs.once)} for measurements, previews and the report. The accuracy of the "
+        "result cannot be predicted"
     )
 
 

@@ -13,7 +13,7 @@ from lightning_fabric import Fabric
 from rich.console import Console
 from torch import Tensor
 
-from neilfpp_method.budget.durations import in_words as time_in_words
+from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.environment_map import check_environment
 from neilfpp_method.data.held_back import PATCHES, hold_back
@@ -42,16 +42,16 @@ from neilfpp_method.train.budgeted import (
 )
 from neilfpp_method.train.build import (
     build_model,
-    cloud_in_words,
+    cloud_summary,
     exposures_of,
     scene_facts,
     show_known_light,
 )
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.effects_record import read_plan, write_plan
-from neilfpp_method.train.health_record import in_words as health_in_words
+from neilfpp_method.train.health_record import health_summary
 from neilfpp_method.train.launch import launch
-from neilfpp_method.train.light_record import in_words
+from neilfpp_method.train.light_record import light_summary
 from neilfpp_method.train.lock import alone_in
 from neilfpp_method.train.loop import train
 from neilfpp_method.train.memory import check_training_memory
@@ -147,7 +147,7 @@ def run_training(
             )
         config, planned = plan.config_of_model, read_budget(out)
         if budget not in (None, planned and planned.budget):
-            has = "no budget" if planned is None else f"a budget of {time_in_words(planned.budget)}"
+            has = "no budget" if planned is None else f"a budget of {format_duration(planned.budget)}"
             raise UserError(f"{out}: the run has {has}", "leave --budget out, or start a new run")
         ledger.add(read_work(out))
         if _is_finished(out, plan.config):
@@ -216,7 +216,7 @@ def run_training(
                     console.print(line, style="yellow", soft_wrap=True, markup=False)
                 if source.scale < 1:
                     console.print(_scaled(source.scale, len(pixels), rays), soft_wrap=True)
-                for line in (cloud_in_words(capture, config), _exposures_in_words(plan)):
+                for line in (cloud_summary(capture, config), _exposures_summary(plan)):
                     if line is not None:
                         console.print(line, soft_wrap=True)
             console.print(f"run folder {out}", soft_wrap=True)
@@ -258,12 +258,12 @@ def run_training(
         # Written once more, to include the time of the last checkpoint and preview.
         write_work(out, ledger)
     if fabric.is_global_zero and training.fits:
-        console.print(f"light: {in_words(config.light, training.fits)}", soft_wrap=True)
+        console.print(f"light: {light_summary(config.light, training.fits)}", soft_wrap=True)
     if fabric.is_global_zero and training.plan.request.base != "as-set":
         console.print(table(training.plan))
     findings = list(watch.findings.values())
     if fabric.is_global_zero:
-        console.print(f"health: {health_in_words(findings)}", soft_wrap=True, markup=False)
+        console.print(f"health: {health_summary(findings)}", soft_wrap=True, markup=False)
         if at_end is not None:
             at_end(out)
     if fabric.is_global_zero and planned is not None:
@@ -288,7 +288,7 @@ def _log_gains(plan: Plan, capture: Capture, pixels: PixelDataset) -> Tensor | N
     return torch.zeros(len(pixels.views), 3) if exposures is None else exposures.log_gain
 
 
-def _exposures_in_words(plan: Plan) -> str | None:
+def _exposures_summary(plan: Plan) -> str | None:
     """One line that photographs have gains, with the reason; None if they have none."""
     decision = plan.newest("exposure")
     return f"effects: exposure on, {decision.reason}" if decision is not None and decision.on else None

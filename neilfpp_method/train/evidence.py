@@ -72,7 +72,7 @@ def _start_light(run: Training, model: NeilfModel, step: int) -> None:
         decisions, first = review_light(run.plan, model, run.pixels, step, _light_pixels(run))
         _report(run, decisions)
         if first is not None:
-            run.reporter.say(first.in_words())
+            run.reporter.say(first.summary())
             start_with(model, first)
             evidence = run.light_solver.start(first.observed, first.material, model.scene)
             note_fit(run.fits, evidence, model.lamps.lit, step)
