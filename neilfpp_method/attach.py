@@ -25,7 +25,7 @@ from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
 from neilfpp_method.health.cases import Health
 from neilfpp_method.health.guard import StepGuard
-from neilfpp_method.health.look import look_at_hits
+from neilfpp_method.health.measure import measure_hits
 from neilfpp_method.health.watch import Watch
 from neilfpp_method.hosts.answers import Rendered, as_hits
 from neilfpp_method.hosts.base import HasParameterGroups, Host, ImageHost, LightsItself
@@ -139,8 +139,8 @@ class AttachedNeilf(nn.Module):
         if self._last_rendered is not None:
             batch, hits = self._last_rendered
             on_object = hits[torch.nonzero(batch.mask > 0.5)[:, 0]]
-            look = look_at_hits(self.model, on_object, self._with_material)
-            self.watch.judge(look, self.step_guard.skipped, self._steps)
+            measured = measure_hits(self.model, on_object, self._with_material)
+            self.watch.judge(measured, self.step_guard.skipped, self._steps)
         return Health.of(self.watch.findings.values())
 
     def maps(self, rays: RayBatch | Camera, hits: Rendered | None = None) -> Maps:

@@ -25,7 +25,7 @@ from neilfpp_method.effects.review import record_exposures, record_facts
 from neilfpp_method.effects.table import table
 from neilfpp_method.errors import Unsound, UserError
 from neilfpp_method.health.cases import verdict_of
-from neilfpp_method.health.watch import LOOKED_AT, Watch
+from neilfpp_method.health.watch import CHECKED_PIXELS, Watch
 from neilfpp_method.inspection.findings import problems_of_poses
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, stage_steps
@@ -296,7 +296,7 @@ def _exposures_summary(plan: Plan) -> str | None:
 
 def _watch(pixels: PixelDataset, config: NeilfConfig, reporter: Reporter) -> Watch:
     seed_step(config.train.seed, step=-2)
-    return Watch(pixels.sample(LOOKED_AT, gradients=False), reporter.warn)
+    return Watch(pixels.sample(CHECKED_PIXELS, gradients=False), reporter.warn)
 
 
 def _refuse_changes(
