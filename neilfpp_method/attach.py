@@ -30,7 +30,7 @@ from neilfpp_method.health.watch import Watch
 from neilfpp_method.hosts.answers import Rendered, as_hits
 from neilfpp_method.hosts.base import HasParameterGroups, Host, ImageHost, LightsItself
 from neilfpp_method.hosts.capabilities import CAPABILITIES
-from neilfpp_method.hosts.first_look import FirstLook, check_batch, check_points, check_rows
+from neilfpp_method.hosts.first_batches import FirstBatches, check_batch, check_points, check_rows
 from neilfpp_method.hosts.foreign import ForeignHost, answers_secondary_rays, proxy_for
 from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.outputs import host_name
@@ -75,9 +75,10 @@ class AttachedNeilf(nn.Module):
         self.proxy = proxy
         self.light_solver = model.light_solver()
         self.missing = missing_capabilities(_inner(model.host))
-        facts = model.facts
-        hit_share = model.config.shading.hit_share
-        self.first_look = FirstLook(host_name(model.host), hit_share, facts.response, facts.median_radiance)
+        facts, hit_share = model.facts, model.config.shading.hit_share
+        self.first_batches = FirstBatches(
+            host_name(model.host), hit_share, facts.response, facts.median_radiance
+        )
         self.step_guard = StepGuard(log.warning)
         self.watch = Watch(None, log.warning)
         self._steps, self._with_material = 0, False
@@ -108,7 +109,7 @@ class AttachedNeilf(nn.Module):
         """
         check_batch(batch)
         self._check_device_and_dtype(batch.rays)
-        self.first_look.pixels(batch)
+        self.first_batches.pixels(batch)
         position = self._position(step)
         weights = active_losses(position.stage, self.model.config, self.model.stages, position.share)
         if not weights:
@@ -261,7 +262,7 @@ class AttachedNeilf(nn.Module):
             return host.camera_hits(rays)
 
     def _observe(self, batch: PixelBatch, hits: SurfaceHits) -> None:
-        self.first_look.hits(batch, hits)
+        self.first_batches.hits(batch, hits)
         self._last_rendered = batch, hits.detach()
         if isinstance(self.model.host, ForeignHost):
             self.model.host.show_proxy(batch.rays, hits)

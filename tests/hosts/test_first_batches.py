@@ -10,12 +10,12 @@ import torch
 
 from neilfpp_method.attach import attach_neilf, pixel_batch
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.first_look import BATCHES, check_points
+from neilfpp_method.hosts.first_batches import BATCHES, check_points
 from neilfpp_method.structures import RayBatch
 from tests.hosts.balls import Ball, BallHost, ball_rays
 from tests.scenes import tiny_config
 
-SAYS = "neilfpp_method.hosts.first_look"
+SAYS = "neilfpp_method.hosts.first_batches"
 
 
 def batch(rays: RayBatch, color: float = 0.4):
