@@ -152,7 +152,7 @@ def _how_to_continue(path: Path) -> str:
 def _from_files(files: Files) -> list[tuple[str, str, Html]]:
     settings = tables.settings_section(files.config.preset, changed_settings(files.config))
     return [
-        ("time", "Time", tables.time_section(files.timing, files.work, files.looks, _previews(files.path))),
+        ("time", "Time", tables.time_section(files.timing, files.work, files.checks, _previews(files.path))),
         ("effects", "Effects", tables.effects_section(files.effects)),
         ("settings", "Settings", settings),
     ]

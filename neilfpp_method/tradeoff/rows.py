@@ -19,7 +19,7 @@ from neilfpp_method.train.budget_record import read_budget
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.json_files import read_json
-from neilfpp_method.train.quality import read_looks
+from neilfpp_method.train.quality import read_checks
 from neilfpp_method.train.run import load_run
 
 __all__ = ["Row", "measured", "rows_of", "run_row"]
@@ -117,8 +117,8 @@ def measured(row: Row) -> Measured | None:
         return None
     known = read_json(row.out / METRICS) if (row.out / METRICS).is_file() else {}
     figures = {name: float(known[name]) for name in FIGURES if isinstance(known.get(name), int | float)}
-    looks = read_looks(row.out)
-    if looks:
-        last = looks[-1]
+    checks = read_checks(row.out)
+    if checks:
+        last = checks[-1]
         figures["held_back_psnr"] = last.radiance if last.physical is None else last.physical
     return Measured(row.budget, row.config.train.seed, plan.took, figures)

@@ -20,7 +20,7 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.timing.ledger import Ledger
 from neilfpp_method.train.budget_record import BudgetPlan, Revision, write_budget
 from neilfpp_method.train.pace import with_steps
-from neilfpp_method.train.quality import Look
+from neilfpp_method.train.quality import QualityCheck
 from neilfpp_method.train.trial import Trial, try_out
 from neilfpp_method.train.work_record import waiting
 
@@ -134,14 +134,14 @@ def close_budget(run: Path, plan: BudgetPlan, seconds: float) -> None:
     write_budget(run, plan)
 
 
-def outcome(plan: BudgetPlan, looks: Sequence[Look]) -> str:
+def outcome(plan: BudgetPlan, checks: Sequence[QualityCheck]) -> str:
     """One line for the console at the end: time taken against the budget, steps, and accuracy."""
     seconds = plan.took or 0.0
     deviation = f"{100.0 * (seconds / plan.budget - 1.0):+.1f} %".replace("-", "\N{MINUS SIGN}")
     steps = ", ".join(f"{stage.replace('_', ' ')} {count}" for stage, count in plan.steps.items())
     text = f"budget: {seconds:.1f} s of {plan.budget:.0f} s ({deviation}); steps: {steps}"
-    if looks:
-        last = looks[-1]
+    if checks:
+        last = checks[-1]
         physical = "" if last.physical is None else f", PBR {last.physical:.1f} dB"
         text += f"; PSNR of held-back pixels: R {last.radiance:.1f} dB{physical}"
     return text

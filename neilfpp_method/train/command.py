@@ -60,7 +60,7 @@ from neilfpp_method.train.output import default_folder
 from neilfpp_method.train.pace import Pace
 from neilfpp_method.train.preview import write_preview
 from neilfpp_method.train.progress import Reporter, reporting
-from neilfpp_method.train.quality import Quality, has_looks
+from neilfpp_method.train.quality import Quality, has_checks
 from neilfpp_method.train.reading import load_pixels
 from neilfpp_method.train.run import (
     PIXELS,
@@ -233,7 +233,7 @@ def run_training(
         stop_request(continue_with) as stopped,
     ):
         # A run that began without held-back pixels, in nerfstudio, continues to train on all pixels.
-        held_back = hold_back(pixels, config.train.seed, PATCHES if is_new or has_looks(out) else 0)
+        held_back = hold_back(pixels, config.train.seed, PATCHES if is_new or has_checks(out) else 0)
         preview = _preview(out, capture, fabric, reporter)
         solver, watch = model.light_solver(), _watch(pixels, config, reporter)
         training = Training(
@@ -268,7 +268,7 @@ def run_training(
             at_end(out)
     if fabric.is_global_zero and planned is not None:
         close_budget(out, planned, ledger.total)
-        console.print(outcome(planned, training.quality.looks), soft_wrap=True)
+        console.print(outcome(planned, training.quality.checks), soft_wrap=True)
     if strict and verdict_of(findings) == "failed":
         raise Unsound(f"{out}: {findings[0].what}", findings[0].remedy)
     return out
