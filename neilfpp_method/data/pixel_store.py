@@ -33,7 +33,7 @@ from neilfpp_method.data.view_pixels import read_view
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 
-__all__ = ["PixelStore", "border", "expect_draws", "load_pixels", "store_bytes"]
+__all__ = ["PixelStore", "advise_random_access", "border", "load_pixels", "store_bytes"]
 
 FORMAT, VERSION = "neilfpp-pixels", 1
 BORDER_SHARE = 0.5
@@ -107,7 +107,7 @@ def store_bytes(views: Sequence[View], hdr: bool) -> int:
 def load_pixels(
     views: Sequence[View],
     hdr: bool,
-    shown: Callable[[int], Bool[np.ndarray, " N"]],
+    has_ray: Callable[[int], Bool[np.ndarray, " N"]],
     folder: Path | None = None,
     on_view: Callable[[str], None] | None = None,
     exact: bool = False,
@@ -117,7 +117,7 @@ def load_pixels(
     Args:
         views: at least one.
         hdr: whether pixels are linear radiance; else display values.
-        shown: which pixels of a view its lens reaches.
+        has_ray: which pixels of a view its lens reaches.
         folder: where the pixels are kept; none: in memory.
         on_view: called with the name of each view that has been read.
         exact: keep the values of the files in single precision, 13 bytes a pixel; in memory alone.
@@ -128,16 +128,16 @@ def load_pixels(
     if exact and folder is not None:
         raise ValueError("exact pixels are kept in memory: a folder has those of a training")
     if folder is None:
-        return _in_any_encoding(views, encodings_for(hdr, exact), hdr, shown, None, on_view)
+        return _fill_smallest(views, encodings_for(hdr, exact), hdr, has_ray, None, on_view)
     made_from = _made_from(views, hdr)
-    known = _open(folder, views, made_from)
-    if known is not None:
-        return known
+    reusable = _open(folder, views, made_from)
+    if reusable is not None:
+        return reusable
     _check_room(folder, store_bytes(views, hdr))
     (folder / "store.json").unlink(missing_ok=True)
     with ExitStack() as files:
         paths = {name: files.enter_context(replacing(folder / f"{name}.npy")) for name in ("color", "bits")}
-        store = _in_any_encoding(views, encodings_for(hdr), hdr, shown, paths, on_view)
+        store = _fill_smallest(views, encodings_for(hdr), hdr, has_ray, paths, on_view)
         description = {
             "format": FORMAT,
             "version": VERSION,
@@ -157,33 +157,33 @@ def load_pixels(
 # ----------------------------------------------------------------------------------------------------- making
 
 
-def _in_any_encoding(
+def _fill_smallest(
     views: Sequence[View],
     ladder: Sequence[Encoding],
     hdr: bool,
-    shown: Callable[[int], Bool[np.ndarray, " N"]],
+    has_ray: Callable[[int], Bool[np.ndarray, " N"]],
     paths: dict[str, Path] | None,
     on_view: Callable[[str], None] | None,
 ) -> PixelStore:
     """In the smallest encoding that holds every view; if one needs more, all views are read again."""
     if ladder[0] is BYTES and any(view.file_size is not None for view in views):
         ladder = ladder[1:]  # means of bytes are no bytes
-    told: set[str] = set()
+    reported: set[str] = set()
 
-    def tell_once(name: str) -> None:
-        if on_view and name not in told:
-            told.add(name)
+    def report_once(name: str) -> None:
+        if on_view and name not in reported:
+            reported.add(name)
             on_view(name)
 
-    stores = (_filled(views, hdr, encoding, shown, paths, tell_once) for encoding in ladder)
+    stores = (_fill(views, hdr, encoding, has_ray, paths, report_once) for encoding in ladder)
     return next(store for store in stores if store is not None)
 
 
-def _filled(
+def _fill(
     views: Sequence[View],
     hdr: bool,
     encoding: Encoding,
-    shown: Callable[[int], Bool[np.ndarray, " N"]],
+    has_ray: Callable[[int], Bool[np.ndarray, " N"]],
     paths: dict[str, Path] | None,
     on_view: Callable[[str], None],
 ) -> PixelStore | None:
@@ -203,7 +203,7 @@ def _filled(
             if encoded is None:
                 return None
             codes[store.rows(i)], store.scales[i] = encoded.codes.reshape(-1, 3), encoded.scale
-            bits[store.rows(i)] = _bits(pixels.mask, pixels.valid.reshape(-1) & shown(i))
+            bits[store.rows(i)] = _bits(pixels.mask, pixels.valid.reshape(-1) & has_ray(i))
             if pixels.mask is None:
                 unknown.append(i)
             store.release()
@@ -312,8 +312,8 @@ def _made_from(views: Sequence[View], hdr: bool) -> str:
 def _state(path: Path | None) -> tuple[str, int, int] | None:
     if path is None or not path.is_file():
         return None
-    known = path.stat()
-    return path.name, known.st_size, known.st_mtime_ns
+    status = path.stat()
+    return path.name, status.st_size, status.st_mtime_ns
 
 
 def _open(folder: Path, views: Sequence[View], made_from: str) -> PixelStore | None:
@@ -336,7 +336,7 @@ def _open(folder: Path, views: Sequence[View], made_from: str) -> PixelStore | N
     return store
 
 
-def expect_draws(store: PixelStore) -> None:
+def advise_random_access(store: PixelStore) -> None:
     """Tell the system that single pixels will be read, so that it does not read ahead of each page."""
     for array in (store.codes, store.bits):
         _advise(array, "MADV_RANDOM")

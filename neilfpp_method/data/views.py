@@ -271,7 +271,7 @@ class CameraRays:
             planes = np.concatenate([_whole_plane(camera, dtype) for camera in kinds.values()])
             self._lens_plane = torch.from_numpy(planes).to(device)
 
-    def shown(self, i: int) -> Bool[Tensor, " P"]:
+    def has_ray(self, i: int) -> Bool[Tensor, " P"]:
         """Which pixels of camera `i`, row by row, have a ray; all but those where its lens shows nothing."""
         camera = self._cameras[i]
         size = camera.width * camera.height

@@ -100,17 +100,17 @@ def visual_hull(outlines: Sequence[Outline], radius: float, resolution: int) -> 
     """
     centre = (np.arange(resolution) + 0.5) * (2 * radius / resolution) - radius
     points = np.stack(np.meshgrid(centre, centre, centre, indexing="ij"), axis=-1).reshape(-1, 3)
-    left = np.arange(len(points))
-    seen, outside = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+    candidates = np.arange(len(points))
+    seen_by, excluded_by = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     # Small silhouettes first: they leave the least for the others to be asked about.
     for outline in sorted(outlines, key=lambda outline: float(outline.inside.mean())):
-        found = sightings([outline], points[left])
-        seen[left] += found.seen
-        outside[left] += found.seen - found.inside
-        left = left[outside[left] <= MAX_EXCLUDING_SHARE * len(outlines)]
+        found = sightings([outline], points[candidates])
+        seen_by[candidates] += found.seen
+        excluded_by[candidates] += found.seen - found.inside
+        candidates = candidates[excluded_by[candidates] <= MAX_EXCLUDING_SHARE * len(outlines)]
     hull = np.zeros(len(points), bool)
-    known = seen[left] >= max(2, MIN_SEEN_SHARE * len(outlines))
-    hull[left] = known & (outside[left] <= MAX_EXCLUDING_SHARE * seen[left])
+    enough_views = seen_by[candidates] >= max(2, MIN_SEEN_SHARE * len(outlines))
+    hull[candidates] = enough_views & (excluded_by[candidates] <= MAX_EXCLUDING_SHARE * seen_by[candidates])
     return hull.reshape(resolution, resolution, resolution)
 
 

@@ -133,11 +133,11 @@ def _sharpness(light: Float32[np.ndarray, "H W"], shown: Bool[np.ndarray, "H W"]
     if typical <= 0:
         return 0.0
     grey = linear_to_srgb(torch.from_numpy(light * np.float32(MIDDLE_GREY / typical)).clamp(0, 1)).numpy()
-    grey, kept = _fitted(grey, SHARPNESS_SIDE), _fitted(shown.astype(np.float32), SHARPNESS_SIDE) > 0.5
-    if not kept.any():
+    grey, on_object = _fitted(grey, SHARPNESS_SIDE), _fitted(shown.astype(np.float32), SHARPNESS_SIDE) > 0.5
+    if not on_object.any():
         return 0.0
-    spread = float(grey[kept].var())
-    return float(cv2.Laplacian(grey, cv2.CV_32F)[kept].var()) / spread if spread > 0 else 0.0
+    spread = float(grey[on_object].var())
+    return float(cv2.Laplacian(grey, cv2.CV_32F)[on_object].var()) / spread if spread > 0 else 0.0
 
 
 def _clipped(image: ImageFile, color: Float32[np.ndarray, "H W 3"], shown: Bool[np.ndarray, "H W"]) -> float:

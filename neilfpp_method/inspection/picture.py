@@ -64,7 +64,7 @@ def _plan(
     """Cameras as dots with viewing directions, seen along a world axis; the circle is the unit sphere."""
     plan = Image.new("RGB", (PLAN, PLAN), (255, 255, 255))
     pen = ImageDraw.Draw(plan)
-    centres, forward = inspection.stand.centres[:, axes], inspection.stand.axes[:, axes]
+    centres, forward = inspection.placement.centres[:, axes], inspection.placement.axes[:, axes]
     reach = 1.15 * max(1.0, float(np.abs(centres).max()))
 
     def place(points: Float64[np.ndarray, "*N 2"]) -> Float64[np.ndarray, "*N 2"]:
@@ -86,7 +86,7 @@ def _list(pen: ImageDraw.ImageDraw, corner: tuple[int, int], inspection: Inspect
         color = PROBLEM if finding.severity == "problem" else WARNING
         _write(pen, (corner[0], corner[1] + 26 * place), finding.kind.replace("_", " ") + count, 16, color)
     if not inspection.findings:
-        _write(pen, corner, "nothing is wrong with it", 16, FINE)
+        _write(pen, corner, "no problems found", 16, FINE)
 
 
 def _cell(

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Float64
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.views import project
 
-__all__ = ["Stand", "duplicates", "exposure_factors", "stand"]
+__all__ = ["CameraPlacement", "camera_placement", "duplicates", "exposure_factors"]
 
 NEIGHBOURS = 6
 """Number of views, nearest in pose, with which a view is compared."""
@@ -27,7 +27,7 @@ SPHERE = 1000
 
 
 @dataclass(frozen=True)
-class Stand:
+class CameraPlacement:
     """Where the cameras stand about the scene; in the scene frame, whose unit sphere holds the object.
 
     `away` views do not show the scene's centre, `within` stand in the unit sphere. `coverage` is the share of
@@ -43,7 +43,7 @@ class Stand:
     gap: float
 
 
-def stand(capture: Capture) -> Stand:
+def camera_placement(capture: Capture) -> CameraPlacement:
     """Where the cameras of a capture stand."""
     cameras = [capture.normalisation.camera(view.camera) for view in capture.views]
     centres = np.stack([camera.c2w[:, 3] for camera in cameras])
@@ -56,7 +56,7 @@ def stand(capture: Capture) -> Stand:
     directions = centres / distance.clip(1e-9)
     cosines = directions @ directions.T
     np.fill_diagonal(cosines, -1.0)
-    return Stand(
+    return CameraPlacement(
         centres=centres,
         axes=np.stack([camera.w2c[2, :3] for camera in cameras]),
         away=np.array(away),
@@ -74,19 +74,19 @@ def _lattice() -> Float64[np.ndarray, "S 3"]:
     return np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
 
 
-def exposure_factors(luminances: Sequence[float], where: Stand) -> Float64[np.ndarray, " V"]:
+def exposure_factors(luminances: Sequence[float], placement: CameraPlacement) -> Float64[np.ndarray, " V"]:
     """How much brighter each view is than the median of the views nearest in pose; 1 where unknown.
 
     Near is what stands near and looks the same way: the distance of the centres, in their median distance
     from the scene's, and the angle of the axes count alike.
     """
     light = np.array(luminances)
-    scale = max(float(np.median(np.linalg.norm(where.centres, axis=1))), 1e-9)
-    pose = np.concatenate([where.centres / scale, where.axes], axis=1)
-    known = light > 0
+    scale = max(float(np.median(np.linalg.norm(placement.centres, axis=1))), 1e-9)
+    pose = np.concatenate([placement.centres / scale, placement.axes], axis=1)
+    lit = light > 0
     factors = np.ones(len(light))
-    for i in np.flatnonzero(known):
-        others = np.flatnonzero(known & (np.arange(len(light)) != i))
+    for i in np.flatnonzero(lit):
+        others = np.flatnonzero(lit & (np.arange(len(light)) != i))
         if len(others):
             nearest = others[np.argsort(np.linalg.norm(pose[others] - pose[i], axis=1))[:NEIGHBOURS]]
             factors[i] = light[i] / np.median(light[nearest])

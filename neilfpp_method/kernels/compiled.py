@@ -20,10 +20,10 @@ from numba.extending import intrinsic
 __all__ = [
     "add_to_table",
     "interpolate",
-    "pull_through_softplus",
-    "pull_to_points",
+    "point_gradient",
     "softplus",
     "softplus_and_slope",
+    "softplus_gradient",
     "sphere_trace",
 ]
 
@@ -88,7 +88,7 @@ def _value_and_slopes(corners, x, y, z):
 
 
 @compiled
-def _twists(corners, x, y, z):
+def _mixed_derivatives(corners, x, y, z):
     """The mixed second derivatives xy, xz, yz in units of the cell; those along one axis are 0."""
     c0, c1, c2, c3, c4, c5, c6, c7 = corners
     low, high = c3 - c2 - c1 + c0, c7 - c6 - c5 + c4
@@ -177,7 +177,7 @@ def add_to_table(points, offsets, cells, dense, features, jacobian, with_jacobia
 
 
 @compiled
-def pull_to_points(
+def point_gradient(
     points, table, offsets, cells, dense, features, jacobian, with_jacobian, gradient, start, stop
 ):
     """Write what the gradients of features and Jacobian ask of the points from `start` to `stop`."""
@@ -200,7 +200,7 @@ def pull_to_points(
                 if with_jacobian:
                     gx, gy = jacobian[n, column, 0] * dx, jacobian[n, column, 1] * dy
                     gz = jacobian[n, column, 2] * dz
-                    xy, xz, yz = _twists(corners, x, y, z)
+                    xy, xz, yz = _mixed_derivatives(corners, x, y, z)
                     by_x += gy * xy + gz * xz
                     by_y += gx * xy + gz * yz
                     by_z += gx * xz + gy * yz
@@ -217,19 +217,19 @@ def sphere_trace(grid, radius, origins, directions, least, most_steps, distance,
     cells = len(grid) - 1
     edge, reach = number(2 * radius / cells), number(radius)
     for n in range(start, stop):
-        gone, met = number(0), False
+        length, is_hit = number(0), False
         for _ in range(most_steps):
-            x = origins[n, 0] + gone * directions[n, 0]
-            y = origins[n, 1] + gone * directions[n, 1]
-            z = origins[n, 2] + gone * directions[n, 2]
+            x = origins[n, 0] + length * directions[n, 0]
+            y = origins[n, 1] + length * directions[n, 1]
+            z = origins[n, 2] + length * directions[n, 2]
             if abs(x) > reach or abs(y) > reach or abs(z) > reach:
                 break
             clearance = _at_vertices(grid, (x + reach) / edge, (y + reach) / edge, (z + reach) / edge, cells)
             if clearance < least:
-                met = True
+                is_hit = True
                 break
-            gone += max(clearance, least)
-        distance[n], hit[n] = gone, met
+            length += max(clearance, least)
+        distance[n], hit[n] = length, is_hit
 
 
 @compiled
@@ -255,7 +255,7 @@ def _at_vertices(grid, x, y, z, cells):
 
 # ------------------------------------------------------------------------------ softplus, computed in float32
 
-FAINT = np.float32(40)  # e^−40 is nothing beside 1, and its square no denormal number yet
+MAX_EXPONENT = np.float32(40)  # e^−40 is nothing beside 1, and its square no denormal number yet
 HALF, UNIT = np.float32(0.5), np.float32(1)
 
 
@@ -270,12 +270,12 @@ def _from_bits(_context, _bits):
 
 
 @compiled
-def _falling_exponential(t):
-    """e^−t for t ≥ 0, to the last digit or two; t counts for FAINT at most.
+def _exp_of_negative(t):
+    """e^−t for t ≥ 0, to the last digit or two; t counts for MAX_EXPONENT at most.
 
     e^−t = 2^−n e^r with |r| ≤ ½ ln 2: e^r by its Taylor series, ln 2 in two parts (Cody & Waite 1980).
     """
-    t = FAINT if t > FAINT else t  # what is not a number stays none
+    t = MAX_EXPONENT if t > MAX_EXPONENT else t  # what is not a number stays none
     n = np.int32(t * np.float32(1.4426950408889634) + HALF)
     r = np.float32(n) * np.float32(0.693359375) - t
     r = r - np.float32(n) * np.float32(2.12194440e-4)
@@ -286,7 +286,7 @@ def _falling_exponential(t):
 
 
 @compiled
-def _log_of_one_and(e):
+def _log1p(e):
     """ln(1 + e), 0 ≤ e ≤ 1, to 2e-8: e times the degree-8 Chebyshev approximation of ln(1 + e) / e."""
     tail = np.float32(0.07836167) + e * (np.float32(-0.029588507) + e * np.float32(0.005253458))
     tail = np.float32(-0.24844369) + e * (np.float32(0.19111431) + e * (np.float32(-0.1367477) + e * tail))
@@ -299,7 +299,7 @@ def softplus(z, value, sharpness, start, stop):
     sharp = np.float32(sharpness)
     z, value = z[start:stop], value[start:stop]  # slices from 0 on become vector instructions
     for n in range(len(z)):
-        rest = _log_of_one_and(_falling_exponential(abs(z[n]) * sharp)) / sharp
+        rest = _log1p(_exp_of_negative(abs(z[n]) * sharp)) / sharp
         value[n] = rest + (z[n] if z[n] > 0 else np.float32(0))
 
 
@@ -309,14 +309,14 @@ def softplus_and_slope(z, value, slope, sharpness, start, stop):
     sharp = np.float32(sharpness)
     z, value, slope = z[start:stop], value[start:stop], slope[start:stop]
     for n in range(len(z)):
-        e = _falling_exponential(abs(z[n]) * sharp)
-        value[n] = _log_of_one_and(e) / sharp + (z[n] if z[n] > 0 else np.float32(0))
+        e = _exp_of_negative(abs(z[n]) * sharp)
+        value[n] = _log1p(e) / sharp + (z[n] if z[n] > 0 else np.float32(0))
         share = UNIT / (UNIT + e)
         slope[n] = share if z[n] > 0 else e * share
 
 
 @compiled
-def pull_through_softplus(slope, to_value, to_slope, gradient, sharpness, start, stop):
+def softplus_gradient(slope, to_value, to_slope, gradient, sharpness, start, stop):
     """Write what the gradients of value and slope ask of z, for the numbers from `start` to `stop`."""
     sharp = np.float32(sharpness)
     slope, to_value, to_slope = slope[start:stop], to_value[start:stop], to_slope[start:stop]

@@ -163,7 +163,7 @@ def _add_to_table(
 
 
 @kernel
-def _pull_to_points(
+def _point_gradient(
     points, table, grid, features, jacobian, gradient, count, levels,
     f_point, f_column, j_point, j_column, j_axis,
     width: tl.constexpr, with_jacobian: tl.constexpr, block: tl.constexpr,
@@ -257,7 +257,7 @@ def point_gradient(
     count, levels = len(x01), len(spec.resolutions)
     features, jacobian = gradients.features, _jacobian(gradients)
     with torch.cuda.device_of(x01):
-        _pull_to_points[(_blocks(count),)](
+        _point_gradient[(_blocks(count),)](
             x01, table, _grid(spec, x01.device), features, jacobian, found, count, levels,
             *features.stride(), *jacobian.stride(),
             spec.features, gradients.jacobian is not None, BLOCK, **FUSED,

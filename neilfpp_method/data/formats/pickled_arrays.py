@@ -42,10 +42,10 @@ def read_pickled_arrays(path: Path) -> tuple[Float64[np.ndarray, " *shape"], ...
                 raise ValueError(
                     "damaged"
                 )  # the unpickler makes room for as many objects as such a number says
-        held = _Arrays(io.BytesIO(data)).load()
-        if not isinstance(held, tuple | list):
+        arrays = _Arrays(io.BytesIO(data)).load()
+        if not isinstance(arrays, tuple | list):
             raise ValueError("it is no tuple of arrays")
-        return tuple(_numbers(array) for array in held)
+        return tuple(_numbers(array) for array in arrays)
     except Exception as error:  # a forged file can fail anywhere in the unpickler
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise UserError(
@@ -95,10 +95,10 @@ STAND_INS: dict[tuple[str, str], Callable[..., Any]] = {
 
 class _Arrays(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Callable[..., Any]:
-        known = (module.replace("numpy._core", "numpy.core"), name)
-        if known not in STAND_INS:
+        key = (module.replace("numpy._core", "numpy.core"), name)
+        if key not in STAND_INS:
             raise pickle.UnpicklingError(f"it asks for {module}.{name}")
-        return STAND_INS[known]
+        return STAND_INS[key]
 
 
 def _numbers(array: Any) -> Float64[np.ndarray, " *shape"]:
