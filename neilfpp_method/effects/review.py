@@ -75,21 +75,21 @@ def record_facts(plan: Plan, facts: SceneFacts) -> None:
         plan.decisions.append(Decision(0, "response", on, "files", f"the files hold {kind}"))
 
 
-def record_exposures(plan: Plan, found: Exposures | None) -> None:
+def record_exposures(plan: Plan, exposures: Exposures | None) -> None:
     """Record the decision on gains of the photographs, before training.
 
     Args:
         plan: the plan to which the decision is added, unless it has one already.
-        found: the measured exposures; None if the capture has no point cloud.
+        exposures: the measured exposures; None if the capture has no point cloud.
     """
     if plan.newest("exposure") is not None:
         return
-    if found is None:
+    if exposures is None:
         reason = "not measured: this needs a point cloud"
         plan.decisions.append(Decision(0, "exposure", False, "files", reason))
         return
-    on, reason = found.measured.favours(chosen=False) is True, found.measured.summary()
-    plan.decisions.append(Decision(0, "exposure", on, "files", reason, found.measured))
+    on, reason = exposures.measured.favours(chosen=False) is True, exposures.measured.summary()
+    plan.decisions.append(Decision(0, "exposure", on, "files", reason, exposures.measured))
 
 
 def needs_surface(plan: Plan) -> bool:
@@ -126,16 +126,16 @@ def review_light(
         measured = lobe_evidence(places, model.scene, typical, model.brdf.metals)
         decisions.append(plan.decide("long-tails", measured, step, must_be_earned=True))
         model.use(plan.config)
-    found = None
+    first = None
     if model.lobe is not None:
         transport = place_transport(places, model.lobe, model.scene)
         if plan.is_open("metals") and model.brdf.metals:
             # More places than `review_surface` has: the error of the measurement is a third as large.
             decisions.append(plan.decide("metals", metals_evidence(places, transport, typical), step))
             model.use(plan.config)
-        found = find_first_light(places, transport, typical, model.brdf.metals)
+        first = find_first_light(places, transport, typical, model.brdf.metals)
     model.train(mode)
-    return decisions, found
+    return decisions, first
 
 
 @torch.no_grad()
@@ -168,29 +168,29 @@ def review_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: in
     return decisions
 
 
-def record_lamps(plan: Plan, found: Evidence | None, lit: int, step: int) -> list[Decision]:
+def record_lamps(plan: Plan, evidence: Evidence | None, lit: int, step: int) -> list[Decision]:
     """Record the decision on lamps that the light solver has taken in a fit.
 
     Args:
         plan: the plan to which the decision is added.
-        found: the comparison of the fits with and without lamps; None if there was none.
+        evidence: the comparison of the fits with and without lamps; None if there was none.
         lit: number of lamps after the fit.
         step: number of steps trained so far.
 
     Returns:
         The new decision; empty if it is the same as before.
     """
-    if found is None or not plan.is_open("lamps"):
+    if evidence is None or not plan.is_open("lamps"):
         return []
     before, on = plan.newest("lamps"), lit > 0
     if before is not None and before.on == on:
         return []
     measured = Measurement(
         "reduction of the error at held-back points by lamps",
-        found.gain,
-        found.deviation,
+        evidence.gain,
+        evidence.deviation,
         MIN_GAIN,
-        found.points,
+        evidence.points,
     )
     reason = measured.summary() if before is None else f"revised: {measured.summary()}"
     plan.decisions.append(Decision(step, "lamps", on, "evidence", reason, measured))

@@ -115,8 +115,8 @@ def measured(row: Row) -> Measured | None:
     plan = read_budget(row.out)
     if plan is None or plan.took is None:
         return None
-    known = read_json(row.out / METRICS) if (row.out / METRICS).is_file() else {}
-    figures = {name: float(known[name]) for name in FIGURES if isinstance(known.get(name), int | float)}
+    metrics = read_json(row.out / METRICS) if (row.out / METRICS).is_file() else {}
+    figures = {name: float(metrics[name]) for name in FIGURES if isinstance(metrics.get(name), int | float)}
     checks = read_checks(row.out)
     if checks:
         last = checks[-1]

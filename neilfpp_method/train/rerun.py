@@ -83,8 +83,8 @@ def _computed(model: NeilfModel, skipped: SkippedStep) -> Rerun:
     }
     gradients = tuple(name for name, found in broken.items() if found)
     ends = [terms[name].values for name in losses] + [grad for found in broken.values() for grad in found]
-    known = [origin for end in ends if (origin := origins.origin_of(end)) is not None]
-    first = min(known, key=lambda origin: origin.order, default=None)
+    origins_found = [origin for end in ends if (origin := origins.origin_of(end)) is not None]
+    first = min(origins_found, key=lambda origin: origin.order, default=None)
     return Rerun(skipped, inputs, losses, gradients, first)
 
 
