@@ -135,7 +135,10 @@ def view(content: dict) -> dict:
     ("change", "words"),
     [
         (lambda c: c.update(format="another"), "no capture in this folder"),
-        (lambda c: c.update(version=2), "version 2 of the format; version 1 is read"),
+        (
+            lambda c: c.update(version=2),
+            "version 2 of the format; this version of the package reads version 1",
+        ),
         (lambda c: c.pop("version"), "version is missing"),
         (lambda c: c.update(response="log"), "response: not linear or srgb"),
         (lambda c: c.update(views=[]), "no views"),
