@@ -95,7 +95,7 @@ def read_mask(path: Path, view: View) -> Bool[np.ndarray, "H W"]:
     """Return where a mask of the view is above one half, at the size of its files."""
     values = read_image(path).mask
     if values.shape[::-1] != file_size(view):
-        raise UserError(f"{path}: the mask does not have the size of {view.image}", "load the capture again")
+        raise UserError(f"{path}: the mask has another size than {view.image}", "load the capture again")
     return values > 0.5
 
 
