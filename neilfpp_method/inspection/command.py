@@ -1,4 +1,4 @@
-"""`neilfpp inspect`: the findings on the terminal, as JSON and as a picture."""
+"""Run `neilfpp inspect`: print the findings, and write them as JSON and as a picture."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ def run_inspection(
     strict: bool,
     console: Console,
 ) -> None:
-    """Inspect a capture and say what is in it.
+    """Inspect a capture and print a report.
 
     Args:
-        root: the capture's folder.
-        out: where `inspect.json` and `inspect.png` go; none: they are not written.
-        format: the capture's format; none: found out.
-        response: what the pixels are; auto: told from the files.
-        strict: end with status 1 where there is a problem.
-        console: where the report goes.
+        root: the folder of the capture.
+        out: folder for `inspect.json` and `inspect.png`; None: they are not written.
+        format: the layout of the capture; None: it is detected.
+        response: meaning of the pixel values; "auto": as the files state.
+        strict: whether to end with status 1 if there is a problem.
+        console: the console for the report.
 
     Raises:
-        UserError: the folder holds no capture that can be loaded.
-        EarlyEnd: `strict`, and there is a problem.
+        UserError: the folder has no capture that can be loaded.
+        EarlyEnd: `strict` is set, and there is a problem.
     """
     capture = load_capture(root, format=format, response=response)
     columns = (TextColumn("reading images"), BarColumn(), MofNCompleteColumn())
@@ -69,7 +69,7 @@ def run_inspection(
 
 
 def to_json(inspection: Inspection) -> dict[str, Any]:
-    """The inspection as plain values."""
+    """Return the inspection as plain values, the content of `inspect.json`."""
     capture, placement = inspection.capture, inspection.placement
     figures = ("luminance", "stops", "sharpness", "clipped", "invalid", "broken", "pixels", "levels")
     return {

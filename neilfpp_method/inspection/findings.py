@@ -1,4 +1,4 @@
-"""Findings about a capture: figures that exceed limits, with remedies, and a verdict."""
+"""Find defects of a capture: figures that exceed limits, with remedies, and a verdict."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ EDGE, STRAY_POINTS, SMALL_CLOUD = 1.05, 0.1, 0.2
 """Distance from the centre beyond which a point is outside the box, in scene units; share of such points that
 is reported; extent below which the object is small for its box, in scene units."""
 DISPLAY_LEVELS = 256
-"""Number of levels of 8-bit images: linear radiance with so few levels was converted from them."""
+"""Number of levels of 8-bit images. Linear images with so few levels were converted from 8-bit images."""
 PIXELS_PER_LEVEL = 16
 """Smallest number of pixels per level with which the number of levels is meaningful."""
 BETTER_WITHOUT: Mapping[str, str] = {
@@ -80,7 +80,7 @@ class Finding:
     views: tuple[str, ...] = ()
 
     def line(self) -> str:
-        """For the terminal, without its severity."""
+        """The finding in one line for the console, without its severity."""
         rest = f" and {len(self.views) - MAX_NAMED} more" if len(self.views) > MAX_NAMED else ""
         named = f" [{', '.join(self.views[:MAX_NAMED])}{rest}]" if self.views else ""
         return f"{self.text}{named}; {self.remedy}"
@@ -96,7 +96,16 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Inspection:
-    """All that was found; `views`, `factors` and the views of `placement` are in the capture's order."""
+    """The result of an inspection.
+
+    Attributes:
+        capture: the capture.
+        views: figures of each view, in the order of the capture.
+        placement: the placement of the cameras, in the same order.
+        factors: brightness of each view relative to its neighbours (`exposure_factors`), in the same order.
+        findings: the defects, problems first.
+        verdict: the quality of the radiance.
+    """
 
     capture: Capture
     views: tuple[ViewFigures, ...]
@@ -107,11 +116,11 @@ class Inspection:
 
 
 def inspect_capture(capture: Capture, on_view: Callable[[str], None] = lambda name: None) -> Inspection:
-    """Look at every view of a capture.
+    """Inspect a capture; this reads every image.
 
     Args:
         capture: the capture.
-        on_view: called with the name of each view once it is measured.
+        on_view: called with the name of each view after it has been measured.
     """
     views = []
     for view in capture.views:
@@ -127,22 +136,23 @@ def inspect_capture(capture: Capture, on_view: Callable[[str], None] = lambda na
 
 
 def problems(inspection: Inspection) -> tuple[str, ...]:
-    """What spoils or prevents a result, in lines for people."""
+    """Return one line for the console per finding that is a problem."""
     return tuple(
         f"problem: {finding.line()}" for finding in inspection.findings if finding.severity == "problem"
     )
 
 
 def problems_of_poses(capture: Capture) -> tuple[str, ...]:
-    """As `problems`, of what cameras and points tell without a look at any pixel, so at once."""
+    """The same as `problems`, for cameras and point cloud only; fast, because no image is read."""
     found = (*_of_cameras(capture, camera_placement(capture)), *_of_scene(capture))
     return tuple(f"problem: {finding.line()}" for finding in found if finding.severity == "problem")
 
 
 def views_to_leave_out(inspection: Inspection) -> Mapping[str, str]:
-    """The views that a capture is better without, and why: black ones, blurred ones, and duplicates.
+    """Return the views that should be left out: black ones, blurred ones, and duplicates.
 
-    None where too few would remain.
+    Returns:
+        The reason by the name of the view; empty if too few views would remain.
 
     Example:
         >>> views_to_leave_out(inspect_capture(load_capture("captures/teapot")))
@@ -259,7 +269,7 @@ def _of_scene(capture: Capture) -> Iterator[Finding]:
         yield Finding("point_cloud", "problem", error.problem, error.remedy)
         return
     reach = points.abs().amax(dim=-1).numpy()
-    # A box about what the cameras look at leaves points of the background out on purpose.
+    # A box around the point that the cameras look at excludes background points on purpose.
     outside = 0.0 if capture.scene_from == "focus" else float((reach > EDGE).mean())
     if outside > STRAY_POINTS:
         text = f"{100 * outside:.0f} % of the point cloud lies outside of the scene box"
