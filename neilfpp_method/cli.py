@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # In a parallel training only the first process prints errors and sets the exit status.
     first = os.environ.get("LOCAL_RANK", "0") == "0"
     errors = Console(stderr=True, quiet=not first)
-    with ended_by_signal() as asked:
+    with ended_by_signal() as ending:
         try:
             _run(arguments[0], arguments[1:])
         except EarlyEnd as end:
@@ -50,10 +50,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             # tyro has printed the help of a command.
             return 0
         except BaseException as error:
-            if not asked.number and not isinstance(error, KeyboardInterrupt):
+            if not ending.number and not isinstance(error, KeyboardInterrupt):
                 raise
             errors.print("stopped")
-            return asked.status if asked.number else Stopped.status
+            return ending.status if ending.number else Stopped.status
     return 0
 
 

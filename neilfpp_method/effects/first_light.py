@@ -82,7 +82,7 @@ class FirstLight:
     observed: Observed
     material: Material
 
-    def in_words(self) -> str:
+    def summary(self) -> str:
         """One line for the console."""
         ends = self.errors[SCALES[0]], self.errors[SCALES[-1]]
         bounded = min(self.errors.values()) < min(ends)

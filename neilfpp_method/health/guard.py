@@ -51,7 +51,7 @@ class StepGuard:
 
     def watch(self, optimizer: Optimizer) -> None:
         """Check the gradients of this and all other watched optimizers before each step of the optimizer."""
-        if not any(optimizer is known for known in self._optimizers):
+        if not any(optimizer is watched for watched in self._optimizers):
             self._optimizers.append(optimizer)
             optimizer.register_step_pre_hook(self._before_step)
 
@@ -99,11 +99,11 @@ class StepGuard:
             if gradients:
                 name = group.get("name", f"group {i}")
                 norms[name] = torch.stack([g.norm() for g in gradients]).norm()
-        known = {f"loss {name}": value.detach() for name, value in self._terms.items()}
-        known |= {f"the gradient of {name}": norm for name, norm in norms.items()}
-        if not known:
+        terms = {f"loss {name}": value.detach() for name, value in self._terms.items()}
+        terms |= {f"the gradient of {name}": norm for name, norm in norms.items()}
+        if not terms:
             return None
-        values = torch.stack([value.to(torch.float32) for value in known.values()]).tolist()
+        values = torch.stack([value.to(torch.float32) for value in terms.values()]).tolist()
         return next(
-            (name for name, value in zip(known, values, strict=True) if not math.isfinite(value)), None
+            (name for name, value in zip(terms, values, strict=True) if not math.isfinite(value)), None
         )

@@ -26,7 +26,7 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import OrientedPoints
 
-__all__ = ["build_model", "cloud_in_words", "exposures_of", "scene_facts", "show_known_light"]
+__all__ = ["build_model", "cloud_summary", "exposures_of", "scene_facts", "show_known_light"]
 
 LDR_SCALE = 1.0
 """Largest radiance that R can represent for LDR input, as published: the scale of its sigmoid."""
@@ -135,7 +135,7 @@ def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
 HOSTS: Mapping[str, Callable[[Capture, SceneFacts, NeilfConfig], Host]] = {"volsdf": _volsdf, "mesh": _mesh}
 
 
-def cloud_in_words(capture: Capture, config: NeilfConfig) -> str | None:
+def cloud_summary(capture: Capture, config: NeilfConfig) -> str | None:
     """One line for the console on whether a point cloud supervises geometry.
 
     Returns None if the settings use no point cloud.

@@ -49,7 +49,7 @@ def test_scale_and_map_are_found_together():
     start = torch.full((3, ROWS, 2 * ROWS), math.log(typical / truth))
     assert log_distance(found.log_radiance) < 0.6 * log_distance(start)
     assert found.places == COUNT
-    assert f"{COUNT} places" in found.in_words()
+    assert f"{COUNT} places" in found.summary()
     assert len(found.observed) == len(found.material.roughness) <= len(places.place)
     assert (found.material.base_color == found.mean.base_color).all()
 
