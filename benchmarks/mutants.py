@@ -44,8 +44,10 @@ LOADED_BEFORE = (
     "hypothesis",
 )
 """What tests use of others, loaded once and shared by all processes."""
-LONGEST = 300
-"""Seconds that the tests of one fault may take."""
+LONGEST = 300.0
+"""Seconds of computing that the tests of one fault may take."""
+LONGEST_BY_CLOCK = 3000
+"""Seconds by the clock that they may take, if they wait without computing."""
 
 
 @dataclass(frozen=True)
@@ -486,7 +488,9 @@ def _first_failure(copy: Path, tests: str) -> str | None:
     failed.unlink(missing_ok=True)
     child = os.fork()
     if not child:
-        signal.alarm(LONGEST)
+        # Either signal ends the process.
+        signal.setitimer(signal.ITIMER_PROF, LONGEST)
+        signal.alarm(LONGEST_BY_CLOCK)
         os.chdir(copy)
         sys.dont_write_bytecode = True
         # An editable install finds the package by its name; here it is the copy.

@@ -75,10 +75,10 @@ class AttachedNeilf(nn.Module):
         self.proxy = proxy
         self.light_solver = model.light_solver()
         self.missing = missing_capabilities(_inner(model.host))
-        facts, hit_share = model.facts, model.config.shading.hit_share
-        self.first_batches = FirstBatches(
-            host_name(model.host), hit_share, facts.response, facts.median_radiance
-        )
+        host, config, facts = model.host, model.config, model.facts
+        traced = model.borrowed and config.inter_reflection.mode != "off"
+        render = host.render if traced and answers_secondary_rays(_inner(host)) else None
+        self.first_batches = FirstBatches(host_name(host), config.shading.hit_share, facts, render)
         self.step_guard = StepGuard(log.warning)
         self.watch = Watch(None, log.warning)
         self._steps, self._with_material = 0, False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -35,3 +36,19 @@ def test_licence_and_citation_name_the_same_version():
     assert (ROOT / "LICENSE").read_text().startswith("MIT License")
     assert f"version: {neilfpp_method.__version__}\n" in (ROOT / "CITATION.cff").read_text()
     assert f'version = "{neilfpp_method.__version__}"\n' in (ROOT / "pyproject.toml").read_text()
+
+
+def test_hints_in_messages_are_commands_that_install_an_extra():
+    """Quoted, because brackets are a pattern to some shells, with the name and extras of pyproject.toml."""
+    project = (ROOT / "pyproject.toml").read_text()
+    (name,) = re.findall(r'^name = "(.+)"$', project, re.MULTILINE)
+    section = project.split("[project.optional-dependencies]")[1].split("\n[")[0]
+    extras = re.findall(r"^(\w+) = \[", section, re.MULTILINE)
+    hints = {
+        f"{path.relative_to(ROOT)}: {hint}"
+        for path in (ROOT / "neilfpp_method").rglob("*.py")
+        for hint in re.findall(r"\S* ?\S* ?\S*neilfpp[-_.]method\[[^ ]*", path.read_text())
+    }
+    assert len(hints) > 4
+    wanted = re.compile(rf".*pip install '{name}\[({'|'.join(extras)})\]'\W*")
+    assert [hint for hint in sorted(hints) if not wanted.fullmatch(hint)] == []

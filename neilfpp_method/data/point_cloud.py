@@ -31,6 +31,8 @@ TYPES = dict(zip(OLD_NAMES + NEW_NAMES, CODES + CODES, strict=True))
 BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": None}
 HEADER_LIMIT = 65_536
 """Largest number of bytes of the header of a PLY file."""
+ROUNDING = 1e-6
+"""Largest rounding error of a written position, as a share of the longest edge of the bounding box."""
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
 
@@ -97,14 +99,33 @@ def has_normals(path: Path) -> bool:
 
 
 def write_oriented_ply(path: Path, points: WorldPoints) -> Path:
-    """Write points as a binary PLY file in single precision, and return its path."""
-    properties = "".join(f"property float {name}\n" for name in POSITION + NORMAL)
+    """Write points as binary PLY.
+
+    Numbers are in single precision, except that positions are in double precision if rounding them would move
+    a point by more than `ROUNDING` of the extent of the cloud, as in map coordinates.
+
+    Returns:
+        The path.
+    """
+    kind = "double" if _needs_double(points.position) else "float"
+    columns = [(name, kind) for name in POSITION] + [(name, "float") for name in NORMAL]
+    properties = "".join(f"property {kind} {name}\n" for name, kind in columns)
     vertices = f"element vertex {len(points.position)}\n"
     head = f"ply\nformat binary_little_endian 1.0\n{vertices}{properties}end_header\n"
-    rows = np.concatenate([points.position, points.normal], axis=1).astype("<f4")
+    rows = np.empty(len(points.position), [(name, f"<{TYPES[kind]}") for name, kind in columns])
+    for values, names in ((points.position, POSITION), (points.normal, NORMAL)):
+        for name, column in zip(names, values.T, strict=True):
+            rows[name] = column
     with replacing(path) as temporary:
         temporary.write_bytes(head.encode("ascii") + rows.tobytes())
     return path
+
+
+def _needs_double(position: Float64[np.ndarray, "N 3"]) -> bool:
+    if not len(position):
+        return False
+    moved = np.abs(position.astype(np.float32) - position).max()
+    return bool(moved > ROUNDING * np.ptp(position, axis=0).max())
 
 
 def _read(path: Path) -> np.ndarray:

@@ -111,7 +111,7 @@ EFFECTS: Mapping[str, Effect] = {
             off={"inter_reflection.mode": "off"},
             obstacle=_none,
             cost=_traced_cost,
-            risk="shadows and inter-reflections are baked into the base colour",
+            risk="shadows and light between surfaces are baked into the base colour",
         ),
         Effect(
             name="lamps",

@@ -39,6 +39,7 @@ def lobe_evidence(places: Places, scene: SceneTracer | None, typical: float, met
 
     The arguments are those of `find_first_light`.
     """
+    # Places are numbered in the order of random draws, so the first ones are a random subset.
     places = places.where(torch.nonzero(places.place < PLACES)[:, 0])
     transports = [place_transport(places, LOBES[name], scene) for name in ("spherical_gaussian", "ggx")]
     gains, metal = [], []

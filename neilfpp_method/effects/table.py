@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from neilfpp_method.effects.catalogue import EFFECTS, switched
@@ -49,9 +50,13 @@ def rows(plan: Plan) -> list[dict[str, Any]]:
 
 
 def table(plan: Plan) -> Table:
-    """A table of the effects for the terminal."""
-    result = Table(title=f"effects ({plan.request})", title_justify="left", show_lines=False)
-    for heading in ("effect", "decision", "reason", "cost when on", "risk when off"):
+    """A table of the effects for the terminal. From 80 columns on, lines break between words only."""
+    result = Table(
+        title=f"effects ({plan.request})", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
+    )
+    result.add_column("effect", no_wrap=True)
+    result.add_column("decision", no_wrap=True)
+    for heading in ("reason", "cost when on", "risk when off"):
         result.add_column(heading, overflow="fold")
     for row in rows(plan):
         result.add_row(row["effect"], row["decision"], row["reason"], row["cost"], row["risk"])

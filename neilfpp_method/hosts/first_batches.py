@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from neilfpp_method.errors import UserError
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.shading.color import apply_response
-from neilfpp_method.structures import PixelBatch, SurfaceHits
+from neilfpp_method.structures import PixelBatch, RayBatch, SurfaceHits
 
 __all__ = ["FirstBatches", "check_batch", "check_points", "check_rows"]
 
@@ -29,6 +32,14 @@ REACH = 1.5
 """Median distance of hits from the origin above which the scene is too large, scene units. An object in the
 unit sphere may stand on a ground.
 """
+VIEWED_AGAIN = 256
+"""Maximum number of hits that are rendered from another viewpoint, once."""
+ASIDE = 0.6
+"""Tangent of the angle between the other viewpoint and the direction halfway between normal and viewer."""
+APART = 0.01
+"""Largest distance between the hits of one point from two viewpoints, scene units, as in `check_host`."""
+MOVED = 0.4
+"""Largest share of points that may be farther apart; some are occluded from the other viewpoint."""
 SIZES = 30.0
 """Factor between the median of the pixels and `median_radiance` above which they do not belong together."""
 
@@ -41,15 +52,22 @@ class FirstBatches:
     Args:
         name: name of the host in messages.
         hit_share: smallest concentration of a hit.
-        response: meaning of pixel values, "linear" or "srgb".
-        median_radiance: median linear luminance of the object, as given to `attach_neilf`.
+        facts: meaning of pixel values, and median linear luminance of the object.
+        render: renders any rays with the host, to compare its hits from two viewpoints; if None, they are not
+            compared.
     """
 
-    def __init__(self, name: str, hit_share: float, response: str, median_radiance: float) -> None:
+    def __init__(
+        self,
+        name: str,
+        hit_share: float,
+        facts: SceneFacts,
+        render: Callable[[RayBatch], SurfaceHits] | None = None,
+    ) -> None:
         self.name = name
         self.hit_share = hit_share
-        self.response = response
-        self.median_radiance = median_radiance
+        self.facts = facts
+        self.render = render
         self.batches = 0
         self.any_hit = False
         self._warned: set[str] = set()
@@ -102,9 +120,12 @@ class FirstBatches:
                     "return zeros and concentration 0 for a ray that misses; otherwise look for a division "
                     "by zero",
                 )
-        self.any_hit = self.any_hit or bool(hit.any())
+        is_first = bool(hit.any()) and not self.any_hit
+        self.any_hit = self.any_hit or is_first
         if hit.any():
             self._check_surface(batch, hits.detach(), hit)
+            if is_first and self.render is not None:
+                self._check_another_view(batch, hits.detach(), hit, self.render)
             self._check_median(batch.color[hit])
         elif not self.any_hit:
             self._warn(
@@ -117,11 +138,11 @@ class FirstBatches:
     def _check_colors(self, color: Tensor) -> None:
         if len(color) == 0:
             return
-        if color.min() < -1e-3 * self.median_radiance:
+        if color.min() < -1e-3 * self.facts.median_radiance:
             self._warn(
                 "negative", "some pixels are negative", "give linear radiance or display values, 0 and above"
             )
-        if self.response == "srgb" and color.max() > 1.001:
+        if self.facts.response == "srgb" and color.max() > 1.001:
             raise UserError(
                 f"pixels reach {color.max():.3g}, but display values are at most 1",
                 "divide 8-bit pixels by 255, or attach with response='linear' if these are radiance",
@@ -129,7 +150,7 @@ class FirstBatches:
 
     def _check_median(self, color: Tensor) -> None:
         median = color.mean(-1).median().item()
-        expected = apply_response(torch.tensor(self.median_radiance), self.response).item()
+        expected = apply_response(torch.tensor(self.facts.median_radiance), self.facts.response).item()
         if median > 0 and not 1 / SIZES < median / expected < SIZES:
             self._warn(
                 "median",
@@ -161,6 +182,36 @@ class FirstBatches:
                 "far",
                 f"half of its hits are {reach:.3g} or more from the origin",
                 "move and scale cameras and host so that the object lies in the unit sphere",
+            )
+
+    @torch.no_grad()
+    def _check_another_view(
+        self,
+        batch: PixelBatch,
+        hits: SurfaceHits,
+        hit: Tensor,
+        render: Callable[[RayBatch], SurfaceHits],
+    ) -> None:
+        """Compare hits with those from other viewpoints at the same distance; a wrong depth moves them.
+
+        The random state of the caller is not changed.
+        """
+        rows = torch.nonzero(hit)[:, 0]
+        rows = rows[:: math.ceil(len(rows) / VIEWED_AGAIN)]
+        position, back = hits.position[rows], -batch.directions[rows]
+        distance = (position - batch.origins[rows]).norm(dim=-1, keepdim=True)
+        tangent = normalize(torch.linalg.cross(hits.normal[rows], back.roll(1, dims=-1)), dim=-1)
+        way = normalize(hits.normal[rows] + back + ASIDE * tangent, dim=-1)
+        with torch.random.fork_rng(devices=[position.device] if position.is_cuda else []):
+            again = render(RayBatch(position + distance * way, -way))
+        same = again.is_hit(self.hit_share) & ((again.position - position).norm(dim=-1) < APART)
+        moved = 1.0 - same.float().mean().item()
+        if moved > MOVED:
+            self._warn(
+                "moved",
+                f"{moved:.0%} of its hits are {APART} or more away when seen from another viewpoint",
+                "return distances along the unit ray, not z-depths; a host that is still being trained may "
+                "have no surface yet",
             )
 
     def _warn(self, kind: str, problem: str, remedy: str) -> None:

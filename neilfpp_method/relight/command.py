@@ -234,8 +234,15 @@ def _settings(request: Request, run: Run, name: str) -> dict[str, Any]:
         "box": None if request.box is None else list(request.box),
         "mask": [[path.name, hashlib.sha256(path.read_bytes()).hexdigest()] for path in request.mask],
     }
-    copied = ("rotate", "exposure", "spp", "seconds", "bounces", "background", "denoise", "resolution")
+    budget = _budget(request)
+    settings |= {"spp": budget.samples, "seconds": budget.seconds}
+    copied = ("rotate", "exposure", "bounces", "background", "denoise", "resolution")
     return settings | {key: getattr(request, key) for key in copied}
+
+
+def _budget(request: Request) -> Budget:
+    """The limits per image, with the default number of samples if the options set no limit."""
+    return Budget(request.spp or (SAMPLES if request.seconds is None else None), request.seconds)
 
 
 def _with_lamps(request: Request) -> bool:
@@ -261,7 +268,7 @@ def _render(
     missing: Mapping[str, Sequence[Shot]],
     on_progress: Callable[[float], None],
 ) -> None:
-    budget = Budget(request.spp or (SAMPLES if request.seconds is None else None), request.seconds)
+    budget = _budget(request)
     work = [(scenes[name], folders[name], shot) for name, shots in missing.items() for shot in shots]
     for done, (scene, folder, shot) in enumerate(work):
 

@@ -61,6 +61,6 @@ def _library():
     try:
         import pyoidn
     except ImportError as error:
-        remedy = "install neilfpp-method[denoise], or leave --denoise out and give more --spp"
+        remedy = "pip install 'neilfpp-method[denoise]', or leave --denoise out and give more --spp"
         raise UserError("--denoise needs pyoidn, which is not installed", remedy) from error
     return pyoidn

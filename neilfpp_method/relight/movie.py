@@ -33,7 +33,8 @@ def write_movie(path: Path, pictures: Sequence[Path]) -> None:
         (_by_ffmpeg if _has_ffmpeg() else _by_opencv)(temporary, pictures)
         if not temporary.is_file() or not temporary.stat().st_size:
             raise UserError(
-                f"{path}: no MP4 encoder found", "install imageio-ffmpeg, or encode the PNG files otherwise"
+                f"{path}: no MP4 encoder found",
+                "pip install 'neilfpp-method[movie]', or encode the PNG files with another program",
             )
 
 

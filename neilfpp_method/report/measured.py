@@ -11,7 +11,7 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.published import PROTOCOLS
 from neilfpp_method.train.run import read_json
 
-__all__ = ["OWN", "Measured", "numbers", "read_measured"]
+__all__ = ["OWN", "Measured", "is_outdated", "numbers", "read_measured"]
 
 OWN = "neilfpp"
 """The name of this project's own protocol."""
@@ -70,6 +70,12 @@ def read_measured(path: Path) -> tuple[dict[str, Measured], list[str]]:
     return measurements, notes
 
 
+def is_outdated(file: Path, run: Path) -> bool:
+    """Whether a file of figures is older than the last checkpoint of its run."""
+    checkpoint = run / "checkpoints" / "last.pt"
+    return checkpoint.is_file() and file.stat().st_mtime < checkpoint.stat().st_mtime
+
+
 def numbers(values: Mapping[str, Any]) -> dict[str, float]:
     """Keep the values that are numbers; booleans are dropped."""
     return {
@@ -97,12 +103,12 @@ def _measured(
 ) -> Measured:
     measured = measured if isinstance(measured, dict) else {}
     views, size = measured.get("view_names"), (measured.get("width"), measured.get("height"))
-    checkpoint = file.parent / ("" if name == OWN else "..") / "checkpoints" / "last.pt"
+    run = file.parent if name == OWN else file.parent.parent
     return Measured(
         protocol=name,
         description=description,
         figures=numbers(figures),
         views=tuple(map(str, views)) if isinstance(views, list) and views else None,
         size=size if all(isinstance(side, int) for side in size) else None,
-        outdated=checkpoint.is_file() and file.stat().st_mtime < checkpoint.stat().st_mtime,
+        outdated=is_outdated(file, run),
     )

@@ -13,9 +13,8 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.tradeoff.files import write_tradeoff
 from neilfpp_method.tradeoff.frontier import FIGURES, Point, frontier
-from neilfpp_method.tradeoff.rows import Row, measured, rows_of, run_row
+from neilfpp_method.tradeoff.rows import check_same, measured, rows_of, run_row
 from neilfpp_method.train.output import check_folder
-from neilfpp_method.train.run import read_description
 
 __all__ = ["run_tradeoff"]
 
@@ -58,7 +57,7 @@ def run_tradeoff(
     load_capture(data)
     check_folder(out)
     for row in rows:
-        _check_same(row)
+        check_same(row)
     refused = ""
     for number, row in enumerate(rows, start=1):
         console.print(f"run {number} of {len(rows)}: {row.name}", soft_wrap=True)
@@ -80,16 +79,6 @@ def run_tradeoff(
         console.print(line, soft_wrap=True)
     console.print(f"written to {out / 'tradeoff.csv'}, tradeoff.json and tradeoff.svg", soft_wrap=True)
     return points
-
-
-def _check_same(row: Row) -> None:
-    """Raise a `UserError` if the folder of a row contains another run than the row describes."""
-    if not (row.out / "config.json").is_file():
-        return
-    described = read_description(row.out)
-    same = described.source.root == str(row.data.resolve()) and described.config.preset == row.config.preset
-    if not same or described.config.train.seed != row.config.train.seed:
-        raise UserError(f"{row.out}: a run of another capture or with other settings", "choose another --out")
 
 
 def table(points: Sequence[Point]) -> list[str]:

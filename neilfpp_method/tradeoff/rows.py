@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
@@ -13,16 +13,22 @@ from neilfpp_method.effects.request import parse_effects
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.protocols import evaluate, write_metrics
 from neilfpp_method.evaluate.size import at_size
+from neilfpp_method.report.files import flat_settings
+from neilfpp_method.report.measured import is_outdated
+from neilfpp_method.settings.plain import to_dict
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.tradeoff.frontier import FIGURES, Measured
 from neilfpp_method.train.budget_record import read_budget
+from neilfpp_method.train.budgeted import planned_settings
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.device import pick_device
+from neilfpp_method.train.effects_record import read_plan
 from neilfpp_method.train.json_files import read_json
+from neilfpp_method.train.pace import with_steps
 from neilfpp_method.train.quality import read_checks
-from neilfpp_method.train.run import load_run
+from neilfpp_method.train.run import CaptureSource, load_run, read_description
 
-__all__ = ["Row", "measured", "rows_of", "run_row"]
+__all__ = ["Row", "check_same", "measured", "rows_of", "run_row"]
 
 METRICS = "metrics.json"
 """File of a run with its metrics on test views."""
@@ -62,7 +68,7 @@ def rows_of(
     Raises:
         UserError: if there is no budget, a budget occurs twice, or `seeds` is less than 1.
     """
-    if not budgets or len(set(budgets)) != len(budgets):
+    if not budgets or len(set(map(format_duration, budgets))) != len(budgets):
         raise UserError("--budgets is empty or contains a budget twice", "give each once, as 1m,3m,10m")
     if seeds < 1:
         raise UserError(f"--seeds is {seeds}", "set it to 1 or more")
@@ -75,6 +81,42 @@ def rows_of(
                 Row(data, out / f"{format_duration(budget)}-seed{seed}", seeded, effects, budget, device)
             )
     return rows
+
+
+def check_same(row: Row) -> None:
+    """Check that the folder of a row, if it contains a run, contains the run that the row describes.
+
+    The numbers of steps and the settings that depend on the size of a step (`budget.sizes`) are compared with
+    the plan of the run, because planning for a budget changes them.
+
+    Raises:
+        UserError: if anything else differs; the message names the first difference.
+    """
+    if not (row.out / "config.json").is_file():
+        return
+    described = read_description(row.out)
+    plan = read_budget(row.out)
+    planned = row.config if plan is None else planned_settings(plan, row.config)
+    effects = str(read_plan(row.out, described.config).asked)
+    source = CaptureSource(str(row.data.resolve()), scale=described.source.scale)
+    wanted = _compared(planned, source, row.budget, str(read_asked(row.effects)))
+    stored = _compared(described.config, described.source, plan and plan.budget, effects)
+    for name in dict.fromkeys((*stored, *wanted)):
+        if stored.get(name) != wanted.get(name):
+            raise UserError(
+                f"{row.out}: a run of another capture or with other settings: {name} is {stored.get(name)}, "
+                f"not {wanted.get(name)}",
+                "choose another --out, or remove this folder",
+            )
+
+
+def _compared(
+    config: NeilfConfig, source: CaptureSource, budget: float | None, effects: str
+) -> dict[str, object]:
+    """What has to be the same for two runs to be the same row, by name."""
+    capture = {f"capture.{name}": value for name, value in asdict(source).items()}
+    settings = flat_settings(to_dict(replace(config, train=with_steps(config.train, {}))))
+    return {**capture, **settings, "--effects": effects, "the budget in seconds": budget}
 
 
 def run_row(row: Row, console: Console, at_end: Callable[[Path], None] | None = None) -> None:
@@ -100,7 +142,7 @@ def run_row(row: Row, console: Console, at_end: Callable[[Path], None] | None = 
             budget=row.budget,
             at_end=at_end,
         )
-    if not (row.out / METRICS).is_file():
+    if not _has_metrics(row.out):
         run = at_size(load_run(row.out, pick_device(row.device)), None, None)
         if run.capture.test_views:
             write_metrics(row.out / METRICS, run, evaluate(run))
@@ -115,10 +157,15 @@ def measured(row: Row) -> Measured | None:
     plan = read_budget(row.out)
     if plan is None or plan.took is None:
         return None
-    metrics = read_json(row.out / METRICS) if (row.out / METRICS).is_file() else {}
-    figures = {name: float(metrics[name]) for name in FIGURES if isinstance(metrics.get(name), int | float)}
-    checks = read_checks(row.out)
-    if checks:
-        last = checks[-1]
+    known = read_json(row.out / METRICS) if _has_metrics(row.out) else {}
+    figures = {name: float(known[name]) for name in FIGURES if isinstance(known.get(name), int | float)}
+    looks = read_checks(row.out)
+    if looks:
+        last = looks[-1]
         figures["held_back_psnr"] = last.radiance if last.physical is None else last.physical
     return Measured(row.budget, row.config.train.seed, plan.took, figures)
+
+
+def _has_metrics(run: Path) -> bool:
+    """Whether a run has metrics that are not older than its last checkpoint."""
+    return (run / METRICS).is_file() and not is_outdated(run / METRICS, run)

@@ -7,9 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.point_cloud import load_point_cloud, read_oriented_ply
+from neilfpp_method.data.point_cloud import (
+    WorldPoints,
+    load_point_cloud,
+    read_oriented_ply,
+    write_oriented_ply,
+)
 from neilfpp_method.errors import UserError
 from tests.data.make_capture import RADIUS, SCALE, make_capture, write_ply
 
@@ -49,6 +55,26 @@ def test_dialects(tmp_path: Path, dialect: str) -> None:
     points = read_oriented_ply(path)
     assert np.array_equal(points.position, POSITION)
     assert np.array_equal(points.normal, NORMAL)
+
+
+@pytest.mark.parametrize(("offset", "kind"), [(0.0, "float"), (4e6, "double")])
+def test_written_points_keep_their_positions(tmp_path: Path, offset: float, kind: str) -> None:
+    random = np.random.default_rng(0)
+    normal = random.normal(size=(50, 3))
+    points = WorldPoints(offset + random.uniform(size=(50, 3)), normal.astype(np.float32).astype(np.float64))
+    path = write_oriented_ply(tmp_path / "cloud.ply", points)
+    again = read_oriented_ply(path)
+    assert np.abs(again.position - points.position).max() < 1e-6
+    assert np.array_equal(again.normal, points.normal)
+    assert f"property {kind} x\n".encode() in path.read_bytes()
+    # Another program reads the same file.
+    mesh = trimesh.load(path)
+    assert np.abs(np.asarray(mesh.vertices) - points.position).max() < 1e-6
+
+
+def test_no_points_are_written(tmp_path: Path) -> None:
+    path = write_oriented_ply(tmp_path / "cloud.ply", WorldPoints(np.empty((0, 3)), np.empty((0, 3))))
+    assert b"element vertex 0\nproperty float x\n" in path.read_bytes()
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import logging
 
 import pytest
 import torch
+from torch.nn.functional import normalize
 
 from neilfpp_method.attach import attach_neilf, pixel_batch
 from neilfpp_method.errors import UserError
@@ -94,6 +95,51 @@ def test_a_scene_far_outside_the_unit_sphere_is_said_once(caplog):
     (record,) = (record for record in caplog.records if record.name == SAYS)
     assert "half of its hits are" in record.message
     assert "move and scale cameras and host so that the object lies in the unit sphere" in record.message
+
+
+def test_a_depth_that_is_no_distance_along_the_ray_is_said_once(caplog):
+    """A ball with z-depth of close cameras that look at its centre: positions lie on their rays."""
+
+    def z_depth(rays: RayBatch, outputs: dict) -> dict:
+        axis = normalize(-rays.origins, dim=-1)
+        cosine = (axis * rays.directions).sum(-1, keepdim=True)
+        return {"position": rays.origins + cosine * (outputs["position"] - rays.origins)}
+
+    said = "% of its hits are 0.01 or more away when seen from another viewpoint; return distances along"
+    neilf, true = (attach_neilf(host, tiny_config()) for host in (BallHost(z_depth), BallHost()))
+    with caplog.at_level(logging.WARNING, SAYS):
+        for seed in range(3):
+            rays = ball_rays(256, spread=0.6, seed=seed)
+            close = 0.4 * rays.origins
+            rays = RayBatch(close, normalize(0.5 * rays.directions.roll(1, 0) - close, dim=-1))
+            true.losses(batch(rays), "material_init")
+            neilf.losses(batch(rays), "material_init")
+    (record,) = (record for record in caplog.records if record.name == SAYS)
+    assert said in record.message
+
+
+def test_looking_from_another_viewpoint_changes_no_random_number():
+    """The host draws numbers; training draws the same ones after it as without the check."""
+
+    def drawn(rays: RayBatch, outputs: dict) -> dict:
+        torch.rand(7)
+        return {}
+
+    def after_a_step(render: bool) -> torch.Tensor:
+        neilf = attach_neilf(BallHost(drawn), tiny_config())
+        assert neilf.first_batches.render is not None
+        neilf.first_batches.render = neilf.first_batches.render if render else None
+        torch.manual_seed(3)
+        neilf.losses(batch(ball_rays(64)), "material_init")
+        return torch.rand(4)
+
+    assert torch.equal(after_a_step(render=True), after_a_step(render=False))
+
+
+def test_a_host_of_camera_rays_is_rendered_from_no_other_viewpoint():
+    host = BallHost()
+    host.answers_secondary_rays = False
+    assert attach_neilf(host, tiny_config()).first_batches.render is None
 
 
 def test_directions_that_are_not_unit_are_an_error():

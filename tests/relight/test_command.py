@@ -150,6 +150,20 @@ def test_what_is_there_is_not_made_again(given, sky, tmp_path, capfd):
     assert picture.stat().st_mtime_ns > before
 
 
+def test_the_default_number_of_samples_is_the_same_setting_as_that_number(given, sky, tmp_path, monkeypatch):
+    options = ["--env", str(sky), "--out", str(tmp_path), "--resolution", "32", "--device", "cpu"]
+    monkeypatch.setattr(command, "SAMPLES", 3)
+    assert main(["relight", str(given), *options]) == 0
+    record = tmp_path / "studio" / "000.json"
+    assert json.loads(record.read_text())["spp"] == 3
+    before = record.stat().st_mtime_ns
+    assert main(["relight", str(given), *options, "--spp", "3"]) == 0
+    assert record.stat().st_mtime_ns == before
+    # With a time limit there is no default.
+    assert main(["relight", str(given), *options, "--seconds", "0.1", "--force"]) == 0
+    assert json.loads(record.read_text())["spp"] is None
+
+
 def test_views_are_chosen_by_name(given, sky, tmp_path):
     assert relit(given, "--env", sky, "--out", tmp_path, "--views", "002", "000") == 0
     assert {path.stem for path in (tmp_path / "studio").iterdir()} == {"000", "002"}
@@ -318,7 +332,9 @@ def test_a_full_disk_leaves_no_half_picture(given, sky, tmp_path, capfd):
 
 def test_without_a_denoiser_it_says_so(found, sky, capfd, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyoidn", None)
-    refused(capfd, found, "--env", sky, "--denoise", words=("pyoidn", "neilfpp-method[denoise]"))
+    refused(
+        capfd, found, "--env", sky, "--denoise", words=("pyoidn", "pip install 'neilfpp-method[denoise]'")
+    )
 
 
 def test_truths_for_each_map(found, sky, capfd):

@@ -10,6 +10,7 @@ import pytest
 from neilfpp_method.cli import main
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings import presets
+from neilfpp_method.settings.plain import changed
 from neilfpp_method.tradeoff import rows
 from neilfpp_method.tradeoff.rows import rows_of
 from neilfpp_method.train.budget_record import read_budget
@@ -37,12 +38,15 @@ def test_a_second_call_goes_on_and_does_nothing_twice(tmp_path, words, clock, mo
         assert main(words) == 130  # in the row of 2m, as that of 1s is too small
     assert "skipped: a budget of 1s is too small" in capsys.readouterr().out
     assert read_budget(out / "2m-seed0").took is None
+    # `neilfpp eval` has measured the stopped run.
+    (out / "2m-seed0" / "metrics.json").write_text('{"pbr_psnr": 99.0}')
     assert main(words) == 0
     assert "stopped" not in capsys.readouterr().err
     points = json.loads((out / "tradeoff.json").read_text())["points"]
     assert [point["budget"] for point in points] == [120.0, 180.0]
     assert points[0]["seconds"] == pytest.approx(120.0, rel=0.1)
     assert {"base_color_psnr_scaled", "pbr_psnr", "held_back_psnr"} <= set(points[0]["figures"])
+    assert points[0]["figures"]["pbr_psnr"] < 99.0
     assert not (out / "1s-seed0").exists()
 
     before = files(out / "2m-seed0") | files(out / "3m-seed0")
@@ -51,6 +55,34 @@ def test_a_second_call_goes_on_and_does_nothing_twice(tmp_path, words, clock, mo
 
     assert main([*words, "--host", "mesh"]) == 2
     assert "another capture or with other settings" in capsys.readouterr().err
+
+
+def test_a_row_that_differs_in_any_setting_is_refused_by_name(tmp_path, words, clock, monkeypatch, capsys):
+    assert main([*words, "--budgets", "2m"]) == 0
+    run = tmp_path / "out" / "2m-seed0"
+    assert main([*words, "--budgets", "2m"]) == 0
+
+    wider = changed(small_config(**STEPS), {"brdf.width": 24})
+    with monkeypatch.context() as patch:
+        patch.setitem(presets.PRESETS, "fast", lambda: wider)
+        capsys.readouterr()
+        assert main([*words, "--budgets", "2m"]) == 2
+        before = small_config().brdf.width
+        assert f"brdf.width is {before}, not 24; choose another --out" in capsys.readouterr().err
+
+    for name, key, value, message in (
+        ("effects.json", "asked", "none", "--effects is none, not auto"),
+        ("plan.json", "budget", 119.0, "the budget in seconds is 119.0, not 120.0"),
+        ("capture.json", "response", "srgb", "capture.response is srgb, not auto"),
+    ):
+        text = (run / name).read_text()
+        (run / name).write_text(json.dumps({**json.loads(text), key: value}))
+        assert main([*words, "--budgets", "2m"]) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+        (run / name).write_text(text)
+    assert main([*words, "--budgets", "2m"]) == 0
 
 
 def test_nothing_can_be_run(tmp_path, words, clock, capsys):
@@ -64,6 +96,7 @@ def test_nothing_can_be_run(tmp_path, words, clock, capsys):
     [
         (["--budgets", "soon"], "not a duration"),
         (["--budgets", "1m,60s"], "contains a budget twice"),
+        (["--budgets", "60s,60.2s"], "contains a budget twice"),  # both would be 1m-seed0
         (["--budgets", ","], "--budgets is empty"),
         (["--seeds", "0"], "--seeds is 0"),
     ],

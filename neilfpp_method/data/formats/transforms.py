@@ -3,7 +3,8 @@
     camera_model                      OPENCV (also if missing), OPENCV_FISHEYE, or one of COLMAP's pinholes
     is_fisheye                        instant-ngp's entry for OPENCV_FISHEYE, if there is no camera_model
     fl_x, fl_y, cx, cy, w, h,         for all frames, or in a frame for that frame;
-      k1 … k4, p1, p2                   camera_angle_x (radians) may replace fl_x
+      k1 … k4, p1, p2                   camera_angle_x (radians) may replace fl_x; if a frame has an angle,
+                                        the focal lengths of the file do not apply to it
     frames[].file_path                the image, relative to the file
     frames[].mask_path                optional: the mask, white on the object
     frames[].transform_matrix         camera to world, 4×4, OpenGL axes (x right, y up, z back)
@@ -139,12 +140,7 @@ def _camera(entry: Entry, frame: Entry, image: Path) -> Camera:
     header = image_header(image)
     width, height = (frame.get(name) or entry.get(name) for name in ("w", "h"))
     width, height = width.size() if width else header.width, height.size() if height else header.height
-    fx = number("fl_x") or _focal(number("camera_angle_x"), width)
-    fy = number("fl_y") or _focal(number("camera_angle_y"), height) or fx
-    if fx is None or fy is None:
-        raise UserError(
-            f"{frame.where}: no focal length", "add fl_x, in pixels, or camera_angle_x, in radians"
-        )
+    fx, fy = _focal_lengths(entry, frame, width, height)
     cx, cy = number("cx"), number("cy")
     distortion = {
         name: value for name in ("k1", "k2", "k3", "k4", "p1", "p2") if (value := number(name)) is not None
@@ -161,6 +157,30 @@ def _camera(entry: Entry, frame: Entry, image: Path) -> Camera:
         w2c=_pose(frame["transform_matrix"]),
         lens=lens_from_nerfstudio(model.word(*MODELS) if model else unnamed, distortion, frame.where),
     )
+
+
+def _focal_lengths(entry: Entry, frame: Entry, width: int, height: int) -> tuple[float, float]:
+    """The focal lengths of a frame, in pixels.
+
+    As in nerfstudio, `fl_x` and `fl_y` stand in the file or in the frame, each on its own. As in instant-ngp,
+    an angle of a frame replaces both focal lengths of the file. Without a vertical one, pixels are square.
+    """
+
+    def focal(place: Entry, axis: str, size: int) -> float | None:
+        length, angle = place.get(f"fl_{axis}"), place.get(f"camera_angle_{axis}")
+        return (length and length.number()) or _focal(angle and angle.number(), size)
+
+    fx, fy = focal(frame, "x", width), focal(frame, "y", height)
+    if (fx and not frame.get("fl_x")) or (fy and not frame.get("fl_y")):
+        # At least one of them is from an angle of the frame.
+        fx = fx or fy
+    else:
+        fx, fy = fx or focal(entry, "x", width), fy or focal(entry, "y", height)
+    if fx is None:
+        raise UserError(
+            f"{frame.where}: no focal length", "add fl_x, in pixels, or camera_angle_x, in radians"
+        )
+    return fx, fy or fx
 
 
 def _focal(angle: float | None, size: int) -> float | None:

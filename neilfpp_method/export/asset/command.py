@@ -128,7 +128,8 @@ def export_asset(
     vertices = run.capture.normalisation.to_world(torch.from_numpy(mesh.vertices)).numpy()
     write_asset(run, replace(mesh, vertices=vertices), textures, out)
     if not has_usd():
-        console.print("no USD file was written, because usd-core is missing: pip install neilfpp-method[usd]")
+        remedy = "pip install 'neilfpp-method[usd]'"
+        console.print(f"no USD file was written, because usd-core is missing: {remedy}", soft_wrap=True)
     console.print(f"written to {out}", soft_wrap=True)
 
 

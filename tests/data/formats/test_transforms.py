@@ -153,6 +153,27 @@ def test_a_field_of_view_stands_for_the_focal_length(tmp_path: Path) -> None:
     assert camera.fy == pytest.approx(40.0)
 
 
+@pytest.mark.parametrize(
+    ("of_frame", "fx", "fy"),
+    [
+        ({"camera_angle_x": 2 * np.arctan(WIDTH / 2 / 30.0)}, 30.0, 30.0),
+        ({"camera_angle_y": 2 * np.arctan(HEIGHT / 2 / 40.0)}, 40.0, 40.0),
+        ({"camera_angle_x": 2 * np.arctan(WIDTH / 2 / 30.0), "fl_y": 31.0}, 30.0, 31.0),
+        ({"camera_angle_x": 2 * np.arctan(WIDTH / 2 / 30.0), "fl_x": 29.0}, 29.0, FOCAL[1]),
+        ({"fl_x": 29.0}, 29.0, FOCAL[1]),
+        ({"fl_y": 31.0}, FOCAL[0], 31.0),
+        ({"fl_x": 29.0, "fl_y": 31.0}, 29.0, 31.0),
+    ],
+)
+def test_the_focal_length_of_a_frame_takes_precedence(
+    tmp_path: Path, of_frame: dict[str, float], fx: float, fy: float
+) -> None:
+    root = edit(scene(tmp_path), lambda content: content["frames"][1].update(of_frame))
+    first, second = (view.camera for view in load_capture(root).views[:2])
+    assert (first.fx, first.fy) == FOCAL
+    assert (second.fx, second.fy) == pytest.approx((fx, fy))
+
+
 # ------------------------------------------------------------------------------------------- files and splits
 
 

@@ -97,3 +97,44 @@ print(json.dumps([[fault[0], fault[2]] for fault in outcome.faults]))
     assert [number for number, _ in faults] == [11, 13, 15], faults
     for (_, told), word in zip(faults, ("KeyError", "MemoryError", "SIGSEGV"), strict=True):
         assert word in told
+
+
+def test_the_worker_limits_the_time_of_computing(tmp_path: Path) -> None:
+    """An endless loop is ended after its time of computing. Waiting, as on a loaded machine, is no fault for
+    much longer.
+    """
+    program = """
+import json, sys, time
+from pathlib import Path
+from tests.hard_cases.hostile import worker
+from tests.hard_cases.hostile.readers import Reader
+
+worker.LONGEST, worker.ENDED_AFTER, worker.LONGEST_BY_CLOCK = 0.2, 0.5, 4
+
+def make(folder):
+    (folder / "a").write_bytes(bytes(64))
+    return [folder / "a"]
+
+def compute(seconds):
+    began = time.process_time()
+    while time.process_time() - began < seconds: pass
+
+def read(folder, path):
+    at = folder.parent / "at"
+    number = int.from_bytes(at.read_bytes(), "little") if at.exists() else 0
+    if number == 10: time.sleep(1.0)
+    if number == 11: compute(60.0)
+    if number == 13: compute(0.3)
+    if number == 14: time.sleep(60.0)
+
+outcome = worker.attack(Reader(make, read), Path(sys.argv[1]) / "x", 10, 6)
+print(json.dumps([[fault[0], fault[2]] for fault in outcome.faults]))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path)], cwd=REPOSITORY, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    faults = json.loads(done.stdout.splitlines()[-1])
+    assert [number for number, _ in faults] == [11, 13, 14], faults
+    for (_, what), word in zip(faults, ("SIGPROF", "seconds", "SIGALRM"), strict=True):
+        assert word in what

@@ -30,8 +30,12 @@ LARGEST_GROWTH = 512 << 20
 """Bytes of memory that all inputs together may add to the most that the process ever held."""
 LONGEST = 5.0
 """Seconds of computing that one small file may take."""
-LONGEST_BY_CLOCK = 60
-"""Seconds after which a reader that computes nothing, or does not return from a library, is ended."""
+ENDED_AFTER = 30.0
+"""Seconds of computing after which a reader that does not return is ended."""
+LONGEST_BY_CLOCK = 900
+"""Seconds by the clock after which a reader that waits without computing is ended; many, because one that
+works may take long on a loaded machine.
+"""
 LONGEST_LINE = 2000
 """Characters of a message: paths and a few words of the file."""
 
@@ -100,7 +104,9 @@ def _read_all(
             path.write_bytes(mutated(whole[path], number))
             before_it = len(outcome.faults)
             began = time.process_time()
-            signal.alarm(LONGEST_BY_CLOCK)  # ends the process
+            # Either signal ends the process.
+            signal.setitimer(signal.ITIMER_PROF, ENDED_AFTER)
+            signal.alarm(LONGEST_BY_CLOCK)
             try:
                 reader.read(capture, path)
                 outcome.read += 1
@@ -111,6 +117,7 @@ def _read_all(
             except BaseException:
                 outcome.faults.append((number, path.name, traceback.format_exc(limit=-4)))
             signal.alarm(0)
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
             if time.process_time() - began > LONGEST:
                 outcome.faults.append((number, path.name, f"{time.process_time() - began:.1f} seconds"))
             path.write_bytes(whole[path])
