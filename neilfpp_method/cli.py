@@ -17,7 +17,7 @@ from neilfpp_method.commands import COMMANDS
 from neilfpp_method.commands.command import Command
 from neilfpp_method.commands.ending import ended_by_signal
 from neilfpp_method.commands.mistakes import closest, mistake
-from neilfpp_method.data.native_signals import sigterm_waits
+from neilfpp_method.data.native_signals import sigterm_delayed
 from neilfpp_method.errors import EarlyEnd, Stopped, UserError
 
 __all__ = ["main"]
@@ -71,7 +71,7 @@ def _run(name: str, arguments: Sequence[str]) -> None:
     try:
         options = _resolve_run_folder(_parse(name, command, arguments))
         # Threads that numpy starts inherit the blocked SIGTERM, so only the main thread receives it.
-        with sigterm_waits():
+        with sigterm_delayed():
             import numpy  # noqa: F401
         command.run(options)
     except OSError as error:

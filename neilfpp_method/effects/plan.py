@@ -95,8 +95,8 @@ class Plan:
                 decide(name, is_on, "settings", f"{'on' if is_on else 'off'} in the settings")
             elif not is_on:
                 decide(name, False, "settings", "off in the settings")
-            elif effect.unjudged(settings):
-                decide(name, True, "settings", effect.unjudged(settings))
+            elif effect.not_measured(settings):
+                decide(name, True, "settings", effect.not_measured(settings))
         plan._leave_out_dependent_effects()
         return plan
 
@@ -137,7 +137,7 @@ class Plan:
             reason = f"requires {effect.needs}, which is off"
             self.decisions.append(Decision(0, name, False, cause.by, reason))
 
-    def decide(self, name: str, measured: Measurement, step: int, must_be_earned: bool = False) -> Decision:
+    def decide(self, name: str, measured: Measurement, step: int, starts_off: bool = False) -> Decision:
         """Decide an open effect by evidence and record the decision.
 
         The effect stays as it is if there are too few samples, or if evidence only advises (see
@@ -147,11 +147,11 @@ class Plan:
             name: name of the effect.
             measured: the evidence.
             step: number of steps trained so far.
-            must_be_earned: whether the effect counts as off so far, even if the settings have it on, so that
+            starts_off: whether the effect counts as off so far, even if the settings have it on, so that
                 only significant evidence keeps it on (see `Measurement.favours`).
         """
         before = self.is_on(name)
-        favoured = measured.favours(before and not must_be_earned)
+        favoured = measured.favours(before and not starts_off)
         advised = EFFECTS[name].advised
         on = before if favoured is None or advised else favoured
         reason = f"{measured.summary()}; shown as advice only" if advised else measured.summary()

@@ -18,7 +18,7 @@ from neilfpp_method.fields.mlp import Mlp
 from neilfpp_method.settings.types import BackgroundConfig, FrequencyConfig, HashGridConfig
 from neilfpp_method.volume.compositing import composite, render_weights
 
-__all__ = ["InvertedSphere", "field_beyond"]
+__all__ = ["InvertedSphere", "background_field"]
 
 POSITION_OCTAVES, DIRECTION_OCTAVES = 10, 4
 """Octaves of the frequency encodings of positions and directions (NeRF++)."""
@@ -30,7 +30,7 @@ START_SCALE = 1e-3
 """Factor on the initial weights of the last layer, so that the field starts as an almost constant color."""
 
 
-def field_beyond(
+def background_field(
     kind: str,
     config: BackgroundConfig,
     encoding: FrequencyConfig | HashGridConfig,

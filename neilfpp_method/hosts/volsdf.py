@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from neilfpp_method import losses
-from neilfpp_method.fields.background import field_beyond
+from neilfpp_method.fields.background import background_field
 from neilfpp_method.fields.outgoing_radiance import MID_GREY, OutgoingRadianceField
 from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.base import RegularisedHits
@@ -99,7 +99,7 @@ class VolSdfHost(nn.Module):
         )
         self.density = LaplaceDensity(config.volume.beta_init)
         self.register_buffer("background_color", torch.tensor(background_color))
-        self.background = field_beyond(
+        self.background = background_field(
             background, config.background, config.encoding, radius, radiance_scale, self.background_color
         )
         balls = None if cameras is None else free_balls(cameras, self.point_position, radius)

@@ -21,7 +21,7 @@ from neilfpp_method.timing.ledger import Ledger
 from neilfpp_method.train.budget_record import BudgetPlan, Revision, write_budget
 from neilfpp_method.train.pace import with_steps
 from neilfpp_method.train.quality import QualityCheck
-from neilfpp_method.train.trial import Trial, try_out
+from neilfpp_method.train.trial import Trial, run_trial
 from neilfpp_method.train.work_record import waiting
 
 __all__ = ["close_budget", "outcome", "plan_budget", "planned_effects", "planned_settings"]
@@ -78,7 +78,7 @@ def plan_budget(
             limit = min(TRIAL_SHARE * budget, MAX_TRIAL)
             changed = sized(config, size)
             places, light = PLACES_SHARE * budget, LIGHT_SHARE * budget
-            trials[size] = try_out(capture, changed, request, device, limit, places, light, report, wait)
+            trials[size] = run_trial(capture, changed, request, device, limit, places, light, report, wait)
         return share_for(trials[size].costs, budget, ledger.total)
 
     size: Size = "usual"

@@ -128,7 +128,7 @@ def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
         )
     scale, start = facts.radiance_scale, facts.median_radiance
     host = MeshHost(mesh, config, scale, facts.background, facts.background_color, start)
-    _check_seen(host, capture, path or "inputs/model/mesh.ply")
+    _check_visible(host, capture, path or "inputs/model/mesh.ply")
     return host
 
 
@@ -148,7 +148,7 @@ def cloud_summary(capture: Capture, config: NeilfConfig) -> str | None:
     return f"{used}; --config.loss.point-cloud 0 switches this off"
 
 
-def _check_seen(host: MeshHost, capture: Capture, path: str) -> None:
+def _check_visible(host: MeshHost, capture: Capture, path: str) -> None:
     """Raise a `UserError` unless the cameras see the outside of the mesh."""
     cameras = [capture.normalisation.camera(view.camera) for view in capture.train_views]
     outside = torch.cat([host.cross(camera_rays(camera)[::SEEN_EVERY]).outside for camera in cameras])

@@ -52,7 +52,7 @@ from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.health_record import health_summary
 from neilfpp_method.train.launch import launch
 from neilfpp_method.train.light_record import light_summary
-from neilfpp_method.train.lock import alone_in
+from neilfpp_method.train.lock import run_lock
 from neilfpp_method.train.loop import train
 from neilfpp_method.train.memory import check_training_memory
 from neilfpp_method.train.optimizer import seed_step
@@ -190,7 +190,7 @@ def run_training(
         capture = at_scale(capture, source.scale)
     check_training_memory(capture)
     fabric = launch(torch_device, devices, nodes)
-    with listening(ledger), _nothing_left_on_failure(out), alone_in(out):
+    with listening(ledger), _removed_on_failure(out), run_lock(out):
         pixels = load_pixels(capture, out / PIXELS, fabric, console)
         if resume:
             facts = described.facts
@@ -227,7 +227,7 @@ def run_training(
     fabric.barrier()
     continue_with = continue_command(command, out, device, devices, nodes)
     with (
-        alone_in(out),
+        run_lock(out),
         listening(ledger),
         reporting(out, console, fabric.is_global_zero) as reporter,
         stop_request(continue_with) as stopped,
@@ -359,7 +359,7 @@ def _scaled(scale: float, pixels: int, rays: int) -> str:
 
 
 @contextmanager
-def _nothing_left_on_failure(out: Path) -> Iterator[None]:
+def _removed_on_failure(out: Path) -> Iterator[None]:
     """If the context fails before the run exists, remove all folders that were created for it."""
     created = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:

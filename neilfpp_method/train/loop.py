@@ -131,7 +131,7 @@ def _keep_pace(run: Training, position: StagePosition, step: int) -> int:
     """Adapt the number of steps to the budget if there is one. Returns the length of the stage."""
     if run.pace is None:
         return position.length
-    revised = run.pace.keep(run.config.train, position, step)
+    revised = run.pace.revise(run.config.train, position, step)
     if revised is not run.config.train:
         run.config = dataclasses.replace(run.config, train=revised)
         run.reporter.lengthen(stage_steps(revised)[position.stage])

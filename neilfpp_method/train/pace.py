@@ -44,7 +44,7 @@ class Pace:
     ledger: Ledger
     revised: float = 0.0
 
-    def keep(self, config: TrainConfig, position: StagePosition, step: int) -> TrainConfig:
+    def revise(self, config: TrainConfig, position: StagePosition, step: int) -> TrainConfig:
         """Plan the remaining steps again if it is time to do so.
 
         Args:

@@ -40,7 +40,7 @@ from neilfpp_method.train.build import build_model, scene_facts, show_known_ligh
 from neilfpp_method.train.optimizer import make_optimizer, seed_step, set_rates
 from neilfpp_method.train.preview import preview_pixels
 
-__all__ = ["Trial", "try_out"]
+__all__ = ["Trial", "run_trial"]
 
 VIEWS = 4
 """Number of training views that a trial reads."""
@@ -94,7 +94,7 @@ class _Seconds:
     fits: list[float] = field(default_factory=list)
 
 
-def try_out(
+def run_trial(
     capture: Capture,
     config: NeilfConfig,
     request: EffectRequest,

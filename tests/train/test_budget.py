@@ -24,7 +24,7 @@ from neilfpp_method.train.budget_record import BudgetPlan, read_budget
 from neilfpp_method.train.budgeted import planned_effects
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.run import load_checkpoint, load_run
-from neilfpp_method.train.trial import Trial, try_out
+from neilfpp_method.train.trial import Trial, run_trial
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import small_config, small_training, solved_light
 from tests.train.test_resume import interrupt_at
@@ -51,7 +51,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> None:
     stages = {name.replace("steps", "init").replace("joint_init", "joint"): n for name, n in STEPS.items()}
     costs = Costs({stage: StageCost(steps=n, **cost) for stage, n in stages.items()}, reserve=0.0)
     monkeypatch.setattr(command, "Ledger", ticking)
-    monkeypatch.setattr(budgeted, "try_out", lambda *_: Trial(costs, places=0.0, light_pixels=0))
+    monkeypatch.setattr(budgeted, "run_trial", lambda *_: Trial(costs, places=0.0, light_pixels=0))
 
 
 def run(data: Path | None, out: Path, resume: bool = False, **options) -> str:
@@ -138,7 +138,7 @@ def test_a_run_without_a_budget_has_none(tmp_path, capture, clock):
 def test_a_trial_measures_every_stage_that_has_steps(capture):
     config = solved_light(small_config(sdf_steps=100, material_steps=0, joint_steps=50))
     state = load_capture(capture)
-    trial = try_out(
+    trial = run_trial(
         state,
         config,
         EffectRequest("auto"),
@@ -160,7 +160,7 @@ def test_a_trial_measures_every_stage_that_has_steps(capture):
 
 def test_evidence_that_takes_too_long_is_not_looked_for(capture):
     config = solved_light(small_config(sdf_steps=0))
-    trial = try_out(
+    trial = run_trial(
         load_capture(capture),
         config,
         EffectRequest("auto"),
@@ -180,7 +180,7 @@ def test_the_first_light_is_part_of_the_plan_and_takes_as_many_pixels_as_there_i
     many = load_capture(make_capture(tmp_path / "many", views=9))
 
     def trial(most_for_light: float) -> Trial:
-        return try_out(
+        return run_trial(
             many, config, EffectRequest("auto"), torch.device("cpu"), 0.05, 1e-9, most_for_light, report=False
         )
 
@@ -206,7 +206,7 @@ def test_without_time_for_the_first_light_training_starts_from_an_even_one(tmp_p
 
 def test_what_settings_decide_is_not_tried(capture):
     config = small_config(joint_steps=0)
-    trial = try_out(
+    trial = run_trial(
         load_capture(capture),
         config,
         EffectRequest("as-set"),
