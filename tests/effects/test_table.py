@@ -12,9 +12,9 @@ from neilfpp_method.settings.presets import PRESETS, preset
 
 
 @pytest.mark.parametrize("name", list(PRESETS))
-@pytest.mark.parametrize("request", ["auto", "as-set", "none", "all"])
-def test_no_word_is_broken_at_80_columns(name, request):
-    plan = Plan.begin(parse_effects(request), preset(name))
+@pytest.mark.parametrize("effects", ["auto", "as-set", "none", "all"])
+def test_no_word_is_broken_at_80_columns(name, effects):
+    plan = Plan.begin(parse_effects(effects), preset(name))
     console = Console(width=80, markup=False, highlight=False)
     with console.capture() as captured:
         console.print(table(plan))
