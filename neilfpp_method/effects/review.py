@@ -35,6 +35,7 @@ __all__ = [
     "record_facts",
     "record_lamps",
     "review_light",
+    "review_material",
     "review_surface",
 ]
 
@@ -93,7 +94,7 @@ def record_exposures(plan: Plan, exposures: Exposures | None) -> None:
 
 
 def needs_surface(plan: Plan) -> bool:
-    """Whether measurements at the surface could decide anything."""
+    """Whether `review_surface` or `review_material` could decide anything."""
     return any(plan.is_open(name) for name in ("inter-reflection", *JUDGED, "joint-stage"))
 
 
@@ -110,8 +111,10 @@ def review_light(
         The decisions, and the initial light; the light is None if there are too few views or places, or if
         surfaces have no specular lobe.
     """
-    if len(pixels.views) < MIN_TRAIN_VIEWS or most < FEWEST_PIXELS:
-        return [], None
+    if len(pixels.views) < MIN_TRAIN_VIEWS:
+        return _not_measured(plan, step, f"fewer than {MIN_TRAIN_VIEWS} training views"), None
+    if most < FEWEST_PIXELS:
+        return _not_measured(plan, step, "the budget leaves no time for it"), None
     mode = model.training
     model.eval()
     surface = _rendered_surface(model, pixels.sample(LIGHT_PIXELS, gradients=False)).observed
@@ -121,7 +124,9 @@ def review_light(
     typical, decisions = model.facts.median_radiance, []
     if len(places.place.unique()) < MIN_PLACES:
         model.train(mode)
-        return [], None
+        return _not_measured(
+            plan, step, f"fewer than {MIN_PLACES} places are shown by {MIN_VIEWS} views"
+        ), None
     if plan.is_open("long-tails") and plan.newest("long-tails") is None:
         measured = lobe_evidence(places, model.scene, typical, model.brdf.metals)
         decisions.append(plan.decide("long-tails", measured, step, starts_off=True))
@@ -130,7 +135,6 @@ def review_light(
     if model.lobe is not None:
         transport = place_transport(places, model.lobe, model.scene)
         if plan.is_open("metals") and model.brdf.metals:
-            # More places than `review_surface` has: the error of the measurement is a third as large.
             decisions.append(plan.decide("metals", metals_evidence(places, transport, typical), step))
             model.use(plan.config)
         first = find_first_light(places, transport, typical, model.brdf.metals)
@@ -159,13 +163,27 @@ def review_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: in
     if plan.is_open("inter-reflection"):
         measured = self_visibility(model, plan.settings.inter_reflection, surface.position, surface.normal)
         decisions.append(plan.decide("inter-reflection", measured, step))
-    names = frozenset(name for name in JUDGED if plan.is_open(name))
-    evidence = material_evidence(model, pixels, surface.position, surface.normal, names) if names else {}
-    decisions += [plan.decide(name, measured, step) for name, measured in evidence.items()]
     if plan.is_open("joint-stage") and has_material(step, plan.settings.train):
         decisions.append(plan.decide("joint-stage", shading_disagreement(model, rendered), step))
     model.train(mode)
     return decisions
+
+
+@torch.no_grad()
+def review_material(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int) -> list[Decision]:
+    """Take the decisions that compare fits of light and material at places, after those on lobe and metals.
+
+    The arguments and the result are those of `review_surface`.
+    """
+    names = frozenset(name for name in JUDGED if plan.is_open(name))
+    if not names:
+        return []
+    mode = model.training
+    model.eval()
+    surface = _rendered_surface(model, pixels.sample(SURFACE_PIXELS, gradients=False)).observed
+    evidence = material_evidence(model, pixels, surface.position, surface.normal, names)
+    model.train(mode)
+    return [plan.decide(name, measured, step) for name, measured in evidence.items()]
 
 
 def record_lamps(plan: Plan, evidence: Evidence | None, lit: int, step: int) -> list[Decision]:
@@ -185,16 +203,22 @@ def record_lamps(plan: Plan, evidence: Evidence | None, lit: int, step: int) -> 
     before, on = plan.newest("lamps"), lit > 0
     if before is not None and before.on == on:
         return []
-    measured = Measurement(
-        "reduction of the error at held-back points by lamps",
-        evidence.gain,
-        evidence.deviation,
-        MIN_GAIN,
-        evidence.points,
-    )
+    where, threshold = ("in held-back views", 0.0) if evidence.in_views else ("at held-back points", MIN_GAIN)
+    what = f"reduction of the error {where} by lamps"
+    measured = Measurement(what, evidence.gain, evidence.deviation, threshold, evidence.points)
     reason = measured.summary() if before is None else f"revised: {measured.summary()}"
     plan.decisions.append(Decision(step, "lamps", on, "evidence", reason, measured))
     return plan.decisions[-1:]
+
+
+def _not_measured(plan: Plan, step: int, reason: str) -> list[Decision]:
+    """Record that the lobe and metals stay as they are, if they are open."""
+    open_names = [name for name in ("long-tails", "metals") if plan.is_open(name)]
+    decisions = [
+        Decision(step, name, plan.is_on(name), "evidence", f"not measured: {reason}") for name in open_names
+    ]
+    plan.decisions += decisions
+    return decisions
 
 
 def _rendered_surface(model: NeilfModel, pixels: PixelBatch) -> RenderedSurface:

@@ -79,7 +79,7 @@ class MeshHost(nn.Module):
         )
         self.register_buffer("background_color", torch.tensor(background_color))
         self.background = background_field(
-            background, config.background, radius, radiance_scale, self.background_color
+            background, config.background, config.encoding, radius, radiance_scale, self.background_color
         )
         triangles = mesh.vertices[mesh.faces]
         across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])

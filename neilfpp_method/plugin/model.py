@@ -215,7 +215,7 @@ class NeilfMethod(Model):
         if first is not None:
             CONSOLE.log(first.summary())
             start_with(self.neilf, first)
-            self.light_solver.start(first.observed, first.material, self.neilf.scene)
+            self.light_solver.start(first.observed, first.material, self.neilf.scene, first.lamp_trial)
 
     def _solve_light(self, step: int) -> None:
         """Bound β and fit the light if due, after the optimizer step as in the standalone loop."""

@@ -6,15 +6,17 @@ The first process measures and decides for all.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.first_light import start_with
-from neilfpp_method.effects.plan import Decision
+from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.review import (
     MOST_PIXELS,
     needs_surface,
     record_lamps,
     review_light,
+    review_material,
     review_surface,
 )
 from neilfpp_method.model import NeilfModel
@@ -26,6 +28,9 @@ from neilfpp_method.train.optimizer import seed_step
 from neilfpp_method.train.training import Training
 
 __all__ = ["apply_plan", "review_before_stage", "solve_light"]
+
+Review = Callable[[Plan, NeilfModel, PixelDataset, int], list[Decision]]
+"""Measures with the model after so many steps and adds its decisions to the plan."""
 
 
 def solve_light(run: Training, model: NeilfModel, computed: StepResult, step: int) -> None:
@@ -58,8 +63,9 @@ def _share_light(run: Training, model: NeilfModel) -> None:
 def review_before_stage(run: Training, model: NeilfModel, step: int) -> None:
     """Take the measurements before a stage that trains material."""
     if model.stages[stage_at(step, run.config.train).stage].moves_material:
-        _review_effects(run, model, step)
+        _review_effects(run, model, step, review_surface, -3)
         _start_light(run, model, step)
+        _review_effects(run, model, step, review_material, -5)
 
 
 def _start_light(run: Training, model: NeilfModel, step: int) -> None:
@@ -74,7 +80,7 @@ def _start_light(run: Training, model: NeilfModel, step: int) -> None:
         if first is not None:
             run.reporter.say(first.summary())
             start_with(model, first)
-            evidence = run.light_solver.start(first.observed, first.material, model.scene)
+            evidence = run.light_solver.start(first.observed, first.material, model.scene, first.lamp_trial)
             note_fit(run.fits, evidence, model.lamps.lit, step)
             _report(run, record_lamps(run.plan, evidence, model.lamps.lit, step))
     _share_light(run, model)
@@ -87,14 +93,22 @@ def _light_pixels(run: Training) -> int:
     return MOST_PIXELS if most is None else most
 
 
-def _review_effects(run: Training, model: NeilfModel, step: int) -> None:
-    """Decide open effects by evidence. The first process does this for all."""
+def _review_effects(run: Training, model: NeilfModel, step: int, review: Review, stream: int) -> None:
+    """Decide open effects by evidence. The first process does this for all.
+
+    Args:
+        run: the training.
+        model: its model.
+        step: number of steps trained so far.
+        review: takes the measurements.
+        stream: selects the random numbers of these measurements, which are none of a training step.
+    """
     if not needs_surface(run.plan):
         return
     decisions: list[Decision] = []
     if run.fabric.is_global_zero:
-        seed_step(run.config.train.seed, -3 - step)
-        decisions = review_surface(run.plan, model, run.pixels, step)
+        seed_step(run.config.train.seed, stream - step)
+        decisions = review(run.plan, model, run.pixels, step)
         _report(run, decisions)
     _share_decisions(run, model, decisions)
 

@@ -20,7 +20,7 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import PIXELS_OF_A_VIEW, at_scale, scale_for_pixels
 from neilfpp_method.effects.first_light import seconds_of_pixel
 from neilfpp_method.effects.material import JUDGED, seconds_of_evidence
-from neilfpp_method.effects.plan import Decision, Plan
+from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.effects.review import (
     FEWEST_PIXELS,
@@ -147,7 +147,7 @@ def run_trial(
         place_seconds = 0.0
     light_pixels, light = None, 0.0
     if solver.seeks_start and len(capture.train_views) >= MIN_TRAIN_VIEWS and with_material:
-        rate = seconds_of_pixel(device, plan.is_open("long-tails"))
+        rate = seconds_of_pixel(device, plan.is_open("long-tails"), plan.is_open("metals"))
         light_pixels = min(MOST_PIXELS, int(most_for_light / rate))
         light_pixels = 0 if light_pixels < FEWEST_PIXELS else light_pixels
         light = rate * light_pixels
@@ -233,11 +233,9 @@ def _steps(
 
 
 def _review_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset) -> None:
-    """Measure evidence at the surface, except that at places, which takes longer than a trial."""
-    excluded = [Decision(0, name, plan.is_on(name), "settings", "not part of a trial") for name in JUDGED]
-    decided = [*plan.decisions, *excluded]
+    """Measure evidence at the surface; that at places takes longer than a trial."""
     if plan.is_open("inter-reflection"):
-        review_surface(Plan(plan.request, plan.settings, decided), model, pixels, 0)
+        review_surface(Plan(plan.request, plan.settings, [*plan.decisions]), model, pixels, 0)
 
 
 def _picture_seconds(
