@@ -29,6 +29,7 @@ from neilfpp_method.effects.place_fit import (
     seconds_of_step,
 )
 from neilfpp_method.effects.places import Places
+from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.structures import Material, Observed
 

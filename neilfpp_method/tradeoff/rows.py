@@ -97,9 +97,9 @@ def check_same(row: Row) -> None:
     described = read_description(row.out)
     plan = read_budget(row.out)
     planned = row.config if plan is None else planned_settings(plan, row.config)
-    effects = str(read_plan(row.out, described.config).asked)
+    effects = str(read_plan(row.out, described.config).request)
     source = CaptureSource(str(row.data.resolve()), scale=described.source.scale)
-    wanted = _compared(planned, source, row.budget, str(read_asked(row.effects)))
+    wanted = _compared(planned, source, row.budget, str(parse_effects(row.effects)))
     stored = _compared(described.config, described.source, plan and plan.budget, effects)
     for name in dict.fromkeys((*stored, *wanted)):
         if stored.get(name) != wanted.get(name):
