@@ -1,7 +1,6 @@
 """Evidence for specular reflection, varying roughness, an environment map and its colours.
 
-Places that many views show are fitted with all of these effects, and from that fit on without each of them.
-The fits use most of the views and are compared at pixels of the held-back views. Lamps are not part of the
+Places that many views show are fitted with all of these effects and without each of them. The fits use most of the views and are compared at pixels of the held-back views. Lamps are not part of the
 fits, and metals are if the model has them (`effects.metals` decides).
 
 The base colour of every place is free. A place without specular reflection therefore contains no information
@@ -52,10 +51,12 @@ MIN_VIEWS = 4
 WORTH = 0.01
 """Reduction of the relative error above which an effect is worth its cost."""
 CARRIED_ROUNDS = 2
-"""Alternations of light and material in the fits that are compared, which start from a common fit."""
-FITS = 10
-"""Number of fits of this size to which the measurements at places before one stage amount (estimate): 2 fits,
-14 that start from them and take a quarter of the time, and the noise of lobe sampling.
+"""Alternations of light and material in the fits with one roughness, which start from the fit with all effects.
+The other fits do not: the light of that fit is too good for surfaces without reflection.
+"""
+FITS = 14
+"""Number of fits of this size to which the measurements at places before one stage amount (estimate): 8 fits,
+6 that take a quarter of the time, and the noise of lobe sampling.
 """
 REST = 0.5
 """Time of all work other than descent, as a share of that of descent (estimate)."""
@@ -195,18 +196,11 @@ class Trial:
     held_back_transport: Transport
     typical: float
 
-    def begin(self, metals: bool) -> PlaceFit:
-        """Fit the model with all effects; the fits that are compared start from it."""
-        return fit_places(self.known, self.transport, self.typical, metals)
-
-    def fit(self, model: Model, start: PlaceFit) -> Explained:
-        """Fit a model and evaluate it in the held-back views."""
+    def fit(self, model: Model, start: PlaceFit | None = None) -> Explained:
+        """Fit a model, from a given fit on if there is one, and evaluate it in the held-back views."""
         transport, typical = model.restrict(self.transport), self.typical
-        if not model.metals:
-            start = replace(start, metallic=torch.zeros_like(start.metallic))
-        fit = fit_places(
-            self.known, transport, typical, model.metals, None, start, CARRIED_ROUNDS, model.form
-        )
+        rounds = ROUNDS if start is None else CARRIED_ROUNDS
+        fit = fit_places(self.known, transport, typical, model.metals, None, start, rounds, model.form)
         if model.roughness is not None:
             fit = replace(fit, roughness=torch.full_like(fit.roughness, model.roughness))
         fitted = place_errors(fit, self.known, transport, typical).mean().item()
@@ -235,21 +229,20 @@ def judge_material(
         known, held_back = torch.nonzero(~is_held_back)[:, 0], torch.nonzero(is_held_back)[:, 0]
         parts = (places.where(known), transport[known], places.where(held_back), transport[held_back])
         trials.append(Trial(*parts, typical))
-    starts = [trial.begin(metals) for trial in trials]
 
     def fit_all(model: Model) -> list[Explained]:
-        return [trial.fit(model, start) for trial, start in zip(trials, starts, strict=True)]
+        return [trial.fit(model) for trial in trials]
 
     glossy = Model(metals=metals)
     glossy_fits = fit_all(glossy)
     measured: dict[str, Measurement] = {}
     if "varying-roughness" in names:
 
-        def fitted_error(number: int) -> float:
-            return trials[0].fit(replace(glossy, roughness=number), starts[0]).fitted_error
+        def with_roughness(number: int, turn: int) -> Explained:
+            return trials[turn].fit(replace(glossy, roughness=number), glossy_fits[turn].fit)
 
-        shared = min(SHARED, key=fitted_error)
-        shared_fits = fit_all(replace(glossy, roughness=shared))
+        shared = min(SHARED, key=lambda number: with_roughness(number, 0).fitted_error)
+        shared_fits = [with_roughness(shared, turn) for turn in range(TURNS)]
         counted = [(one.fit.roughness - shared).abs() >= ANOTHER for one in glossy_fits]
         measured["varying-roughness"] = _saved("varying-roughness", shared_fits, glossy_fits, counted)
     if "reflection" in names:

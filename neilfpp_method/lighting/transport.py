@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -139,22 +139,44 @@ def from_texels(
 @torch.no_grad()
 def from_texels_at(
     environment: EnvironmentLight,
+    points: Observed,
     observed: Observed,
+    place: Int[Tensor, " N"],
     roughnesses: Sequence[float],
     lobe: Lobe,
     scene: SceneTracer | None,
 ) -> Transport:
-    """The transport from the texels of a map at several roughnesses, with directions traced only once.
+    """The transport from the texels of a map at several roughnesses, to N pixels that show P surface points.
 
-    Layer 0 of the result is the diffuse part; layers 1 + 2k and 2 + 2k are the facing and grazing parts at
-    roughness number k. `sources` has half precision. Other arguments as in `from_texels`.
+    One random direction per point and texel is traced, whatever the number of pixels and roughnesses. It
+    decides what blocks the texel. The BRDF of each pixel is evaluated in another random direction in the
+    texel, so that the pixels of a point have independent errors.
+
+    Args:
+        environment: as in `from_texels`.
+        points: the surface points; only their positions and normals are read.
+        observed: the pixels.
+        place: index of the surface point that each pixel shows.
+        roughnesses: the values of roughness.
+        lobe: as in `from_texels`.
+        scene: as in `from_texels`.
+
+    Returns:
+        Layer 0 is the diffuse part; layers 1 + 2k and 2 + 2k are the facing and grazing parts at roughness
+        number k. `sources` has half precision.
     """
     texels = environment.log_radiance[0].numel()
+    spans = _spans(len(points), texels)
+    rays = _joined_rays([_texel_rays(environment, points[span], scene) for span in spans])
     parts = []
-    for part, rough in _chunks(observed, observed.position[:, :1], texels):
-        rays = _texel_rays(environment, part, scene)
-        kernels = [_kernel(part, torch.full_like(rough, r), rays.wi, rays.weight, lobe) for r in roughnesses]
-        layers = [rays.transport(kernel if k == 0 else kernel[1:]) for k, kernel in enumerate(kernels)]
+    for span in _spans(len(observed), texels):
+        part = observed[span]
+        shared = rays[place[span]].redrawn(environment, part)
+        layers = []
+        for number, value in enumerate(roughnesses):
+            roughness = torch.full_like(part.position[:, :1], value)
+            kernel = _kernel(part, roughness, shared.wi, shared.weight, lobe)
+            layers.append(shared.transport(kernel if number == 0 else kernel[1:]))
         parts.append(
             Transport(torch.cat([x.sources.half() for x in layers]), torch.cat([x.scene for x in layers]))
         )
@@ -179,6 +201,18 @@ class _TexelRays:
     texels: int
     met: SceneLight | None
 
+    def __getitem__(self, points: Tensor) -> _TexelRays:
+        """The rays of some of the points."""
+        met = None if self.met is None else self.met[points]
+        return _TexelRays(self.wi[points], self.number[points], self.weight[points], self.texels, met)
+
+    def redrawn(self, environment: EnvironmentLight, observed: Observed) -> _TexelRays:
+        """The rays of N pixels with other directions in the same texels, and the same hits."""
+        drawn = environment.texel_directions(observed.position)
+        wi = drawn.wi.gather(1, self.number[..., None].expand(-1, -1, 3))
+        weight = dot(wi, observed.normal).clamp_min(0) * drawn.solid_angle[self.number]
+        return replace(self, wi=wi, weight=weight)
+
     def transport(self, kernel: Float[Tensor, "K N S"]) -> Transport:
         """The transport through a kernel, which is the BRDF times `weight`."""
         sent = kernel.new_zeros(*kernel.shape[:2], 3)
@@ -199,6 +233,15 @@ def _texel_rays(environment: EnvironmentLight, observed: Observed, scene: SceneT
     wi = drawn.wi.gather(1, number[..., None].expand(-1, -1, 3))
     met = None if scene is None else scene(observed.position, wi)
     return _TexelRays(wi, number, weight, texels, met)
+
+
+def _joined_rays(parts: Sequence[_TexelRays]) -> _TexelRays:
+    wi, number, weight = (torch.cat([getattr(p, name) for p in parts]) for name in ("wi", "number", "weight"))
+    met = None
+    if parts[0].met is not None:
+        names = ("hit", "radiance", "distance")
+        met = SceneLight(*(torch.cat([getattr(p.met, name) for p in parts]) for name in names))
+    return _TexelRays(wi, number, weight, parts[0].texels, met)
 
 
 def _joined(parts: Sequence[Transport]) -> Transport:
@@ -280,6 +323,10 @@ def _chunks(
     observed: Observed, roughness: Float[Tensor, "N 1"], sources: int
 ) -> list[tuple[Observed, Tensor]]:
     """Split points into chunks of at most `PAIRS_AT_ONCE` pairs of a point and a source."""
+    return [(observed[span], roughness[span]) for span in _spans(len(observed), sources)]
+
+
+def _spans(points: int, sources: int) -> list[slice]:
+    """Slices of at most `PAIRS_AT_ONCE` pairs of a point and a source; at least one."""
     rows = max(1, PAIRS_AT_ONCE // max(1, sources))
-    spans = [slice(start, start + rows) for start in range(0, max(1, len(observed)), rows)]
-    return [(observed[span], roughness[span]) for span in spans]
+    return [slice(start, start + rows) for start in range(0, max(1, points), rows)]
