@@ -1,12 +1,12 @@
 """A traceable proxy for the surface of a host without cheap tracing, built from training rays.
 
 Hits of camera rays are oriented points. The newest of them are fused into a grid of distances
-(`volume.fusion`) with the mean radiance that was seen there. Rays between surfaces are sphere-traced in the
-grid. So visibility, hard inter-reflection, an environment map and lamps work on any host.
+(`volume.fusion`) with the mean observed radiance. Rays between surfaces are sphere-traced in the grid, so
+visibility, hard inter-reflection, an environment map and lamps work on any host.
 
 Before new rays are added, they are traced through the current grid. This measures its error, and removes
-points that the new rays pass through, so that the proxy follows a host that moves with a delay of a few dozen
-steps.
+points that the new rays pass through. The proxy therefore follows a surface that changes, with a delay of a
+few dozen steps.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class ProxyReport:
 
     Attributes:
         points: number of points that it consists of.
-        age: mean number of steps since the points were seen.
+        age: mean number of steps since the points were observed.
         agreement: share of rays that hit in both host and proxy, or miss in both.
         error: median difference of the distances along rays that hit in both, scene units.
         error_95: 95th percentile of that difference.
@@ -93,8 +93,7 @@ class SurfaceProxy(nn.Module):
         radius: half the edge of the cube that contains the scene, scene units.
         resolution: vertices of the grid along an edge.
         hit_share: smallest concentration of a hit.
-        radiance: radiance of the host at surface points x towards wo; None: the mean of the radiance that was
-            seen.
+        radiance: radiance of the host at surface points x towards wo; None: the mean observed radiance.
     """
 
     def __init__(
@@ -268,7 +267,7 @@ class SurfaceProxy(nn.Module):
         return self._report
 
     def _outgoing(self, place: Float[Tensor, "P 3"], wo: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-        """Radiance of surface points towards wo: the host's, or the mean that was seen."""
+        """Radiance of surface points towards wo: that of the host, or the mean observed radiance."""
         if self._radiance is not None and len(place):
             return self._radiance(place, wo)
         return mean_at(self._surface, self.radius, place)
@@ -280,7 +279,7 @@ class SurfaceProxy(nn.Module):
         return self._surface
 
     def _trace(self, rays: RayBatch) -> GridHits:
-        """Where rays, which may start outside of the cube, hit the grid's surface."""
+        """Trace rays, which may start outside of the cube, to the surface of the grid."""
         grid = self._known_surface().distance
         enter, passes = self._entry(rays)
         start = rays.origins + enter[:, None] * rays.directions
