@@ -25,12 +25,12 @@ from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
 from neilfpp_method.health.cases import Health
 from neilfpp_method.health.guard import StepGuard
-from neilfpp_method.health.look import look_at_hits
+from neilfpp_method.health.measure import measure_hits
 from neilfpp_method.health.watch import Watch
 from neilfpp_method.hosts.answers import Rendered, as_hits
 from neilfpp_method.hosts.base import HasParameterGroups, Host, ImageHost, LightsItself
 from neilfpp_method.hosts.capabilities import CAPABILITIES
-from neilfpp_method.hosts.first_look import FirstLook, check_batch, check_points, check_rows
+from neilfpp_method.hosts.first_batches import FirstBatches, check_batch, check_points, check_rows
 from neilfpp_method.hosts.foreign import ForeignHost, answers_secondary_rays, proxy_for
 from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.outputs import host_name
@@ -78,7 +78,7 @@ class AttachedNeilf(nn.Module):
         host, config, facts = model.host, model.config, model.facts
         traced = model.borrowed and config.inter_reflection.mode != "off"
         render = host.render if traced and answers_secondary_rays(_inner(host)) else None
-        self.first_look = FirstLook(host_name(host), config.shading.hit_share, facts, render)
+        self.first_batches = FirstBatches(host_name(host), config.shading.hit_share, facts, render)
         self.step_guard = StepGuard(log.warning)
         self.watch = Watch(None, log.warning)
         self._steps, self._with_material = 0, False
@@ -109,7 +109,7 @@ class AttachedNeilf(nn.Module):
         """
         check_batch(batch)
         self._check_device_and_dtype(batch.rays)
-        self.first_look.pixels(batch)
+        self.first_batches.pixels(batch)
         position = self._position(step)
         weights = active_losses(position.stage, self.model.config, self.model.stages, position.share)
         if not weights:
@@ -140,8 +140,8 @@ class AttachedNeilf(nn.Module):
         if self._last_rendered is not None:
             batch, hits = self._last_rendered
             on_object = hits[torch.nonzero(batch.mask > 0.5)[:, 0]]
-            look = look_at_hits(self.model, on_object, self._with_material)
-            self.watch.judge(look, self.step_guard.skipped, self._steps)
+            measured = measure_hits(self.model, on_object, self._with_material)
+            self.watch.judge(measured, self.step_guard.skipped, self._steps)
         return Health.of(self.watch.findings.values())
 
     def maps(self, rays: RayBatch | Camera, hits: Rendered | None = None) -> Maps:
@@ -262,7 +262,7 @@ class AttachedNeilf(nn.Module):
             return host.camera_hits(rays)
 
     def _observe(self, batch: PixelBatch, hits: SurfaceHits) -> None:
-        self.first_look.hits(batch, hits)
+        self.first_batches.hits(batch, hits)
         self._last_rendered = batch, hits.detach()
         if isinstance(self.model.host, ForeignHost):
             self.model.host.show_proxy(batch.rays, hits)

@@ -18,7 +18,7 @@ from neilfpp_method.commands import COMMANDS
 from neilfpp_method.commands.command import Command
 from neilfpp_method.commands.ending import ended_by_signal
 from neilfpp_method.commands.mistakes import TYRO_UNKNOWN, closest, mistake
-from neilfpp_method.data.native_signals import sigterm_waits
+from neilfpp_method.data.native_signals import sigterm_delayed
 from neilfpp_method.errors import EarlyEnd, Stopped, UserError
 
 __all__ = ["main"]
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # In a parallel training only the first process prints errors and sets the exit status.
     first = os.environ.get("LOCAL_RANK", "0") == "0"
     errors = Console(stderr=True, quiet=not first)
-    with ended_by_signal() as asked:
+    with ended_by_signal() as ending:
         try:
             _run(arguments[0], arguments[1:])
         except EarlyEnd as end:
@@ -51,10 +51,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             # tyro has printed the help of a command.
             return 0
         except BaseException as error:
-            if not asked.number and not isinstance(error, KeyboardInterrupt):
+            if not ending.number and not isinstance(error, KeyboardInterrupt):
                 raise
             errors.print("stopped")
-            return asked.status if asked.number else Stopped.status
+            return ending.status if ending.number else Stopped.status
     return 0
 
 
@@ -72,7 +72,7 @@ def _run(name: str, arguments: Sequence[str]) -> None:
     try:
         options = _resolve_run_folder(_parse(name, command, arguments))
         # Threads that numpy starts inherit the blocked SIGTERM, so only the main thread receives it.
-        with sigterm_waits():
+        with sigterm_delayed():
             import numpy  # noqa: F401
         command.run(options)
     except OSError as error:

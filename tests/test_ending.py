@@ -12,7 +12,7 @@ import pytest
 from neilfpp_method.cli import main
 from neilfpp_method.commands import COMMANDS
 from neilfpp_method.data.images import replacing
-from neilfpp_method.data.native_signals import sigterm_waits
+from neilfpp_method.data.native_signals import sigterm_delayed
 
 
 @dataclass
@@ -63,7 +63,7 @@ def test_sigterm_waits_for_a_library_that_puts_its_own_handler_in_place():
     told: list[str] = []
     before = signal.signal(signal.SIGTERM, lambda *_: told.append("ours"))
     try:
-        with sigterm_waits():
+        with sigterm_delayed():
             signal.signal(signal.SIGTERM, lambda *_: told.append("the library's"))
             signal.raise_signal(signal.SIGTERM)
             assert told == []

@@ -34,7 +34,7 @@ def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Looks of a few rays: NeuS takes half a minute for 512 on a busy core."""
     monkeypatch.setattr(proxy, "ROUNDS", 1)
     monkeypatch.setattr(proxy, "ROUND", 16)
-    monkeypatch.setattr(plugin_model, "LOOKED_AT", 16)
+    monkeypatch.setattr(plugin_model, "CHECKED_PIXELS", 16)
 
 
 CENTRE, RADIUS = torch.tensor([4.0, -2.0, 1.0]), 1.5

@@ -6,7 +6,7 @@ import re
 
 from neilfpp_method.errors import UserError
 
-__all__ = ["in_words", "read_duration"]
+__all__ = ["format_duration", "read_duration"]
 
 UNITS = {"h": 3600.0, "m": 60.0, "s": 1.0}
 """Seconds per unit."""
@@ -32,10 +32,10 @@ def read_duration(text: str) -> float:
     return seconds
 
 
-def in_words(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Format a duration as `read_duration` parses it, rounded to seconds, or to minutes from an hour on.
 
-    >>> in_words(59.6), in_words(600), in_words(754), in_words(5400)
+    >>> format_duration(59.6), format_duration(600), format_duration(754), format_duration(5400)
     ('1m', '10m', '12m34s', '1h30m')
     """
     whole = round(seconds)

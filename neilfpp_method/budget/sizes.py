@@ -49,12 +49,12 @@ def sized(config: NeilfConfig, size: Size) -> NeilfConfig:
     >>> sized(NeilfConfig(), "small").train.rays
     2048
     """
-    known = {
+    candidates = {
         name: factor
         for name, factor in FACTORS[size].items()
         if not name.startswith("light.fit.") or config.light.kind != "free"
     }
-    values = {name: max(1, round(factor * _value(config, name))) for name, factor in known.items()}
+    values = {name: max(1, round(factor * _value(config, name))) for name, factor in candidates.items()}
     return changed(config, values)
 
 

@@ -24,8 +24,8 @@ class Completion:
 def run(options: Completion) -> None:
     from neilfpp_method.commands import COMMANDS
 
-    known = {name: command.options for name, command in COMMANDS.items()}
-    subcommand_cli_from_dict(known, prog="neilfpp", args=["--tyro-print-completion", options.shell])
+    commands = {name: command.options for name, command in COMMANDS.items()}
+    subcommand_cli_from_dict(commands, prog="neilfpp", args=["--tyro-print-completion", options.shell])
 
 
 COMMAND = Command(Completion, run, ["neilfpp completion bash", "neilfpp completion zsh"])

@@ -6,11 +6,11 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-__all__ = ["Asked", "ended_by_signal"]
+__all__ = ["EndSignal", "ended_by_signal"]
 
 
-class Asked:
-    """The signal that has asked the process to end; `number` is 0 if there was none."""
+class EndSignal:
+    """The signal that asked the process to end; `number` is 0 if there was none."""
 
     def __init__(self) -> None:
         self.number = 0
@@ -22,16 +22,16 @@ class Asked:
 
 
 @contextmanager
-def ended_by_signal() -> Iterator[Asked]:
+def ended_by_signal() -> Iterator[EndSignal]:
     """Raise `KeyboardInterrupt` in the context on Ctrl-C and SIGTERM, so that temporary files are removed.
 
     The signal is also recorded in the yielded object, because an extension module that is being loaded may
     turn the exception into one of its own.
     """
-    asked = Asked()
+    ending = EndSignal()
 
     def handle(number: int, _frame: object) -> None:
-        asked.number = number
+        ending.number = number
         raise KeyboardInterrupt
 
     previous = {}
@@ -40,7 +40,7 @@ def ended_by_signal() -> Iterator[Asked]:
         for number in (signal.SIGINT, signal.SIGTERM):
             previous[number] = signal.signal(number, handle)
     try:
-        yield asked
+        yield ending
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

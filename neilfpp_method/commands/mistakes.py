@@ -19,13 +19,13 @@ TYRO_UNKNOWN = "Unrecognized options:"
 """Beginning of tyro's message about unknown options."""
 
 
-def closest(word: str, known: Iterable[str]) -> str | None:
+def closest(word: str, words: Iterable[str]) -> str | None:
     """The known word that is most similar to a mistyped one; None if none is similar.
 
     >>> closest("tran", ["train", "render"])
     'train'
     """
-    return next(iter(get_close_matches(word, list(known), n=1, cutoff=0.7)), None)
+    return next(iter(get_close_matches(word, list(words), n=1, cutoff=0.7)), None)
 
 
 def mistake(complaint: str, arguments: Sequence[str]) -> tuple[str, str | None]:

@@ -24,11 +24,11 @@ class Replay:
 
 def run(options: Replay) -> None:
     from neilfpp_method.kernels.process import computing_fast
-    from neilfpp_method.train.rerun import in_words, rerun_step
+    from neilfpp_method.train.rerun import rerun_step, rerun_summary
 
     with computing_fast():
         found = rerun_step(options.run, options.step)
-    terminal().print(in_words(found), soft_wrap=True)
+    terminal().print(rerun_summary(found), soft_wrap=True)
 
 
 COMMAND = Command(Replay, run, ["neilfpp replay runs/teapot 1207"])

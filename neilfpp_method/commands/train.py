@@ -87,7 +87,7 @@ class TrainWithSettings(Train):
 
 def run(options: TrainWithSettings) -> None:
     from neilfpp_method.budget.durations import read_duration
-    from neilfpp_method.effects.asked import read_asked
+    from neilfpp_method.effects.request import parse_effects
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.command import run_training
 
@@ -96,10 +96,10 @@ def run(options: TrainWithSettings) -> None:
     named = options.preset is not None or options.config_file is not None
     as_before = options.resume and not named and config == preset(DEFAULT_PRESET)
     published = config.preset.startswith("paper-")
-    asked = (
+    request = (
         None
         if options.resume and options.effects is None
-        else read_asked(options.effects or ("as-set" if published else "auto"))
+        else parse_effects(options.effects or ("as-set" if published else "auto"))
     )
     with computing_fast(), _viewer(options, config):
         run_training(
@@ -115,7 +115,7 @@ def run(options: TrainWithSettings) -> None:
             devices=options.devices,
             nodes=options.nodes,
             strict=options.strict,
-            effects=asked,
+            effects=request,
             budget=budget,
             console=terminal(),
             at_end=(lambda path: after_training(path, options.device)) if options.report else None,

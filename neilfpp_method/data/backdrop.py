@@ -2,8 +2,7 @@
 
 If the images show the ground under a sky, or a table that extends beyond the images, half of the border has
 one colour as well. The views together distinguish these cases: everything that is not background must lie
-inside the scene at a place that all views see covered, that is, in the visual hull (Laurentini 1994) of all
-pixels that do not have the background colour.
+inside the scene, in the visual hull (Laurentini 1994) of all pixels that do not have the background colour.
 """
 
 from __future__ import annotations

@@ -60,19 +60,21 @@ def find_brackets(folder: Path, exposures: Path | None = None, unreadable: Colle
     images = [image for group in listed.values() for image in group]
     if not images:
         raise UserError(f"{folder}: no images", f"one of {', '.join((*IMAGE_SUFFIXES, *RAW_SUFFIXES))}")
-    known = exposures_of(folder, [image for image in images if image not in unreadable], exposures)
-    listed = {name: group for name, group in listed.items() if any(image in known for image in group)}
+    exposure_of = exposures_of(folder, [image for image in images if image not in unreadable], exposures)
+    listed = {name: group for name, group in listed.items() if any(image in exposure_of for image in group)}
     by_name = images[0].parent == folder and not (folder / GROUPS).is_file()
-    guess = by_name and not all(_is_bracket(group, known) for group in listed.values())
-    groups = _returning_groups(images, known) if guess else listed
+    guess = by_name and not all(_is_bracket(group, exposure_of) for group in listed.values())
+    groups = _returning_groups(images, exposure_of) if guess else listed
     for name, group in groups.items():
-        if not _is_bracket(group, known):
+        if not _is_bracket(group, exposure_of):
             raise UserError(
                 f"{folder}: the {len(group)} images of '{name}' are no bracket: their exposures do not all "
                 "differ",
                 f"put each pose in a folder of its own, or list the poses in {GROUPS}",
             )
-    return {name: {image: known.get(image, math.nan) for image in group} for name, group in groups.items()}
+    return {
+        name: {image: exposure_of.get(image, math.nan) for image in group} for name, group in groups.items()
+    }
 
 
 def _listed_groups(folder: Path, unreadable: Collection[Path]) -> Mapping[str, Sequence[Path]]:
@@ -115,20 +117,20 @@ def _returning_groups(
     images: Sequence[Path], exposures: Mapping[Path, float]
 ) -> Mapping[str, Sequence[Path]]:
     """Groups by the shortest period with which the exposures repeat; one group if they do not repeat."""
-    period = next(
-        n
-        for n in range(1, len(images) + 1)
-        if len(images) % n == 0 and all(len(set(_told(images[k::n], exposures))) <= 1 for k in range(n))
-    )
+
+    def repeats(n: int) -> bool:
+        return all(len(set(_recorded_exposures(images[k::n], exposures))) <= 1 for k in range(n))
+
+    period = next(n for n in range(1, len(images) + 1) if len(images) % n == 0 and repeats(n))
     return {images[i].stem: images[i : i + period] for i in range(0, len(images), period)}
 
 
 def _is_bracket(images: Sequence[Path], exposures: Mapping[Path, float]) -> bool:
-    told = _told(images, exposures)
-    return len(images) >= 2 and len(set(told)) == len(told)
+    recorded = _recorded_exposures(images, exposures)
+    return len(images) >= 2 and len(set(recorded)) == len(recorded)
 
 
-def _told(images: Sequence[Path], exposures: Mapping[Path, float]) -> list[float]:
+def _recorded_exposures(images: Sequence[Path], exposures: Mapping[Path, float]) -> list[float]:
     return [exposures[image] for image in images if image in exposures]
 
 

@@ -36,13 +36,13 @@ TEST_EVERY = 8
 """Default split: every 8th view is a test view, as in mip-NeRF 360 and many papers after it."""
 
 FOUND: Mapping[SceneSource, str] = {
-    "box": ", as the capture says",
-    "points": ", told by the points",
-    "focus": ", told by the cameras' focus, as the points reach far beyond it",
-    "masks": ", told by the masks",
-    "cameras": ", guessed from the cameras alone: add masks, points or a scene box where it is wrong",
+    "box": ", as stated by the capture",
+    "points": ", computed from the points",
+    "focus": ", from the point that the cameras look at, because the points extend far beyond it",
+    "masks": ", computed from the masks",
+    "cameras": ", guessed from the cameras only: add masks, points or a scene box if it is wrong",
 }
-"""Where the scene box comes from, as the end of a line about it."""
+"""Source of the scene box, as the end of a line about the box."""
 
 
 class Reader(Protocol):
@@ -202,7 +202,7 @@ def _check_views(views: tuple[View, ...]) -> bool:
     for view in views:
         check_camera(view.camera, str(view.image))
         if not plain_name(view.name):
-            raise UserError(f"{view.image}: '{view.name}' cannot name a file", "rename the view")
+            raise UserError(f"{view.image}: '{view.name}' is not a valid file name", "rename the view")
         if view.name in names:
             raise UserError(
                 f"{view.image} and {names[view.name].image} have the same name", "rename one of them"
@@ -219,7 +219,7 @@ def _check_views(views: tuple[View, ...]) -> bool:
             if (header.width, header.height) != size:
                 turned = (header.height, header.width) == size
                 remedy = (
-                    "turn the pixels as the image's EXIF says"
+                    "rotate the pixels as the EXIF data of the image states"
                     if turned
                     else "resize the image, or scale its camera"
                 )

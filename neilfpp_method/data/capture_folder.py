@@ -1,6 +1,6 @@
-"""The project's own capture folder: `capture.json`, and the images, masks and points that it names.
+"""Read and write the capture layout of this project: `capture.json`, and the files that it names.
 
-docs/captures.md describes every entry, so that the folder can be read and written without this project.
+docs/captures.md describes every entry, so other programs can read and write such folders.
 """
 
 from __future__ import annotations
@@ -25,27 +25,29 @@ VERSION = 1
 
 
 def recognise(root: Path) -> bool:
-    """Whether the folder has a `capture.json` of this format; a run's folder has one of another."""
+    """Return whether the folder has a `capture.json` of this format; in run folders it has another format."""
     path = root / FILE
     return path.is_file() and FORMAT.encode() in path.read_bytes()
 
 
 def read(root: Path) -> CaptureFiles:
-    """The capture's files.
+    """Read a capture.
 
     Raises:
-        UserError: `capture.json` is malformed, of a later version, or names a file that is missing or outside
-            the folder.
+        UserError: `capture.json` is malformed or of a later version, or names a file that is missing or
+        outside
+            of the folder.
     """
     entry = Entry.load(inside(root, root / FILE))
     entry["format"].word(FORMAT)
     if entry["version"].size() > VERSION:
         raise UserError(
-            f"{entry.where}: version {entry['version'].size()} of the format", f"version {VERSION} is read"
+            f"{entry.where}: version {entry['version'].size()} of the format",
+            f"this version of the package reads version {VERSION}",
         )
     views = tuple(_view(root, i, view) for i, view in enumerate(entry["views"].items()))
     if not views:
-        raise UserError(f"{entry.where}: no views", "add some")
+        raise UserError(f"{entry.where}: no views", "add views to the list")
     test = entry.get("test")
     return CaptureFiles(
         inputs=root,
@@ -59,22 +61,22 @@ def read(root: Path) -> CaptureFiles:
 
 
 def read_scene(entry: Entry) -> Normalisation:
-    """The scene box of an entry with `centre` and `radius`.
+    """Read the scene box from an entry with `centre` and `radius`.
 
     Raises:
-        UserError: they are no numbers, or the radius is not positive.
+        UserError: they are not numbers, or the radius is not positive.
     """
     x, y, z = map(float, entry["centre"].numbers((3,)))
     radius = entry["radius"].number()
     if radius <= 0:
         raise UserError(
-            f"{entry.name('radius')}: not positive", "give half the largest extent of the scene's box"
+            f"{entry.name('radius')}: not positive", "give half of the longest edge of the scene box"
         )
     return Normalisation(radius, (x, y, z))
 
 
 def _source(scene: Entry) -> SceneSource:
-    """What told the scene box when the folder was made."""
+    """The source of the scene box, as recorded when the folder was written."""
     source = scene.get("source")
     return "box" if source is None else source.word(*get_args(SceneSource))
 
@@ -82,7 +84,7 @@ def _source(scene: Entry) -> SceneSource:
 def _view(root: Path, index: int, entry: Entry) -> View:
     image = _file(root, entry, "image")
     if image is None:
-        raise UserError(f"{entry.name('image')} is missing", "name the image's file")
+        raise UserError(f"{entry.name('image')} is missing", "give the path of the image file")
     exposure, balance = entry.get("exposure"), entry.get("white_balance")
     red, green, blue = (1.0, 1.0, 1.0) if balance is None else map(float, balance.numbers((3,)))
     return View(
@@ -127,7 +129,7 @@ def _file(root: Path, entry: Entry, key: str) -> Path | None:
 
 @runtime_checkable
 class Writable(Protocol):
-    """What is written: a `CaptureFiles`, or a `Capture`."""
+    """What `write_capture` writes: a `CaptureFiles` or a `Capture`."""
 
     @property
     def views(self) -> tuple[View, ...]: ...
@@ -145,20 +147,20 @@ class Writable(Protocol):
 def write_capture(
     root: Path, files: Writable, *, response: Literal["linear", "srgb"], test: Collection[str] = ()
 ) -> Path:
-    """Write `capture.json` into a folder whose images, masks and points are there already; returns its path.
+    """Write `capture.json` into a folder that already contains images, masks and points; return its path.
 
     Args:
-        root: the capture's folder.
-        files: views, scene box and point cloud; all paths lie in `root`.
-        response: what the pixels are.
-        test: the names of the views that are held out.
+        root: the folder of the capture.
+        files: views, scene box and point cloud; all paths are inside of `root`.
+        response: meaning of the pixel values.
+        test: names of the held-out views.
 
     Raises:
-        UserError: a path leads out of `root`, or `test` names no view.
+        UserError: a path leads out of `root`, or `test` contains a name that no view has.
     """
     names = [view.name for view in files.views]
     if strange := sorted(set(test) - set(names)):
-        raise UserError(f"{root}: there is no view {strange[0]!r} to hold out", "name views of the capture")
+        raise UserError(f"{root}: there is no view {strange[0]!r} to hold out", "choose views of the capture")
     description = {
         "format": FORMAT,
         "version": VERSION,
@@ -197,5 +199,5 @@ def _described(root: Path, view: View) -> dict[str, Any]:
 
 
 def _relative(root: Path, path: Path | None) -> str | None:
-    """The path as it stands in the file: from `root`, with forward slashes."""
+    """The path as it is written into the file: relative to `root`, with forward slashes."""
     return path and inside(root, path).resolve().relative_to(root.resolve()).as_posix()

@@ -12,10 +12,10 @@ in the middle of a command.
 
 from __future__ import annotations
 
-from neilfpp_method.data.native_signals import sigterm_waits
+from neilfpp_method.data.native_signals import sigterm_delayed
 from neilfpp_method.errors import UserError
 
-with sigterm_waits():
+with sigterm_delayed():
     import cv2  # noqa: F401
     import pycolmap
 

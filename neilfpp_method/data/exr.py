@@ -88,8 +88,8 @@ def exr_samples(path: Path) -> Float32[np.ndarray, "H W C"]:
     # A cropped render stores a part of its frame, a render with overscan more than its frame.
     samples = np.zeros((frame.height, frame.width, len(picture.channels)), np.float32)
     x, y = data.left - frame.left, data.top - frame.top
-    seen = stored[max(-y, 0) : max(frame.height - y, 0), max(-x, 0) : max(frame.width - x, 0)]
-    samples[max(y, 0) :, max(x, 0) :][: seen.shape[0], : seen.shape[1]] = seen
+    visible = stored[max(-y, 0) : max(frame.height - y, 0), max(-x, 0) : max(frame.width - x, 0)]
+    samples[max(y, 0) :, max(x, 0) :][: visible.shape[0], : visible.shape[1]] = visible
     return samples
 
 

@@ -1,6 +1,6 @@
-"""Held-back pixels: pixels of training views that no step learns from, to measure quality during training.
+"""Choose held-back pixels: pixels of training views that no step uses, to measure quality during training.
 
-They are small patches on the object, spread over the views. Test views are not used for that.
+They are small patches on the object, spread over the views. Test views are not used for this purpose.
 """
 
 from __future__ import annotations
@@ -21,22 +21,25 @@ __all__ = ["PATCHES", "SIDE", "hold_back"]
 PATCHES, SIDE = 16, 4
 """Number of patches, and their side in pixels."""
 MAX_SHARE = 1 / 32
-"""Largest share of the object's pixels that is held back: small captures have fewer patches, or none."""
+"""Largest share of the object's pixels that is held back; small captures have fewer patches, or none."""
 TRIES = 64
-"""Random positions that are tried per patch: some overlap other patches, or cross the image border."""
+"""Number of random positions per patch that are tried, because some overlap other patches or cross the border
+of the image."""
 
 
 def hold_back(pixels: PixelDataset, seed: int, patches: int = PATCHES) -> PixelBatch:
-    """Take patches of pixels out of all later draws of `pixels`, and return those of their pixels that are
-    valid and on the object.
+    """Exclude patches of pixels from all later draws of `pixels`.
 
-    Which ones follows from the seed and the capture alone; torch's generators are left as they are. A draw of
-    other pixels still reads the colours beside them for its image gradient.
+    The choice depends only on the seed and the capture; torch's generators are not used. The image gradients
+    of other pixels are still computed from the colours of held-back neighbours.
 
     Args:
-        pixels: of the training views; it draws the patches no more.
-        seed: of the training.
-        patches: how many at most.
+        pixels: the pixels of the training views.
+        seed: seed of the training.
+        patches: maximum number of patches.
+
+    Returns:
+        The pixels of the patches that are valid and on the object.
     """
     bits = pixels.store.bits
     of_object = PixelSet(bits, VALID | MASK, VALID | MASK)
@@ -59,7 +62,7 @@ def hold_back(pixels: PixelDataset, seed: int, patches: int = PATCHES) -> PixelB
 def _places(
     pixels: PixelDataset, of_object: PixelSet, seed: int, tries: int
 ) -> Iterator[tuple[int, Int[np.ndarray, " N"]]]:
-    """Views and the numbers of the pixels of patches about pixels of the object, whole within the image."""
+    """Yield random patches around pixels of the object, as a view and the indices of the patch's pixels."""
     if not of_object.count:
         return
     kth = np.random.default_rng(seed).integers(of_object.count, size=tries)

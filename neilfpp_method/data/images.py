@@ -236,14 +236,14 @@ def _naming(path: Path) -> Iterator[None]:
 @contextmanager
 def _decoders_silent() -> Iterator[None]:
     """Discard what native decoders print to standard error; the `UserError` reports it in one line."""
-    kept = os.dup(2)
+    saved_stderr = os.dup(2)
     with open(os.devnull, "wb") as nowhere:
         os.dup2(nowhere.fileno(), 2)
     try:
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(saved_stderr, 2)
+        os.close(saved_stderr)
 
 
 def _format(path: Path) -> Format:

@@ -23,8 +23,8 @@ def available_memory(proc: Path = Path("/proc"), groups: Path = Path("/sys/fs/cg
     Returns:
         Bytes; None if none of these is known.
     """
-    known = [_system(proc), _group(proc, groups), _group_1(groups), _address_space(proc)]
-    return min((free for free in known if free is not None), default=None)
+    limits = [_system(proc), _group(proc, groups), _group_1(groups), _address_space(proc)]
+    return min((free for free in limits if free is not None), default=None)
 
 
 def check_memory(needed: int, what: str, remedy: str, free: int | None = None) -> None:

@@ -56,7 +56,7 @@ def read_mesh(path: Path, normalisation: Normalisation) -> Mesh:
         or faces.max() >= len(vertices)
     ):
         raise UserError(
-            f"{path}: no triangles, or triangles of vertices that are not there", "export it again"
+            f"{path}: no triangles, or triangles with vertices that do not exist", "export it again"
         )
     return Mesh(normalisation.to_scene(vertices).float(), faces)
 
@@ -75,8 +75,8 @@ def _check_counts(path: Path) -> None:
             length, kind = struct.unpack("<I4s", file.read(8))
             place += 8 + length
             if place > size:
-                raise ValueError("it is shorter than it says")
+                raise ValueError("it is shorter than its header states")
             if kind == b"JSON":
                 accessors = json.loads(file.read(length)).get("accessors", [])
                 if any(accessor["count"] > size for accessor in accessors):
-                    raise ValueError("it announces more numbers than it has bytes")
+                    raise ValueError("its header states more numbers than it has bytes")

@@ -6,11 +6,11 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-__all__ = ["sigterm_waits"]
+__all__ = ["sigterm_delayed"]
 
 
 @contextmanager
-def sigterm_waits() -> Iterator[None]:
+def sigterm_delayed() -> Iterator[None]:
     """Block SIGTERM and restore its handler at the end of the block, when a pending signal is delivered.
 
     Some native libraries install a handler of their own when they are loaded. Threads that are started in the

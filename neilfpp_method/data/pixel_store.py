@@ -1,8 +1,9 @@
-"""The pixels of many views, view after view, row by row: in memory, or in memory-mapped files.
+"""Store the pixels of many views, in memory or in memory-mapped files: view after view, row by row.
 
     color.npy    (P, 3) codes of `pixel_encoding`: 3 bytes per pixel for 8-bit images, else 6 or 12
     bits.npy     (P,) one byte: valid, mask, mask known, near the object (`drawing`); padded to whole blocks
-    store.json   the inputs of the store, written last: a folder without it holds no store
+    store.json   the inputs of the store; it is written last, so a folder without it contains no complete
+    store
 
 Views are read one at a time, so building a store takes the memory of one view. A store is used again if it
 was built from the same files (name, size, modification time), cameras and factors; otherwise it is built
@@ -33,7 +34,7 @@ from neilfpp_method.data.view_pixels import read_view
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 
-__all__ = ["PixelStore", "border", "expect_draws", "load_pixels", "store_bytes"]
+__all__ = ["PixelStore", "advise_random_access", "border", "load_pixels", "store_bytes"]
 
 FORMAT, VERSION = "neilfpp-pixels", 1
 BORDER_SHARE = 0.5
@@ -107,37 +108,38 @@ def store_bytes(views: Sequence[View], hdr: bool) -> int:
 def load_pixels(
     views: Sequence[View],
     hdr: bool,
-    shown: Callable[[int], Bool[np.ndarray, " N"]],
+    has_ray: Callable[[int], Bool[np.ndarray, " N"]],
     folder: Path | None = None,
     on_view: Callable[[str], None] | None = None,
     exact: bool = False,
 ) -> PixelStore:
-    """The pixels of views: those of a folder, if it was made from the same, or else read from their files.
+    """Load the pixels of views: from a store in `folder` if it has the same inputs, otherwise from the
+    images.
 
     Args:
-        views: at least one.
-        hdr: whether pixels are linear radiance; else display values.
-        shown: which pixels of a view its lens reaches.
-        folder: where the pixels are kept; none: in memory.
+        views: the views, at least one.
+        hdr: whether pixels are linear radiance rather than display values.
+        has_ray: function that returns which pixels of a view have a ray through its lens.
+        folder: folder of the store; None: in memory.
         on_view: called with the name of each view that has been read.
-        exact: keep the values of the files in single precision, 13 bytes a pixel; in memory alone.
+        exact: store the values of the files in single precision, with 13 bytes per pixel; only in memory.
 
     Raises:
         UserError: an image cannot be used (see `PixelDataset`), or the folder cannot be written.
     """
     if exact and folder is not None:
-        raise ValueError("exact pixels are kept in memory: a folder has those of a training")
+        raise ValueError("exact pixels can only be stored in memory")
     if folder is None:
-        return _in_any_encoding(views, encodings_for(hdr, exact), hdr, shown, None, on_view)
+        return _fill_smallest(views, encodings_for(hdr, exact), hdr, has_ray, None, on_view)
     made_from = _made_from(views, hdr)
-    known = _open(folder, views, made_from)
-    if known is not None:
-        return known
+    reusable = _open(folder, views, made_from)
+    if reusable is not None:
+        return reusable
     _check_room(folder, store_bytes(views, hdr))
     (folder / "store.json").unlink(missing_ok=True)
     with ExitStack() as files:
         paths = {name: files.enter_context(replacing(folder / f"{name}.npy")) for name in ("color", "bits")}
-        store = _in_any_encoding(views, encodings_for(hdr), hdr, shown, paths, on_view)
+        store = _fill_smallest(views, encodings_for(hdr), hdr, has_ray, paths, on_view)
         description = {
             "format": FORMAT,
             "version": VERSION,
@@ -157,37 +159,41 @@ def load_pixels(
 # ----------------------------------------------------------------------------------------------------- making
 
 
-def _in_any_encoding(
+def _fill_smallest(
     views: Sequence[View],
     ladder: Sequence[Encoding],
     hdr: bool,
-    shown: Callable[[int], Bool[np.ndarray, " N"]],
+    has_ray: Callable[[int], Bool[np.ndarray, " N"]],
     paths: dict[str, Path] | None,
     on_view: Callable[[str], None] | None,
 ) -> PixelStore:
-    """In the smallest encoding that holds every view; if one needs more, all views are read again."""
-    if ladder[0] is BYTES and any(view.file_size is not None for view in views):
-        ladder = ladder[1:]  # means of bytes are no bytes
-    told: set[str] = set()
+    """Fill a store with the smallest encoding that can represent all views.
 
-    def tell_once(name: str) -> None:
-        if on_view and name not in told:
-            told.add(name)
+    The encodings are tried from small to large; all views are read again for each.
+    """
+    if ladder[0] is BYTES and any(view.file_size is not None for view in views):
+        # Averages of 8-bit values are not 8-bit values.
+        ladder = ladder[1:]
+    reported: set[str] = set()
+
+    def report_once(name: str) -> None:
+        if on_view and name not in reported:
+            reported.add(name)
             on_view(name)
 
-    stores = (_filled(views, hdr, encoding, shown, paths, tell_once) for encoding in ladder)
+    stores = (_fill(views, hdr, encoding, has_ray, paths, report_once) for encoding in ladder)
     return next(store for store in stores if store is not None)
 
 
-def _filled(
+def _fill(
     views: Sequence[View],
     hdr: bool,
     encoding: Encoding,
-    shown: Callable[[int], Bool[np.ndarray, " N"]],
+    has_ray: Callable[[int], Bool[np.ndarray, " N"]],
     paths: dict[str, Path] | None,
     on_view: Callable[[str], None],
 ) -> PixelStore | None:
-    """The store in one encoding; none where a view does not fit in it."""
+    """Fill a store with the given encoding; return None if the encoding cannot represent a view."""
     total = sum(view.camera.width * view.camera.height for view in views)
     codes = _plane(paths and paths["color"], (total, 3), encoding.dtype)
     bits = _plane(paths and paths["bits"], (-(-total // BLOCK) * BLOCK,), np.dtype(np.uint8))
@@ -203,7 +209,7 @@ def _filled(
             if encoded is None:
                 return None
             codes[store.rows(i)], store.scales[i] = encoded.codes.reshape(-1, 3), encoded.scale
-            bits[store.rows(i)] = _bits(pixels.mask, pixels.valid.reshape(-1) & shown(i))
+            bits[store.rows(i)] = _bits(pixels.mask, pixels.valid.reshape(-1) & has_ray(i))
             if pixels.mask is None:
                 unknown.append(i)
             store.release()
@@ -215,7 +221,8 @@ def _filled(
     if len(unknown) == len(views):
         _mask_from_background(store)
     else:
-        for i in unknown:  # as good as any other pixel near the object
+        # In views without a mask every pixel may be on the object, so all count as near it.
+        for i in unknown:
             bits[store.rows(i)] |= NEAR
     return store
 
@@ -232,9 +239,11 @@ def _near(mask: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, " N"]:
 
 
 def _mask_from_background(store: PixelStore) -> None:
-    """Without masks, pixels of exactly the border's most common colour are off the object; others unknown.
+    """If no view has a mask, mark the pixels whose colour is exactly that of most border pixels as
+    background.
 
-    Rendered captures and clipped backdrops have such pixels; a noisy backdrop has hardly any.
+    For all other pixels the mask remains unknown. Rendered captures and clipped backdrops have such pixels;
+    photographs of other backdrops have few because of noise.
     """
     numbers, view = border(store)
     colors = store.colors(numbers, view)
@@ -255,12 +264,14 @@ def _mask_from_background(store: PixelStore) -> None:
 
 
 def _median(values: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, " C"]:
-    """One of the values: of two in the middle the lower, so that a colour that most share is met exactly."""
+    """The lower median per channel. It is one of the values, so a colour that most pixels have is found
+    exactly.
+    """
     return np.partition(values, (len(values) - 1) // 2, axis=0)[(len(values) - 1) // 2]
 
 
 def border(store: PixelStore) -> tuple[Int[np.ndarray, " B"], Int[np.ndarray, " B"]]:
-    """The numbers of the valid pixels on the borders of all images, and their views."""
+    """Return the indices of the valid pixels on the borders of all images, and their views."""
     numbers, views = [], []
     for i, view in enumerate(store.views):
         width, height = view.camera.width, view.camera.height
@@ -276,7 +287,11 @@ def border(store: PixelStore) -> tuple[Int[np.ndarray, " B"], Int[np.ndarray, " 
 
 
 def _plane(path: Path | None, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """An array of zeros, in memory or in a preallocated file: writing to a map on a full disk would crash."""
+    """Make an array of zeros in memory, or in a file.
+
+    The blocks of the file are allocated at once: writing to a memory map on a full disk would end the
+    process.
+    """
     if path is None:
         return np.zeros(shape, dtype)
     array = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
@@ -293,12 +308,12 @@ def _check_room(folder: Path, needed: int) -> None:
         raise UserError(
             f"{folder}: the pixels of the training views take {needed / 1e9:.1f} GB, and {free / 1e9:.1f} GB "
             "are free there",
-            "make room, choose another --out, or take smaller images with --scale",
+            "free disk space, choose another --out, or reduce the images with --scale",
         )
 
 
 def _made_from(views: Sequence[View], hdr: bool) -> str:
-    """A hash of all that decides what is stored."""
+    """Return a hash of everything that the content of a store depends on."""
     parts: list[object] = [VERSION, hdr]
     for view in views:
         camera = view.camera
@@ -312,12 +327,12 @@ def _made_from(views: Sequence[View], hdr: bool) -> str:
 def _state(path: Path | None) -> tuple[str, int, int] | None:
     if path is None or not path.is_file():
         return None
-    known = path.stat()
-    return path.name, known.st_size, known.st_mtime_ns
+    status = path.stat()
+    return path.name, status.st_size, status.st_mtime_ns
 
 
 def _open(folder: Path, views: Sequence[View], made_from: str) -> PixelStore | None:
-    """The store of a folder; none where it was made from something else, is damaged, or is none."""
+    """Open the store of a folder; None if it does not exist, is damaged, or has other inputs."""
     try:
         description = json.loads((folder / "store.json").read_text("utf-8"))
         kind = [description[name] for name in ("format", "version", "made_from")]
@@ -336,8 +351,8 @@ def _open(folder: Path, views: Sequence[View], made_from: str) -> PixelStore | N
     return store
 
 
-def expect_draws(store: PixelStore) -> None:
-    """Tell the system that single pixels will be read, so that it does not read ahead of each page."""
+def advise_random_access(store: PixelStore) -> None:
+    """Tell the operating system that single pixels will be read, so that it does not read pages ahead."""
     for array in (store.codes, store.bits):
         _advise(array, "MADV_RANDOM")
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from neilfpp_method.data.backdrop import MAX_RAYS, leaves_room
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.drawing import KNOWN, MASK, NEAR, VALID, PixelDraws
-from neilfpp_method.data.pixel_store import PixelStore, border, expect_draws, load_pixels
+from neilfpp_method.data.pixel_store import PixelStore, advise_random_access, border, load_pixels
 from neilfpp_method.data.silhouettes import MAX_VIEWS, Outline
 from neilfpp_method.data.views import CameraRays, View
 from neilfpp_method.errors import UserError
@@ -82,14 +82,14 @@ class PixelDataset:
         self.views = tuple(views)
         self.device = torch.device(device)
         self._rays = CameraRays([capture.normalisation.camera(view.camera) for view in views], device)
-        self.store: PixelStore = load_pixels(self.views, capture.hdr, self._shown, folder, on_view, exact)
+        self.store: PixelStore = load_pixels(self.views, capture.hdr, self._has_ray, folder, on_view, exact)
         self._draws = PixelDraws(self.store.bits, len(self.store))
         if not self._draws.valid.count:
             raise UserError(f"{capture.root}: no pixel is valid", "check the validity masks: white is valid")
-        expect_draws(self.store)
+        advise_random_access(self.store)
 
-    def _shown(self, i: int) -> Bool[np.ndarray, " N"]:
-        return self._rays.shown(i).cpu().numpy()
+    def _has_ray(self, i: int) -> Bool[np.ndarray, " N"]:
+        return self._rays.has_ray(i).cpu().numpy()
 
     def on(self, device: torch.device | str) -> PixelDataset:
         """Return the same pixels, with batches on another device."""
@@ -132,7 +132,7 @@ class PixelDataset:
         rows, camera = self.store.rows(i), self.views[i].camera
         numbers, colors = np.arange(rows.start, rows.stop), self.store.view_colors(i)
         shape = camera.height, camera.width
-        gradient = _gradient(self._seen(colors).view(shape)).reshape(-1) if gradients else None
+        gradient = _gradient(self._display_luminance(colors).view(shape)).reshape(-1) if gradients else None
         return self._batch(numbers, np.full(len(numbers), i), colors, gradient)
 
     def at(self, i: int, rows: Int[Tensor, " N"]) -> PixelBatch:
@@ -185,7 +185,7 @@ class PixelDataset:
         lit = self._lit() if self.capture.hdr else ()
         return MIDDLE_GREY / float(lit.median()) if len(lit) else 1.0
 
-    def _seen(self, colors: Float32[np.ndarray, "*shape 3"]) -> Float32[Tensor, "*shape"]:
+    def _display_luminance(self, colors: Float32[np.ndarray, "*shape 3"]) -> Float32[Tensor, "*shape"]:
         """Display luminance; linear images are exposed so that the median of the object is middle grey."""
         color = torch.from_numpy(colors)
         return luminance(tone_map(self._exposure * color) if self.capture.hdr else color)
@@ -200,8 +200,8 @@ class PixelDataset:
         columns = np.clip(column + NEIGHBOURS[:, 1, None], 0, last[:, 0])
         rows = np.clip(row + NEIGHBOURS[:, 0, None], 0, last[:, 1])
         around = self.store.starts[views] + rows * size[:, 0] + columns
-        seen = self._seen(self.store.colors(around, np.broadcast_to(views, around.shape)))
-        return _scharr(seen.unbind(0))
+        colors = self.store.colors(around, np.broadcast_to(views, around.shape))
+        return _scharr(self._display_luminance(colors).unbind(0))
 
     # --------------------------------------------------------------------------------------------- statistics
 
@@ -227,8 +227,8 @@ class PixelDataset:
 
     def _lit(self) -> Float[Tensor, " L"]:
         """Linear luminance of the object pixels that are not black."""
-        seen = luminance(self._of_the_object())
-        return seen[seen > DARK * seen.mean()]
+        values = luminance(self._of_the_object())
+        return values[values > DARK * values.mean()]
 
     def _of_the_object(self) -> Float[Tensor, "S 3"]:
         """Linear colours of valid object pixels, evenly spaced if there are more than `MAX_COUNTED`."""

@@ -1,4 +1,4 @@
-"""Oriented point clouds: PLY files, ASCII or binary, whose vertices have positions and normals."""
+"""Read and write oriented point clouds: ASCII or binary PLY files whose vertices have normals."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 TYPES = dict(zip(OLD_NAMES + NEW_NAMES, CODES + CODES, strict=True))
 BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": None}
 HEADER_LIMIT = 65_536
-"""Longest header of a PLY file, bytes."""
+"""Largest number of bytes of the header of a PLY file."""
 ROUNDING = 1e-6
 """Largest rounding error of a written position, as a share of the longest edge of the bounding box."""
 POSITION = ("x", "y", "z")
@@ -39,17 +39,17 @@ NORMAL = ("nx", "ny", "nz")
 
 @dataclass(frozen=True)
 class WorldPoints:
-    """What the file holds: positions and normals, of any length, in the world frame."""
+    """Positions and normals as the file stores them: in the world frame, with normals of any length."""
 
     position: Float64[np.ndarray, "N 3"]
     normal: Float64[np.ndarray, "N 3"]
 
 
 def load_point_cloud(path: Path, normalisation: Normalisation) -> OrientedPoints:
-    """An oriented point cloud in the scene frame.
+    """Read an oriented point cloud and transform it to the scene frame, with unit normals.
 
     Raises:
-        UserError: as `read_oriented_ply`.
+        UserError: as in `read_oriented_ply`.
     """
     points = read_oriented_ply(path)
     position = normalisation.to_scene(torch.from_numpy(points.position))
@@ -58,11 +58,12 @@ def load_point_cloud(path: Path, normalisation: Normalisation) -> OrientedPoints
 
 
 def read_oriented_ply(path: Path) -> WorldPoints:
-    """The vertices of a PLY file.
+    """Read positions and normals of the vertices of a PLY file.
 
     Raises:
-        UserError: the file is missing, malformed or cut off, has no points or no normals, or holds a number
-            that is not finite or a normal of no length.
+        UserError: the file is missing, malformed or cut off, has no points or no normals, or contains a
+        number
+            that is not finite or a normal of length 0.
     """
     vertices = _read(path)
     position, normal = _columns(path, vertices, POSITION), _columns(path, vertices, NORMAL)
@@ -71,14 +72,15 @@ def read_oriented_ply(path: Path) -> WorldPoints:
     broken = ~(np.isfinite(position) & np.isfinite(normal)).all(axis=1) | (np.abs(normal).max(axis=1) < 1e-6)
     if broken.any():
         raise UserError(
-            f"{path}: {broken.sum()} of {len(broken)} points are not finite or have a normal of no length",
+            f"{path}: {broken.sum()} of {len(broken)} points are not finite or have a normal of length 0",
             "remove these points",
         )
     return WorldPoints(position, normal)
 
 
 def read_positions(path: Path) -> Float64[np.ndarray, "N 3"]:
-    """The positions of a PLY file's vertices, in the world frame, without those that are not finite.
+    """Read the positions of the vertices of a PLY file, in the world frame, without those that are not
+    finite.
 
     Raises:
         UserError: the file is missing, malformed or cut off.
@@ -88,10 +90,10 @@ def read_positions(path: Path) -> Float64[np.ndarray, "N 3"]:
 
 
 def has_normals(path: Path) -> bool:
-    """Whether the vertices of a PLY file have normals.
+    """Return whether the vertices of a PLY file have normals.
 
     Raises:
-        UserError: as `read_positions`.
+        UserError: as in `read_positions`.
     """
     return set(NORMAL) <= set(_read(path).dtype.names)
 
@@ -143,7 +145,9 @@ def _columns(path: Path, vertices: np.ndarray, names: tuple[str, str, str]) -> F
 
 
 def _vertices(data: bytes) -> np.ndarray:
-    """The vertex table as a structured array; the vertices must come first, as all common writers do."""
+    """Parse the vertices into a structured array. They must be the first element, as all common programs
+    write them.
+    """
     head, separator, _ = data[:HEADER_LIMIT].partition(b"end_header")
     if not separator or not head.startswith(b"ply"):
         raise ValueError("it has no PLY header")
@@ -154,7 +158,7 @@ def _vertices(data: bytes) -> np.ndarray:
         raise ValueError("its first element is not the vertices")
     count = int(lines[elements[0]][2])
     if count < 0:
-        raise ValueError("it announces a negative number of points")
+        raise ValueError("its header states a negative number of points")
     own = lines[elements[0] : elements[1] if len(elements) > 1 else None]
     properties = [(words[2], TYPES[words[1]]) for words in own if words[0] == "property"]
     body = data.index(b"\n", len(head)) + 1
@@ -167,7 +171,7 @@ def _vertices(data: bytes) -> np.ndarray:
         )
         if rows.shape != (count, len(properties)):
             raise ValueError(
-                f"{count} points with {len(properties)} numbers each are announced, and not there"
+                f"its header states {count} points with {len(properties)} numbers each, but they are missing"
             )
         return np.rec.fromarrays(rows.T, names=[name for name, _ in properties])
     return np.frombuffer(data, np.dtype([(name, order + kind) for name, kind in properties]), count, body)

@@ -114,13 +114,13 @@ def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalisation:
     centre = meeting_point(axes, np.ones(len(views))) if focus is None else focus.centre
     if centre is None:
         raise UserError(
-            f"{where}: the cameras look in one direction: they do not tell where the scene is",
+            f"{where}: the cameras look in one direction, so the position of the scene is unknown",
             "add points or a scene box",
         )
     depth = np.einsum("ni,ni->n", centre - axes.eyes, axes.ahead)
     if np.median(depth) <= 0:
         raise UserError(
-            f"{where}: the cameras look away from one another: they do not tell where the scene is",
+            f"{where}: the cameras look away from one another, so the position of the scene is unknown",
             "add points or a scene box",
         )
     half = [min(c.width / c.fx, c.height / c.fy) / 2 for c in (view.camera for view in views)]
@@ -131,7 +131,7 @@ def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalisation:
 def _box(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> Normalisation:
     scale = MARGIN * float((high - low).max()) / 2
     if not scale > 0:
-        raise UserError("all points of the scene lie in one place", "add a scene box")
+        raise UserError("all points of the scene are equal", "add a scene box")
     x, y, z = map(float, (low + high) / 2)
     return Normalisation(scale, (x, y, z))
 
@@ -150,7 +150,7 @@ def _carve(outlines: Sequence[Outline], start: Normalisation) -> Normalisation:
         held = grid[agreement(outlines, grid) >= AGREEMENT]
         if not len(held):
             raise UserError(
-                "the masks have no place in common", "check masks and cameras, or add a scene box"
+                "no point of the scene lies in all masks", "check masks and cameras, or add a scene box"
             )
         low, high = held.min(axis=0) - cell, held.max(axis=0) + cell
     return _box(low, high)

@@ -1,14 +1,14 @@
-"""The ground truth of a capture, where it is at hand: depth, normals, masks, materials, mesh and light field.
+"""Read the ground truth of a capture: depth, normals, masks, materials, mesh and light field.
 
-Everything is optional and read when asked for. What belongs to a view is flat, row by row, as in
-`PixelDataset.view`. Where a view has fewer pixels than its files, a pixel shows a surface if all of its area
-does; its depth is that at its centre, all else the mean over its area. All positions, lengths and directions
-are in the scene frame.
+Every file is optional and is read by the method that needs it. Maps of a view are flat, row by row, as in
+`PixelDataset.view`. If a view has fewer pixels than its files, a pixel shows a surface if its whole area
+does; its depth is that at its centre, and all other values are means over its area. All positions, lengths
+and directions that the methods return are in the scene frame.
 
-    <inputs>/depth_maps/<stem>.exr                    depth along the camera's axis, world units; 0: none
-    <inputs>/normal_maps/<stem>.exr                   unit normals, world axes; 0: none
+    <inputs>/depth_maps/<stem>.exr                    depth along the camera's axis, world units; 0: no
+    surface <inputs>/normal_maps/<stem>.exr                   unit normals, world axes; 0: no surface
     <inputs>/model/mesh.ply                           the surface, world frame
-    ground_truths/materials/{kd,roughness,metallic}/  <stem>.png, linear, usually for the test views alone
+    ground_truths/materials/{kd,roughness,metallic}/  <stem>.png, linear, usually only for the test views
     light/light_field_gt.npz                          incident and outgoing radiance at surface points
 """
 
@@ -35,9 +35,10 @@ __all__ = ["LightField", "Truth"]
 
 @dataclass(frozen=True)
 class LightField:
-    """Radiance at N surface points: what arrives from S directions `wi` and what leaves in K directions `wo`.
+    """Radiance at N surface points: incident from S directions `wi`, and outgoing in K directions `wo`.
 
-    Directions are unit and point away from the surface. Each `wi` stands for 2π/S of the hemisphere.
+    Directions are unit vectors that point away from the surface. Each `wi` represents a solid angle of 2π/S
+    of the hemisphere.
     """
 
     position: Float[Tensor, "N 3"]
@@ -51,33 +52,35 @@ class LightField:
 
 @dataclass(frozen=True)
 class Truth:
-    """What is known of a capture besides its images. Each method returns none where its files are not there.
+    """The ground truth of a capture. Each method returns None if its files do not exist.
 
     Raises (each method):
-        UserError: a file is there and cannot be read, or does not have the view's size.
+        UserError: a file exists but cannot be read, or does not have the size of the view.
     """
 
     capture: Capture
 
     def depth(self, view: View) -> Float[Tensor, " P"] | None:
-        """Depth along the camera's axis in scene units, 0 on the background."""
+        """Return the depth along the camera's axis in scene units, 0 on the background."""
         pixels = self._pixels(
             self.capture.inputs / "depth_maps" / f"{view.name}.exr", view, channels=1, mean=False
         )
         return None if pixels is None else pixels[:, 0] / self.capture.normalisation.scale
 
     def mask(self, view: View) -> Bool[Tensor, " P"] | None:
-        """Where the depth map shows a surface."""
+        """Return which pixels show a surface, according to the depth map."""
         depth = self.depth(view)
         return None if depth is None else depth > 0
 
     def normal(self, view: View) -> Float[Tensor, "P 3"] | None:
-        """Unit normals, 0 on the background; the world's axes are the scene's."""
+        """Return unit normals, 0 on the background. World frame and scene frame have the same axes."""
         pixels = self._pixels(self.capture.inputs / "normal_maps" / f"{view.name}.exr", view, channels=3)
         return None if pixels is None else torch.nn.functional.normalize(pixels, dim=-1)
 
     def material(self, view: View) -> Material | None:
-        """Base colour, roughness and metallic, 0 on the background; none unless all three are there."""
+        """Return base colour, roughness and metallic, 0 on the background; None if one of the maps is
+        missing.
+        """
         folder = self.capture.root / "ground_truths" / "materials"
         base_color, roughness, metallic = (
             self._pixels(folder / name / f"{view.name}.png", view, channels)
@@ -88,12 +91,12 @@ class Truth:
         return Material(base_color, roughness, metallic)
 
     def mesh(self) -> Mesh | None:
-        """The surface."""
+        """Return the surface."""
         path = self._file(self.capture.inputs / "model" / "mesh.ply")
         return None if path is None else read_mesh(path, self.capture.normalisation)
 
     def light_field(self) -> LightField | None:
-        """Incident and outgoing radiance at surface points."""
+        """Return incident and outgoing radiance at surface points."""
         path = self._file(self.capture.root / "light" / "light_field_gt.npz")
         if path is None:
             return None
@@ -112,7 +115,8 @@ class Truth:
             for name, shape in shapes.items():
                 if get[name].shape != shape:
                     raise ValueError(f"{name} has the shape {tuple(get[name].shape)}, not {shape}")
-        except Exception as error:  # a damaged archive raises what zipfile, zlib and numpy please
+        except Exception as error:
+            # For a damaged archive, zipfile, zlib and numpy raise many types of exceptions.
             raise UserError(
                 f"{path}: not a light field ({error})", "remove the file, or write it again"
             ) from error
@@ -132,12 +136,13 @@ class Truth:
     def _pixels(
         self, path: Path, view: View, channels: int, mean: bool = True
     ) -> Float[Tensor, "P C"] | None:
-        """The pixels of a file, flat."""
+        """Read the pixels of a file, row by row; `mean` selects the mean over the area of a reduced pixel."""
         if self._file(path) is None:
             return None
         pixels = read_image(path).pixels
         if channels == 1 and (pixels == pixels[..., :1]).all():
-            pixels = pixels[..., :1]  # many programs write grey as three channels that are alike
+            # Many programs write a grey image with three equal channels.
+            pixels = pixels[..., :1]
         wanted = (*file_size(view)[::-1], channels)
         if pixels.shape != wanted:
             raise UserError(

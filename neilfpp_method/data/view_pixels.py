@@ -1,4 +1,4 @@
-"""The pixels of one view as its files hold them, at the size of its camera: colours, mask and validity."""
+"""Read the pixels of one view from its files: colours, mask and validity, at the size of its camera."""
 
 from __future__ import annotations
 
@@ -19,21 +19,20 @@ from neilfpp_method.shading.color import linear_to_srgb, srgb_to_linear
 __all__ = ["ViewPixels", "pixel_colors", "read_colors", "read_mask", "read_view"]
 
 HALF = 0.5
-"""Share of the area of a reduced pixel that must be on the object."""
+"""Smallest share of the area of a reduced pixel that must be on the object."""
 ROWS = 256
-"""Rows of an image that are made linear together: bounds the memory."""
+"""Number of rows of an image that are converted to linear values at once; bounds the memory."""
 
 
 @dataclass(frozen=True)
 class ViewPixels:
-    """What a view's files say of its pixels.
+    """The pixels of a view.
 
     Attributes:
-        color: linear radiance on the scale that the views share, or display values; finite where nothing is
-            `broken`.
-        mask: where the object is, by the mask file or the alpha channel; none where the view has neither.
-        valid: all but those that the validity mask leaves out; a pixel that covers several is valid where all
-            of them are.
+        color: linear radiance on the scale that all views share, or display values; finite if `broken` is 0.
+        mask: pixels on the object, by the mask file or the alpha channel; None if the view has neither.
+        valid: pixels that the validity mask does not exclude; a reduced pixel is valid if all pixels of the
+            file that it covers are.
         broken: number of pixels of the file that are NaN, infinite or negative, and not marked as invalid.
     """
 
@@ -47,8 +46,8 @@ def read_view(view: View, hdr: bool) -> ViewPixels:
     """Read the files of a view.
 
     Raises:
-        UserError: a file cannot be read, or has another size than when the capture was loaded; the mask shows
-            no object; or display values have an exposure.
+        UserError: a file cannot be read, or does not have the size that it had when the capture was loaded;
+            the mask shows no object; or display values have an exposure.
     """
     image = _read(view)
     color = pixel_colors(view, image, hdr).numpy()
@@ -67,33 +66,33 @@ def read_view(view: View, hdr: bool) -> ViewPixels:
 
 
 def read_colors(view: View, hdr: bool) -> Float32[np.ndarray, "H W 3"]:
-    """The colours of a view alone, as `read_view` has them."""
+    """Read only the colours of a view, as `read_view` returns them."""
     color = pixel_colors(view, _read(view), hdr).numpy()
     width, height = view.camera.width, view.camera.height
     return color if file_size(view) == (width, height) else _scaled(color, hdr, width, height)
 
 
 def pixel_colors(view: View, image: ImageFile, hdr: bool) -> Float32[Tensor, "H W 3"]:
-    """The pixels of a view's image at its own size; linear images keep neither exposure nor white balance.
+    """Return the pixels of an image at the size of its file, divided by exposure and white balance.
 
     Raises:
-        UserError: display values with an exposure or a white balance.
+        UserError: the pixels are display values, and the view has an exposure or a white balance.
     """
     color = torch.from_numpy(image.pixels).expand(-1, -1, 3)
     factors = view.exposure * torch.tensor(view.white_balance)
     if (factors == 1.0).all():
         return color
     if not hdr:
-        # Values clipped for display stay clipped at any exposure: no render compares with the quotient.
+        # Values clipped for display stay clipped after the division, so no rendering could match them.
         raise UserError(
             f"{view.image}: an exposure or white balance for display values (sRGB)",
-            "develop the images linearly, or expose them all alike and leave out the factors",
+            "develop the images linearly, or use one exposure for all images and leave out the factors",
         )
     return color / factors
 
 
 def read_mask(path: Path, view: View) -> Bool[np.ndarray, "H W"]:
-    """Where a mask of the view, at the size of its files, is above one half."""
+    """Return where a mask of the view is above one half, at the size of its files."""
     values = read_image(path).mask
     if values.shape[::-1] != file_size(view):
         raise UserError(f"{path}: the mask has another size than {view.image}", "load the capture again")
@@ -113,7 +112,7 @@ def _read(view: View) -> ImageFile:
 
 
 def _object_mask(view: View, image: ImageFile) -> Bool[np.ndarray, "H W"] | None:
-    """The object: where the mask file, or else the image's alpha, is above one half; none without either."""
+    """Where the mask file, or else the alpha channel, is above one half; None if there is neither."""
     if view.mask is None and image.alpha is None:
         return None
     mask = read_mask(view.mask, view) if view.mask else image.alpha > 0.5
@@ -128,11 +127,12 @@ def _object_mask(view: View, image: ImageFile) -> Bool[np.ndarray, "H W"] | None
 def _scaled(
     color: Float32[np.ndarray, "H W 3"], hdr: bool, width: int, height: int
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Averaged in linear radiance."""
+    """Resize an image by averaging linear radiance."""
     if hdr:
         return area_average(color, width, height)
     linear = np.empty(color.shape, np.float32)
-    for start in range(0, len(color), ROWS):  # a power of a whole photograph would take several of its size
+    # Converting a whole photograph at once would take several times its memory.
+    for start in range(0, len(color), ROWS):
         rows = slice(start, start + ROWS)
         linear[rows] = srgb_to_linear(torch.from_numpy(np.ascontiguousarray(color[rows]))).numpy()
     return linear_to_srgb(torch.from_numpy(area_average(linear, width, height))).numpy()

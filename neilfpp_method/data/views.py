@@ -1,7 +1,7 @@
-"""What a capture is made of: cameras, views, and the map from the world to the scene frame.
+"""The parts of a capture: cameras, views, and the transformation from the world frame to the scene frame.
 
-Cameras have OpenCV axes (x right, y down, z forward) and pixel centres at +0.5: pixel (column, row) is seen
-through the image point (column + ½, row + ½). They are pinholes, or have a `Lens` that bends straight lines.
+Cameras have OpenCV axes (x right, y down, z forward). The centre of pixel (column, row) is the image point
+(column + ½, row + ½). A camera without a `Lens` is a pinhole camera.
 """
 
 from __future__ import annotations
@@ -37,21 +37,23 @@ __all__ = [
 ]
 
 MAX_BLIND_SHARE = 0.6
-"""Share of an image that a lens may leave dark: a fisheye's circle fills 44 % of 16:9."""
+"""Largest share of an image at which a lens may show nothing: the circle of a fisheye fills 44 % of a 16:9
+image."""
 MAX_TABULATED = 2**26
-"""Pixels of different lenses whose rays are kept in memory: half a gigabyte."""
+"""Largest number of pixels, over all different lenses, whose rays are stored: half a gigabyte."""
 PLANE_PART = 2**20
-"""Pixels whose rays are computed together: bounds the memory."""
+"""Number of pixels whose rays are computed at once; bounds the memory."""
 MIN_FOCAL, LARGEST = 1e-3, 1e12
-"""Smallest focal length, pixels, and the largest number of a camera: rays are computed in float32."""
+"""Smallest focal length, in pixels, and largest absolute value of any number of a camera, so that rays can be
+computed in float32."""
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Focal lengths and principal point in pixels, size in pixels, and the pose, world (or scene) to camera.
+    """Focal lengths, principal point and size in pixels, and the pose from world (or scene) to camera.
 
-    Without `lens` a pinhole; with it, focal lengths and principal point apply to the plane on which the lens
-    shows the scene. Cameras are compared by identity: an array has no single truth value.
+    Without `lens` it is a pinhole camera. With it, focal lengths and principal point apply to the distorted
+    image plane. Cameras are compared by identity, because the comparison of arrays has no single truth value.
     """
 
     fx: float
@@ -65,27 +67,31 @@ class Camera:
 
     @property
     def intrinsics(self) -> Float64[np.ndarray, " 4"]:
-        """fx, fy, cx, cy."""
+        """The numbers fx, fy, cx, cy."""
         return np.array([self.fx, self.fy, self.cx, self.cy])
 
     @property
     def c2w(self) -> Float64[np.ndarray, "3 4"]:
-        """Camera to world: the transposed rotation, and the camera's centre in the last column."""
+        """Camera to world: the transposed rotation, with the camera's centre as the last column."""
         rotation = self.w2c[:3, :3].T
         return np.concatenate([rotation, -rotation @ self.w2c[:3, 3:]], axis=1)
 
 
 def check_camera(camera: Camera, where: str) -> None:
-    """Refuse what is no camera with a rigid pose; `where` says to whom the camera belongs.
+    """Check that a camera has finite numbers in a usable range and a rigid pose.
+
+    Args:
+        camera: the camera.
+        where: the file or view to which the camera belongs, for the message.
 
     Raises:
-        UserError: the camera is malformed.
+        UserError: it does not.
     """
     rotation = camera.w2c[:3, :3]
     if not (np.isfinite(camera.w2c).all() and np.isfinite(camera.intrinsics).all()):
         raise UserError(f"{where}: the camera has a number that is not finite", "export the cameras again")
     if min(camera.fx, camera.fy) <= 0:
-        raise UserError(f"{where}: the focal length is not positive", "give it in pixels")
+        raise UserError(f"{where}: the focal length is not positive", "give the focal length in pixels")
     if min(camera.fx, camera.fy) < MIN_FOCAL or max(*abs(camera.intrinsics), abs(camera.w2c).max()) > LARGEST:
         raise UserError(
             f"{where}: the camera has a focal length below {MIN_FOCAL:g} px or a number beyond {LARGEST:g}",
@@ -96,7 +102,8 @@ def check_camera(camera: Camera, where: str) -> None:
     rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0
     if not rigid or not np.allclose(camera.w2c[3], [0, 0, 0, 1]):
         raise UserError(
-            f"{where}: the extrinsic is no rotation and translation", "give world-to-camera, 4×4, row-major"
+            f"{where}: the extrinsic matrix is not a rotation and a translation",
+            "give world-to-camera, 4×4, row-major",
         )
     if camera.lens is not None:
         camera.lens.check(where)
@@ -184,23 +191,26 @@ class CaptureFiles:
 
 
 def inside(root: Path, path: Path) -> Path:
-    """The path itself, when it leads to a place under `root` once links are followed.
+    """Return `path` if it is inside of `root` after links have been resolved.
+
+    Without this check, a capture from an untrusted source could make the program read any file.
 
     Raises:
-        UserError: it leaves `root`, or is no path at all; a capture from a stranger could otherwise read any
-            file.
+        UserError: the path leaves `root`, or is not a valid path.
     """
     try:
-        path.exists()  # raises where the name itself is not possible
+        # `exists` raises an exception for an impossible name.
+        path.exists()
         if path.resolve().is_relative_to(root.resolve()):
             return path
-    except (OSError, RuntimeError, ValueError):  # a name too long, a loop of links, a null byte
+    except (OSError, RuntimeError, ValueError):
+        # The name is too long, links form a loop, or the name contains a null byte.
         pass
     raise UserError(f"{path}: not a path within the capture folder {root}", "copy the file into the folder")
 
 
 def plain_name(name: str) -> bool:
-    """Whether a name can be that of a file anywhere: no folder in it, not hidden, printable."""
+    """Return whether a name is a valid file name on all systems: without folders, not hidden, printable."""
     return bool(name) and name.isprintable() and not name.startswith(".") and not set(name) & set("/\\:")
 
 
@@ -209,16 +219,18 @@ def plain_name(name: str) -> bool:
 
 @dataclass(frozen=True)
 class Projection:
-    """Image points (column + ½ at a pixel's centre) and depth along the camera's axis, in pose units."""
+    """Image points, in pixels with centres at +½, and depths along the camera's axis, in the unit of its
+    pose.
+    """
 
     pixel: Float[Tensor, "N 2"]
     depth: Float[Tensor, " N"]
 
 
 def project(camera: Camera, points: Float[Tensor, "N 3"]) -> Projection:
-    """Where the camera sees points: u = fx·x/z + cx, v = fy·y/z + cy, with x/z and y/z bent by its lens.
+    """Project points into the image: u = fx·x/z + cx, v = fy·y/z + cy, where the lens distorts (x/z, y/z).
 
-    A depth ≤ 0 means the point is behind the camera. Differentiable without a lens.
+    A point with depth ≤ 0 is behind the camera. The result is differentiable if the camera has no lens.
     """
     w2c = torch.as_tensor(camera.w2c, dtype=points.dtype, device=points.device)
     intrinsics = torch.as_tensor(camera.intrinsics, dtype=points.dtype, device=points.device)
@@ -231,7 +243,7 @@ def project(camera: Camera, points: Float[Tensor, "N 3"]) -> Projection:
 
 
 def camera_rays(camera: Camera, dtype: torch.dtype = torch.float32) -> RayBatch:
-    """Rays through all pixels, row by row: N = height · width, in the frame of the camera's pose."""
+    """Return rays through all N = height · width pixels, row by row, in the frame of the camera's pose."""
     pixel = torch.arange(camera.height * camera.width)
     return CameraRays([camera], dtype=dtype)(torch.zeros_like(pixel), pixel)
 
@@ -239,14 +251,15 @@ def camera_rays(camera: Camera, dtype: torch.dtype = torch.float32) -> RayBatch:
 class CameraRays:
     """Rays through the centres of pixels of many cameras, in the frame of their poses.
 
-    The rays of a pinhole are computed when asked for; those of a lens are looked up, as its equations have no
-    closed inverse: 8 bytes a pixel, shared by cameras that differ in their pose alone. Where lenses have more
-    than `MAX_TABULATED` pixels together, as when every photograph has been calibrated by itself, they are
-    computed when asked for, too, which takes longer. A pixel at which a lens shows nothing, as in the corners
-    of a fisheye, has a ray that leads backwards, away from what the camera sees.
+    The rays of a pinhole camera are computed on demand. Those of a lens are read from a table, because the
+    equations of a lens have no closed-form inverse. The table takes 8 bytes per pixel, and cameras that
+    differ only in their pose share it. If the lenses have more than `MAX_TABULATED` pixels in total, for
+    example because every photograph was calibrated separately, their rays are computed on demand as well,
+    which takes longer. A pixel at which a lens shows nothing, such as in the corners of a fisheye image, has
+    a ray that points backwards, away from the scene.
 
     Raises:
-        UserError: a lens shows nothing at most of its pixels.
+        UserError: a lens shows nothing at more than `MAX_BLIND_SHARE` of its pixels.
     """
 
     def __init__(
@@ -271,8 +284,8 @@ class CameraRays:
             planes = np.concatenate([_whole_plane(camera, dtype) for camera in kinds.values()])
             self._lens_plane = torch.from_numpy(planes).to(device)
 
-    def shown(self, i: int) -> Bool[Tensor, " P"]:
-        """Which pixels of camera `i`, row by row, have a ray; all but those where its lens shows nothing."""
+    def has_ray(self, i: int) -> Bool[Tensor, " P"]:
+        """Return which pixels of camera `i`, row by row, have a ray: its lens shows something there."""
         camera = self._cameras[i]
         size = camera.width * camera.height
         if camera.lens is None:
@@ -284,7 +297,7 @@ class CameraRays:
         return ~plane.isnan().any(dim=-1).to(self._width.device)
 
     def __call__(self, camera: Int[Tensor, " N"], pixel: Int[Tensor, " N"]) -> RayBatch:
-        """Rays of cameras, by number, through pixels, counted row by row."""
+        """Return the rays through pixels, given by the index of their camera and their index in its image."""
         width, intrinsics, c2w = self._width[camera], self._intrinsics[camera], self._c2w[camera]
         corner = torch.stack([pixel % width, pixel // width], dim=-1)
         plane = (corner.to(intrinsics.dtype) + 0.5 - intrinsics[:, 2:]) / intrinsics[:, :2]
@@ -305,7 +318,7 @@ class CameraRays:
     def _computed(
         self, plane: Float[Tensor, "N 2"], camera: Int[Tensor, " N"], pixel: Int[Tensor, " N"]
     ) -> Float[Tensor, "N 2"]:
-        """The plane with what the lenses say, asked for these pixels alone."""
+        """Replace the entries of `plane` that belong to cameras with a lens by the undistorted points."""
         plane = plane.clone()
         for i in camera.unique().tolist():
             if self._cameras[i].lens is not None:
@@ -316,12 +329,14 @@ class CameraRays:
 
 
 def _shape(camera: Camera) -> tuple[Lens | None, float, float, float, float, int, int]:
-    """All of a camera but its pose."""
+    """All properties of a camera except its pose."""
     return (camera.lens, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
 
 
 def _whole_plane(camera: Camera, dtype: torch.dtype) -> Float[np.ndarray, "P 2"]:
-    """`_straight_plane` of all pixels of a camera, at ray precision; in parts, to bound the memory."""
+    """`_straight_plane` of all pixels of a camera, in the precision of rays; computed in parts to bound
+    memory.
+    """
     count = camera.width * camera.height
     parts = np.split(np.arange(count), range(PLANE_PART, count, PLANE_PART))
     plane = np.concatenate(
@@ -337,6 +352,6 @@ def _whole_plane(camera: Camera, dtype: torch.dtype) -> Float[np.ndarray, "P 2"]
 
 
 def _straight_plane(camera: Camera, pixel: Int[np.ndarray, " N"]) -> Float64[np.ndarray, "N 2"]:
-    """Where the rays through pixels of a camera with a lens meet the plane at unit distance; NaN: no ray."""
+    """Points of the plane at depth 1 that rays of a camera with a lens meet; NaN if a pixel has no ray."""
     centres = np.stack([pixel % camera.width, pixel // camera.width], axis=1) + 0.5
     return camera.lens.straighten((centres - camera.intrinsics[2:]) / camera.intrinsics[:2])

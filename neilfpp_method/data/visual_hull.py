@@ -1,8 +1,7 @@
-"""The visual hull of silhouettes: all places that no silhouette excludes, and its signed distance.
+"""Compute the visual hull of silhouettes, and its signed distance.
 
-Every view with a mask says of each place that it sees whether the object can be there. What is left is the
-smallest body that the masks alone can tell (Laurentini 1994): it holds the object, and has its outline from
-every camera, but no hollow that is not seen from the side.
+The visual hull consists of all points that no silhouette excludes (Laurentini 1994). It contains the object
+and has the same outline in every view, but it fills concavities that no outline shows.
 """
 
 from __future__ import annotations
@@ -21,41 +20,43 @@ from neilfpp_method.data.silhouettes import Outline, sightings
 __all__ = ["HULL_RADIUS", "RESOLUTION", "DistanceCube", "find_hull", "signed_distance", "visual_hull"]
 
 HULL_RADIUS = 1.3
-"""Half an edge of the carved cube, scene units: the unit sphere, which holds the object, and a margin."""
+"""Half an edge of the carved cube, scene units: the unit sphere, which contains the object, and a margin."""
 RESOLUTION = 96
-"""Cells along an edge, 0.027 scene units each: a start that training refines."""
+"""Number of cells along an edge of the cube. A cell is 0.027 scene units wide; training refines the result.
+"""
 MAX_EXCLUDING_SHARE = 0.05
-"""Share of the views of a place that may exclude it, rounded down: a few masks are wrong."""
+"""Largest share of the views seeing a point that may exclude it, because a few masks may be wrong."""
 MIN_SEEN_SHARE = 0.25
-"""Share of all views, and at least two views, that must see a place in the hull."""
+"""Smallest share of all views that must see a point of the hull; in addition, at least two views must."""
 MIN_CELLS = 64
-"""Cells of the smallest hull that a field is started from."""
+"""Smallest number of cells of a hull from which the distance field is initialised."""
 SMOOTHING = 1.5
-"""Standard deviation, cells, of the blur that removes the steps of the cells. A ball of radius 0.6 then has
-normals that are 2° off instead of 8°, and a radius that is 0.004 too small.
+"""Standard deviation, in cells, of the Gaussian blur that removes the staircase of the cells. With it, the
+normals of a ball of radius 0.6 are wrong by 2° instead of 8°, and its radius is 0.004 too small.
 """
 
 
 @dataclass(frozen=True)
 class DistanceCube:
-    """Signed distance, scene units, negative inside, at the cell centres of the cube [−radius, radius]³.
+    """Signed distance in scene units, negative inside, at the cell centres of the cube [−radius, radius]³.
 
-    `distance[i, j, k]` belongs to x = −radius + (i + ½) · 2 radius / R, and y and z by j and k alike.
+    `distance[i, j, k]` is the distance at x = −radius + (i + ½) · 2 radius / R, with y and z from j and k in
+    the same way.
     """
 
     distance: Float32[Tensor, "R R R"]
     radius: float
 
     def at(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-        """The distance at points of the scene frame, trilinear between centres.
+        """Return the distance at points of the scene frame, interpolated trilinearly between cell centres.
 
-        Beyond the outermost centres it is that of the nearest place within, and the way there: what a field
-        takes from it far away is a slope of 1 that leads back.
+        Outside of the outermost centres, the distance to the nearest point inside is added to the value
+        there, so a field that is fitted far away has a gradient of length 1 that points outwards.
         """
         grid = self.distance.to(x)
         edge = self.radius * (1.0 - 1.0 / len(grid))
         within = x.clamp(-edge, edge)
-        # grid_sample has x along the last axis, and −1 and 1 on the outer faces of the outermost cells.
+        # In `grid_sample`, x is the last axis, and −1 and 1 are the outer faces of the outermost cells.
         place = (within / self.radius).flip(-1).view(1, -1, 1, 1, 3)
         found = torch.nn.functional.grid_sample(grid[None, None], place, mode="bilinear", align_corners=False)
         return found.view(-1) + (x - within).square().sum(-1).sqrt()
@@ -64,12 +65,15 @@ class DistanceCube:
 def find_hull(
     outlines: Sequence[Outline], radius: float = HULL_RADIUS, resolution: int = RESOLUTION
 ) -> DistanceCube | str:
-    """The signed distance of the visual hull, or in a few words why these silhouettes do not make one.
+    """Compute the signed distance of the visual hull.
 
     Args:
         outlines: silhouettes with their cameras in the scene frame.
         radius: half an edge of the cube that is carved, scene units.
-        resolution: cells along an edge.
+        resolution: number of cells along an edge.
+
+    Returns:
+        The distance; or, if these silhouettes have no usable hull, the reason in a few words.
 
     Example:
         >>> hull = find_hull(outlines)
@@ -77,48 +81,53 @@ def find_hull(
     """
     hull = visual_hull(outlines, radius, resolution)
     if hull.sum() < MIN_CELLS:
-        return "the masks have next to no place in common"
-    # A body that leaves the cube has no surface there: masks show a ground, or the box is too small.
+        return "the masks have almost no region in common"
+    # A hull that reaches the faces of the cube is cut off there: the masks show a ground, or the scene box is
+    # too small.
     faces = np.ones_like(hull)
     faces[1:-1, 1:-1, 1:-1] = False
     if hull[faces].any():
-        return "what the masks show reaches beyond the scene box"
+        return "the masks show something that extends beyond the scene box"
     return DistanceCube(torch.from_numpy(signed_distance(hull, 2 * radius / resolution)), radius)
 
 
 def visual_hull(outlines: Sequence[Outline], radius: float, resolution: int) -> Bool[np.ndarray, "R R R"]:
-    """Which cells of the cube [−radius, radius]³ have centres in nearly all silhouettes of views that see it.
+    """Return which cells of the cube [−radius, radius]³ are in the hull.
 
-    A view sees what is in its image, and what is beside its image where its silhouette does not touch the
-    border (`Outline.complete`): a close-up says nothing of what lies outside it. A place that too few views
-    see is not in the hull.
+    The centre of such a cell lies in nearly all silhouettes of the views that see it, and enough views see
+    it. A view sees the points in its image. If its silhouette does not touch the border (`Outline.complete`),
+    it also sees the points beside its image, all of which are outside of the silhouette; a close-up has no
+    information on these points.
 
     Args:
         outlines: silhouettes with their cameras, in the frame of the cube.
         radius: half an edge of the cube.
-        resolution: R.
+        resolution: number of cells along an edge, R.
     """
     centre = (np.arange(resolution) + 0.5) * (2 * radius / resolution) - radius
     points = np.stack(np.meshgrid(centre, centre, centre, indexing="ij"), axis=-1).reshape(-1, 3)
-    left = np.arange(len(points))
-    seen, outside = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
-    # Small silhouettes first: they leave the least for the others to be asked about.
+    candidates = np.arange(len(points))
+    seen_by, excluded_by = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+    # Small silhouettes exclude the most points, so fewer points remain for the following views.
     for outline in sorted(outlines, key=lambda outline: float(outline.inside.mean())):
-        found = sightings([outline], points[left])
-        seen[left] += found.seen
-        outside[left] += found.seen - found.inside
-        left = left[outside[left] <= MAX_EXCLUDING_SHARE * len(outlines)]
+        found = sightings([outline], points[candidates])
+        seen_by[candidates] += found.seen
+        excluded_by[candidates] += found.seen - found.inside
+        candidates = candidates[excluded_by[candidates] <= MAX_EXCLUDING_SHARE * len(outlines)]
     hull = np.zeros(len(points), bool)
-    known = seen[left] >= max(2, MIN_SEEN_SHARE * len(outlines))
-    hull[left] = known & (outside[left] <= MAX_EXCLUDING_SHARE * seen[left])
+    enough_views = seen_by[candidates] >= max(2, MIN_SEEN_SHARE * len(outlines))
+    hull[candidates] = enough_views & (excluded_by[candidates] <= MAX_EXCLUDING_SHARE * seen_by[candidates])
     return hull.reshape(resolution, resolution, resolution)
 
 
 def signed_distance(inside: Bool[np.ndarray, "R R R"], cell: float) -> Float32[np.ndarray, "R R R"]:
-    """Smoothed Euclidean distance of cell centres from the surface of the body, negative inside.
+    """Return the smoothed Euclidean distance of cell centres from the surface, negative inside.
 
-    The surface lies half a cell from the centres next to it. `cell` is the width of a cell; without a cell
-    inside, or outside, there is no surface and no distance.
+    The surface lies half a cell from the centres next to it.
+
+    Args:
+        inside: which cells are inside; at least one cell must be inside and one outside.
+        cell: width of a cell, in the unit of the result.
     """
     within, without = ndimage.distance_transform_edt(inside), ndimage.distance_transform_edt(~inside)
     exact = np.where(inside, 0.5 - within, without - 0.5) * cell

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from neilfpp_method.effects.asked import read_asked
+from neilfpp_method.effects.request import parse_effects
 from neilfpp_method.evaluate.protocols import evaluate, write_metrics
 from neilfpp_method.evaluate.sheet import write_contact_sheet
 from neilfpp_method.evaluate.views import render_test_views
@@ -57,7 +57,7 @@ def run_demo(out: Path, *, short: bool, resume: bool, device: str, console: Cons
         device=device,
         devices=1,
         console=console,
-        effects=None if resume else read_asked("auto"),
+        effects=None if resume else parse_effects("auto"),
         command="neilfpp demo",
     )
     run = load_run(out, pick_device(device))

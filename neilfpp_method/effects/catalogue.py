@@ -26,7 +26,7 @@ class Effect:
         obstacle: why it cannot be switched with given settings; empty if it can.
         cost: what it costs while material is trained.
         risk: what goes wrong if it is left out although the scene has it.
-        unjudged: why no evidence is collected with given settings; empty if it is.
+        not_measured: why no evidence is collected with given settings; empty if it is.
         advised: whether evidence is shown but never changes the effect, because it cannot show reliably that
             the effect is not needed.
         needs: the effect without which this one does not exist; empty if there is none.
@@ -42,7 +42,7 @@ class Effect:
     obstacle: Callable[[NeilfConfig], str]
     cost: Callable[[NeilfConfig], str]
     risk: str
-    unjudged: Callable[[NeilfConfig], str] = lambda config: ""
+    not_measured: Callable[[NeilfConfig], str] = lambda config: ""
     solved: bool = False
     advised: bool = False
     needs: str = ""
@@ -154,7 +154,7 @@ EFFECTS: Mapping[str, Effect] = {
             cost=lambda config: "three unknowns per texel instead of one",
             risk="the colours of the light are baked into the base colour",
             advised=True,
-            unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
+            not_measured=_free_light(UNKNOWN_IN_FREE_LIGHT),
         ),
         Effect(
             name="reflection",
@@ -169,7 +169,7 @@ EFFECTS: Mapping[str, Effect] = {
             ),
             risk="highlights are baked into the base colour",
             advised=True,
-            unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
+            not_measured=_free_light(UNKNOWN_IN_FREE_LIGHT),
         ),
         Effect(
             name="metals",
@@ -180,7 +180,7 @@ EFFECTS: Mapping[str, Effect] = {
             obstacle=_without_reflection("surfaces without specular reflection have no metallic"),
             cost=lambda config: "one more unknown at every point",
             risk="metal becomes a dark glossy dielectric",
-            unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
+            not_measured=_free_light(UNKNOWN_IN_FREE_LIGHT),
             needs="reflection",
         ),
         Effect(
@@ -193,7 +193,7 @@ EFFECTS: Mapping[str, Effect] = {
             cost=lambda config: "one more unknown at every point",
             risk="all highlights have the average sharpness",
             advised=True,
-            unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
+            not_measured=_free_light(UNKNOWN_IN_FREE_LIGHT),
             needs="reflection",
         ),
         Effect(
@@ -207,7 +207,7 @@ EFFECTS: Mapping[str, Effect] = {
                 f"the pdf of the lobe in {config.shading.train_samples * config.train.rays} directions a step"
             ),
             risk="sharp reflections are noisy",
-            unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
+            not_measured=_free_light(UNKNOWN_IN_FREE_LIGHT),
             needs="reflection",
         ),
         Effect(
@@ -219,7 +219,7 @@ EFFECTS: Mapping[str, Effect] = {
             obstacle=_without_reflection("surfaces without specular reflection have no highlights"),
             cost=lambda config: "none",
             risk="the wide tails of highlights are explained by more roughness",
-            unjudged=_free_light(UNKNOWN_IN_FREE_LIGHT),
+            not_measured=_free_light(UNKNOWN_IN_FREE_LIGHT),
             needs="reflection",
         ),
         Effect(

@@ -18,7 +18,7 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading import apply_response
 from neilfpp_method.structures import Observed
 
-__all__ = ["WORTH", "ShownSurface", "shading_disagreement"]
+__all__ = ["WORTH", "RenderedSurface", "shading_disagreement"]
 
 WORTH = 0.01
 """Excess of the relative error of shading over that of R above which the joint stage is worth its cost."""
@@ -27,7 +27,7 @@ AT_ONCE = 256
 
 
 @dataclass(frozen=True)
-class ShownSurface:
+class RenderedSurface:
     """P surface points with their pixels.
 
     Attributes:
@@ -40,12 +40,12 @@ class ShownSurface:
 
 
 @torch.no_grad()
-def shading_disagreement(model: NeilfModel, seen: ShownSurface) -> Measurement:
+def shading_disagreement(model: NeilfModel, surface: RenderedSurface) -> Measurement:
     """Mean relative error of shaded pixels minus that of R.
 
     Args:
         model: the model, in evaluation mode.
-        seen: surface points with their pixels and the radiance of R.
+        surface: surface points with their pixels and the radiance of R.
     """
     what = "error of shading in excess of that of R"
     response, unit = model.facts.response, model.units.physical
@@ -55,10 +55,10 @@ def shading_disagreement(model: NeilfModel, seen: ShownSurface) -> Measurement:
         return (difference / error_unit(pixel, response, unit)).abs().clamp_max(1).mean(-1)
 
     excess = []
-    for start in range(0, len(seen.radiance), AT_ONCE):
-        part, radiance = seen.observed[start : start + AT_ONCE], seen.radiance[start : start + AT_ONCE]
+    for start in range(0, len(surface.radiance), AT_ONCE):
+        part, radiance = surface.observed[start : start + AT_ONCE], surface.radiance[start : start + AT_ONCE]
         material = model.materials(part.position)
         samples = model.config.shading.eval_samples
         shaded = model.shade(part.position, part.normal, part.wo, material, samples).color
         excess.append(error(shaded, part.pixel) - error(radiance, part.pixel))
-    return mean_of(torch.cat(excess) if excess else seen.radiance[:, 0], what, WORTH)
+    return mean_of(torch.cat(excess) if excess else surface.radiance[:, 0], what, WORTH)

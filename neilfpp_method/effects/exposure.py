@@ -71,17 +71,17 @@ def measure_exposures(pixels: PixelDataset, cloud: OrientedPoints) -> Exposures:
     """
     chosen = torch.from_numpy(np.random.default_rng(0).permutation(len(cloud))[:POINTS])
     points = cloud[chosen]
-    seen = _seen(pixels, points)
-    known = (~seen.isnan()).any(-1).sum(1) >= MIN_VIEWS
-    seen, normal = seen[known], points.normal[known]
-    return Exposures(_gains(seen), judge_gains(seen, normal))
+    log_values = _log_values(pixels, points)
+    enough_views = (~log_values.isnan()).any(-1).sum(1) >= MIN_VIEWS
+    log_values, normal = log_values[enough_views], points.normal[enough_views]
+    return Exposures(_gains(log_values), judge_gains(log_values, normal))
 
 
-def judge_gains(seen: Float[Tensor, "P V 3"], normal: Float[Tensor, "P 3"]) -> Measurement:
+def judge_gains(log_values: Float[Tensor, "P V 3"], normal: Float[Tensor, "P 3"]) -> Measurement:
     """The reduction of the error by gains, at points of another orientation than the fitted ones.
 
     Args:
-        seen: logarithm of the linear value of each point in each view; NaN where a view is not usable.
+        log_values: logarithm of the linear value of each point in each view; NaN where a view is not usable.
         normal: unit normals of the points.
 
     Returns:
@@ -90,8 +90,8 @@ def judge_gains(seen: Float[Tensor, "P V 3"], normal: Float[Tensor, "P 3"]) -> M
     what = "reduction of the error by gains, at points of another orientation"
     group, measured = _split_by_orientation(normal), []
     for held_back in (group, ~group):
-        gain = _gains(seen[~held_back])
-        saved = _error(seen[held_back], torch.zeros_like(gain)) - _error(seen[held_back], gain)
+        gain = _gains(log_values[~held_back])
+        saved = _error(log_values[held_back], torch.zeros_like(gain)) - _error(log_values[held_back], gain)
         measured.append(mean_of(saved[~saved.isnan()], what, WORTH))
     undecided = [one for one in measured if one.favours(chosen=False) is None]
     return (undecided or sorted(measured, key=lambda one: one.value))[0]
@@ -113,9 +113,9 @@ def _split_by_orientation(normal: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
     return group
 
 
-def _seen(pixels: PixelDataset, points: OrientedPoints) -> Float[Tensor, "P V 3"]:
+def _log_values(pixels: PixelDataset, points: OrientedPoints) -> Float[Tensor, "P V 3"]:
     """Logarithm of the linear value of each point in each view; NaN where the view is not usable."""
-    seen = torch.full((len(points), len(pixels.views), 3), torch.nan)
+    log_values = torch.full((len(points), len(pixels.views), 3), torch.nan)
     for number, view in enumerate(pixels.views):
         camera = pixels.capture.normalisation.camera(view.camera)
         shown = project(camera, points.position)
@@ -124,8 +124,8 @@ def _seen(pixels: PixelDataset, points: OrientedPoints) -> Float[Tensor, "P V 3"
         within = (column > 0) & (row > 0) & (column < camera.width - 1) & (row < camera.height - 1)
         at = torch.nonzero(within & (shown.depth > 0) & (_cosine(camera, points) > MIN_COSINE))[:, 0]
         if len(at):
-            seen[at, number] = _around(pixels, number, column[at], row[at])
-    return seen
+            log_values[at, number] = _around(pixels, number, column[at], row[at])
+    return log_values
 
 
 def _cosine(camera: Camera, points: OrientedPoints) -> Float[Tensor, " P"]:
@@ -152,23 +152,23 @@ def _around(pixels: PixelDataset, number: int, column: Tensor, row: Tensor) -> F
     return torch.where(good, mean.clamp_min(1e-20).log(), torch.nan)
 
 
-def _gains(seen: Float[Tensor, "P V 3"]) -> Float[Tensor, "V 3"]:
+def _gains(log_values: Float[Tensor, "P V 3"]) -> Float[Tensor, "V 3"]:
     """Log gains that minimise the sum of absolute errors, jointly with the colours of the points.
 
     The gain of a view that shows none of the points is about 0.
     """
-    usable = ~seen.isnan()
-    known, weight = seen.nan_to_num(0.0), usable.float()
-    gain, color = torch.zeros(seen.shape[1:]), torch.zeros(len(seen), 1, 3)
+    usable = ~log_values.isnan()
+    values, weight = log_values.nan_to_num(0.0), usable.float()
+    gain, color = torch.zeros(log_values.shape[1:]), torch.zeros(len(log_values), 1, 3)
     for _ in range(ROUNDS):
-        color = (weight * (known - gain)).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(1e-6)
-        gain = (weight * (known - color)).sum(0) / weight.sum(0).clamp_min(1e-6)
+        color = (weight * (values - gain)).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(1e-6)
+        gain = (weight * (values - color)).sum(0) / weight.sum(0).clamp_min(1e-6)
         gain = gain - gain.mean(0)
-        weight = usable / ((known - color - gain).abs() + QUADRATIC_BELOW)
+        weight = usable / ((values - color - gain).abs() + QUADRATIC_BELOW)
     return gain
 
 
-def _error(seen: Float[Tensor, "P V 3"], gain: Float[Tensor, "V 3"]) -> Float[Tensor, " P"]:
+def _error(log_values: Float[Tensor, "P V 3"], gain: Float[Tensor, "V 3"]) -> Float[Tensor, " P"]:
     """Mean relative deviation of the views of each point from their median, after division by the gains."""
-    common = seen - gain
+    common = log_values - gain
     return (common - common.nanmedian(1, keepdim=True).values).abs().nanmean((1, 2))

@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from neilfpp_method.effects.lamps import LampTrial
 from neilfpp_method.effects.place_fit import (
     FIRST_STEPS,
     ROUNDS,
@@ -28,7 +29,7 @@ from neilfpp_method.effects.place_fit import (
     seconds_of_step,
 )
 from neilfpp_method.effects.places import Places
-from neilfpp_method.fields.direction_map import interpolate, map_directions
+from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.structures import Material, Observed
 
@@ -51,6 +52,8 @@ CARRIED_ROUNDS = 2
 
 LOBE_FITS = 3
 """Fits to all pixels that take as long as evidence for the lobe: four to three quarters of them."""
+METAL_FITS = 3
+"""Fits to all pixels that take as long as evidence for metals: four to four fifths of them."""
 MEASURED = 2000
 """Pixels of the products from which `seconds_of_pixel` is estimated."""
 REST = 0.3
@@ -72,6 +75,7 @@ class FirstLight:
         observed: at most `LAMP_PIXELS` pixels of the places, for the search for lamps.
         material: material of these pixels, with the same base colour everywhere. In the fit the base colour
             of each place is free, so that it contains the light of lamps.
+        lamp_trial: measures whether lamps explain held-back views better.
     """
 
     log_radiance: Float[Tensor, "3 H W"]
@@ -81,8 +85,9 @@ class FirstLight:
     places: int
     observed: Observed
     material: Material
+    lamp_trial: LampTrial
 
-    def in_words(self) -> str:
+    def summary(self) -> str:
         """One line for the console."""
         ends = self.errors[SCALES[0]], self.errors[SCALES[-1]]
         bounded = min(self.errors.values()) < min(ends)
@@ -127,31 +132,42 @@ def find_first_light(places: Places, transport: Transport, typical: float, metal
     drawn = torch.randperm(len(places.place), device=places.place.device)[:LAMP_PIXELS]
     material = best.material(places.place[drawn])
     even = Material(mean.base_color.expand(len(drawn), 3), material.roughness, material.metallic)
-    observed = places.observed[drawn]
-    return FirstLight(best.log_radiance, mean, errors, scale, len(numbers), observed, even)
+    start = _rescaled(fits, scale)
+
+    def refit(changed: Transport) -> PlaceFit:
+        return fit_places(known[0], changed, typical, metals, scale, start, CARRIED_ROUNDS)
+
+    trial = LampTrial(*known, *unknown, typical, refit)
+    return FirstLight(
+        best.log_radiance, mean, errors, scale, len(numbers), places.observed[drawn], even, trial
+    )
 
 
-def seconds_of_pixel(device: torch.device, with_lobe: bool) -> float:
+def seconds_of_pixel(device: torch.device, with_lobe: bool, with_metals: bool) -> float:
     """Estimate how long the search takes here for each pixel that places have.
 
     Args:
         device: where it is done.
         with_lobe: whether evidence for the lobe of highlights is measured, too.
+        with_metals: whether evidence for metals is measured, too.
     """
     whole = FIRST_STEPS + (ROUNDS - 1) * STEPS
     carried = CARRIED_ROUNDS * STEPS
-    steps = (1 - 1 / FOLDS) * (whole + (len(SCALES) - 1) * carried) + carried
-    steps += LOBE_FITS * whole if with_lobe else 0
+    # The scales, the two fits with and without lamps, and the final one to all views.
+    steps = (1 - 1 / FOLDS) * (whole + (len(SCALES) + 1) * carried) + carried
+    steps += (LOBE_FITS * with_lobe + METAL_FITS * with_metals) * whole
     return (1 + REST) * steps * seconds_of_step(MEASURED, device) / MEASURED
 
 
 @torch.no_grad()
 def start_with(model: NeilfModel, found: FirstLight) -> None:
     """Set the light of a model, and the initial material of its untrained BRDF field."""
-    light = model.light.log_radiance
-    directions = map_directions(*light.shape[1:]).to(light)
-    resampled = interpolate(found.log_radiance, directions).permute(2, 0, 1)
-    light.copy_(resampled.mean(0, keepdim=True) if model.config.light.monochrome else resampled)
+    log_radiance = found.log_radiance
+    model.light.resample(
+        log_radiance.mean(0, keepdim=True).expand_as(log_radiance)
+        if model.config.light.monochrome
+        else log_radiance
+    )
     model.brdf.start_at(found.mean)
 
 

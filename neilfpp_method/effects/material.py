@@ -1,10 +1,8 @@
-"""Evidence for specular reflection, metals, varying roughness, an environment map and its colours.
+"""Evidence for specular reflection, varying roughness, an environment map and its colours.
 
-Places that many views show are fitted with each of these effects and without it. A single view of a metal can
-also be explained by a dark glossy dielectric under a bright light, and vice versa; only the change from view
-to view distinguishes the two. So light and materials are fitted to most of the views, and the fits are
-compared at pixels of the held-back views. Metals are decided first; all other effects are then measured with
-metals if these are accepted. Lamps are not part of the fits.
+Places that many views show are fitted with all of these effects, and from that fit on without each of them.
+The fits use most of the views and are compared at pixels of the held-back views. Lamps are not part of the
+fits, and metals are if the model has them (`effects.metals` decides).
 
 The base colour of every place is free. A place without specular reflection therefore contains no information
 about the light, and the benefit of an environment map and of its colours is underestimated.
@@ -24,7 +22,6 @@ from neilfpp_method.effects.measurement import Measurement, mean_of
 from neilfpp_method.effects.noise import lobe_noise
 from neilfpp_method.effects.place_fit import (
     FIRST_STEPS,
-    METALLICS,
     ROUGHNESSES,
     ROUNDS,
     STEPS,
@@ -54,14 +51,14 @@ MIN_VIEWS = 4
 """Minimum number of views per place: fewer do not distinguish materials."""
 WORTH = 0.01
 """Reduction of the relative error above which an effect is worth its cost."""
-FITS = 20
-"""Number of fits of this size to which the measurements at places before one stage amount (estimate): 16
-fits, and the noise of lobe sampling.
+CARRIED_ROUNDS = 2
+"""Alternations of light and material in the fits that are compared, which start from a common fit."""
+FITS = 10
+"""Number of fits of this size to which the measurements at places before one stage amount (estimate): 2 fits,
+14 that start from them and take a quarter of the time, and the noise of lobe sampling.
 """
 REST = 0.5
 """Time of all work other than descent, as a share of that of descent (estimate)."""
-METAL = 0.5
-"""Metallic above which a place is classified as metal."""
 SHARED = (2, 4, 6, 8)
 """Indices in `ROUGHNESSES` that are tried as the common roughness of all places."""
 ANOTHER = 2
@@ -73,7 +70,6 @@ LIGHT_FORMS: Mapping[str, Callable[[Tensor], Tensor]] = {
 """Projection of a map onto the maps that are possible without an effect: a single colour, or grey."""
 SAVED: Mapping[str, str] = {
     "reflection": "reduction of the error in held-back views by specular reflection",
-    "metals": "reduction of the error in held-back views by metals, at places classified as metal",
     "varying-roughness": "reduction of the error in held-back views by varying roughness, where it differs",
     "environment-map": "reduction of the error in held-back views by a map over a single colour",
     "coloured-light": "reduction of the error in held-back views by colours of the map",
@@ -96,7 +92,7 @@ def material_evidence(
     For lobe sampling it is the reduction of the noise of a pixel.
 
     Args:
-        model: provides the surface and R; its material and light are not used.
+        model: provides the surface and R, the lobe, and whether there are metals.
         pixels: the training pixels.
         position: points on the surface, scene frame; the first `PLACES` are used.
         normal: unit normals at these points.
@@ -109,7 +105,7 @@ def material_evidence(
     if not len(places.place):
         return {name: Measurement("views of the same place", 0.0, 0.0, WORTH, 0) for name in names}
     transport = place_transport(places, LOBES[model.config.shading.lobe], model.scene)
-    judged = judge_material(places, transport, model.facts.median_radiance, names)
+    judged = judge_material(places, transport, model.facts.median_radiance, names, model.brdf.metals)
     if "lobe-sampling" in names:
         judged.measured["lobe-sampling"] = lobe_noise(model, places, judged.glossy)
     return judged.measured
@@ -131,7 +127,7 @@ class Judged:
 
     Attributes:
         measured: a measurement for each effect.
-        glossy: a fit with specular reflection, and with metals if these are accepted.
+        glossy: a fit with all effects.
     """
 
     measured: dict[str, Measurement]
@@ -199,10 +195,18 @@ class Trial:
     held_back_transport: Transport
     typical: float
 
-    def fit(self, model: Model) -> Explained:
+    def begin(self, metals: bool) -> PlaceFit:
+        """Fit the model with all effects; the fits that are compared start from it."""
+        return fit_places(self.known, self.transport, self.typical, metals)
+
+    def fit(self, model: Model, start: PlaceFit) -> Explained:
         """Fit a model and evaluate it in the held-back views."""
         transport, typical = model.restrict(self.transport), self.typical
-        fit = fit_places(self.known, transport, typical, model.metals, form=model.form)
+        if not model.metals:
+            start = replace(start, metallic=torch.zeros_like(start.metallic))
+        fit = fit_places(
+            self.known, transport, typical, model.metals, None, start, CARRIED_ROUNDS, model.form
+        )
         if model.roughness is not None:
             fit = replace(fit, roughness=torch.full_like(fit.roughness, model.roughness))
         fitted = place_errors(fit, self.known, transport, typical).mean().item()
@@ -213,7 +217,9 @@ class Trial:
 
 
 @torch.no_grad()
-def judge_material(places: Places, transport: Transport, typical: float, names: frozenset[str]) -> Judged:
+def judge_material(
+    places: Places, transport: Transport, typical: float, names: frozenset[str], metals: bool
+) -> Judged:
     """Measure the reduction of the error in held-back views by each of `names`.
 
     Args:
@@ -221,6 +227,7 @@ def judge_material(places: Places, transport: Transport, typical: float, names: 
         transport: the transport to these pixels (`place_transport`).
         typical: radiance of a typical pixel.
         names: the effects to measure.
+        metals: whether metallic may be greater than 0 in the fits with specular reflection.
     """
     trials = []
     for turn in range(TURNS):
@@ -228,20 +235,20 @@ def judge_material(places: Places, transport: Transport, typical: float, names: 
         known, held_back = torch.nonzero(~is_held_back)[:, 0], torch.nonzero(is_held_back)[:, 0]
         parts = (places.where(known), transport[known], places.where(held_back), transport[held_back])
         trials.append(Trial(*parts, typical))
-    measured: dict[str, Measurement] = {}
+    starts = [trial.begin(metals) for trial in trials]
 
     def fit_all(model: Model) -> list[Explained]:
-        return [trial.fit(model) for trial in trials]
+        return [trial.fit(model, start) for trial, start in zip(trials, starts, strict=True)]
 
-    dielectric = Model()
-    with_metals = replace(dielectric, metals=True)
-    dielectric_fits, metal_fits = fit_all(dielectric), fit_all(with_metals)
-    counted = [_metallic(one.fit) > METAL for one in metal_fits]
-    measured["metals"] = _saved("metals", dielectric_fits, metal_fits, counted)
-    metals = measured["metals"].favours(False) is True
-    glossy, glossy_fits = (with_metals, metal_fits) if metals else (dielectric, dielectric_fits)
+    glossy = Model(metals=metals)
+    glossy_fits = fit_all(glossy)
+    measured: dict[str, Measurement] = {}
     if "varying-roughness" in names:
-        shared = min(SHARED, key=lambda number: trials[0].fit(replace(glossy, roughness=number)).fitted_error)
+
+        def fitted_error(number: int) -> float:
+            return trials[0].fit(replace(glossy, roughness=number), starts[0]).fitted_error
+
+        shared = min(SHARED, key=fitted_error)
         shared_fits = fit_all(replace(glossy, roughness=shared))
         counted = [(one.fit.roughness - shared).abs() >= ANOTHER for one in glossy_fits]
         measured["varying-roughness"] = _saved("varying-roughness", shared_fits, glossy_fits, counted)
@@ -251,11 +258,6 @@ def judge_material(places: Places, transport: Transport, typical: float, names: 
         if name in names:
             measured[name] = _saved(name, fit_all(replace(glossy, form=form)), glossy_fits)
     return Judged({name: measured[name] for name in SAVED if name in names}, glossy_fits[0].fit)
-
-
-def _metallic(fit: PlaceFit) -> Float[Tensor, " P"]:
-    """Metallic of each place."""
-    return torch.tensor(METALLICS, device=fit.metallic.device)[fit.metallic]
 
 
 def _saved(

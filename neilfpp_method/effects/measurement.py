@@ -47,10 +47,10 @@ class Measurement:
             return self.value + 2 * self.deviation > self.threshold
         return self.value > max(2 * self.deviation, self.threshold)
 
-    def in_words(self) -> str:
+    def summary(self) -> str:
         """One clause for the console and the report.
 
-        >>> Measurement("directions that meet the surface", 0.042, 0.003, 0.01, 1024).in_words()
+        >>> Measurement("directions that meet the surface", 0.042, 0.003, 0.01, 1024).summary()
         'directions that meet the surface: 4.20 ± 0.30 % (threshold 1 %)'
         """
         share = f"{100 * self.value:.2f} ± {100 * self.deviation:.2f} %".replace("-", "\N{MINUS SIGN}")

@@ -112,9 +112,9 @@ def gather_places(
         if model.facts.response == "srgb":
             same = same & (batch.color.amax(-1) < CLIPPED)
             linear = srgb_to_linear(linear)
-        kept = torch.nonzero(same)[:, 0]
-        observed = Observed(hits.position[kept], hit_normal[kept], -batch.directions[kept], linear[kept])
-        parts.append(Places(len(position), place[kept], torch.full_like(kept, number), observed))
+        rows = torch.nonzero(same)[:, 0]
+        observed = Observed(hits.position[rows], hit_normal[rows], -batch.directions[rows], linear[rows])
+        parts.append(Places(len(position), place[rows], torch.full_like(rows, number), observed))
     if not parts:
         none = torch.zeros(0, dtype=torch.long, device=position.device)
         return Places(len(position), none, none, Observed(*[position[:0]] * 4))

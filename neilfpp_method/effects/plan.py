@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from neilfpp_method.effects.asked import Asked
 from neilfpp_method.effects.catalogue import EFFECTS, switched
 from neilfpp_method.effects.measurement import Measurement
+from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.settings.types import NeilfConfig
 
 __all__ = ["Decision", "Plan", "decided_settings"]
@@ -65,38 +65,38 @@ class Plan:
     """The effects of a run.
 
     Attributes:
-        asked: the value of `--effects`.
+        request: the value of `--effects`.
         settings: the settings of the run before any decision.
         decisions: all decisions in order; the newest one on each effect holds.
     """
 
-    asked: Asked
+    request: EffectRequest
     settings: NeilfConfig
     decisions: list[Decision] = field(default_factory=list)
 
     @staticmethod
-    def begin(asked: Asked, settings: NeilfConfig) -> Plan:
+    def begin(request: EffectRequest, settings: NeilfConfig) -> Plan:
         """A plan with the decisions that need no measurement."""
-        plan = Plan(asked, settings)
+        plan = Plan(request, settings)
 
         def decide(name: str, on: bool, by: By, reason: str) -> None:
             plan.decisions.append(Decision(0, name, on, by, reason))
 
         for name, effect in EFFECTS.items():
             obstacle, is_on = effect.obstacle(settings), effect.is_on(settings)
-            if name in asked.named:
-                sign = "+" if asked.named[name] else "-"
-                decide(name, asked.named[name], "asked", f"--effects {sign}{name}")
+            if name in request.named:
+                sign = "+" if request.named[name] else "-"
+                decide(name, request.named[name], "asked", f"--effects {sign}{name}")
             elif obstacle:
                 decide(name, is_on, "settings", obstacle)
-            elif asked.base in ("all", "none"):
-                decide(name, asked.base == "all", "asked", f"--effects {asked.base}")
-            elif asked.base == "as-set":
+            elif request.base in ("all", "none"):
+                decide(name, request.base == "all", "asked", f"--effects {request.base}")
+            elif request.base == "as-set":
                 decide(name, is_on, "settings", f"{'on' if is_on else 'off'} in the settings")
             elif not is_on:
                 decide(name, False, "settings", "off in the settings")
-            elif effect.unjudged(settings):
-                decide(name, True, "settings", effect.unjudged(settings))
+            elif effect.not_measured(settings):
+                decide(name, True, "settings", effect.not_measured(settings))
         plan._leave_out_dependent_effects()
         return plan
 
@@ -137,7 +137,7 @@ class Plan:
             reason = f"requires {effect.needs}, which is off"
             self.decisions.append(Decision(0, name, False, cause.by, reason))
 
-    def decide(self, name: str, measured: Measurement, step: int, must_be_earned: bool = False) -> Decision:
+    def decide(self, name: str, measured: Measurement, step: int, starts_off: bool = False) -> Decision:
         """Decide an open effect by evidence and record the decision.
 
         The effect stays as it is if there are too few samples, or if evidence only advises (see
@@ -147,14 +147,14 @@ class Plan:
             name: name of the effect.
             measured: the evidence.
             step: number of steps trained so far.
-            must_be_earned: whether the effect counts as off so far, even if the settings have it on, so that
+            starts_off: whether the effect counts as off so far, even if the settings have it on, so that
                 only significant evidence keeps it on (see `Measurement.favours`).
         """
         before = self.is_on(name)
-        favoured = measured.favours(before and not must_be_earned)
+        favoured = measured.favours(before and not starts_off)
         advised = EFFECTS[name].advised
         on = before if favoured is None or advised else favoured
-        reason = f"{measured.in_words()}; shown as advice only" if advised else measured.in_words()
+        reason = f"{measured.summary()}; shown as advice only" if advised else measured.summary()
         if favoured is None:
             reason = f"not decided: only {measured.samples} samples of the {measured.what}"
         elif self.newest(name) is not None and on != before:

@@ -52,7 +52,7 @@ def rows(plan: Plan) -> list[dict[str, Any]]:
 def table(plan: Plan) -> Table:
     """A table of the effects for the terminal. From 80 columns on, lines break between words only."""
     result = Table(
-        title=f"effects ({plan.asked})", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
+        title=f"effects ({plan.request})", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
     )
     result.add_column("effect", no_wrap=True)
     result.add_column("decision", no_wrap=True)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.evaluate import metrics

@@ -1,4 +1,10 @@
-"""Radiance beyond the scene sphere: an inverted-sphere radiance field (NeRF++, Zhang et al. 2020, §4)."""
+"""Radiance beyond the scene sphere: an inverted-sphere radiance field (NeRF++, Zhang et al. 2020, §4).
+
+With frequency encodings the field is that of NeRF++. With a hash grid, the space beyond the sphere is
+contracted into a shell (mip-NeRF 360, Barron et al. 2022, eq. 10), and a grid of that shell encodes
+positions. It learns the background as fast as the grids of G and R learn the scene; while the background is
+unknown, density in front of the cameras explains it.
+"""
 
 from __future__ import annotations
 
@@ -7,26 +13,33 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from neilfpp_method.fields.encodings import FrequencyEncoding
+from neilfpp_method.fields.encodings import FrequencyEncoding, HashGrid, position_encoding
 from neilfpp_method.fields.mlp import Mlp
-from neilfpp_method.settings.types import BackgroundConfig
+from neilfpp_method.settings.types import BackgroundConfig, FrequencyConfig, HashGridConfig
 from neilfpp_method.volume.compositing import composite, render_weights
 
-__all__ = ["InvertedSphere", "field_beyond"]
+__all__ = ["InvertedSphere", "background_field"]
 
 POSITION_OCTAVES, DIRECTION_OCTAVES = 10, 4
 """Octaves of the frequency encodings of positions and directions (NeRF++)."""
+SHELL_RADIUS = 2.0
+"""Outer radius of the shell into which the space beyond the sphere is contracted; the inner one is 1."""
 MIN_START = 1e-2
 """Smallest distance of the initial radiance from both ends of the sigmoid's range, relative to the range."""
 START_SCALE = 1e-3
 """Factor on the initial weights of the last layer, so that the field starts as an almost constant color."""
 
 
-def field_beyond(
-    kind: str, config: BackgroundConfig, radius: float, scale: float, start: Float[Tensor, " 3"]
+def background_field(
+    kind: str,
+    config: BackgroundConfig,
+    encoding: FrequencyConfig | HashGridConfig,
+    radius: float,
+    scale: float,
+    start: Float[Tensor, " 3"],
 ) -> InvertedSphere | None:
     """Make an `InvertedSphere` if `kind` is "inverted_sphere"; otherwise return None."""
-    return InvertedSphere(config, radius, scale, start) if kind == "inverted_sphere" else None
+    return InvertedSphere(config, encoding, radius, scale, start) if kind == "inverted_sphere" else None
 
 
 class InvertedSphere(nn.Module):
@@ -37,6 +50,7 @@ class InvertedSphere(nn.Module):
 
     Args:
         config: the settings.
+        encoding: kind and sizes of the position encoding.
         radius: radius of the scene sphere.
         scale: largest radiance.
         start: initial linear RGB, the same in all directions. None: half of the largest radiance.
@@ -45,6 +59,7 @@ class InvertedSphere(nn.Module):
     def __init__(
         self,
         config: BackgroundConfig,
+        encoding: FrequencyConfig | HashGridConfig,
         radius: float,
         scale: float,
         start: Float[Tensor, " 3"] | None = None,
@@ -53,7 +68,11 @@ class InvertedSphere(nn.Module):
         self.radius = radius
         self.scale = scale
         self.samples = config.samples
-        self.position = FrequencyEncoding(POSITION_OCTAVES, dimensions=4)
+        self.position = (
+            FrequencyEncoding(POSITION_OCTAVES, dimensions=4)
+            if isinstance(encoding, FrequencyConfig)
+            else position_encoding(encoding, SHELL_RADIUS)
+        )
         self.direction = FrequencyEncoding(DIRECTION_OCTAVES)
         width = config.width
         self.trunk = Mlp(
@@ -75,8 +94,7 @@ class InvertedSphere(nn.Module):
         """
         inverse = self._inverse_radii(origins)
         points = _on_sphere(origins, directions, 1 / inverse)
-        chart = torch.cat((points, inverse[None, :, None].expand(len(points), -1, 1)), -1)
-        trunk = self.trunk(self.position(chart))
+        trunk = self.trunk(self._encoded(points, inverse))
         # Scaled by the radius, as 1/r spans [0, 1/radius]: initially half of the light passes all samples, so
         # that all of them get a gradient.
         density = self.radius * functional.softplus(trunk[..., 0])
@@ -85,6 +103,16 @@ class InvertedSphere(nn.Module):
         travelled = (1 / self.radius - inverse).expand(len(points), -1)
         weights = render_weights(density, travelled, origins.new_full((len(points),), 1 / self.radius))
         return composite(weights.weights, color) + weights.transmittance[:, None] * color[:, -1]
+
+    def _encoded(
+        self, points: Float[Tensor, "N M 3"], inverse: Float[Tensor, " M"]
+    ) -> Float[Tensor, "N M F"]:
+        """Features of the unit vectors `points` at the inverse radii `inverse`."""
+        if isinstance(self.position, HashGrid):
+            contracted = points * (SHELL_RADIUS - self.radius * inverse)[:, None]
+            return self.position(contracted.flatten(0, 1)).view(*points.shape[:2], -1)
+        chart = torch.cat((points, inverse[None, :, None].expand(len(points), -1, 1)), -1)
+        return self.position(chart)
 
     def _inverse_radii(self, like: Tensor) -> Float[Tensor, " M"]:
         steps = torch.arange(self.samples, dtype=like.dtype, device=like.device) + 0.5

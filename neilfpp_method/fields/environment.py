@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from neilfpp_method.fields.direction_map import interpolate, texels_of
+from neilfpp_method.fields.direction_map import interpolate, map_directions, texels_of
 from neilfpp_method.shading.color import luminance
 from neilfpp_method.shading.sampling import Technique
 from neilfpp_method.structures import IncidentSamples
@@ -79,6 +79,12 @@ class EnvironmentLight(nn.Module):
         """
         self._resize(*radiance.shape[1:])
         self.log_radiance.copy_(radiance.clamp_min(MIN_RADIANCE * radiance.mean()).log())
+
+    @torch.no_grad()
+    def resample(self, log_radiance: Float[Tensor, "3 H W"]) -> None:
+        """Set the map to that of another size, interpolated in log radiance; its own size does not change."""
+        directions = map_directions(*self.log_radiance.shape[1:]).to(self.log_radiance)
+        self.log_radiance.copy_(interpolate(log_radiance, directions).permute(2, 0, 1))
 
     @torch.no_grad()
     def at_most(self, height: int) -> EnvironmentLight:

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from neilfpp_method.health.look import Look
+from neilfpp_method.health.measure import SurfaceMeasurement
 
 __all__ = [
     "Finding",
@@ -99,26 +99,27 @@ class Health:
         return self.verdict + (": " + "; ".join(f.what for f in self.findings) if self.findings else "")
 
 
-def surface_findings(seen: Look, step: int) -> list[Finding]:
+def surface_findings(measured: SurfaceMeasurement, step: int) -> list[Finding]:
     """Findings on the surface, at the end of a stage that trains it or later."""
-    if seen.opaque < MIN_OPAQUE:
+    if measured.opaque < MIN_OPAQUE:
         return [
             Finding(
                 "no_surface",
                 True,
                 step,
-                f"{seen.opaque:.0%} of the object's pixels show anything at all",
+                f"{measured.opaque:.0%} of the object's pixels show anything at all",
                 "a scene box that misses the object, or masks that are inverted",
                 "look at the picture of `neilfpp inspect`",
             )
         ]
-    if seen.sharp < MIN_SHARP:
+    if measured.sharp < MIN_SHARP:
         return [
             Finding(
                 "fog",
                 True,
                 step,
-                f"only {seen.sharp:.0%} of the rays that show something meet one surface: the scene is fog",
+                f"only {measured.sharp:.0%} of the rays that show something meet one surface: the scene is "
+                "fog",
                 "a scene box that holds the cameras, or too few views, steps or masks",
                 "look at `neilfpp inspect`, give masks, or more --config.train.sdf-steps",
             )
@@ -126,16 +127,16 @@ def surface_findings(seen: Look, step: int) -> list[Finding]:
     return []
 
 
-def material_findings(seen: Look, step: int) -> list[Finding]:
+def material_findings(measured: SurfaceMeasurement, step: int) -> list[Finding]:
     """Findings on the material."""
-    if seen.at_bound is None or seen.at_bound <= MAX_AT_BOUND:
+    if measured.at_bound is None or measured.at_bound <= MAX_AT_BOUND:
         return []
     return [
         Finding(
             "material_at_bounds",
             False,
             step,
-            f"the base colour of {seen.at_bound:.0%} of the surface is black or white",
+            f"the base colour of {measured.at_bound:.0%} of the surface is black or white",
             "a light whose scale is off",
             "give the light with --light, or look at docs/light.md",
         )

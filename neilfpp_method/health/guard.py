@@ -51,7 +51,7 @@ class StepGuard:
 
     def watch(self, optimizer: Optimizer) -> None:
         """Check the gradients of this and all other watched optimizers before each step of the optimizer."""
-        if not any(optimizer is known for known in self._optimizers):
+        if not any(optimizer is watched for watched in self._optimizers):
             self._optimizers.append(optimizer)
             optimizer.register_step_pre_hook(self._before_step)
 
@@ -74,23 +74,23 @@ class StepGuard:
         if self._judged:
             return
         self._judged = True
-        culprit = self._culprit()
-        if culprit is None:
+        name = self._first_not_finite()
+        if name is None:
             self._in_a_row = 0
             return
         for optimizer in self._optimizers:
             optimizer.zero_grad(set_to_none=True)
         self.skipped += 1
         self._in_a_row += 1
-        self.warn(f"step {self._step} skipped: {culprit} is not finite ({self.skipped} skipped so far)")
+        self.warn(f"step {self._step} skipped: {name} is not finite ({self.skipped} skipped so far)")
         if self._in_a_row >= MAX_SKIPPED_IN_A_ROW:
             raise Diverged(
-                f"{MAX_SKIPPED_IN_A_ROW} steps in a row were not finite, the last one in {culprit}",
+                f"{MAX_SKIPPED_IN_A_ROW} steps in a row were not finite, the last one in {name}",
                 "go back to the last good checkpoint; look at the brightest pixels or lower the learning "
                 "rates",
             )
 
-    def _culprit(self) -> str | None:
+    def _first_not_finite(self) -> str | None:
         """The name of a loss or gradient that is not finite, or None; needs one transfer from the device."""
         groups = [group for optimizer in self._optimizers for group in optimizer.param_groups]
         norms = {}
@@ -99,11 +99,11 @@ class StepGuard:
             if gradients:
                 name = group.get("name", f"group {i}")
                 norms[name] = torch.stack([g.norm() for g in gradients]).norm()
-        known = {f"loss {name}": value.detach() for name, value in self._terms.items()}
-        known |= {f"the gradient of {name}": norm for name, norm in norms.items()}
-        if not known:
+        terms = {f"loss {name}": value.detach() for name, value in self._terms.items()}
+        terms |= {f"the gradient of {name}": norm for name, norm in norms.items()}
+        if not terms:
             return None
-        values = torch.stack([value.to(torch.float32) for value in known.values()]).tolist()
+        values = torch.stack([value.to(torch.float32) for value in terms.values()]).tolist()
         return next(
-            (name for name, value in zip(known, values, strict=True) if not math.isfinite(value)), None
+            (name for name, value in zip(terms, values, strict=True) if not math.isfinite(value)), None
         )

@@ -16,17 +16,17 @@ from neilfpp_method.health.cases import (
     surface_findings,
     verdict_of,
 )
-from neilfpp_method.health.look import Look, look
+from neilfpp_method.health.measure import SurfaceMeasurement, measure_surface
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import StagePlan
 from neilfpp_method.structures import PixelBatch, StepResult
 
-__all__ = ["FILE", "FORMAT", "LOOKED_AT", "Watch"]
+__all__ = ["CHECKED_PIXELS", "FILE", "FORMAT", "Watch"]
 
 FILE = "health.json"
 FORMAT = 1
 """Version of the layout of the file."""
-LOOKED_AT = 512
+CHECKED_PIXELS = 512
 """Number of training pixels that are rendered at the end of a stage: about as many as in a step."""
 
 
@@ -59,21 +59,21 @@ class Watch:
 
     def after_stage(self, model: NeilfModel, plan: StagePlan, skipped: int, step: int) -> None:
         """Measure and check the surface, and the material in a stage that trains it."""
-        self.judge(look(model, self.pixels, plan.moves_material), skipped, step)
+        self.judge(measure_surface(model, self.pixels, plan.moves_material), skipped, step)
 
-    def judge(self, seen: Look, skipped: int, step: int) -> None:
+    def judge(self, measured: SurfaceMeasurement, skipped: int, step: int) -> None:
         """Check a measurement and the number of steps skipped so far."""
-        self._replace(("no_surface", "fog"), surface_findings(seen, step))
-        self._replace(("material_at_bounds",), material_findings(seen, step))
+        self._replace(("no_surface", "fog"), surface_findings(measured, step))
+        self._replace(("material_at_bounds",), material_findings(measured, step))
         self._replace(("skipped_steps",), skipped_steps(skipped, step))
 
     def _replace(self, cases: Sequence[str], findings: Sequence[Finding]) -> None:
         """Replace the findings of some cases, and warn of those that are new."""
-        known = {case: self.findings.pop(case) for case in cases if case in self.findings}
+        before = {case: self.findings.pop(case) for case in cases if case in self.findings}
         for finding in findings:
-            if finding.case not in known:
+            if finding.case not in before:
                 self.warn(finding.line())
-            self.findings[finding.case] = known.get(finding.case, finding)
+            self.findings[finding.case] = before.get(finding.case, finding)
 
     def record(self) -> dict[str, Any]:
         """The content of `health.json`."""

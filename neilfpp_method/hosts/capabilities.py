@@ -78,7 +78,7 @@ CAPABILITIES = (
         base.LimitsSurfaceWidth,
         "training loops",
         "train.optimizer",
-        "the host's own training decides how thin the surface becomes",
+        "the width of the surface depends only on the host's own training",
     ),
     Capability(
         "may_meet",

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor, nn
 
 from neilfpp_method.data.mesh import Mesh
-from neilfpp_method.fields.background import field_beyond
+from neilfpp_method.fields.background import background_field
 from neilfpp_method.fields.outgoing_radiance import MID_GREY, OutgoingRadianceField
 from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_tracer, meet, tree_tracer
 from neilfpp_method.hosts.smooth_normals import NEIGHBOURS, smooth_normals
@@ -78,8 +78,8 @@ class MeshHost(nn.Module):
             config.radiance, config.encoding, 0, radius, radiance_scale, radiance_start
         )
         self.register_buffer("background_color", torch.tensor(background_color))
-        self.background = field_beyond(
-            background, config.background, radius, radiance_scale, self.background_color
+        self.background = background_field(
+            background, config.background, config.encoding, radius, radiance_scale, self.background_color
         )
         triangles = mesh.vertices[mesh.faces]
         across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])

@@ -140,15 +140,15 @@ class SurfaceProxy(nn.Module):
             render: renders rays with the host.
             rays, hits: the first batch and its hits.
         """
-        known = hits.position[hits.is_hit(self.hit_share)].detach()
-        for _ in range(ROUNDS if len(known) else 0):
-            origins = rays.origins[torch.randint(len(rays), (ROUND,), device=known.device)]
-            targets = known[torch.randint(len(known), (ROUND,), device=known.device)]
+        hit_points = hits.position[hits.is_hit(self.hit_share)].detach()
+        for _ in range(ROUNDS if len(hit_points) else 0):
+            origins = rays.origins[torch.randint(len(rays), (ROUND,), device=hit_points.device)]
+            targets = hit_points[torch.randint(len(hit_points), (ROUND,), device=hit_points.device)]
             targets = targets + SPREAD * (2 * torch.rand_like(targets) - 1)
             new_rays = RayBatch(origins, safe_normalize(targets - origins))
             new_hits = render(new_rays).detach()
             self._pending.append((new_rays, new_hits))
-            known = torch.cat((known, new_hits.position[new_hits.is_hit(self.hit_share)]))
+            hit_points = torch.cat((hit_points, new_hits.position[new_hits.is_hit(self.hit_share)]))
         self.refresh()
 
     @torch.no_grad()

@@ -150,9 +150,9 @@ def _colors(case: Case) -> None:
     color = case.hits.color.detach()
     case.require(color.isfinite().all(), "its color is not finite")
     case.require((color >= 0.0).all(), "its color is negative")
-    seen = color[case.hit]
-    clipped = (seen == 1.0).float().mean().item()
-    stops = seen.max() == 1.0 and CLIPPED < clipped < 1.0
+    colors = color[case.hit]
+    clipped = (colors == 1.0).float().mean().item()
+    stops = colors.max() == 1.0 and CLIPPED < clipped < 1.0
     case.require(
         not stops, f"{clipped:.0%} of its colors are exactly 1 and none is above: return them unclipped"
     )
@@ -189,8 +189,8 @@ def _gradients_stop(case: Case) -> None:
     for field in fields(SurfaceHits):
         leaks = getattr(held, field.name).requires_grad
         case.require(not leaks, f"its {field.name} carries a gradient under torch.no_grad: detach it there")
-    kept = all(p.requires_grad and p.grad is g for p, g in zip(case.parameters, before, strict=True))
-    case.require(kept, "rendering changes requires_grad or grad of its parameters")
+    unchanged = all(p.requires_grad and p.grad is g for p, g in zip(case.parameters, before, strict=True))
+    case.require(unchanged, "rendering changes requires_grad or grad of its parameters")
 
 
 def _reaches(case: Case, output: Tensor) -> bool:

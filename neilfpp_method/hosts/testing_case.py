@@ -74,9 +74,9 @@ class Case:
     hits: SurfaceHits
     hit: Tensor
 
-    def require(self, kept: bool | Tensor, broken: str) -> None:
-        """Raise `ContractBroken` with the message `broken` unless `kept` is true."""
-        if not kept:
+    def require(self, passed: bool | Tensor, broken: str) -> None:
+        """Raise `ContractBroken` with the message `broken` unless `passed` is true."""
+        if not passed:
             raise ContractBroken(f"{self.name}: {broken}")
 
     def seeded(self, rays: RayBatch, seed: int = 0) -> SurfaceHits:

@@ -69,19 +69,19 @@ def _repeatable(case: Case) -> None:
 
 def _same_without_gradient(case: Case) -> None:
     with torch.enable_grad():
-        kept = case.seeded(case.rays).detach()
+        recorded = case.seeded(case.rays).detach()
     for name in ("color", "position", "normal"):
         same = torch.allclose(
-            getattr(kept, name), getattr(case.constants(case.rays), name), rtol=1e-3, atol=1e-4
+            getattr(recorded, name), getattr(case.constants(case.rays), name), rtol=1e-3, atol=1e-4
         )
         case.require(same, f"its {name} differs under torch.no_grad")
 
 
 def _keeps_what_it_gave(case: Case) -> None:
     first = case.constants(case.rays)
-    kept = [getattr(first, field.name).clone() for field in fields(SurfaceHits)]
+    copies = [getattr(first, field.name).clone() for field in fields(SurfaceHits)]
     case.constants(RayBatch(case.rays.origins, case.rays.directions.roll(1, dims=0)))
-    for field, before in zip(fields(SurfaceHits), kept, strict=True):
+    for field, before in zip(fields(SurfaceHits), copies, strict=True):
         same = torch.equal(getattr(first, field.name), before)
         case.require(same, f"its {field.name} changes when it renders again: return a copy, not a buffer")
 

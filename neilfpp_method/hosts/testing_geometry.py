@@ -40,12 +40,12 @@ def _in_the_sphere(case: Case) -> None:
 
 def _another_view(case: Case) -> None:
     position, distance, aside = _places(case)
-    _look_again(case, position, normalize(aside, dim=-1), distance, "another view")
+    _require_same_hits(case, position, normalize(aside, dim=-1), distance, "another view")
 
 
 def _from_afar(case: Case) -> None:
     position, distance, _ = _places(case)
-    _look_again(
+    _require_same_hits(
         case, position, -case.rays.directions[case.hit], 2 * distance, "twice the distance", "a far plane?"
     )
 
@@ -53,7 +53,7 @@ def _from_afar(case: Case) -> None:
 def _from_close_by(case: Case) -> None:
     position, distance, aside = _places(case)
     broken = "light between surfaces would not see it (a near plane?)"
-    _look_again(
+    _require_same_hits(
         case, position, normalize(aside, dim=-1), torch.full_like(distance, NEAR), f"{NEAR} away", broken
     )
 
@@ -64,13 +64,13 @@ def _normals_of_neighbours(case: Case) -> None:
     side = normalize(torch.linalg.cross(d, d.roll(1, dims=-1) + torch.tensor([0.3, 0.1, -0.2]).to(d)), dim=-1)
     up = torch.linalg.cross(d, side)
     origins = case.rays.origins[case.hit]
-    found = [
+    neighbours = [
         case.constants(RayBatch(origins + sign * BESIDE * axis, d)) for axis in (side, up) for sign in (1, -1)
     ]
-    across, along = (a.position - b.position for a, b in (found[:2], found[2:]))
-    seen = torch.stack([f.is_hit(HIT_SHARE) for f in found]).all(0)
+    across, along = (a.position - b.position for a, b in (neighbours[:2], neighbours[2:]))
+    hit_by_all = torch.stack([f.is_hit(HIT_SHARE) for f in neighbours]).all(0)
     near = torch.stack([across.norm(dim=-1), along.norm(dim=-1)]).amax(0) < 2 * STEEP * BESIDE
-    rows = seen & near
+    rows = hit_by_all & near
     if rows.sum() < 8:
         # The surface is too small or too rough for a decision.
         return
@@ -89,14 +89,14 @@ def _places(case: Case) -> tuple[Tensor, Tensor, Tensor]:
     return position, (position - case.rays.origins[case.hit]).norm(dim=-1), normal + back + ASIDE * tangent
 
 
-def _look_again(
-    case: Case, position: Tensor, way: Tensor, distance: Tensor, whence: str, broken: str = ""
+def _require_same_hits(
+    case: Case, position: Tensor, way: Tensor, distance: Tensor, viewpoint: str, broken: str = ""
 ) -> None:
     start = position + distance[:, None] * way
     again = case.constants(RayBatch(start, -way))
     apart = (again.position - position).norm(dim=-1)
     same = (again.is_hit(HIT_SHARE) & (apart <= APART + 2 * case.width)).float().mean().item()
-    lost = f"{1 - same:.0%} of its hits have another position when seen from {whence}"
+    lost = f"{1 - same:.0%} of its hits have another position when seen from {viewpoint}"
     case.require(same >= AGREE, f"{lost}: {broken or 'is the depth a distance along the ray?'}")
 
 

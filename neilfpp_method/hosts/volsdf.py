@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from neilfpp_method import losses
-from neilfpp_method.fields.background import field_beyond
+from neilfpp_method.fields.background import background_field
 from neilfpp_method.fields.outgoing_radiance import MID_GREY, OutgoingRadianceField
 from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.base import RegularisedHits
@@ -23,7 +23,7 @@ from neilfpp_method.volume.compositing import Weights, composite, depth_weights,
 from neilfpp_method.volume.density import LaplaceDensity, laplace_depth
 from neilfpp_method.volume.distance_grid import GRID_RESOLUTION, cell_size, sample_grid, trace_grid
 from neilfpp_method.volume.empty_space import EmptySpace
-from neilfpp_method.volume.free_space import FreeSpace, cameras_within
+from neilfpp_method.volume.free_space import FreeSpace, free_balls
 from neilfpp_method.volume.intersect import Interval, sphere_interval
 from neilfpp_method.volume.samplers import error_bounded_samples
 
@@ -99,11 +99,11 @@ class VolSdfHost(nn.Module):
         )
         self.density = LaplaceDensity(config.volume.beta_init)
         self.register_buffer("background_color", torch.tensor(background_color))
-        self.background = field_beyond(
-            background, config.background, radius, radiance_scale, self.background_color
+        self.background = background_field(
+            background, config.background, config.encoding, radius, radiance_scale, self.background_color
         )
-        within = torch.empty(0, 3) if cameras is None else cameras_within(cameras, radius)
-        self.free_space = FreeSpace(within, radius) if len(within) else None
+        balls = None if cameras is None else free_balls(cameras, self.point_position, radius)
+        self.free_space = None if balls is None else FreeSpace(balls, radius)
         self.empty_space = EmptySpace(radius) if config.volume.skip_empty else None
         hard = config.inter_reflection.mode == "hard"
         resolution = GRID_RESOLUTION if hard else 0

@@ -71,8 +71,8 @@ def trace_light(
     worth = (start - position).norm(dim=-1) <= MAX_START
     if isinstance(host, KnowsMisses):
         worth &= host.may_meet(RayBatch(start, wi))
-    kept = torch.nonzero(worth)[:, 0]
-    position, start, wi = position[kept], start[kept], wi[kept]
+    rows = torch.nonzero(worth)[:, 0]
+    position, start, wi = position[rows], start[rows], wi[rows]
     with torch.set_grad_enabled(torch.is_grad_enabled() and config.radiance_gradient > 0.0):
         hits = host.render(RayBatch(start, wi))
     radiance = scale_gradient(hits.color, config.radiance_gradient)

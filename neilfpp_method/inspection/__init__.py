@@ -1,1 +1,1 @@
-"""What is in a capture, and what is wrong with it: figures of views, findings and a verdict."""
+"""Inspect a capture: figures of its views, findings on defects, and a verdict on its radiance."""

@@ -1,4 +1,4 @@
-"""`neilfpp inspect`: the findings on the terminal, as JSON and as a picture."""
+"""Run `neilfpp inspect`: print the findings, and write them as JSON and as a picture."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ def run_inspection(
     strict: bool,
     console: Console,
 ) -> None:
-    """Inspect a capture and say what is in it.
+    """Inspect a capture and print a report.
 
     Args:
-        root: the capture's folder.
-        out: where `inspect.json` and `inspect.png` go; none: they are not written.
-        format: the capture's format; none: found out.
-        response: what the pixels are; auto: told from the files.
-        strict: end with status 1 where there is a problem.
-        console: where the report goes.
+        root: the folder of the capture.
+        out: folder for `inspect.json` and `inspect.png`; None: they are not written.
+        format: the layout of the capture; None: it is detected.
+        response: meaning of the pixel values; "auto": as the files state.
+        strict: whether to end with status 1 if there is a problem.
+        console: the console for the report.
 
     Raises:
-        UserError: the folder holds no capture that can be loaded.
-        EarlyEnd: `strict`, and there is a problem.
+        UserError: the folder has no capture that can be loaded.
+        EarlyEnd: `strict` is set, and there is a problem.
     """
     capture = load_capture(root, format=format, response=response)
     columns = (TextColumn("reading images"), BarColumn(), MofNCompleteColumn())
@@ -62,12 +62,15 @@ def run_inspection(
         console.print(f"written to {out}", highlight=False)
     problems = sum(finding.severity == "problem" for finding in inspection.findings)
     if strict and problems:
-        raise EarlyEnd(f"{root}: {problems} problem{'s' * (problems != 1)}", "the remedies stand beside them")
+        raise EarlyEnd(
+            f"{root}: {problems} problem{'s' * (problems != 1)}",
+            "see the remedies above",
+        )
 
 
 def to_json(inspection: Inspection) -> dict[str, Any]:
-    """The inspection as plain values."""
-    capture, where = inspection.capture, inspection.stand
+    """Return the inspection as plain values, the content of `inspect.json`."""
+    capture, placement = inspection.capture, inspection.placement
     figures = ("luminance", "stops", "sharpness", "clipped", "invalid", "broken", "pixels", "levels")
     return {
         "capture": {
@@ -81,8 +84,8 @@ def to_json(inspection: Inspection) -> dict[str, Any]:
             "point_cloud": capture.point_cloud is not None,
             "scene": {"centre": list(capture.normalisation.centre), "radius": capture.normalisation.scale},
             "scene_from": capture.scene_from,
-            "coverage": where.coverage,
-            "degrees_between_views": where.gap,
+            "coverage": placement.coverage,
+            "degrees_between_views": placement.gap,
         },
         "verdict": {"quality": inspection.verdict.quality, "text": inspection.verdict.text},
         "findings": [
@@ -116,14 +119,14 @@ def _print(inspection: Inspection, console: Console) -> None:
     def say(*parts: str | tuple[str, str]) -> None:
         console.print(Text.assemble(*parts), soft_wrap=True)
 
-    where, verdict = inspection.stand, inspection.verdict
+    placement, verdict = inspection.placement, inspection.verdict
     say(inspection.capture.summary)
     say(
-        f"cameras: {where.gap:.0f}° from one to the next; {100 * where.coverage:.0f} % of all directions are "
-        "covered"
+        f"cameras: a median angle of {placement.gap:.0f}° to the nearest camera; they cover "
+        f"{100 * placement.coverage:.0f} % of all directions"
     )
     say("radiance: ", (verdict.quality, STYLES[verdict.quality]), f"; {verdict.text}")
     if not inspection.findings:
-        say(("nothing is wrong with it", STYLES["good"]))
+        say(("no problems found", STYLES["good"]))
     for finding in inspection.findings:
         say((finding.severity, STYLES[finding.severity]), f": {finding.line()}")

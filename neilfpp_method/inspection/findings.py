@@ -1,4 +1,4 @@
-"""Findings about a capture: figures that exceed limits, with remedies, and a verdict."""
+"""Find defects of a capture: figures that exceed limits, with remedies, and a verdict."""
 
 from __future__ import annotations
 
@@ -12,7 +12,12 @@ from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.point_cloud import load_point_cloud
 from neilfpp_method.errors import UserError
 from neilfpp_method.inspection.measure import ViewFigures, measure
-from neilfpp_method.inspection.relations import Stand, duplicates, exposure_factors, stand
+from neilfpp_method.inspection.relations import (
+    CameraPlacement,
+    camera_placement,
+    duplicates,
+    exposure_factors,
+)
 
 __all__ = [
     "Finding",
@@ -21,7 +26,7 @@ __all__ = [
     "inspect_capture",
     "problems",
     "problems_of_poses",
-    "to_leave_out",
+    "views_to_leave_out",
 ]
 
 Severity = Literal["problem", "warning"]
@@ -46,7 +51,7 @@ EDGE, STRAY_POINTS, SMALL_CLOUD = 1.05, 0.1, 0.2
 """Distance from the centre beyond which a point is outside the box, in scene units; share of such points that
 is reported; extent below which the object is small for its box, in scene units."""
 DISPLAY_LEVELS = 256
-"""Number of levels of 8-bit images: linear radiance with so few levels was converted from them."""
+"""Number of levels of 8-bit images. Linear images with so few levels were converted from 8-bit images."""
 PIXELS_PER_LEVEL = 16
 """Smallest number of pixels per level with which the number of levels is meaningful."""
 BETTER_WITHOUT: Mapping[str, str] = {
@@ -75,7 +80,7 @@ class Finding:
     views: tuple[str, ...] = ()
 
     def line(self) -> str:
-        """For the terminal, without its severity."""
+        """The finding in one line for the console, without its severity."""
         rest = f" and {len(self.views) - MAX_NAMED} more" if len(self.views) > MAX_NAMED else ""
         named = f" [{', '.join(self.views[:MAX_NAMED])}{rest}]" if self.views else ""
         return f"{self.text}{named}; {self.remedy}"
@@ -91,56 +96,66 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Inspection:
-    """All that was found; `views`, `factors` and the views of `stand` are in the capture's order."""
+    """The result of an inspection.
+
+    Attributes:
+        capture: the capture.
+        views: figures of each view, in the order of the capture.
+        placement: the placement of the cameras, in the same order.
+        factors: brightness of each view relative to its neighbours (`exposure_factors`), in the same order.
+        findings: the defects, problems first.
+        verdict: the quality of the radiance.
+    """
 
     capture: Capture
     views: tuple[ViewFigures, ...]
-    stand: Stand
+    placement: CameraPlacement
     factors: tuple[float, ...]
     findings: tuple[Finding, ...]
     verdict: Verdict
 
 
 def inspect_capture(capture: Capture, on_view: Callable[[str], None] = lambda name: None) -> Inspection:
-    """Look at every view of a capture.
+    """Inspect a capture; this reads every image.
 
     Args:
         capture: the capture.
-        on_view: called with the name of each view once it is measured.
+        on_view: called with the name of each view after it has been measured.
     """
     views = []
     for view in capture.views:
         views.append(measure(view, capture.hdr))
         on_view(view.name)
-    where = stand(capture)
-    factors = tuple(exposure_factors([view.luminance for view in views], where).tolist())
-    findings = (*_of_views(views, factors, capture), *_of_cameras(capture, where), *_of_scene(capture))
+    placement = camera_placement(capture)
+    factors = tuple(exposure_factors([view.luminance for view in views], placement).tolist())
+    findings = (*_of_views(views, factors, capture), *_of_cameras(capture, placement), *_of_scene(capture))
     verdict = _verdict(capture, views, findings)
     order = {"problem": 0, "warning": 1}
     ranked = tuple(sorted(findings, key=lambda finding: order[finding.severity]))
-    return Inspection(capture, tuple(views), where, factors, ranked, verdict)
+    return Inspection(capture, tuple(views), placement, factors, ranked, verdict)
 
 
 def problems(inspection: Inspection) -> tuple[str, ...]:
-    """What spoils or prevents a result, in lines for people."""
+    """Return one line for the console per finding that is a problem."""
     return tuple(
         f"problem: {finding.line()}" for finding in inspection.findings if finding.severity == "problem"
     )
 
 
 def problems_of_poses(capture: Capture) -> tuple[str, ...]:
-    """As `problems`, of what cameras and points tell without a look at any pixel, so at once."""
-    found = (*_of_cameras(capture, stand(capture)), *_of_scene(capture))
+    """The same as `problems`, for cameras and point cloud only; fast, because no image is read."""
+    found = (*_of_cameras(capture, camera_placement(capture)), *_of_scene(capture))
     return tuple(f"problem: {finding.line()}" for finding in found if finding.severity == "problem")
 
 
-def to_leave_out(inspection: Inspection) -> Mapping[str, str]:
-    """The views that a capture is better without, and why: black ones, blurred ones, and duplicates.
+def views_to_leave_out(inspection: Inspection) -> Mapping[str, str]:
+    """Return the views that should be left out: black ones, blurred ones, and duplicates.
 
-    None where too few would remain.
+    Returns:
+        The reason by the name of the view; empty if too few views would remain.
 
     Example:
-        >>> to_leave_out(inspect_capture(load_capture("captures/teapot")))
+        >>> views_to_leave_out(inspect_capture(load_capture("captures/teapot")))
         {'IMG_0017': 'blurred'}
     """
     proposed = {
@@ -172,7 +187,7 @@ def _of_views(views: Sequence[ViewFigures], factors: Sequence[float], capture: C
         yield Finding(
             "black",
             "problem",
-            "no pixel of the object is lit",
+            "all pixels of the object are black",
             "leave these views out, or correct the masks",
             black,
         )
@@ -207,44 +222,44 @@ def _of_views(views: Sequence[ViewFigures], factors: Sequence[float], capture: C
     if clipped := [view for view in views if view.clipped > CLIPPED_VIEW]:
         worst = max(clipped, key=lambda view: view.clipped)
         text = f"highlights are clipped, up to {100 * worst.clipped:.2g} % of the object ({worst.name})"
-        remedy = "expose shorter, or merge brackets; mark what is clipped in a validity mask"
+        remedy = "use shorter exposures, or merge brackets; mark clipped pixels in a validity mask"
         yield Finding("clipped", "warning", text, remedy, tuple(view.name for view in clipped))
     if invalid := tuple(view.name for view in views if view.invalid > INVALID_VIEW):
         text = "more than half of the pixels are marked as invalid"
         yield Finding("mostly_invalid", "warning", text, "check the validity masks: white is valid", invalid)
     large = [view.levels for view in readable if view.pixels > PIXELS_PER_LEVEL * DISPLAY_LEVELS]
     if capture.hdr and large and max(large) <= DISPLAY_LEVELS:
-        text = f"linear files with {max(large)} levels a channel: 8-bit images in disguise"
+        text = f"linear files with {max(large)} levels per channel: they were converted from 8-bit images"
         yield Finding("few_levels", "problem", text, "develop the RAW files linearly, or merge brackets")
 
 
-def _of_cameras(capture: Capture, where: Stand) -> Iterator[Finding]:
+def _of_cameras(capture: Capture, placement: CameraPlacement) -> Iterator[Finding]:
     names = np.array([view.name for view in capture.views])
-    if where.away.any():
-        text = "the cameras look away: the scene's centre is not in the picture"
+    if placement.away.any():
+        text = "the cameras look away: the centre of the scene is not in the picture"
         remedy = "check the poses and the scene box, or leave these views out"
-        yield Finding("looking_away", "problem", text, remedy, tuple(names[where.away]))
-    if where.within.any():
-        text = "cameras within the unit sphere, which is to hold the object alone"
+        yield Finding("looking_away", "problem", text, remedy, tuple(names[placement.away]))
+    if placement.within.any():
+        text = "these cameras are inside the unit sphere, which should contain only the object"
         yield Finding(
-            "camera_inside", "warning", text, "make the scene box smaller", tuple(names[where.within])
+            "camera_inside", "warning", text, "make the scene box smaller", tuple(names[placement.within])
         )
     count = len(names)
     if count < ADVISED_COUNT:
         severity: Severity = "problem" if count < MIN_COUNT else "warning"
         remedy = f"take {ADVISED_COUNT} or more, better 50, from all around"
         yield Finding("few_views", severity, f"{count} views", remedy)
-    if count >= MIN_COUNT and where.coverage < MIN_COVERAGE:
-        text = f"the views cover {100 * where.coverage:.0f} % of the directions around the object"
+    if count >= MIN_COUNT and placement.coverage < MIN_COVERAGE:
+        text = f"the views cover {100 * placement.coverage:.0f} % of the directions around the object"
         yield Finding("coverage", "warning", text, "add views from other sides, and from other heights")
-    if count >= MIN_COUNT and where.gap > SPARSE_GAP:
-        text = f"{where.gap:.0f}° from one view to the next"
-        yield Finding("sparse", "warning", text, f"add views between them, {SPARSE_GAP:.0f}° apart or less")
+    if count >= MIN_COUNT and placement.gap > SPARSE_GAP:
+        text = f"{placement.gap:.0f}° is the median angle from a view to its nearest neighbour"
+        yield Finding("sparse", "warning", text, f"add views between them, at most {SPARSE_GAP:.0f}° apart")
 
 
 def _of_scene(capture: Capture) -> Iterator[Finding]:
     if capture.scene_from == "cameras":
-        text = "the scene's place and size are guessed from the cameras alone"
+        text = "position and size of the scene are guessed from the cameras only"
         yield Finding("scale_guessed", "warning", text, "add a scene box, a point cloud or masks")
     if capture.point_cloud is None:
         return
@@ -254,14 +269,14 @@ def _of_scene(capture: Capture) -> Iterator[Finding]:
         yield Finding("point_cloud", "problem", error.problem, error.remedy)
         return
     reach = points.abs().amax(dim=-1).numpy()
-    # A box about what the cameras look at leaves points of the background out on purpose.
+    # A box around the point that the cameras look at excludes background points on purpose.
     outside = 0.0 if capture.scene_from == "focus" else float((reach > EDGE).mean())
     if outside > STRAY_POINTS:
-        text = f"{100 * outside:.0f} % of the point cloud lies outside the scene's box"
+        text = f"{100 * outside:.0f} % of the point cloud lies outside of the scene box"
         remedy = "make the scene box larger, or cut the cloud to the object"
         yield Finding("scale", "problem" if outside > 0.5 else "warning", text, remedy)
     elif np.quantile(reach, 0.95) < SMALL_CLOUD:
-        text = f"95 % of the point cloud lies within {100 * SMALL_CLOUD:.0f} % of the scene's box"
+        text = f"95 % of the point cloud lies within {100 * SMALL_CLOUD:.0f} % of the scene box"
         yield Finding("scale", "warning", f"the object is small: {text}", "make the scene box smaller")
 
 
@@ -272,21 +287,22 @@ def _verdict(capture: Capture, views: Sequence[ViewFigures], findings: Sequence[
     kinds = {finding.kind for finding in findings}
     clipped = float(np.mean([view.clipped for view in readable]))
     stops = float(np.median([view.stops for view in readable]))
-    said = f"{stops:.1f} stops on the object, {100 * clipped:.2g} % of it clipped"
+    figures = f"{stops:.1f} stops on the object, {100 * clipped:.2g} % of it clipped"
     if not capture.hdr:
         if clipped > CLIPPED_MUCH or "exposure_jump" in kinds:
             return Verdict(
-                "poor", f"display values (sRGB), {said}: highlights are lost, gloss and light cannot be told"
+                "poor",
+                f"display values (sRGB), {figures}: highlights are lost, so gloss and "
+                "light cannot be determined",
             )
         return Verdict(
-            "limited", f"display values (sRGB), {said}: colours come out, gloss and light only roughly"
+            "limited",
+            f"display values (sRGB), {figures}: colours can be recovered, gloss and light only roughly",
         )
     if "few_levels" in kinds or "exposure_jump" in kinds or clipped > CLIPPED_MUCH:
-        reasons = {"few_levels": "made from 8-bit images", "exposure_jump": "not on one scale"}
-        why = next(
-            (reason for kind, reason in reasons.items() if kind in kinds), "clipped where it is bright"
-        )
-        return Verdict("poor", f"linear, {said}, but {why}")
+        reasons = {"few_levels": "made from 8-bit images", "exposure_jump": "with jumps of the exposure"}
+        why = next((reason for kind, reason in reasons.items() if kind in kinds), "with clipped highlights")
+        return Verdict("poor", f"linear, {figures}, but {why}")
     if clipped > CLIPPED_A_BIT:
-        return Verdict("limited", f"linear, {said}: mark what is clipped in a validity mask")
-    return Verdict("good", f"linear, {said}: good enough for the estimation of materials")
+        return Verdict("limited", f"linear, {figures}: mark clipped pixels in a validity mask")
+    return Verdict("good", f"linear, {figures}: good enough for the estimation of materials")

@@ -1,4 +1,4 @@
-"""Figures of one view from its image: brightness, sharpness, clipping. `findings` judges them."""
+"""Measure one view: brightness, sharpness, clipping and more. `findings` judges these figures."""
 
 from __future__ import annotations
 
@@ -22,36 +22,46 @@ THUMBNAIL_SIDE = 160
 SHARPNESS_SIDE = 1600
 """Longest side at which sharpness is measured, in pixels; finer detail is blurred by demosaicing."""
 MIDDLE_GREY = 0.18
+"""Linear value to which the luminance of the object is scaled before sharpness is measured."""
 BORDER_SHARE = 0.5
+"""Smallest share of border pixels of one colour with which that colour is the background."""
 DARK = 1e-3
+"""Luminance below which a pixel counts as black, relative to the mean of the object."""
 FULL = 254.5 / 255
+"""Display value from which a pixel counts as clipped."""
 PLATEAU_WIDTH = 1e-4
+"""Relative distance from the maximum of a linear image within which a pixel counts as at the maximum."""
 MIN_CLIPPED = 16
-"""Smallest number of pixels at the maximum of an image that counts as clipping."""
+"""Smallest number of pixels at the maximum of a linear image that counts as clipping."""
 LEVEL_SAMPLES = 200_000
-"""Number of pixels from which the distinct levels are counted."""
+"""Number of pixels, up to a factor of two, from which the distinct levels are counted."""
 
 
 @dataclass(frozen=True)
 class ViewFigures:
-    """Figures of an image. Shares are of the object's pixels, by mask, alpha or an even background.
+    """Figures of a view. Shares refer to the pixels of the object unless stated otherwise.
+
+    The object is known from the mask, the alpha channel or a background of a single colour; otherwise all
+    pixels count as the object.
 
     Attributes:
         name: name of the view.
-        unreadable: why the pixels cannot be read, and then all other figures are 0; else empty.
-        luminance: the geometric mean of the linear luminance of the object, on the scale that all views
-            share; 0 for a black image. Unlike the median, it does not jump in an image that is half sky and
-            half ground.
-        stops: between the 1st and the 99.9th percentile of that luminance, in powers of two.
-        sharpness: variance of the Laplacian over the variance of the picture, at one brightness for all
-            views.
-        clipped: share at 255 (display values), or at a level at which an HDR image piles up, in any channel.
-        invalid: share of all pixels that the validity mask leaves out.
+        unreadable: the reason if the pixels cannot be read, in which case all other figures are 0; else
+            empty.
+        luminance: geometric mean of the linear luminance of the object, on the scale that all views share; 0
+            for a black image. Unlike the median, it changes little if the share of sky changes in images that
+            are half sky and half ground.
+        stops: ratio of the 99.9th to the 1st percentile of that luminance, in powers of two.
+        sharpness: variance of the Laplacian divided by the variance of the picture, after all views have been
+            scaled to one brightness.
+        clipped: share of pixels that in any channel are at 255 (display values), or at a maximum at which the
+            values of an HDR image accumulate.
+        invalid: share of all pixels that the validity mask excludes.
         broken: share of all pixels that are NaN, infinite or negative and not marked as invalid.
         pixels: number of the object's pixels that are valid.
-        levels: distinct values among up to 400 000 of the object's pixels, in the channel that has most of
-            them.
-        small: linear radiance, at most 160 pixels a side.
+        levels: number of distinct values among up to 400,000 pixels of the object, in the channel with the
+            most.
+        small: thumbnail in linear radiance, at most 160 pixels a side.
     """
 
     name: str
@@ -70,7 +80,7 @@ class ViewFigures:
 
 
 def measure(view: View, hdr: bool) -> ViewFigures:
-    """The figures of a view; an image that cannot be read is a figure as well."""
+    """Measure a view. If its image cannot be read, the reason is returned in `ViewFigures.unreadable`."""
     try:
         image = read_image(view.image)
         color = pixel_colors(view, image, hdr).numpy()
@@ -118,7 +128,7 @@ def _mask(view: View, kind: str, size: tuple[int, int]) -> Bool[np.ndarray, "H W
 def _off_the_background(
     color: Float32[np.ndarray, "H W 3"], usable: Bool[np.ndarray, "H W"]
 ) -> Bool[np.ndarray, "H W"]:
-    """All but the colour that most of the border shares."""
+    """Pixels that do not have the colour of most border pixels; all pixels if there is no such colour."""
     edge = np.zeros(usable.shape, bool)
     edge[[0, -1]] = edge[:, [0, -1]] = True
     border = color[edge & usable]
@@ -133,11 +143,11 @@ def _sharpness(light: Float32[np.ndarray, "H W"], shown: Bool[np.ndarray, "H W"]
     if typical <= 0:
         return 0.0
     grey = linear_to_srgb(torch.from_numpy(light * np.float32(MIDDLE_GREY / typical)).clamp(0, 1)).numpy()
-    grey, kept = _fitted(grey, SHARPNESS_SIDE), _fitted(shown.astype(np.float32), SHARPNESS_SIDE) > 0.5
-    if not kept.any():
+    grey, on_object = _fitted(grey, SHARPNESS_SIDE), _fitted(shown.astype(np.float32), SHARPNESS_SIDE) > 0.5
+    if not on_object.any():
         return 0.0
-    spread = float(grey[kept].var())
-    return float(cv2.Laplacian(grey, cv2.CV_32F)[kept].var()) / spread if spread > 0 else 0.0
+    spread = float(grey[on_object].var())
+    return float(cv2.Laplacian(grey, cv2.CV_32F)[on_object].var()) / spread if spread > 0 else 0.0
 
 
 def _clipped(image: ImageFile, color: Float32[np.ndarray, "H W 3"], shown: Bool[np.ndarray, "H W"]) -> float:
@@ -146,7 +156,7 @@ def _clipped(image: ImageFile, color: Float32[np.ndarray, "H W 3"], shown: Bool[
         return 0.0
     if not image.hdr:
         return float((image.pixels[shown] >= FULL).any(axis=-1).mean())
-    # A sensor that clips piles pixels up at one level; without clipping hardly two pixels share the maximum.
+    # Clipping of a sensor gives many pixels the same level; without it, few pixels share the maximum.
     top = pixels >= pixels.max(axis=0) * (1 - PLATEAU_WIDTH)
     piled = (top.sum(axis=0) >= MIN_CLIPPED) & (pixels.max(axis=0) > pixels.min(axis=0))
     return float((top & piled).any(axis=-1).mean())

@@ -1,4 +1,4 @@
-"""The picture of an inspection: the cameras along two axes, and all views, flagged ones first."""
+"""Draw the picture of an inspection: the camera positions, and all views, flagged ones first."""
 
 from __future__ import annotations
 
@@ -13,20 +13,23 @@ from neilfpp_method.shading.color import tone_map
 __all__ = ["draw"]
 
 PAPER, INK, PALE_INK = (250, 250, 248), (28, 30, 34), (150, 154, 160)
+"""Colours of the background, of text, and of secondary text."""
 PROBLEM, WARNING, FINE = (200, 40, 40), (225, 150, 20), (70, 130, 180)
+"""Frame colours of views with a problem, with a warning, and without findings."""
 CELL, LABEL, GAP, MARGIN = 160, 40, 12, 32
+"""Side of a view, height of its label, space between views, and margin of the sheet, in pixels."""
 COLUMNS = 7
 """Number of views in a row."""
 PLAN = 420
-"""Side of each plan of the cameras, in pixels."""
+"""Side of each plot of the camera positions, in pixels."""
 MAX_DRAWN = 210
 """Largest number of views in the picture."""
 KEY = 0.25
-"""Linear value at which the capture's median luminance is shown."""
+"""Linear value to which the median luminance of the capture is scaled for display."""
 
 
 def draw(inspection: Inspection) -> UInt8[np.ndarray, "H W 3"]:
-    """The picture; views keep one exposure, so that jumps are seen."""
+    """Draw the picture. All views have the same exposure, so that differences are visible."""
     colors = _colors(inspection)
     ranks = [{PROBLEM: 0, WARNING: 1, FINE: 2}[color] for color in colors]
     order = sorted(range(len(ranks)), key=lambda i: ranks[i])[:MAX_DRAWN]
@@ -61,10 +64,10 @@ def _colors(inspection: Inspection) -> list[tuple[int, int, int]]:
 def _plan(
     inspection: Inspection, axes: tuple[int, int], colors: list[tuple[int, int, int]], title: str
 ) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Cameras as dots with viewing directions, seen along a world axis; the circle is the unit sphere."""
+    """Plot cameras as dots with viewing directions, projected along a world axis, with the unit sphere."""
     plan = Image.new("RGB", (PLAN, PLAN), (255, 255, 255))
     pen = ImageDraw.Draw(plan)
-    centres, forward = inspection.stand.centres[:, axes], inspection.stand.axes[:, axes]
+    centres, forward = inspection.placement.centres[:, axes], inspection.placement.axes[:, axes]
     reach = 1.15 * max(1.0, float(np.abs(centres).max()))
 
     def place(points: Float64[np.ndarray, "*N 2"]) -> Float64[np.ndarray, "*N 2"]:
@@ -86,7 +89,7 @@ def _list(pen: ImageDraw.ImageDraw, corner: tuple[int, int], inspection: Inspect
         color = PROBLEM if finding.severity == "problem" else WARNING
         _write(pen, (corner[0], corner[1] + 26 * place), finding.kind.replace("_", " ") + count, 16, color)
     if not inspection.findings:
-        _write(pen, corner, "nothing is wrong with it", 16, FINE)
+        _write(pen, corner, "no problems found", 16, FINE)
 
 
 def _cell(

@@ -1,4 +1,4 @@
-"""Figures that compare views with one another: exposure, duplicates, and where the cameras stand."""
+"""Compare the views of a capture with one another: exposures, duplicates and camera positions."""
 
 from __future__ import annotations
 
@@ -13,26 +13,31 @@ from jaxtyping import Bool, Float, Float64
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.views import project
 
-__all__ = ["Stand", "duplicates", "exposure_factors", "stand"]
+__all__ = ["CameraPlacement", "camera_placement", "duplicates", "exposure_factors"]
 
 NEIGHBOURS = 6
 """Number of views, nearest in pose, with which a view is compared."""
 THUMBNAIL = (32, 32)
+"""Width and height of the thumbnails that are compared, in pixels."""
 SAME = 0.02
 """Root mean square difference of standardised thumbnails below which two views are duplicates."""
 SEEN_ANGLE = 30.0
 """Largest angle between a covered direction and the nearest view, in degrees."""
 SPHERE = 1000
-"""Number of directions by which the sphere is sampled."""
+"""Number of sampled directions of the sphere."""
 
 
 @dataclass(frozen=True)
-class Stand:
-    """Where the cameras stand about the scene; in the scene frame, whose unit sphere holds the object.
+class CameraPlacement:
+    """The placement of V cameras around the scene, in the scene frame.
 
-    `away` views do not show the scene's centre, `within` stand in the unit sphere. `coverage` is the share of
-    all directions from the centre with a camera at most 30° away, `gap` the median angle, degrees, from one
-    camera to the next.
+    Attributes:
+        centres: centres of the cameras.
+        axes: unit viewing directions.
+        away: cameras that do not show the centre of the scene.
+        within: cameras inside the unit sphere, which contains the object.
+        coverage: share of all directions from the centre that are at most `SEEN_ANGLE` from that of a camera.
+        gap: median angle from a camera to the nearest other camera, seen from the centre, in degrees.
     """
 
     centres: Float64[np.ndarray, "V 3"]
@@ -43,8 +48,8 @@ class Stand:
     gap: float
 
 
-def stand(capture: Capture) -> Stand:
-    """Where the cameras of a capture stand."""
+def camera_placement(capture: Capture) -> CameraPlacement:
+    """Compute the placement of the cameras of a capture."""
     cameras = [capture.normalisation.camera(view.camera) for view in capture.views]
     centres = np.stack([camera.c2w[:, 3] for camera in cameras])
     away = []
@@ -56,7 +61,7 @@ def stand(capture: Capture) -> Stand:
     directions = centres / distance.clip(1e-9)
     cosines = directions @ directions.T
     np.fill_diagonal(cosines, -1.0)
-    return Stand(
+    return CameraPlacement(
         centres=centres,
         axes=np.stack([camera.w2c[2, :3] for camera in cameras]),
         away=np.array(away),
@@ -67,26 +72,33 @@ def stand(capture: Capture) -> Stand:
 
 
 def _lattice() -> Float64[np.ndarray, "S 3"]:
-    """Directions evenly spread over the sphere (Fibonacci)."""
+    """Evenly distributed directions: the Fibonacci lattice."""
     k = np.arange(SPHERE) + 0.5
     z, azimuth = 1 - 2 * k / SPHERE, k * np.pi * (3 - np.sqrt(5))
     ring = np.sqrt(1 - z**2)
     return np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
 
 
-def exposure_factors(luminances: Sequence[float], where: Stand) -> Float64[np.ndarray, " V"]:
-    """How much brighter each view is than the median of the views nearest in pose; 1 where unknown.
+def exposure_factors(luminances: Sequence[float], placement: CameraPlacement) -> Float64[np.ndarray, " V"]:
+    """Return the brightness of each view relative to the median of the views that are nearest in pose.
 
-    Near is what stands near and looks the same way: the distance of the centres, in their median distance
-    from the scene's, and the angle of the axes count alike.
+    The distance of two poses combines, with equal weights, the distance of the camera centres, divided by
+    their median distance from the centre of the scene, and the distance of the unit viewing directions.
+
+    Args:
+        luminances: luminance of each view; 0 if it is unknown.
+        placement: the cameras of the views.
+
+    Returns:
+        A factor per view; 1 if its luminance, or that of all other views, is unknown.
     """
     light = np.array(luminances)
-    scale = max(float(np.median(np.linalg.norm(where.centres, axis=1))), 1e-9)
-    pose = np.concatenate([where.centres / scale, where.axes], axis=1)
-    known = light > 0
+    scale = max(float(np.median(np.linalg.norm(placement.centres, axis=1))), 1e-9)
+    pose = np.concatenate([placement.centres / scale, placement.axes], axis=1)
+    lit = light > 0
     factors = np.ones(len(light))
-    for i in np.flatnonzero(known):
-        others = np.flatnonzero(known & (np.arange(len(light)) != i))
+    for i in np.flatnonzero(lit):
+        others = np.flatnonzero(lit & (np.arange(len(light)) != i))
         if len(others):
             nearest = others[np.argsort(np.linalg.norm(pose[others] - pose[i], axis=1))[:NEIGHBOURS]]
             factors[i] = light[i] / np.median(light[nearest])
@@ -94,9 +106,10 @@ def exposure_factors(luminances: Sequence[float], where: Stand) -> Float64[np.nd
 
 
 def duplicates(pictures: Sequence[Float[np.ndarray, "_ _ 3"]]) -> tuple[tuple[int, int], ...]:
-    """Pairs of pictures that are the same but for compression and brightness.
+    """Return the pairs of pictures that are equal except for compression and brightness.
 
-    Their standardised thumbnails differ by under 2 % of their spread. Pictures of one colour are left out.
+    The standardised thumbnails of such a pair differ by less than 2 % of their standard deviation. Pictures
+    of a single colour are ignored.
     """
     thumbnails = np.stack(
         [cv2.resize(np.sqrt(p.mean(axis=-1)), THUMBNAIL, interpolation=cv2.INTER_AREA) for p in pictures]
@@ -104,6 +117,6 @@ def duplicates(pictures: Sequence[Float[np.ndarray, "_ _ 3"]]) -> tuple[tuple[in
     flat = thumbnails.reshape(len(pictures), -1)
     spread = flat.std(axis=1)
     flat = (flat - flat.mean(axis=1, keepdims=True)) / np.maximum(spread, 1e-9)[:, None]
-    # Of standardised pictures the mean square of the difference is 2 (1 − correlation).
+    # The mean squared difference of two standardised pictures is 2 (1 − correlation).
     alike = (flat @ flat.T / flat.shape[1] > 1 - SAME**2 / 2) & (spread > 0)[:, None] & (spread > 0)
     return tuple((int(i), int(j)) for i, j in np.argwhere(np.triu(alike, 1)))

@@ -1,11 +1,13 @@
-"""The CPU's loops for hash grids, rays and softplus, compiled by Numba on first use and cached on disk.
+"""Loops for hash grids, sphere tracing and softplus on a CPU, compiled by Numba and cached on disk.
 
-They hold no lock of the interpreter, start no threads and add up in a fixed order. All compiled code stands
-in this one file, because what is kept on disk is renewed when its own file changes, and for no other.
+The loops release the global interpreter lock, start no threads, and add numbers in a fixed order. All of them
+are in this file because Numba compiles a function again only if the file of that function has changed; it
+does not notice changes in other files.
 
-A hash grid comes in parts, one entry per level: `offsets` (first table row; and the end), `cells` along an
-edge, and `dense`. The vertices of a cell are numbered x + 2 y + 4 z, each coordinate 0 or 1. Arrays are
-dense, and all of one float type.
+A hash grid is passed as three arrays with one entry per level: `offsets` (the first table row, followed by
+the number of all rows), `cells` along an edge, and `dense` (whether each vertex has its own row). The
+vertices of a cell are numbered x + 2 y + 4 z, with coordinates 0 or 1. All arrays are contiguous; the
+floating-point arrays of a call have the same type.
 """
 
 from __future__ import annotations
@@ -20,25 +22,30 @@ from numba.extending import intrinsic
 __all__ = [
     "add_to_table",
     "interpolate",
-    "pull_through_softplus",
-    "pull_to_points",
+    "point_gradient",
     "softplus",
     "softplus_and_slope",
+    "softplus_gradient",
     "sphere_trace",
 ]
 
-BLOCK = 128  # points that take all levels in turn: what they write stays in the nearest cache
-Y_PRIME, Z_PRIME = np.uint32(2654435761), np.uint32(805459861)  # of the spatial hash
+BLOCK = 128
+"""Number of points for which all levels are computed before the next points, so that what they write stays
+in the first-level cache."""
+Y_PRIME, Z_PRIME = np.uint32(2654435761), np.uint32(805459861)
+"""Factors of y and z in the spatial hash (Müller et al. 2022, eq. 4); that of x is 1."""
 ONE = np.uint32(1)
 
 
 def compiled(function: Callable) -> Callable:
-    """`function` as machine code. A product and a sum may fuse; nothing else may change the arithmetic."""
-    function = inspect.unwrap(function)  # a checker of types may have wrapped it
+    """Compile a function. A product and a sum may be fused; all other arithmetic stays as written."""
+    # A run-time type checker may have wrapped the function.
+    function = inspect.unwrap(function)
     options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
     try:
         return njit(cache=True, **options)(function)
-    except RuntimeError:  # no folder that could keep it may be written: each process compiles it anew
+    except RuntimeError:
+        # No cache folder is writable, so each process compiles the function again.
         return njit(**options)(function)
 
 
@@ -47,19 +54,23 @@ def compiled(function: Callable) -> Callable:
 
 @compiled
 def _locate(points, n, axis, cells):
-    """Along one axis: the cell, the fraction of it, and d(cells) / d(coordinate), 0 off the cube."""
+    """Find the cell of a point along one axis.
+
+    Returns the index of the cell, the position within it (0 to 1), and the derivative of the position in
+    units of the cell with respect to the coordinate, which is 0 outside of the unit cube.
+    """
     number = points.dtype.type
     free = points[n, axis] * number(cells)
     position = min(max(free, number(0)), number(cells))
     start = min(np.floor(position), number(cells - 1))
-    # What is not a number takes the first cell, and makes all that is computed there not a number.
+    # NaN gets the first cell; the fraction is NaN, and so is everything that is computed from it.
     cell = np.uint32(start) if start > 0 else np.uint32(0)
     return cell, position - start, number(cells if position == free else 0)
 
 
 @compiled
 def _vertices(i, j, k, cells, entries, dense):
-    """The rows of a cell's eight vertices in the table of its level."""
+    """Return the rows of a cell's eight vertices in the table of its level."""
     if dense:
         step = np.uint32(cells) + ONE
         a = i + step * (j + step * k)
@@ -77,7 +88,7 @@ def _vertices(i, j, k, cells, entries, dense):
 
 @compiled
 def _value_and_slopes(corners, x, y, z):
-    """Trilinear interpolation, and its derivative along each axis in units of the cell."""
+    """Return the trilinear interpolation, and its derivative along each axis per unit of the cell."""
     c0, c1, c2, c3, c4, c5, c6, c7 = corners
     z0, z1, z2, z3 = c4 - c0, c5 - c1, c6 - c2, c7 - c3
     b0, b1, b2, b3 = c0 + z * z0, c1 + z * z1, c2 + z * z2, c3 + z * z3
@@ -88,8 +99,8 @@ def _value_and_slopes(corners, x, y, z):
 
 
 @compiled
-def _twists(corners, x, y, z):
-    """The mixed second derivatives xy, xz, yz in units of the cell; those along one axis are 0."""
+def _mixed_derivatives(corners, x, y, z):
+    """Return the mixed second derivatives xy, xz, yz per unit of the cell; xx, yy and zz are 0."""
     c0, c1, c2, c3, c4, c5, c6, c7 = corners
     low, high = c3 - c2 - c1 + c0, c7 - c6 - c5 + c4
     near, far = c5 - c4 - c1 + c0, c7 - c6 - c3 + c2
@@ -108,12 +119,13 @@ def _corners(rows, vertices, f):
 
 @compiled
 def interpolate(points, table, offsets, cells, dense, features, jacobian, with_jacobian, start, stop):
-    """Write the features, and on demand the Jacobian, of the points from `start` to `stop`."""
+    """Write the features, and if `with_jacobian` the Jacobian, of the points in [start, stop)."""
     for block in range(start, stop, BLOCK):
         end = min(block + BLOCK, stop)
         for level in range(len(cells)):
             rows = table[offsets[level] : offsets[level + 1]]
-            if dense[level]:  # asked once here, not once per point
+            # Test `dense` once per level, not once per point.
+            if dense[level]:
                 _interpolate_level(
                     points, rows, level, cells[level], True, features, jacobian, with_jacobian, block, end
                 )
@@ -143,7 +155,10 @@ def _interpolate_level(points, rows, level, cells, dense, features, jacobian, wi
 
 @compiled
 def add_to_table(points, offsets, cells, dense, features, jacobian, with_jacobian, table, first, last):
-    """Add the gradients of features and Jacobian to the table, for the levels from `first` to `last`."""
+    """Add the gradient of a loss to that of the table, for the levels in [first, last).
+
+    `features` and `jacobian` are the gradients of the loss with respect to features and Jacobian.
+    """
     width = table.shape[1]
     number = points.dtype.type
     for level in range(first, last):
@@ -160,7 +175,7 @@ def add_to_table(points, offsets, cells, dense, features, jacobian, with_jacobia
                 if with_jacobian:
                     along_x, along_y = jacobian[n, column, 0] * dx, jacobian[n, column, 1] * dy
                     along_z = jacobian[n, column, 2] * dz
-                # `_value_and_slopes` backwards: along x, then y, then z.
+                # The transpose of `_value_and_slopes`: along x, then y, then z.
                 left, right = rest_x * value - along_x, x * value + along_x
                 b0, b1 = rest_y * left - rest_x * along_y, rest_y * right - x * along_y
                 b2, b3 = y * left + rest_x * along_y, y * right + x * along_y
@@ -177,10 +192,13 @@ def add_to_table(points, offsets, cells, dense, features, jacobian, with_jacobia
 
 
 @compiled
-def pull_to_points(
+def point_gradient(
     points, table, offsets, cells, dense, features, jacobian, with_jacobian, gradient, start, stop
 ):
-    """Write what the gradients of features and Jacobian ask of the points from `start` to `stop`."""
+    """Write the gradient of a loss with respect to the points in [start, stop).
+
+    `features` and `jacobian` are the gradients of the loss with respect to features and Jacobian.
+    """
     width = table.shape[1]
     number = points.dtype.type
     for n in range(start, stop):
@@ -200,7 +218,7 @@ def pull_to_points(
                 if with_jacobian:
                     gx, gy = jacobian[n, column, 0] * dx, jacobian[n, column, 1] * dy
                     gz = jacobian[n, column, 2] * dz
-                    xy, xz, yz = _twists(corners, x, y, z)
+                    xy, xz, yz = _mixed_derivatives(corners, x, y, z)
                     by_x += gy * xy + gz * xz
                     by_y += gx * xy + gz * yz
                     by_z += gx * xz + gy * yz
@@ -212,29 +230,32 @@ def pull_to_points(
 
 @compiled
 def sphere_trace(grid, radius, origins, directions, least, most_steps, distance, hit, start, stop):
-    """Write how far rays `start` to `stop` go, and whether they come closer to a surface than `least`."""
+    """Trace the rays in [start, stop) in a grid of distances.
+
+    Writes the length of each ray, and whether it came closer to a surface than `least`.
+    """
     number = grid.dtype.type
     cells = len(grid) - 1
     edge, reach = number(2 * radius / cells), number(radius)
     for n in range(start, stop):
-        gone, met = number(0), False
+        length, is_hit = number(0), False
         for _ in range(most_steps):
-            x = origins[n, 0] + gone * directions[n, 0]
-            y = origins[n, 1] + gone * directions[n, 1]
-            z = origins[n, 2] + gone * directions[n, 2]
+            x = origins[n, 0] + length * directions[n, 0]
+            y = origins[n, 1] + length * directions[n, 1]
+            z = origins[n, 2] + length * directions[n, 2]
             if abs(x) > reach or abs(y) > reach or abs(z) > reach:
                 break
             clearance = _at_vertices(grid, (x + reach) / edge, (y + reach) / edge, (z + reach) / edge, cells)
             if clearance < least:
-                met = True
+                is_hit = True
                 break
-            gone += max(clearance, least)
-        distance[n], hit[n] = gone, met
+            length += max(clearance, least)
+        distance[n], hit[n] = length, is_hit
 
 
 @compiled
 def _at_vertices(grid, x, y, z, cells):
-    """Trilinear interpolation at a place in units of cells; NaN takes the first cell and stays NaN."""
+    """Interpolate trilinearly at a point in units of cells; the result is NaN if the point is."""
     number = grid.dtype.type
     last = number(cells - 1)
     low_x, low_y, low_z = min(np.floor(x), last), min(np.floor(y), last), min(np.floor(z), last)
@@ -255,13 +276,15 @@ def _at_vertices(grid, x, y, z, cells):
 
 # ------------------------------------------------------------------------------ softplus, computed in float32
 
-FAINT = np.float32(40)  # e^−40 is nothing beside 1, and its square no denormal number yet
+MAX_EXPONENT = np.float32(40)
+"""Largest exponent t of `_exp_of_negative`: 1 + e^−40 is 1 in float32, and the square of e^−40 is not yet a
+denormal number."""
 HALF, UNIT = np.float32(0.5), np.float32(1)
 
 
 @intrinsic
 def _from_bits(_context, _bits):
-    """The float32 that is written in these 32 bits."""
+    """Reinterpret the bits of an int32 as a float32."""
 
     def code(context, builder, _signature, arguments):
         return builder.bitcast(arguments[0], context.get_value_type(types.float32))
@@ -270,12 +293,14 @@ def _from_bits(_context, _bits):
 
 
 @compiled
-def _falling_exponential(t):
-    """e^−t for t ≥ 0, to the last digit or two; t counts for FAINT at most.
+def _exp_of_negative(t):
+    """Return e^−t for 0 ≤ t ≤ `MAX_EXPONENT`, to one or two units in the last place; larger t are clamped.
 
-    e^−t = 2^−n e^r with |r| ≤ ½ ln 2: e^r by its Taylor series, ln 2 in two parts (Cody & Waite 1980).
+    e^−t = 2^−n e^r with |r| ≤ ½ ln 2. e^r is computed by its Taylor series, and ln 2 is split into two parts
+    to keep r exact (Cody & Waite 1980).
     """
-    t = FAINT if t > FAINT else t  # what is not a number stays none
+    # This comparison is false for NaN, so NaN remains.
+    t = MAX_EXPONENT if t > MAX_EXPONENT else t
     n = np.int32(t * np.float32(1.4426950408889634) + HALF)
     r = np.float32(n) * np.float32(0.693359375) - t
     r = r - np.float32(n) * np.float32(2.12194440e-4)
@@ -286,8 +311,11 @@ def _falling_exponential(t):
 
 
 @compiled
-def _log_of_one_and(e):
-    """ln(1 + e), 0 ≤ e ≤ 1, to 2e-8: e times the degree-8 Chebyshev approximation of ln(1 + e) / e."""
+def _log1p(e):
+    """Return ln(1 + e) for 0 ≤ e ≤ 1 with an error of at most 2e-8.
+
+    The result is e times the Chebyshev approximation of ln(1 + e) / e of degree 8.
+    """
     tail = np.float32(0.07836167) + e * (np.float32(-0.029588507) + e * np.float32(0.005253458))
     tail = np.float32(-0.24844369) + e * (np.float32(0.19111431) + e * (np.float32(-0.1367477) + e * tail))
     return e * (UNIT + e * (np.float32(-0.49999502) + e * (np.float32(0.3331927) + e * tail)))
@@ -295,29 +323,34 @@ def _log_of_one_and(e):
 
 @compiled
 def softplus(z, value, sharpness, start, stop):
-    """Write ln(1 + e^(sharpness z)) / sharpness for the numbers from `start` to `stop`."""
+    """Write ln(1 + e^(sharpness z)) / sharpness for the numbers in [start, stop)."""
     sharp = np.float32(sharpness)
-    z, value = z[start:stop], value[start:stop]  # slices from 0 on become vector instructions
+    # The compiler vectorises a loop that starts at 0.
+    z, value = z[start:stop], value[start:stop]
     for n in range(len(z)):
-        rest = _log_of_one_and(_falling_exponential(abs(z[n]) * sharp)) / sharp
+        rest = _log1p(_exp_of_negative(abs(z[n]) * sharp)) / sharp
         value[n] = rest + (z[n] if z[n] > 0 else np.float32(0))
 
 
 @compiled
 def softplus_and_slope(z, value, slope, sharpness, start, stop):
-    """As `softplus`, and its derivative, 1 / (1 + e^(−sharpness z))."""
+    """Write softplus and its derivative 1 / (1 + e^(−sharpness z)) for the numbers in [start, stop)."""
     sharp = np.float32(sharpness)
     z, value, slope = z[start:stop], value[start:stop], slope[start:stop]
     for n in range(len(z)):
-        e = _falling_exponential(abs(z[n]) * sharp)
-        value[n] = _log_of_one_and(e) / sharp + (z[n] if z[n] > 0 else np.float32(0))
+        e = _exp_of_negative(abs(z[n]) * sharp)
+        value[n] = _log1p(e) / sharp + (z[n] if z[n] > 0 else np.float32(0))
         share = UNIT / (UNIT + e)
         slope[n] = share if z[n] > 0 else e * share
 
 
 @compiled
-def pull_through_softplus(slope, to_value, to_slope, gradient, sharpness, start, stop):
-    """Write what the gradients of value and slope ask of z, for the numbers from `start` to `stop`."""
+def softplus_gradient(slope, to_value, to_slope, gradient, sharpness, start, stop):
+    """Write the gradient of a loss with respect to z, for the numbers in [start, stop).
+
+    `to_value` and `to_slope` are the gradients of the loss with respect to the outputs of
+    `softplus_and_slope`.
+    """
     sharp = np.float32(sharpness)
     slope, to_value, to_slope = slope[start:stop], to_value[start:stop], to_slope[start:stop]
     gradient = gradient[start:stop]

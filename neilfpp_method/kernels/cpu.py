@@ -83,7 +83,7 @@ def point_gradient(
         *_arrays(found),
     )
     for_each(
-        lambda start, stop: compiled.pull_to_points(*fixed, start, stop), _shares_of_points(len(x01), spec)
+        lambda start, stop: compiled.point_gradient(*fixed, start, stop), _shares_of_points(len(x01), spec)
     )
     return found
 

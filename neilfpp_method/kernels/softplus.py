@@ -71,7 +71,7 @@ class _Softplus(torch.autograd.Function):
         if torch.is_grad_enabled():
             return slope * (to_value + to_slope * ctx.sharpness * (1.0 - slope)), None
         gradient = torch.empty_like(slope)
-        _run("pull_through_softplus", ctx.sharpness, slope, to_value, to_slope, gradient)
+        _run("softplus_gradient", ctx.sharpness, slope, to_value, to_slope, gradient)
         return gradient, None
 
 

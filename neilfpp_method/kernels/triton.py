@@ -1,8 +1,8 @@
 """Hash-grid encoding on a GPU by Triton, or on CPU tensors by Triton's interpreter (`TRITON_INTERPRET=1`).
 
-A program takes a block of points through one level. Features and Jacobian are written with the points last,
-so that neighbouring lanes write neighbouring numbers. The gradient of the table is added up by atomics:
-reruns differ by rounding. The vertices of a cell are numbered x + 2 y + 4 z.
+A Triton program computes one level for a block of points. Features and Jacobian are stored with the points as
+the last axis, so that neighbouring lanes write neighbouring numbers. The gradient of the table is accumulated
+by atomic additions, so repeated runs differ by rounding. The vertices of a cell are numbered x + 2 y + 4 z.
 """
 
 from __future__ import annotations
@@ -23,12 +23,15 @@ from neilfpp_method.kernels.grid import Encoded, GridSpec
 
 __all__ = ["KERNELS"]
 
-BLOCK = 128  # points of one program
-FUSED = {"enable_fp_fusion": True}  # a product and a sum may become one instruction, as on the CPU
+BLOCK = 128
+"""Number of points that one program computes."""
+FUSED = {"enable_fp_fusion": True}
+"""Launch option: the compiler may fuse a product and a sum, as on the CPU."""
 
 
 def kernel(function: Callable) -> triton.runtime.KernelInterface:
-    """`function` as a kernel, or as a part of one; a checker of types may have wrapped it."""
+    """Make a function a Triton kernel, or a function that kernels call."""
+    # A run-time type checker may have wrapped the function.
     return triton.jit(inspect.unwrap(function))
 
 
@@ -37,20 +40,20 @@ def kernel(function: Callable) -> triton.runtime.KernelInterface:
 
 @kernel
 def _locate(points, n, here, axis, cells):
-    """Along one axis: the cell, the fraction of it, and d(cells) / d(coordinate), 0 off the cube."""
+    """Find the cell of a point along one axis; see `compiled._locate`. `here` masks lanes without a point."""
     scale = cells.to(points.dtype.element_ty)
     free = tl.load(points + 3 * n + axis, mask=here, other=0.0) * scale
     inner = tl.maximum(free, 0.0, propagate_nan=tl.PropagateNan.ALL)
     position = tl.minimum(inner, scale, propagate_nan=tl.PropagateNan.ALL)
     start = tl.minimum(tl.floor(position), scale - 1.0, propagate_nan=tl.PropagateNan.ALL)
-    # What is not a number takes the first cell, and makes all that is computed there not a number.
+    # NaN gets the first cell; the fraction is NaN, and so is everything that is computed from it.
     cell = tl.where(start > 0.0, start, 0.0).to(tl.uint32)
     return cell, position - start, tl.where(position == free, scale, 0.0)
 
 
 @kernel
 def _row(i, j, k, cells, entries, dense):
-    """The row of a vertex in the table of its level."""
+    """Return the row of a vertex in the table of its level."""
     step = (cells + 1).to(tl.uint32)
     hashed = (i ^ (j * 2654435761) ^ (k * 805459861)) & (entries - 1).to(tl.uint32)
     return tl.where(dense != 0, i + step * (j + step * k), hashed).to(tl.int64)
@@ -58,7 +61,7 @@ def _row(i, j, k, cells, entries, dense):
 
 @kernel
 def _vertices(i, j, k, offset, cells, entries, dense):
-    """The rows of a cell's eight vertices in the whole table."""
+    """Return the rows of a cell's eight vertices in the table of all levels."""
     r0 = offset + _row(i, j, k, cells, entries, dense)
     r1 = offset + _row(i + 1, j, k, cells, entries, dense)
     r2 = offset + _row(i, j + 1, k, cells, entries, dense)
@@ -72,7 +75,7 @@ def _vertices(i, j, k, offset, cells, entries, dense):
 
 @kernel
 def _corners(column, width, r0, r1, r2, r3, r4, r5, r6, r7, here):
-    """One feature at the eight vertices; `column` points at it in the first row of the table."""
+    """Load a feature at the eight vertices; `column` is its address in the first row of the table."""
     c0 = tl.load(column + r0 * width, mask=here, other=0.0)
     c1 = tl.load(column + r1 * width, mask=here, other=0.0)
     c2 = tl.load(column + r2 * width, mask=here, other=0.0)
@@ -86,7 +89,7 @@ def _corners(column, width, r0, r1, r2, r3, r4, r5, r6, r7, here):
 
 @kernel
 def _value_and_slopes(c0, c1, c2, c3, c4, c5, c6, c7, x, y, z):
-    """Trilinear interpolation, and its derivative along each axis in units of the cell."""
+    """Return the trilinear interpolation, and its derivative along each axis per unit of the cell."""
     z0, z1, z2, z3 = c4 - c0, c5 - c1, c6 - c2, c7 - c3
     b0, b1, b2, b3 = c0 + z * z0, c1 + z * z1, c2 + z * z2, c3 + z * z3
     y0, y1 = b2 - b0, b3 - b1
@@ -146,7 +149,7 @@ def _add_to_table(
             along_x = tl.load(slopes, mask=here, other=0.0) * dx
             along_y = tl.load(slopes + j_axis, mask=here, other=0.0) * dy
             along_z = tl.load(slopes + 2 * j_axis, mask=here, other=0.0) * dz
-        # `_value_and_slopes` backwards: along x, then y, then z.
+        # The transpose of `_value_and_slopes`: along x, then y, then z.
         left, right = rest_x * value - along_x, x * value + along_x
         b0, b1 = rest_y * left - rest_x * along_y, rest_y * right - x * along_y
         b2, b3 = y * left + rest_x * along_y, y * right + x * along_y
@@ -163,7 +166,7 @@ def _add_to_table(
 
 
 @kernel
-def _pull_to_points(
+def _point_gradient(
     points, table, grid, features, jacobian, gradient, count, levels,
     f_point, f_column, j_point, j_column, j_axis,
     width: tl.constexpr, with_jacobian: tl.constexpr, block: tl.constexpr,
@@ -172,7 +175,8 @@ def _pull_to_points(
     here = n < count
     to_x = tl.zeros((block,), points.dtype.element_ty)
     to_y, to_z = to_x, to_x
-    for level in range(levels):  # in turn: a point's gradient is added up in one place
+    # A program computes all levels, so the gradient of a point is summed without atomics.
+    for level in range(levels):
         offset, cells = tl.load(grid + level), tl.load(grid + levels + level)
         entries, dense = tl.load(grid + 2 * levels + level), tl.load(grid + 3 * levels + level)
         i, x, dx = _locate(points, n, here, 0, cells)
@@ -190,7 +194,7 @@ def _pull_to_points(
                 gx = tl.load(slopes, mask=here, other=0.0) * dx
                 gy = tl.load(slopes + j_axis, mask=here, other=0.0) * dy
                 gz = tl.load(slopes + 2 * j_axis, mask=here, other=0.0) * dz
-                # The mixed second derivatives, in units of the cell; those along one axis are 0.
+                # The mixed second derivatives per unit of the cell; the pure ones (xx, yy, zz) are 0.
                 low, high = c3 - c2 - c1 + c0, c7 - c6 - c5 + c4
                 near, far = c5 - c4 - c1 + c0, c7 - c6 - c3 + c2
                 back, front = c6 - c4 - c2 + c0, c7 - c5 - c3 + c1
@@ -257,7 +261,7 @@ def point_gradient(
     count, levels = len(x01), len(spec.resolutions)
     features, jacobian = gradients.features, _jacobian(gradients)
     with torch.cuda.device_of(x01):
-        _pull_to_points[(_blocks(count),)](
+        _point_gradient[(_blocks(count),)](
             x01, table, _grid(spec, x01.device), features, jacobian, found, count, levels,
             *features.stride(), *jacobian.stride(),
             spec.features, gradients.jacobian is not None, BLOCK, **FUSED,
@@ -266,17 +270,20 @@ def point_gradient(
 
 
 def _blocks(count: int) -> int:
-    return max(1, triton.cdiv(count, BLOCK))  # a launch of nothing is an error
+    # Triton does not launch 0 programs.
+    return max(1, triton.cdiv(count, BLOCK))
 
 
 def _jacobian(gradients: OutputGradients) -> Float[Tensor, "M F 3"]:
-    """The gradient of the Jacobian; an empty one stands for none."""
+    """The gradient of the Jacobian; an empty tensor if there is none."""
     return gradients.features.new_empty(0, 0, 3) if gradients.jacobian is None else gradients.jacobian
 
 
 @lru_cache(maxsize=32)
 def _grid(spec: GridSpec, device: torch.device) -> Int[Tensor, "4 L"]:
-    """Per level: first table row, cells along an edge, rows, and whether each vertex has its own row."""
+    """Four numbers per level: first table row, cells along an edge, number of rows, and whether each vertex
+    has its own row.
+    """
     dense = [spec.is_dense(level) for level in range(len(spec.resolutions))]
     rows = [spec.offsets[:-1], spec.resolutions, spec.entries_per_level, dense]
     return torch.tensor([list(map(int, row)) for row in rows], device=device)

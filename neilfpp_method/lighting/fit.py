@@ -62,17 +62,19 @@ class Light:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Comparison of a light with lamps against one without, at held-back points that neither was fitted to.
+    """Comparison of a light with lamps against one without, where neither was fitted.
 
     Attributes:
         gain: mean reduction of the relative error by the lamps.
         deviation: standard error of that mean.
         points: number of held-back points.
+        in_views: whether the points were compared in held-back views, with base colours fitted in others.
     """
 
     gain: float
     deviation: float
     points: int
+    in_views: bool = False
 
     def favours(self, chosen: bool) -> bool:
         """Whether the light with lamps should be used.

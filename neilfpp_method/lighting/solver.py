@@ -10,12 +10,15 @@ The free light field is learned by gradient descent instead; its solver, `Nothin
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 import torch
 from torch import nn
 
 from neilfpp_method.fields.brdf import BrdfField
+from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.memory import SurfaceMemory
@@ -27,7 +30,15 @@ from neilfpp_method.settings.types import FreeLightConfig, MapLightConfig
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import Material, Observed, SceneTracer, StepResult
 
-__all__ = ["LightSolver", "MapSolver", "NothingToSolve", "make_light_solver"]
+__all__ = ["JudgeLamps", "LightSolver", "MapSolver", "NothingToSolve", "make_light_solver"]
+
+
+JudgeLamps = Callable[[Lamps, Lobe | None, SceneTracer | None], Evidence]
+"""Measures the benefit of lamps by other data than the points at which they were found."""
+START_ROWS = 16
+"""Rows of the map while lamps are sought beside an initial map. The five comparisons then take seconds: these
+are a ninth of the texels of preset `fast`.
+"""
 
 
 @runtime_checkable
@@ -60,7 +71,9 @@ class LightSolver(Protocol):
         """Whether the solver fits a map and neither a fit nor an observed point exists yet."""
         ...
 
-    def start(self, observed: Observed, material: Material, scene: SceneTracer | None) -> Evidence | None:
+    def start(
+        self, observed: Observed, material: Material, scene: SceneTracer | None, judge: JudgeLamps
+    ) -> Evidence | None:
         """Look for lamps in addition to an initial map that has been set; if none is found, keep that map.
 
         The first `solve` is then due one interval of fits later, so that surfaces first learn under this
@@ -70,9 +83,11 @@ class LightSolver(Protocol):
             observed: surface points.
             material: their material.
             scene: as in `solve`.
+            judge: compares the lamps with none. They are rejected if they are worse by more than one standard
+                error.
 
         Returns:
-            As in `solve`.
+            As in `solve`; the result of `judge` if that rejected the lamps.
         """
         ...
 
@@ -96,7 +111,9 @@ class NothingToSolve(nn.Module):
 
     due, points, seeks_start = False, 0, False
 
-    def start(self, observed: Observed, material: Material, scene: SceneTracer | None) -> None:
+    def start(
+        self, observed: Observed, material: Material, scene: SceneTracer | None, judge: JudgeLamps
+    ) -> None:
         """Do nothing."""
 
     def observe(self, step: StepResult) -> None:
@@ -163,15 +180,26 @@ class MapSolver(nn.Module):
         return fits_map and self.memory.age is None and self.points == 0
 
     @torch.no_grad()
-    def start(self, observed: Observed, material: Material, scene: SceneTracer | None) -> Evidence | None:
+    def start(
+        self, observed: Observed, material: Material, scene: SceneTracer | None, judge: JudgeLamps
+    ) -> Evidence | None:
         """See `LightSolver.start`."""
         self.memory.wait()
         if self.config.kind == "distant":
             return None
-        before, rows = self.light.light.log_radiance.clone(), slice(self.config.fit.points)
-        measured = self._solve(observed[rows], material[rows], scene, first=True, lamps_if_undecided=True)
-        if not self.light.lamps.lit:
-            self.light.light.log_radiance.copy_(before)
+        environment, lamps = self.light.light, self.light.lamps
+        # What cameras saw of the light is stored for the texels of the full map.
+        coarse = environment.at_most(START_ROWS) if self.sky is None else environment
+        trial, rows = LightModel(copy.deepcopy(coarse), lamps), slice(self.config.fit.points)
+        measured = self._solve(trial, observed[rows], material[rows], scene, first=True, at_start=True)
+        if lamps.lit and measured is not None:
+            in_views = judge(lamps, self.lobe, scene)
+            if in_views.gain < -in_views.deviation:
+                none = lamps.position[:0]
+                lamps.place(none, none)
+                measured = in_views
+        if lamps.lit:
+            environment.resample(trial.light.log_radiance)
         return measured
 
     def use(self, config: MapLightConfig, lobe: Lobe | None) -> None:
@@ -184,18 +212,19 @@ class MapSolver(nn.Module):
         if not self.due:
             return None
         first, observed = self.memory.age is None, self.memory.recall()
-        return self._solve(observed, brdf(observed.position), scene, first)
+        return self._solve(self.light, observed, brdf(observed.position), scene, first)
 
     def _solve(
         self,
+        light: LightModel,
         observed: Observed,
         material: Material,
         scene: SceneTracer | None,
         first: bool,
-        lamps_if_undecided: bool = False,
+        at_start: bool = False,
     ) -> Evidence | None:
         sky = None if self.sky is None else self.sky.known()
-        environment = self.light.light
+        environment = light.light
         objective = Objective(
             self.response,
             self.unit,
@@ -204,7 +233,7 @@ class MapSolver(nn.Module):
             self.config.monochrome,
         )
         measured = solve_light(
-            self.light,
+            light,
             observed,
             material,
             self.lobe,
@@ -212,7 +241,7 @@ class MapSolver(nn.Module):
             objective,
             self.config,
             first,
-            lamps_if_undecided,
+            lamps_if_undecided=at_start,
         )
         if environment.even:
             environment.log_radiance.copy_(environment.log_radiance[:, :1, :1].clone())

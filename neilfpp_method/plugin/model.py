@@ -20,15 +20,15 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.effects.asked import Asked
 from neilfpp_method.effects.first_light import start_with
-from neilfpp_method.effects.looks import look_at_light
 from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.request import EffectRequest
+from neilfpp_method.effects.review import review_light
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.health.cases import Health
 from neilfpp_method.health.guard import StepGuard
-from neilfpp_method.health.watch import LOOKED_AT, Watch
+from neilfpp_method.health.watch import CHECKED_PIXELS, Watch
 from neilfpp_method.hosts.foreign import ForeignHost, proxy_for
 from neilfpp_method.hosts.nerfstudio import OWN_LOSSES, NerfstudioHost
 from neilfpp_method.hosts.proxy import SurfaceProxy
@@ -127,7 +127,7 @@ class NeilfMethod(Model):
         self.pixels = pixels
         self.light_solver = self.neilf.light_solver()
         seed_step(settings.train.seed, step=-2)
-        self.watch = Watch(pixels.sample(LOOKED_AT, gradients=False), CONSOLE.log)
+        self.watch = Watch(pixels.sample(CHECKED_PIXELS, gradients=False), CONSOLE.log)
         self.guard = StepGuard(CONSOLE.log)
         self.record: RunRecord | None = None
         self.computed: StepResult | None = None
@@ -182,7 +182,7 @@ class NeilfMethod(Model):
             *theirs,
             TrainingCallback(before, self._begin_step, args=[optimizers]),
             TrainingCallback(after, self._solve_light),
-            TrainingCallback(after, self._look_and_save, args=[trainer]),
+            TrainingCallback(after, self._check_and_save, args=[trainer]),
             TrainingCallback(after, self._end_after_last, args=[trainer]),
             TrainingCallback(
                 [TrainingCallbackLocation.AFTER_TRAIN], lambda step: self.while_training.close()
@@ -210,12 +210,12 @@ class NeilfMethod(Model):
         """Set the initial light before material is trained, as in the standalone loop."""
         settings = self.config.neilf
         seed_step(settings.train.seed, -4 - step)
-        plan, pixels = Plan.begin(Asked("as-set"), settings), self.pixels.on(self.device)
-        _, first = look_at_light(plan, self.neilf, pixels, step)
+        plan, pixels = Plan.begin(EffectRequest("as-set"), settings), self.pixels.on(self.device)
+        _, first = review_light(plan, self.neilf, pixels, step)
         if first is not None:
-            CONSOLE.log(first.in_words())
+            CONSOLE.log(first.summary())
             start_with(self.neilf, first)
-            self.light_solver.start(first.observed, first.material, self.neilf.scene)
+            self.light_solver.start(first.observed, first.material, self.neilf.scene, first.lamp_trial)
 
     def _solve_light(self, step: int) -> None:
         """Bound β and fit the light if due, after the optimizer step as in the standalone loop."""
@@ -230,7 +230,7 @@ class NeilfMethod(Model):
         self.evidence = self.light_solver.solve(self.neilf.brdf, self.neilf.scene) or self.evidence
         self.computed = None
 
-    def _look_and_save(self, trainer: Trainer, step: int) -> None:
+    def _check_and_save(self, trainer: Trainer, step: int) -> None:
         """Check the health at the end of a stage; write the run folder then and when nerfstudio saves."""
         done = step + 1
         position = stage_at(step, self.config.neilf.train)

@@ -20,7 +20,7 @@ from neilfpp_method.data.point_cloud import WorldPoints, read_oriented_ply, writ
 from neilfpp_method.data.scene_box import SceneBox, find_box
 from neilfpp_method.data.views import CaptureFiles, View
 from neilfpp_method.errors import UserError
-from neilfpp_method.inspection.findings import inspect_capture, problems, to_leave_out
+from neilfpp_method.inspection.findings import inspect_capture, problems, views_to_leave_out
 from neilfpp_method.prepare.dense_cloud import dense_cloud
 from neilfpp_method.prepare.options import Prepare
 from neilfpp_method.prepare.pictures import write_picture
@@ -109,7 +109,7 @@ def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
     prepared = load_capture(step.folder)
     bar = open_bar("inspecting", len(prepared.views))
     inspection = inspect_capture(prepared, lambda _: bar.advance())
-    rejected = to_leave_out(inspection) if options.auto else {}
+    rejected = views_to_leave_out(inspection) if options.auto else {}
     if rejected:
         kept = tuple(view for view in prepared.views if view.name not in rejected)
         prepared = replace(prepared, views=kept)

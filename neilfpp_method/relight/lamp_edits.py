@@ -69,16 +69,17 @@ def edited_lamps(
             )
     if lamps is None or not edits:
         return lamps
-    position, kept = lamps.position.clone(), torch.ones(count, dtype=torch.bool, device=lamps.position.device)
+    position = lamps.position.clone()
+    remaining = torch.ones(count, dtype=torch.bool, device=position.device)
     for edit in edits:
         if edit.position is None:
-            kept[edit.number] = False
+            remaining[edit.number] = False
         else:
             world_position = torch.tensor(edit.position, dtype=torch.float64)
             position[edit.number] = normalisation.to_scene(world_position).to(position)
-    if not kept.any():
+    if not remaining.any():
         return None
-    return Lamplight(position[kept], lamps.axis[kept], lamps.radiance[kept], lamps.radius)
+    return Lamplight(position[remaining], lamps.axis[remaining], lamps.radiance[remaining], lamps.radius)
 
 
 def _parse(text: str) -> LampEdit:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from neilfpp_method.report.markup import Html, element, joined
 from neilfpp_method.timing.ledger import WORK
-from neilfpp_method.train.quality import Look
+from neilfpp_method.train.quality import QualityCheck
 
 __all__ = ["quality_curve", "work_bars"]
 
@@ -41,18 +41,18 @@ distinguish most of them; the legend names them.
 """
 
 
-def quality_curve(looks: Sequence[Look]) -> Html | None:
+def quality_curve(checks: Sequence[QualityCheck]) -> Html | None:
     """Draw the PSNR of R and of the rendering equation at held-back pixels over the seconds of the run.
 
     Returns None if there was no measurement during training.
     """
-    if not looks:
+    if not checks:
         return None
-    radiance = [(look.seconds, look.radiance) for look in looks]
-    physical = [(look.seconds, look.physical) for look in looks if look.physical is not None]
+    radiance = [(check.seconds, check.radiance) for check in checks]
+    physical = [(check.seconds, check.physical) for check in checks if check.physical is not None]
     values = [value for _, value in (*radiance, *physical)]
-    x_ticks, y_ticks = _ticks(0.0, looks[-1].seconds), _ticks(min(values), max(values))
-    right, low, high = max(x_ticks[-1], looks[-1].seconds), y_ticks[0], y_ticks[-1]
+    x_ticks, y_ticks = _ticks(0.0, checks[-1].seconds), _ticks(min(values), max(values))
+    right, low, high = max(x_ticks[-1], checks[-1].seconds), y_ticks[0], y_ticks[-1]
 
     def to_pixels(seconds: float, value: float) -> tuple[float, float]:
         across, up = seconds / max(right, 1e-9), (value - low) / (high - low)

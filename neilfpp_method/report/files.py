@@ -15,7 +15,7 @@ from neilfpp_method.settings.plain import to_dict
 from neilfpp_method.settings.presets import PRESETS, fixed_geometry, free_light
 from neilfpp_method.settings.types import MeshConfig, NeilfConfig
 from neilfpp_method.train.health_record import read_findings
-from neilfpp_method.train.quality import Look, read_looks
+from neilfpp_method.train.quality import QualityCheck, read_checks
 from neilfpp_method.train.run import read_description, read_json
 from neilfpp_method.train.work_record import read_work
 
@@ -45,7 +45,7 @@ class Files:
         measured: figures by protocol; empty if the run was not evaluated.
         timing: seconds by stage.
         work: seconds by stage and kind of work.
-        looks: measurements at held-back pixels during training.
+        checks: measurements at held-back pixels during training.
         effects: one row per effect, from `effects.json`.
         machine: hardware and package versions, from `environment.json`.
         notes: one message per file that could not be read.
@@ -58,7 +58,7 @@ class Files:
     measured: Mapping[str, Measured]
     timing: Mapping[str, float]
     work: Mapping[str, Mapping[str, float]]
-    looks: Sequence[Look]
+    checks: Sequence[QualityCheck]
     effects: list[Mapping[str, Any]]
     machine: Mapping[str, Any]
     notes: list[str]
@@ -94,7 +94,7 @@ def read_files(path: Path) -> Files:
         measured=measured,
         timing=numbers(optional_json("timing.json")),
         work=read_or(lambda: read_work(path), {}),
-        looks=read_or(lambda: read_looks(path), []),
+        checks=read_or(lambda: read_checks(path), []),
         effects=[row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else [],
         machine=optional_json("environment.json"),
         notes=notes,

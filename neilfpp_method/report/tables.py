@@ -10,7 +10,7 @@ from neilfpp_method.health.cases import Finding, verdict_of
 from neilfpp_method.report.curves import quality_curve, work_bars
 from neilfpp_method.report.files import Changed
 from neilfpp_method.report.markup import Html, cell, element, joined, table, with_code
-from neilfpp_method.train.quality import Look
+from neilfpp_method.train.quality import QualityCheck
 
 __all__ = [
     "STAGE_TITLES",
@@ -121,7 +121,7 @@ def figures_section(metrics: Mapping[str, float], description: str) -> Html:
 def time_section(
     timing: Mapping[str, float],
     work: Mapping[str, Mapping[str, float]],
-    looks: Sequence[Look],
+    checks: Sequence[QualityCheck],
     previews: Sequence[tuple[str, str]],
 ) -> Html:
     """Build the section with the time of each stage by kind of work, quality over time, and previews.
@@ -129,7 +129,7 @@ def time_section(
     Args:
         timing: seconds by stage.
         work: seconds by stage and kind of work; if not empty, it replaces `timing`.
-        looks: measurements at held-back pixels during training.
+        checks: measurements at held-back pixels during training.
         previews: stage and data URL of the image at the end of each stage.
     """
     stages = {stage: sum(parts.values()) for stage, parts in work.items()} or dict(timing)
@@ -167,7 +167,7 @@ def time_section(
         for stage, url in previews
     )
     times = table(("stage", "time", "", "largest parts"), *rows)
-    curve = quality_curve(looks)
+    curve = quality_curve(checks)
     caption = "Quality during training at held-back pixels, small patches of training views:"
     caption = element("p", caption, class_="pale") if curve else None
     return joined(times, work_bars(work, STAGE_TITLES), caption, curve, *pictures)

@@ -20,7 +20,7 @@ from neilfpp_method.report.page import page
 from neilfpp_method.report.surface import packed_surface
 from neilfpp_method.report.views import ReportViews, encode_views, run_for_display
 from neilfpp_method.schedule import Stage
-from neilfpp_method.train.light_record import in_words, read_fits
+from neilfpp_method.train.light_record import light_summary, read_fits
 from neilfpp_method.train.run import Run, load_run
 
 __all__ = ["REPORT", "ReportOptions", "write_report"]
@@ -117,7 +117,7 @@ def _with_model(run: Run, files: Files, options: ReportOptions, on_progress: Cal
             "train with --test-every 8."
         )
     light = (
-        in_words(run.config.light, read_fits(run.path, run.step))
+        light_summary(run.config.light, read_fits(run.path, run.step))
         if run.has_material
         else "no light has been estimated yet"
     )
@@ -152,7 +152,7 @@ def _how_to_continue(path: Path) -> str:
 def _from_files(files: Files) -> list[tuple[str, str, Html]]:
     settings = tables.settings_section(files.config.preset, changed_settings(files.config))
     return [
-        ("time", "Time", tables.time_section(files.timing, files.work, files.looks, _previews(files.path))),
+        ("time", "Time", tables.time_section(files.timing, files.work, files.checks, _previews(files.path))),
         ("effects", "Effects", tables.effects_section(files.effects)),
         ("settings", "Settings", settings),
     ]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from neilfpp_method.budget.durations import in_words
+from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.types import NeilfConfig
@@ -88,7 +88,7 @@ def table(points: Sequence[Point]) -> list[str]:
     for point in points:
         values = "  ".join(f"{_with_deviation(point, name):>20}" for name in names)
         mark = "  dominated" if point.dominated else ""
-        lines.append(f"{in_words(point.budget):8} {point.seconds:6.1f} s  {values}{mark}")
+        lines.append(f"{format_duration(point.budget):8} {point.seconds:6.1f} s  {values}{mark}")
         if point.per_minute:
             gained = "  ".join(f"{point.per_minute[name]:+18.2f}/m" for name in names)
             lines.append(f"{'':19}{gained}")

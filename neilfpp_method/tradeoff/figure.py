@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from neilfpp_method.budget.durations import in_words
+from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.report.markup import Html, element
 from neilfpp_method.tradeoff.frontier import FIGURES, Point
 
@@ -83,7 +83,7 @@ def _panel(name: str, points: Sequence[Point]) -> list[Html]:
             drawn.append(element("line", **bar, stroke=LINE))
         fill = "#ffffff" if point.dominated else LINE
         drawn.append(element("circle", cx=f"{x:.1f}", cy=f"{y:.1f}", r=4, fill=fill, stroke=LINE))
-        label = f"{in_words(point.budget)}: {point.figures[name]:.2f}"
+        label = f"{format_duration(point.budget)}: {point.figures[name]:.2f}"
         drawn.append(_text(x, y - 9, label, GRAY if point.dominated else INK, "middle"))
     return drawn
 

@@ -8,7 +8,7 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 
-from neilfpp_method.budget.durations import in_words
+from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.data.images import replacing
 from neilfpp_method.tradeoff.figure import draw_frontier
 from neilfpp_method.tradeoff.frontier import FIGURES, Measured, frontier
@@ -31,8 +31,8 @@ def write_tradeoff(out: Path, title: str, runs: Sequence[Measured]) -> None:
     lines.writerow(["budget", "seed", "budget_seconds", "seconds", *names, "dominated"])
     for run in runs:
         figures = [f"{run.figures[name]:.4f}" if name in run.figures else "" for name in names]
-        known = [in_words(run.budget), run.seed, f"{run.budget:.0f}", f"{run.seconds:.2f}"]
-        lines.writerow([*known, *figures, "yes" if dominated[run.budget] else "no"])
+        values = [format_duration(run.budget), run.seed, f"{run.budget:.0f}", f"{run.seconds:.2f}"]
+        lines.writerow([*values, *figures, "yes" if dominated[run.budget] else "no"])
     stored = {
         "format": FORMAT,
         "title": title,

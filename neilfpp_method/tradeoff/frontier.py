@@ -76,8 +76,8 @@ class Point:
 
 def frontier(runs: Sequence[Measured]) -> list[Point]:
     """The points of a frontier, by budget."""
-    known = set(FIGURES).intersection(*(run.figures for run in runs)) if runs else set()
-    names = [name for name in FIGURES if name in known]
+    common = set(FIGURES).intersection(*(run.figures for run in runs)) if runs else set()
+    names = [name for name in FIGURES if name in common]
     by_budget: dict[float, list[Measured]] = {}
     for run in sorted(runs, key=lambda run: run.budget):
         by_budget.setdefault(run.budget, []).append(run)

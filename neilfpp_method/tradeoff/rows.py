@@ -8,8 +8,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from neilfpp_method.budget.durations import in_words
-from neilfpp_method.effects.asked import read_asked
+from neilfpp_method.budget.durations import format_duration
+from neilfpp_method.effects.request import parse_effects
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.protocols import evaluate, write_metrics
 from neilfpp_method.evaluate.size import at_size
@@ -25,7 +25,7 @@ from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.effects_record import read_plan
 from neilfpp_method.train.json_files import read_json
 from neilfpp_method.train.pace import with_steps
-from neilfpp_method.train.quality import read_looks
+from neilfpp_method.train.quality import read_checks
 from neilfpp_method.train.run import CaptureSource, load_run, read_description
 
 __all__ = ["Row", "check_same", "measured", "rows_of", "run_row"]
@@ -68,7 +68,7 @@ def rows_of(
     Raises:
         UserError: if there is no budget, a budget occurs twice, or `seeds` is less than 1.
     """
-    if not budgets or len(set(map(in_words, budgets))) != len(budgets):
+    if not budgets or len(set(map(format_duration, budgets))) != len(budgets):
         raise UserError("--budgets is empty or contains a budget twice", "give each once, as 1m,3m,10m")
     if seeds < 1:
         raise UserError(f"--seeds is {seeds}", "set it to 1 or more")
@@ -77,7 +77,9 @@ def rows_of(
     for budget in sorted(budgets):
         for seed in range(config.train.seed, config.train.seed + seeds):
             seeded = replace(config, train=replace(config.train, seed=seed))
-            rows.append(Row(data, out / f"{in_words(budget)}-seed{seed}", seeded, effects, budget, device))
+            rows.append(
+                Row(data, out / f"{format_duration(budget)}-seed{seed}", seeded, effects, budget, device)
+            )
     return rows
 
 
@@ -95,9 +97,9 @@ def check_same(row: Row) -> None:
     described = read_description(row.out)
     plan = read_budget(row.out)
     planned = row.config if plan is None else planned_settings(plan, row.config)
-    effects = str(read_plan(row.out, described.config).asked)
+    effects = str(read_plan(row.out, described.config).request)
     source = CaptureSource(str(row.data.resolve()), scale=described.source.scale)
-    wanted = _compared(planned, source, row.budget, str(read_asked(row.effects)))
+    wanted = _compared(planned, source, row.budget, str(parse_effects(row.effects)))
     stored = _compared(described.config, described.source, plan and plan.budget, effects)
     for name in dict.fromkeys((*stored, *wanted)):
         if stored.get(name) != wanted.get(name):
@@ -136,7 +138,7 @@ def run_row(row: Row, console: Console, at_end: Callable[[Path], None] | None = 
             device=row.device,
             devices=1,
             console=console,
-            effects=None if exists else read_asked(row.effects),
+            effects=None if exists else parse_effects(row.effects),
             budget=row.budget,
             at_end=at_end,
         )
@@ -157,7 +159,7 @@ def measured(row: Row) -> Measured | None:
         return None
     known = read_json(row.out / METRICS) if _has_metrics(row.out) else {}
     figures = {name: float(known[name]) for name in FIGURES if isinstance(known.get(name), int | float)}
-    looks = read_looks(row.out)
+    looks = read_checks(row.out)
     if looks:
         last = looks[-1]
         figures["held_back_psnr"] = last.radiance if last.physical is None else last.physical

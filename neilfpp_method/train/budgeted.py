@@ -8,20 +8,20 @@ from pathlib import Path
 
 import torch
 
-from neilfpp_method.budget.durations import in_words
+from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.budget.plan import MIN_SHARE, share_for, smallest_budget, steps_for
 from neilfpp_method.budget.sizes import Size, next_size, sized
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.effects.asked import Asked
 from neilfpp_method.effects.material import JUDGED
 from neilfpp_method.effects.plan import Decision, Plan
+from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.timing.ledger import Ledger
 from neilfpp_method.train.budget_record import BudgetPlan, Revision, write_budget
 from neilfpp_method.train.pace import with_steps
-from neilfpp_method.train.quality import Look
-from neilfpp_method.train.trial import Trial, try_out
+from neilfpp_method.train.quality import QualityCheck
+from neilfpp_method.train.trial import Trial, run_trial
 from neilfpp_method.train.work_record import waiting
 
 __all__ = ["close_budget", "outcome", "plan_budget", "planned_effects", "planned_settings"]
@@ -44,7 +44,7 @@ def plan_budget(
     budget: float,
     capture: Capture,
     config: NeilfConfig,
-    asked: Asked,
+    request: EffectRequest,
     device: torch.device,
     devices: int,
     ledger: Ledger,
@@ -57,7 +57,7 @@ def plan_budget(
         budget: time of the whole command, in seconds.
         capture: the capture, with views of the size of their files.
         config: the settings; the steps of its stages are used as proportions.
-        asked: the value of `--effects`.
+        request: the value of `--effects`.
         device: the device of the training.
         devices: number of processes of the training, which must be 1.
         ledger: the clock; time that has already passed is part of the budget.
@@ -78,7 +78,7 @@ def plan_budget(
             limit = min(TRIAL_SHARE * budget, MAX_TRIAL)
             changed = sized(config, size)
             places, light = PLACES_SHARE * budget, LIGHT_SHARE * budget
-            trials[size] = try_out(capture, changed, asked, device, limit, places, light, report, wait)
+            trials[size] = run_trial(capture, changed, request, device, limit, places, light, report, wait)
         return share_for(trials[size].costs, budget, ledger.total)
 
     size: Size = "usual"
@@ -89,13 +89,15 @@ def plan_budget(
     if affordable < MIN_SHARE:
         needed = smallest_budget(trial.costs, ledger.total)
         raise UserError(
-            f"a budget of {in_words(budget)} is too small: {in_words(ledger.total)} of it have passed, and "
-            f"{in_words(trial.costs.once)} are needed for work that does not depend on the number of steps",
-            f"the smallest usable budget on this machine at its present load is --budget {in_words(needed)}",
+            f"a budget of {format_duration(budget)} is too small: {format_duration(ledger.total)} of it have "
+            f"passed, and {format_duration(trial.costs.once)} are needed for work that does not depend on "
+            "the number of steps",
+            "the smallest usable budget on this machine at its present load is --budget "
+            f"{format_duration(needed)}",
         )
     plan = BudgetPlan(budget, size, trial.costs, trial.places > 0.0, trial.light_pixels)
     plan.revisions.append(Revision(ledger.total, 0, steps_for(trial.costs, affordable)))
-    say(_in_words(plan))
+    say(_plan_summary(plan))
     return plan
 
 
@@ -116,13 +118,13 @@ def planned_effects(plan: BudgetPlan, effects: Plan) -> None:
         effects.decisions.append(Decision(0, LONG_TAILS, effects.is_on(LONG_TAILS), "settings", reason))
 
 
-def _in_words(plan: BudgetPlan) -> str:
+def _plan_summary(plan: BudgetPlan) -> str:
     """One line for the console, before the training."""
     steps = ", ".join(f"{stage.replace('_', ' ')} {count}" for stage, count in plan.steps.items())
     return (
-        f"budget {in_words(plan.budget)}: planned steps: {steps}; step size: {plan.size}; "
-        f"{in_words(plan.costs.once)} for measurements, previews and the report. The accuracy of the result "
-        "cannot be predicted"
+        f"budget {format_duration(plan.budget)}: planned steps: {steps}; step size: {plan.size}; "
+        f"{format_duration(plan.costs.once)} for measurements, previews and the report. The accuracy of the "
+        "result cannot be predicted"
     )
 
 
@@ -132,14 +134,14 @@ def close_budget(run: Path, plan: BudgetPlan, seconds: float) -> None:
     write_budget(run, plan)
 
 
-def outcome(plan: BudgetPlan, looks: Sequence[Look]) -> str:
+def outcome(plan: BudgetPlan, checks: Sequence[QualityCheck]) -> str:
     """One line for the console at the end: time taken against the budget, steps, and accuracy."""
     seconds = plan.took or 0.0
     deviation = f"{100.0 * (seconds / plan.budget - 1.0):+.1f} %".replace("-", "\N{MINUS SIGN}")
     steps = ", ".join(f"{stage.replace('_', ' ')} {count}" for stage, count in plan.steps.items())
     text = f"budget: {seconds:.1f} s of {plan.budget:.0f} s ({deviation}); steps: {steps}"
-    if looks:
-        last = looks[-1]
+    if checks:
+        last = checks[-1]
         physical = "" if last.physical is None else f", PBR {last.physical:.1f} dB"
         text += f"; PSNR of held-back pixels: R {last.radiance:.1f} dB{physical}"
     return text

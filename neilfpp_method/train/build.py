@@ -26,7 +26,7 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import OrientedPoints
 
-__all__ = ["build_model", "cloud_in_words", "exposures_of", "scene_facts", "show_known_light"]
+__all__ = ["build_model", "cloud_summary", "exposures_of", "scene_facts", "show_known_light"]
 
 LDR_SCALE = 1.0
 """Largest radiance that R can represent for LDR input, as published: the scale of its sigmoid."""
@@ -128,14 +128,14 @@ def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
         )
     scale, start = facts.radiance_scale, facts.median_radiance
     host = MeshHost(mesh, config, scale, facts.background, facts.background_color, start)
-    _check_seen(host, capture, path or "inputs/model/mesh.ply")
+    _check_visible(host, capture, path or "inputs/model/mesh.ply")
     return host
 
 
 HOSTS: Mapping[str, Callable[[Capture, SceneFacts, NeilfConfig], Host]] = {"volsdf": _volsdf, "mesh": _mesh}
 
 
-def cloud_in_words(capture: Capture, config: NeilfConfig) -> str | None:
+def cloud_summary(capture: Capture, config: NeilfConfig) -> str | None:
     """One line for the console on whether a point cloud supervises geometry.
 
     Returns None if the settings use no point cloud.
@@ -148,7 +148,7 @@ def cloud_in_words(capture: Capture, config: NeilfConfig) -> str | None:
     return f"{used}; --config.loss.point-cloud 0 switches this off"
 
 
-def _check_seen(host: MeshHost, capture: Capture, path: str) -> None:
+def _check_visible(host: MeshHost, capture: Capture, path: str) -> None:
     """Raise a `UserError` unless the cameras see the outside of the mesh."""
     cameras = [capture.normalisation.camera(view.camera) for view in capture.train_views]
     outside = torch.cat([host.cross(camera_rays(camera)[::SEEN_EVERY]).outside for camera in cameras])

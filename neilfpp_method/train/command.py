@@ -13,19 +13,19 @@ from lightning_fabric import Fabric
 from rich.console import Console
 from torch import Tensor
 
-from neilfpp_method.budget.durations import in_words as time_in_words
+from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.environment_map import check_environment
 from neilfpp_method.data.held_back import PATCHES, hold_back
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import at_scale, scale_for_rays
-from neilfpp_method.effects.asked import Asked, check_asked
-from neilfpp_method.effects.looks import note_exposures, note_facts
 from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.request import EffectRequest, check_effects
+from neilfpp_method.effects.review import record_exposures, record_facts
 from neilfpp_method.effects.table import table
 from neilfpp_method.errors import Unsound, UserError
 from neilfpp_method.health.cases import verdict_of
-from neilfpp_method.health.watch import LOOKED_AT, Watch
+from neilfpp_method.health.watch import CHECKED_PIXELS, Watch
 from neilfpp_method.inspection.findings import problems_of_poses
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, stage_steps
@@ -42,17 +42,17 @@ from neilfpp_method.train.budgeted import (
 )
 from neilfpp_method.train.build import (
     build_model,
-    cloud_in_words,
+    cloud_summary,
     exposures_of,
     scene_facts,
     show_known_light,
 )
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.effects_record import read_plan, write_plan
-from neilfpp_method.train.health_record import in_words as health_in_words
+from neilfpp_method.train.health_record import health_summary
 from neilfpp_method.train.launch import launch
-from neilfpp_method.train.light_record import in_words
-from neilfpp_method.train.lock import alone_in
+from neilfpp_method.train.light_record import light_summary
+from neilfpp_method.train.lock import run_lock
 from neilfpp_method.train.loop import train
 from neilfpp_method.train.memory import check_training_memory
 from neilfpp_method.train.optimizer import seed_step
@@ -60,7 +60,7 @@ from neilfpp_method.train.output import default_folder
 from neilfpp_method.train.pace import Pace
 from neilfpp_method.train.preview import write_preview
 from neilfpp_method.train.progress import Reporter, reporting
-from neilfpp_method.train.quality import Quality, has_looks
+from neilfpp_method.train.quality import Quality, has_checks
 from neilfpp_method.train.reading import load_pixels
 from neilfpp_method.train.run import (
     PIXELS,
@@ -94,7 +94,7 @@ def run_training(
     format: str | None = None,
     scale: float | None = None,
     strict: bool = False,
-    effects: Asked | None = None,
+    effects: EffectRequest | None = None,
     budget: float | None = None,
     command: str = "neilfpp train",
     at_end: Callable[[Path], None] | None = None,
@@ -116,7 +116,7 @@ def run_training(
         scale: size of the images relative to their files; None for the largest that the rays of the training
             can use.
         strict: whether to raise `Unsound` if the result is unusable.
-        effects: the value of `--effects` (`effects.asked`); None for the effects of the settings or, with
+        effects: the value of `--effects` (`effects.request`); None for the effects of the settings or, with
             `resume`, of the run.
         budget: time of everything from here to the end of `at_end`, in seconds; None to train as many steps
             as the settings say or, with `resume`, to keep the budget of the run.
@@ -141,13 +141,13 @@ def run_training(
         described = read_description(out)
         _refuse_changes(out, described, data, config, test_every, response, format, scale)
         plan, source = read_plan(out, described.config), described.source
-        if effects not in (None, plan.asked):
+        if effects not in (None, plan.request):
             raise UserError(
-                f"{out}: its effects are '{plan.asked}'", "leave --effects out, or start a new run"
+                f"{out}: its effects are '{plan.request}'", "leave --effects out, or start a new run"
             )
         config, planned = plan.config_of_model, read_budget(out)
         if budget not in (None, planned and planned.budget):
-            has = "no budget" if planned is None else f"a budget of {time_in_words(planned.budget)}"
+            has = "no budget" if planned is None else f"a budget of {format_duration(planned.budget)}"
             raise UserError(f"{out}: the run has {has}", "leave --budget out, or start a new run")
         ledger.add(read_work(out))
         if _is_finished(out, plan.config):
@@ -159,9 +159,9 @@ def run_training(
     else:
         if data is None or config is None:
             raise UserError("no capture given", "name its folder with --data DIR")
-        asked = effects or Asked("as-set")
-        check_asked(asked, config)
-        _check(Plan.begin(asked, config).config)
+        request = effects or EffectRequest("as-set")
+        check_effects(request, config)
+        _check(Plan.begin(request, config).config)
         source = CaptureSource(str(data.resolve()), test_every, response, format)
         check_free(out := out or default_folder(data, config))
     capture = source.load_again(out) if resume else source.load()
@@ -173,7 +173,7 @@ def run_training(
                 budget,
                 capture,
                 config,
-                asked,
+                request,
                 torch_device,
                 devices * nodes,
                 ledger,
@@ -181,7 +181,7 @@ def run_training(
                 console.print,
             )
             config = planned_settings(planned, config)
-        settings, plan = config, Plan.begin(asked, config)
+        settings, plan = config, Plan.begin(request, config)
         if planned is not None:
             planned_effects(planned, plan)
         config = plan.config
@@ -190,14 +190,14 @@ def run_training(
         capture = at_scale(capture, source.scale)
     check_training_memory(capture)
     fabric = launch(torch_device, devices, nodes)
-    with listening(ledger), _nothing_left_on_failure(out), alone_in(out):
+    with listening(ledger), _removed_on_failure(out), run_lock(out):
         pixels = load_pixels(capture, out / PIXELS, fabric, console)
         if resume:
             facts = described.facts
         else:
             gains = _log_gains(plan, capture, pixels)
             facts = scene_facts(capture, pixels, config, gains)
-        note_facts(plan, facts)
+        record_facts(plan, facts)
         config = plan.config_of_model
         seed_step(config.train.seed, step=-1)
         model = build_model(capture, facts, config)
@@ -216,7 +216,7 @@ def run_training(
                     console.print(line, style="yellow", soft_wrap=True, markup=False)
                 if source.scale < 1:
                     console.print(_scaled(source.scale, len(pixels), rays), soft_wrap=True)
-                for line in (cloud_in_words(capture, config), _exposures_in_words(plan)):
+                for line in (cloud_summary(capture, config), _exposures_summary(plan)):
                     if line is not None:
                         console.print(line, soft_wrap=True)
             console.print(f"run folder {out}", soft_wrap=True)
@@ -227,13 +227,13 @@ def run_training(
     fabric.barrier()
     continue_with = continue_command(command, out, device, devices, nodes)
     with (
-        alone_in(out),
+        run_lock(out),
         listening(ledger),
         reporting(out, console, fabric.is_global_zero) as reporter,
         stop_request(continue_with) as stopped,
     ):
         # A run that began without held-back pixels, in nerfstudio, continues to train on all pixels.
-        held_back = hold_back(pixels, config.train.seed, PATCHES if is_new or has_looks(out) else 0)
+        held_back = hold_back(pixels, config.train.seed, PATCHES if is_new or has_checks(out) else 0)
         preview = _preview(out, capture, fabric, reporter)
         solver, watch = model.light_solver(), _watch(pixels, config, reporter)
         training = Training(
@@ -258,17 +258,17 @@ def run_training(
         # Written once more, to include the time of the last checkpoint and preview.
         write_work(out, ledger)
     if fabric.is_global_zero and training.fits:
-        console.print(f"light: {in_words(config.light, training.fits)}", soft_wrap=True)
-    if fabric.is_global_zero and training.plan.asked.base != "as-set":
+        console.print(f"light: {light_summary(config.light, training.fits)}", soft_wrap=True)
+    if fabric.is_global_zero and training.plan.request.base != "as-set":
         console.print(table(training.plan))
     findings = list(watch.findings.values())
     if fabric.is_global_zero:
-        console.print(f"health: {health_in_words(findings)}", soft_wrap=True, markup=False)
+        console.print(f"health: {health_summary(findings)}", soft_wrap=True, markup=False)
         if at_end is not None:
             at_end(out)
     if fabric.is_global_zero and planned is not None:
         close_budget(out, planned, ledger.total)
-        console.print(outcome(planned, training.quality.looks), soft_wrap=True)
+        console.print(outcome(planned, training.quality.checks), soft_wrap=True)
     if strict and verdict_of(findings) == "failed":
         raise Unsound(f"{out}: {findings[0].what}", findings[0].remedy)
     return out
@@ -282,13 +282,13 @@ def _log_gains(plan: Plan, capture: Capture, pixels: PixelDataset) -> Tensor | N
     if not plan.is_on("exposure"):
         return None
     exposures = exposures_of(capture, pixels)
-    note_exposures(plan, exposures)
+    record_exposures(plan, exposures)
     if not plan.is_on("exposure"):
         return None
     return torch.zeros(len(pixels.views), 3) if exposures is None else exposures.log_gain
 
 
-def _exposures_in_words(plan: Plan) -> str | None:
+def _exposures_summary(plan: Plan) -> str | None:
     """One line that photographs have gains, with the reason; None if they have none."""
     decision = plan.newest("exposure")
     return f"effects: exposure on, {decision.reason}" if decision is not None and decision.on else None
@@ -296,7 +296,7 @@ def _exposures_in_words(plan: Plan) -> str | None:
 
 def _watch(pixels: PixelDataset, config: NeilfConfig, reporter: Reporter) -> Watch:
     seed_step(config.train.seed, step=-2)
-    return Watch(pixels.sample(LOOKED_AT, gradients=False), reporter.warn)
+    return Watch(pixels.sample(CHECKED_PIXELS, gradients=False), reporter.warn)
 
 
 def _refuse_changes(
@@ -359,7 +359,7 @@ def _scaled(scale: float, pixels: int, rays: int) -> str:
 
 
 @contextmanager
-def _nothing_left_on_failure(out: Path) -> Iterator[None]:
+def _removed_on_failure(out: Path) -> Iterator[None]:
     """If the context fails before the run exists, remove all folders that were created for it."""
     created = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:

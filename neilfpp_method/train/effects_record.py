@@ -15,10 +15,10 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from neilfpp_method.effects.asked import Asked, read_asked
 from neilfpp_method.effects.catalogue import EFFECTS
 from neilfpp_method.effects.measurement import Measurement
 from neilfpp_method.effects.plan import Decision, Plan
+from neilfpp_method.effects.request import EffectRequest, parse_effects
 from neilfpp_method.effects.table import rows
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.plain import from_dict
@@ -36,7 +36,7 @@ def write_plan(run: Path, plan: Plan) -> None:
     decisions = [dataclasses.asdict(decision) for decision in plan.decisions]
     write_json(
         run / FILE,
-        {"format": FORMAT, "asked": str(plan.asked), "decisions": decisions, "effects": rows(plan)},
+        {"format": FORMAT, "asked": str(plan.request), "decisions": decisions, "effects": rows(plan)},
     )
 
 
@@ -56,7 +56,7 @@ def read_plan(run: Path, settings: NeilfConfig, before: int | None = None) -> Pl
     """
     path = run / FILE
     if not path.is_file():
-        return Plan.begin(Asked("as-set"), settings)
+        return Plan.begin(EffectRequest("as-set"), settings)
     stored = read_json(path)
     if stored.get("format") != FORMAT or not isinstance(stored.get("decisions"), list):
         raise UserError(
@@ -64,7 +64,7 @@ def read_plan(run: Path, settings: NeilfConfig, before: int | None = None) -> Pl
         )
     try:
         decisions = [_decision(entry, str(path)) for entry in stored["decisions"]]
-        asked = read_asked(stored["asked"])
+        request = parse_effects(stored["asked"])
     except (TypeError, AttributeError, KeyError) as error:
         # A key is missing, or a value is not an object.
         raise UserError(
@@ -72,7 +72,7 @@ def read_plan(run: Path, settings: NeilfConfig, before: int | None = None) -> Pl
         ) from error
     if before is not None:
         decisions = [one for one in decisions if one.before_training or one.step <= before]
-    return Plan(asked, settings, decisions)
+    return Plan(request, settings, decisions)
 
 
 def _decision(entry: dict[str, Any], where: str) -> Decision:

@@ -6,17 +6,19 @@ The first process measures and decides for all.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.first_light import start_with
-from neilfpp_method.effects.looks import (
+from neilfpp_method.effects.plan import Decision, Plan
+from neilfpp_method.effects.review import (
     MOST_PIXELS,
-    after_fit,
-    look_at_light,
-    look_at_surface,
-    wants_surface,
+    needs_surface,
+    record_lamps,
+    review_light,
+    review_material,
+    review_surface,
 )
-from neilfpp_method.effects.plan import Decision
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import stage_at
 from neilfpp_method.structures import StepResult
@@ -25,7 +27,10 @@ from neilfpp_method.train.light_record import note_fit
 from neilfpp_method.train.optimizer import seed_step
 from neilfpp_method.train.training import Training
 
-__all__ = ["apply_plan", "look_before_stage", "solve_light"]
+__all__ = ["apply_plan", "review_before_stage", "solve_light"]
+
+Review = Callable[[Plan, NeilfModel, PixelDataset, int], list[Decision]]
+"""Measures with the model after so many steps and adds its decisions to the plan."""
 
 
 def solve_light(run: Training, model: NeilfModel, computed: StepResult, step: int) -> None:
@@ -44,7 +49,7 @@ def solve_light(run: Training, model: NeilfModel, computed: StepResult, step: in
         with doing("light_fits", apart=True):
             evidence = solver.solve(model.brdf, model.scene)
         note_fit(run.fits, evidence, model.lamps.lit, step)
-        _report(run, after_fit(run.plan, evidence, model.lamps.lit, step + 1))
+        _report(run, record_lamps(run.plan, evidence, model.lamps.lit, step + 1))
     _share_light(run, model)
 
 
@@ -55,11 +60,12 @@ def _share_light(run: Training, model: NeilfModel) -> None:
             part.load_state_dict(run.fabric.broadcast(part.state_dict()))
 
 
-def look_before_stage(run: Training, model: NeilfModel, step: int) -> None:
+def review_before_stage(run: Training, model: NeilfModel, step: int) -> None:
     """Take the measurements before a stage that trains material."""
     if model.stages[stage_at(step, run.config.train).stage].moves_material:
-        _look_at_effects(run, model, step)
+        _review_effects(run, model, step, review_surface, -3)
         _start_light(run, model, step)
+        _review_effects(run, model, step, review_material, -5)
 
 
 def _start_light(run: Training, model: NeilfModel, step: int) -> None:
@@ -69,14 +75,14 @@ def _start_light(run: Training, model: NeilfModel, step: int) -> None:
     decisions: list[Decision] = []
     if run.fabric.is_global_zero:
         seed_step(run.config.train.seed, -4 - step)
-        decisions, first = look_at_light(run.plan, model, run.pixels, step, _light_pixels(run))
+        decisions, first = review_light(run.plan, model, run.pixels, step, _light_pixels(run))
         _report(run, decisions)
         if first is not None:
-            run.reporter.say(first.in_words())
+            run.reporter.say(first.summary())
             start_with(model, first)
-            evidence = run.light_solver.start(first.observed, first.material, model.scene)
+            evidence = run.light_solver.start(first.observed, first.material, model.scene, first.lamp_trial)
             note_fit(run.fits, evidence, model.lamps.lit, step)
-            _report(run, after_fit(run.plan, evidence, model.lamps.lit, step))
+            _report(run, record_lamps(run.plan, evidence, model.lamps.lit, step))
     _share_light(run, model)
     _share_decisions(run, model, decisions)
 
@@ -87,14 +93,22 @@ def _light_pixels(run: Training) -> int:
     return MOST_PIXELS if most is None else most
 
 
-def _look_at_effects(run: Training, model: NeilfModel, step: int) -> None:
-    """Decide open effects by evidence. The first process does this for all."""
-    if not wants_surface(run.plan):
+def _review_effects(run: Training, model: NeilfModel, step: int, review: Review, stream: int) -> None:
+    """Decide open effects by evidence. The first process does this for all.
+
+    Args:
+        run: the training.
+        model: its model.
+        step: number of steps trained so far.
+        review: takes the measurements.
+        stream: selects the random numbers of these measurements, which are none of a training step.
+    """
+    if not needs_surface(run.plan):
         return
     decisions: list[Decision] = []
     if run.fabric.is_global_zero:
-        seed_step(run.config.train.seed, -3 - step)
-        decisions = look_at_surface(run.plan, model, run.pixels, step)
+        seed_step(run.config.train.seed, stream - step)
+        decisions = review(run.plan, model, run.pixels, step)
         _report(run, decisions)
     _share_decisions(run, model, decisions)
 

@@ -79,7 +79,7 @@ class OriginsOfNotFinite(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         broken = [_memory(value) for value in _tensors((args, kwargs)) if not is_finite(value)]
-        known = [self._origins[memory] for memory in broken if memory in self._origins]
+        sources = [self._origins[memory] for memory in broken if memory in self._origins]
         result = func(*args, **(kwargs or {}))
         uninitialised = func.__name__.startswith(UNINITIALISED)
         for value in _tensors(result):
@@ -87,8 +87,8 @@ class OriginsOfNotFinite(TorchDispatchMode):
                 self._origins.pop(_memory(value), None)
             elif is_finite(value):
                 continue
-            elif known:
-                self._origins[_memory(value)] = min(known, key=lambda origin: origin.order)
+            elif sources:
+                self._origins[_memory(value)] = min(sources, key=lambda origin: origin.order)
             elif not broken:
                 # If an input was not finite but has no known origin, the value comes from outside of the
                 # context or from a compiled loop, which is not a torch operation.

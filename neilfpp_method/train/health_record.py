@@ -10,7 +10,7 @@ from neilfpp_method.health.watch import FILE, FORMAT, Watch
 from neilfpp_method.settings.plain import from_dict
 from neilfpp_method.train.run import read_json, write_json
 
-__all__ = ["in_words", "read_findings", "write_findings"]
+__all__ = ["health_summary", "read_findings", "write_findings"]
 
 
 def write_findings(run: Path, watch: Watch) -> None:
@@ -43,6 +43,6 @@ def read_findings(run: Path) -> list[Finding] | None:
         ) from error
 
 
-def in_words(findings: list[Finding]) -> str:
+def health_summary(findings: list[Finding]) -> str:
     """The verdict in one line."""
     return str(Health.of(findings))

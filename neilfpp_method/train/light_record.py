@@ -13,7 +13,7 @@ from neilfpp_method.settings.plain import from_dict
 from neilfpp_method.settings.types import FreeLightConfig, MapLightConfig
 from neilfpp_method.train.run import read_json, write_json
 
-__all__ = ["LightFit", "in_words", "note_fit", "read_fits", "write_fits"]
+__all__ = ["LightFit", "light_summary", "note_fit", "read_fits", "write_fits"]
 
 FORMAT = 1
 FILE = "light.json"
@@ -74,7 +74,7 @@ def read_fits(run: Path, before: int) -> list[LightFit]:
     return [fit for fit in fits if fit.step < before]
 
 
-def in_words(config: FreeLightConfig | MapLightConfig, fits: Sequence[LightFit]) -> str:
+def light_summary(config: FreeLightConfig | MapLightConfig, fits: Sequence[LightFit]) -> str:
     """One line on the kind of light of a run, with the evidence unless the settings decide."""
     if isinstance(config, FreeLightConfig):
         return "a field that is free at every point"

@@ -15,14 +15,14 @@ except ImportError:
     # Windows has no fcntl.
     fcntl = None
 
-__all__ = ["LOCK", "alone_in"]
+__all__ = ["LOCK", "run_lock"]
 
 LOCK = ".training"
 """The lock file in a run folder. It contains the id of the process that holds it."""
 
 
 @contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
+def run_lock(folder: Path) -> Iterator[None]:
     """Lock a run folder for the duration of the context; the folder is created if it is missing.
 
     The operating system releases the lock when the process ends in any way, so a killed training does not

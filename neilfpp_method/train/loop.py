@@ -31,7 +31,7 @@ from neilfpp_method.settings.facts import RadianceUnits
 from neilfpp_method.structures import LossTerms
 from neilfpp_method.timing.ledger import doing
 from neilfpp_method.train.effects_record import read_plan, write_plan
-from neilfpp_method.train.evidence import apply_plan, look_before_stage, solve_light
+from neilfpp_method.train.evidence import apply_plan, review_before_stage, solve_light
 from neilfpp_method.train.health_record import read_findings, write_findings
 from neilfpp_method.train.light_record import read_fits, write_fits
 from neilfpp_method.train.optimizer import (
@@ -41,7 +41,7 @@ from neilfpp_method.train.optimizer import (
     seed_step,
     set_rates,
 )
-from neilfpp_method.train.quality import read_looks, write_looks
+from neilfpp_method.train.quality import read_checks, write_checks
 from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, save_checkpoint, write_json
 from neilfpp_method.train.skipped import Moment, keep_step
 from neilfpp_method.train.training import Training
@@ -67,7 +67,7 @@ def train(run: Training) -> None:
     step = _restore(run, optimizer)
     optimizer = run.fabric.setup_optimizers(optimizer)
     if step == 0:
-        look_before_stage(run, model, 0)
+        review_before_stage(run, model, 0)
     while step < total_steps(run.config.train):
         position = stage_at(step, run.config.train)
         step = _train_stage(run, model, optimizer, step, position)
@@ -76,7 +76,7 @@ def train(run: Training) -> None:
                 run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
         if step < total_steps(run.config.train):
             with doing("looks", apart=True):
-                look_before_stage(run, model, step)
+                review_before_stage(run, model, step)
         _save(run, optimizer, step, also=position.stage.value)
         with doing("looks", apart=True):
             model.eval()
@@ -115,7 +115,7 @@ def _train_stage(
         run.watch.after_step(model.stages[stage], computed, step)
         number, step = number + 1, step + 1
         length = _keep_pace(run, StagePosition(stage, number, length), step)
-        _look_at_quality(run, model, StagePosition(stage, number, length), step)
+        _check_quality(run, model, StagePosition(stage, number, length), step)
         run.seconds[stage.value] = before + time.perf_counter() - started
         if number == length:
             # `train` saves the end of a stage under its name, and a stop takes effect after that.
@@ -131,7 +131,7 @@ def _keep_pace(run: Training, position: StagePosition, step: int) -> int:
     """Adapt the number of steps to the budget if there is one. Returns the length of the stage."""
     if run.pace is None:
         return position.length
-    revised = run.pace.keep(run.config.train, position, step)
+    revised = run.pace.revise(run.config.train, position, step)
     if revised is not run.config.train:
         run.config = dataclasses.replace(run.config, train=revised)
         run.reporter.lengthen(stage_steps(revised)[position.stage])
@@ -139,9 +139,9 @@ def _keep_pace(run: Training, position: StagePosition, step: int) -> int:
 
 
 @doing("looks", apart=True)
-def _look_at_quality(run: Training, model: NeilfModel, position: StagePosition, step: int) -> None:
+def _check_quality(run: Training, model: NeilfModel, position: StagePosition, step: int) -> None:
     if run.fabric.is_global_zero:
-        run.quality.look_when_due(model, position, step, run.ledger.total)
+        run.quality.check_when_due(model, position, step, run.ledger.total)
 
 
 @doing("optimiser")
@@ -237,7 +237,7 @@ def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str 
             write_fits(run.path, run.fits)
             write_findings(run.path, run.watch)
             write_plan(run.path, run.plan)
-            write_looks(run.path, run.quality)
+            write_checks(run.path, run.quality)
             if run.pace is not None:
                 run.pace.save(run.path, run.config.train)
             for name in filter(None, (also, "last")):
@@ -263,7 +263,7 @@ def _restore(run: Training, optimizer: torch.optim.Optimizer) -> int:
         run.seconds.update(read_json(run.path / "timing.json"))
     run.fits += read_fits(run.path, saved["step"])
     run.plan = read_plan(run.path, run.plan.settings, saved["step"])
-    run.quality.looks += read_looks(run.path, saved["step"])
+    run.quality.checks += read_checks(run.path, saved["step"])
     apply_plan(run, run.model)
     run.watch.findings |= {finding.case: finding for finding in read_findings(run.path) or ()}
     return saved["step"]

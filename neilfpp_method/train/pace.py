@@ -37,14 +37,14 @@ class Pace:
     Attributes:
         plan: the plan, to which revisions are added.
         ledger: the clock.
-        looked: time of the last revision, in seconds.
+        revised: time of the last revision, in seconds.
     """
 
     plan: BudgetPlan
     ledger: Ledger
-    looked: float = 0.0
+    revised: float = 0.0
 
-    def keep(self, config: TrainConfig, position: StagePosition, step: int) -> TrainConfig:
+    def revise(self, config: TrainConfig, position: StagePosition, step: int) -> TrainConfig:
         """Plan the remaining steps again if it is time to do so.
 
         Args:
@@ -56,9 +56,9 @@ class Pace:
             The settings with the new steps; `config` itself if nothing has changed.
         """
         now = self.ledger.total
-        if now - self.looked < EVERY * self.plan.budget or position.step >= position.length:
+        if now - self.revised < EVERY * self.plan.budget or position.step >= position.length:
             return config
-        self.looked = now
+        self.revised = now
         stage = position.stage.value
         parts = self.ledger.seconds().get(stage, {})
         fitting = parts.get("light_fits", 0.0)

@@ -1,10 +1,10 @@
 """Measure the quality of a training while it runs, at held-back pixels (`data.held_back`).
 
-The pixels are rendered as evaluation renders test views, so the PSNR is that of `volume_psnr` and `pbr_psnr`:
-clipped and encoded as sRGB. A measurement (a "look") is made after every tenth of a stage but at least
-`MIN_STEPS` steps after the previous one, and at the end of each stage. Looks within a stage are postponed
-while all looks together have taken more than `MAX_SHARE` of the time of the run. The record is
-`RUN/quality.json`.
+The pixels are rendered as evaluation renders test views, so the PSNR is that of `volume_psnr` and
+`pbr_psnr`: clipped and encoded as sRGB. A check is made after every tenth of a stage, but at least
+`MIN_STEPS` steps after the previous check, and at the end of each stage. Checks within a stage are postponed
+while all checks together have taken more than `MAX_SHARE` of the time of the run. The record is
+`RUN/quality.json`; its key `looks` holds the checks.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from neilfpp_method.shading.color import tone_map
 from neilfpp_method.structures import PixelBatch
 from neilfpp_method.train.json_files import is_finite_number, read_json, write_json
 
-__all__ = ["FILE", "Look", "Quality", "has_looks", "read_looks", "write_looks"]
+__all__ = ["FILE", "Quality", "QualityCheck", "has_checks", "read_checks", "write_checks"]
 
 FORMAT = 1
 FILE = "quality.json"
-LOOKS_OF_STAGE = 10
+CHECKS_PER_STAGE = 10
 """Number of measurements per stage."""
 MIN_STEPS = 200
 """Minimum number of steps between two measurements in a stage; each costs about as much as a step."""
@@ -41,7 +41,7 @@ MAX_SHARE = 0.015
 
 
 @dataclass(frozen=True)
-class Look:
+class QualityCheck:
     """A measurement at the held-back pixels.
 
     Attributes:
@@ -68,14 +68,14 @@ class Quality:
     Attributes:
         pixels: the held-back pixels; if the capture is too small to hold any back, nothing is measured.
         hdr: whether the pixels are linear radiance rather than display values.
-        looks: the measurements in order.
+        checks: the measurements in order.
     """
 
     pixels: PixelBatch
     hdr: bool
-    looks: list[Look] = field(default_factory=list)
+    checks: list[QualityCheck] = field(default_factory=list)
 
-    def look_when_due(self, model: NeilfModel, position: StagePosition, step: int, seconds: float) -> None:
+    def check_when_due(self, model: NeilfModel, position: StagePosition, step: int, seconds: float) -> None:
         """Measure the quality if a measurement is due.
 
         Args:
@@ -94,15 +94,15 @@ class Quality:
         # A model that is not finite is reported by `health`.
         if not all(map(math.isfinite, (radiance, physical or 0.0))):
             return
-        self.looks.append(Look(step, position.stage.value, seconds, radiance, physical, took))
+        self.checks.append(QualityCheck(step, position.stage.value, seconds, radiance, physical, took))
 
     def _due(self, position: StagePosition, step: int, seconds: float) -> bool:
         if position.step == position.length:
             return True
-        before = max((look.step for look in self.looks), default=0)
+        before = max((check.step for check in self.checks), default=0)
         since = min(step - before, position.step)
-        cheap = sum(look.took for look in self.looks) <= MAX_SHARE * seconds
-        return cheap and since >= max(MIN_STEPS, math.ceil(position.length / LOOKS_OF_STAGE))
+        cheap = sum(check.took for check in self.checks) <= MAX_SHARE * seconds
+        return cheap and since >= max(MIN_STEPS, math.ceil(position.length / CHECKS_PER_STAGE))
 
 
 @torch.no_grad()
@@ -123,18 +123,18 @@ def _psnr(rendered: Float[Tensor, "N 3"], photograph: Float[Tensor, "N 3"]) -> f
     return -10.0 * math.log10(max(float((rendered - photograph).square().mean()), 1e-10))
 
 
-def write_looks(run: Path, quality: Quality) -> None:
+def write_checks(run: Path, quality: Quality) -> None:
     """Write the measurements so far, and the number of held-back pixels, into the run folder."""
-    looks = [dataclasses.asdict(look) for look in quality.looks]
-    write_json(run / FILE, {"format": FORMAT, "pixels": len(quality.pixels), "looks": looks})
+    checks = [dataclasses.asdict(check) for check in quality.checks]
+    write_json(run / FILE, {"format": FORMAT, "pixels": len(quality.pixels), "looks": checks})
 
 
-def has_looks(run: Path) -> bool:
+def has_checks(run: Path) -> bool:
     """Whether a run has a record of held-back pixels."""
     return (run / FILE).exists()
 
 
-def read_looks(run: Path, before: int | None = None) -> Sequence[Look]:
+def read_checks(run: Path, before: int | None = None) -> Sequence[QualityCheck]:
     """Read the measurements of a run.
 
     Args:
@@ -156,14 +156,16 @@ def read_looks(run: Path, before: int | None = None) -> Sequence[Look]:
             f"{path}: a record of another version", "remove the file, or use the version that wrote it"
         )
     try:
-        looks = [from_dict(Look, look, str(path)) for look in stored["looks"]]
+        checks = [from_dict(QualityCheck, check, str(path)) for check in stored["looks"]]
     except (TypeError, AttributeError) as error:
         # A key is missing, or a value is not an object.
         raise UserError(
             f"{path}: not a complete record ({error})", "remove the file, or train again"
         ) from error
     if not all(
-        is_finite_number(n) for look in looks for n in (look.seconds, look.radiance, look.physical or 0.0)
+        is_finite_number(n)
+        for check in checks
+        for n in (check.seconds, check.radiance, check.physical or 0.0)
     ):
         raise UserError(f"{path}: a number that is not finite", "remove the file, or train again")
-    return [look for look in looks if before is None or look.step <= before]
+    return [check for check in checks if before is None or check.step <= before]

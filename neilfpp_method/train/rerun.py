@@ -19,7 +19,7 @@ from neilfpp_method.train.first_not_finite import Origin, OriginsOfNotFinite, is
 from neilfpp_method.train.run import load_weights, read_description
 from neilfpp_method.train.skipped import SkippedStep, load_step
 
-__all__ = ["Rerun", "in_words", "rerun_step"]
+__all__ = ["Rerun", "rerun_step", "rerun_summary"]
 
 ROWS_SHOWN = 8
 """Maximum number of rays that the report of a step lists."""
@@ -83,8 +83,8 @@ def _computed(model: NeilfModel, skipped: SkippedStep) -> Rerun:
     }
     gradients = tuple(name for name, found in broken.items() if found)
     ends = [terms[name].values for name in losses] + [grad for found in broken.values() for grad in found]
-    known = [origin for end in ends if (origin := origins.origin_of(end)) is not None]
-    first = min(known, key=lambda origin: origin.order, default=None)
+    origins_found = [origin for end in ends if (origin := origins.origin_of(end)) is not None]
+    first = min(origins_found, key=lambda origin: origin.order, default=None)
     return Rerun(skipped, inputs, losses, gradients, first)
 
 
@@ -94,7 +94,7 @@ def _broken_inputs(model: NeilfModel, batch: PixelBatch) -> Iterator[str]:
     yield from (f.name for f in fields(batch) if not is_finite(getattr(batch, f.name)))
 
 
-def in_words(rerun: Rerun) -> str:
+def rerun_summary(rerun: Rerun) -> str:
     """A report of a few lines for the console."""
     skipped, origin = rerun.skipped, rerun.origin
     lines = [f"step {skipped.step}, stage {skipped.stage.value}, {len(skipped.batch)} rays"]

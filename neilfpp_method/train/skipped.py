@@ -114,9 +114,9 @@ def load_step(run: Path, step: int) -> SkippedStep:
     """
     path = run / FOLDER / f"{step}.pt"
     if not path.is_file():
-        kept = sorted(int(file.stem) for file in (run / FOLDER).glob("*.pt") if file.stem.isdecimal())
-        if kept:
-            remedy = f"choose one of {', '.join(map(str, kept))} (the first {MAX_KEPT} are stored)"
+        stored_steps = sorted(int(file.stem) for file in (run / FOLDER).glob("*.pt") if file.stem.isdecimal())
+        if stored_steps:
+            remedy = f"choose one of {', '.join(map(str, stored_steps))} (the first {MAX_KEPT} are stored)"
         else:
             remedy = "the run has skipped no step, so there is nothing to replay"
         raise UserError(f"{run}: step {step} is not a stored skipped step", remedy)

@@ -35,7 +35,7 @@ class Training:
         pixels: the training pixels.
         fabric: device and processes.
         reporter: progress output.
-        should_stop: whether a stop has been requested; asked once per step.
+        should_stop: whether a stop has been requested; called once per step.
         preview: writes the preview picture at the end of a stage.
         continue_with: command line that continues the run after a stop.
         light_solver: fits the light.

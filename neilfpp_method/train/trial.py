@@ -18,19 +18,19 @@ from neilfpp_method.budget.plan import Costs, StageCost
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import PIXELS_OF_A_VIEW, at_scale, scale_for_pixels
-from neilfpp_method.effects.asked import Asked
 from neilfpp_method.effects.first_light import seconds_of_pixel
-from neilfpp_method.effects.looks import (
-    FEWEST_PIXELS,
-    MIN_PHOTOGRAPHS,
-    MOST_PIXELS,
-    look_at_surface,
-    note_facts,
-)
 from neilfpp_method.effects.material import JUDGED, seconds_of_evidence
-from neilfpp_method.effects.plan import Decision, Plan
-from neilfpp_method.health.look import look
-from neilfpp_method.health.watch import LOOKED_AT
+from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.request import EffectRequest
+from neilfpp_method.effects.review import (
+    FEWEST_PIXELS,
+    MIN_TRAIN_VIEWS,
+    MOST_PIXELS,
+    record_facts,
+    review_surface,
+)
+from neilfpp_method.health.measure import measure_surface
+from neilfpp_method.health.watch import CHECKED_PIXELS
 from neilfpp_method.lighting.solver import LightSolver, NothingToSolve
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition, active_losses, stage_steps, weigh
@@ -40,7 +40,7 @@ from neilfpp_method.train.build import build_model, scene_facts, show_known_ligh
 from neilfpp_method.train.optimizer import make_optimizer, seed_step, set_rates
 from neilfpp_method.train.preview import preview_pixels
 
-__all__ = ["Trial", "try_out"]
+__all__ = ["Trial", "run_trial"]
 
 VIEWS = 4
 """Number of training views that a trial reads."""
@@ -94,10 +94,10 @@ class _Seconds:
     fits: list[float] = field(default_factory=list)
 
 
-def try_out(
+def run_trial(
     capture: Capture,
     config: NeilfConfig,
-    asked: Asked,
+    request: EffectRequest,
     device: torch.device,
     limit: float,
     most_for_places: float,
@@ -111,7 +111,7 @@ def try_out(
         capture: the capture. Large views are read at a smaller size, which does not affect the time of a
             step.
         config: the settings; the steps of its stages are used as proportions.
-        asked: the value of `--effects`.
+        request: the value of `--effects`.
         device: the device of the training.
         limit: approximate time that the steps of all stages may take together, in seconds.
         most_for_places: maximum time of the measurements at places, in seconds. If they would take more they
@@ -124,9 +124,9 @@ def try_out(
     small = replace(capture, views=_some(capture))
     small = at_scale(small, scale_for_pixels(small.views, PIXELS_OF_A_VIEW * len(small.views)))
     pixels = PixelDataset(small, small.train_views, device)
-    plan = Plan.begin(asked, config)
+    plan = Plan.begin(request, config)
     facts = scene_facts(small, pixels, config)
-    note_facts(plan, facts)
+    record_facts(plan, facts)
     config = plan.config_of_model
     trial_config, fit_scale = changed(config, {"shading.hit_share": LOOSE}), 1.0
     if config.light.kind != "free":
@@ -141,25 +141,25 @@ def try_out(
 
     lengths = {stage: steps for stage, steps in stage_steps(config.train).items() if steps}
     measures_places = model.lobe is not None and any(plan.is_open(name) for name in JUDGED)
-    place_look = seconds_of_evidence(device) if measures_places else 0.0
+    place_seconds = seconds_of_evidence(device) if measures_places else 0.0
     with_material = [stage for stage in lengths if model.stages[stage].moves_material]
-    if place_look * len(with_material) > most_for_places:
-        place_look = 0.0
+    if place_seconds * len(with_material) > most_for_places:
+        place_seconds = 0.0
     light_pixels, light = None, 0.0
-    if solver.seeks_start and len(capture.train_views) >= MIN_PHOTOGRAPHS and with_material:
-        rate = seconds_of_pixel(device, plan.is_open("long-tails"))
+    if solver.seeks_start and len(capture.train_views) >= MIN_TRAIN_VIEWS and with_material:
+        rate = seconds_of_pixel(device, plan.is_open("long-tails"), plan.is_open("metals"))
         light_pixels = min(MOST_PIXELS, int(most_for_light / rate))
         light_pixels = 0 if light_pixels < FEWEST_PIXELS else light_pixels
         light = rate * light_pixels
-    surface = _timed(lambda: _look_at_surface(plan, model, pixels), wait)
+    surface = _timed(lambda: _review_surface(plan, model, pixels), wait)
     costs, picture, fitted = {}, 0.0, False
     for stage, steps in lengths.items():
         moves = model.stages[stage].moves_material
         seconds = _steps(model, solver, optimizer, pixels, trial_config, stage, limit / len(lengths), wait)
         model.eval()
         picture = _picture_seconds(model, small, pixels, moves, wait)
-        sample = pixels.sample(LOOKED_AT, gradients=False)
-        looked = _timed(lambda sample=sample, moves=moves: look(model, sample, moves), wait)
+        sample = pixels.sample(CHECKED_PIXELS, gradients=False)
+        health_check = _timed(lambda sample=sample, moves=moves: measure_surface(model, sample, moves), wait)
         model.train()
         first, later = (seconds.fits[:1] or [0.0])[0], (seconds.fits[-1:] or [0.0])[0]
         every = 1 if config.light.kind == "free" else config.light.fit.every
@@ -173,12 +173,12 @@ def try_out(
             steps,
             step,
             fit=fit_scale * later / every,
-            start=(surface + place_look if moves else 0.0) + before,
-            end=picture + 2 * looked,
+            start=(surface + place_seconds if moves else 0.0) + before,
+            end=picture + 2 * health_check,
             first_fit=0.0 if light_pixels else first_fit,
         )
         fitted = fitted or moves
-    places = place_look * len(with_material)
+    places = place_seconds * len(with_material)
     return Trial(Costs(costs, REPORT * picture if report else 0.0), places, light_pixels)
 
 
@@ -232,12 +232,10 @@ def _steps(
     return times
 
 
-def _look_at_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset) -> None:
-    """Measure evidence at the surface, except that at places, which takes longer than a trial."""
-    excluded = [Decision(0, name, plan.is_on(name), "settings", "not part of a trial") for name in JUDGED]
-    decided = [*plan.decisions, *excluded]
+def _review_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset) -> None:
+    """Measure evidence at the surface; that at places takes longer than a trial."""
     if plan.is_open("inter-reflection"):
-        look_at_surface(Plan(plan.asked, plan.settings, decided), model, pixels, 0)
+        review_surface(Plan(plan.request, plan.settings, [*plan.decisions]), model, pixels, 0)
 
 
 def _picture_seconds(

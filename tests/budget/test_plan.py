@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from neilfpp_method.budget.durations import in_words, read_duration
+from neilfpp_method.budget.durations import format_duration, read_duration
 from neilfpp_method.budget.plan import (
     MAX_SHARE,
     MIN_SHARE,
@@ -199,4 +199,4 @@ def test_what_is_no_time(text):
 
 @pytest.mark.parametrize("seconds", [1, 59, 60, 61, 600, 3540, 3600, 5400, 86_400])
 def test_times_in_words_are_read_again(seconds):
-    assert read_duration(in_words(float(seconds))) == seconds
+    assert read_duration(format_duration(float(seconds))) == seconds

@@ -154,7 +154,10 @@ def test_summary(tmp_path: Path) -> None:
     summary = load_capture(make_capture(tmp_path / "ball", masks=True)).summary.splitlines()
     assert summary[0] == "ball (sfm_scene): 6 views of 24×18, 5 to train on and 1 to test on"
     assert summary[1] == "pixels: linear HDR; mask files: 6; point cloud: oriented_pcd.ply"
-    assert summary[2] == "scene: centre (0.3, -0.2, 0.5), 1 scene unit = 1.5 world units, as the capture says"
+    assert (
+        summary[2]
+        == "scene: centre (0.3, -0.2, 0.5), 1 scene unit = 1.5 world units, as stated by the capture"
+    )
 
 
 # -------------------------------------------------------------------------------------------------- real data

@@ -135,7 +135,10 @@ def view(content: dict) -> dict:
     ("change", "words"),
     [
         (lambda c: c.update(format="another"), "no capture in this folder"),
-        (lambda c: c.update(version=2), "version 2 of the format; version 1 is read"),
+        (
+            lambda c: c.update(version=2),
+            "version 2 of the format; this version of the package reads version 1",
+        ),
         (lambda c: c.pop("version"), "version is missing"),
         (lambda c: c.update(response="log"), "response: not linear or srgb"),
         (lambda c: c.update(views=[]), "no views"),
@@ -151,15 +154,15 @@ def view(content: dict) -> dict:
         (lambda c: view(c).update(image="/etc/hostname"), "not a path within the capture"),
         (lambda c: view(c).update(mask="../mask.png"), "not a path within the capture"),
         (lambda c: view(c).update(valid=5), "views.3.valid: not a file name"),
-        (lambda c: view(c).update(name="../003"), "'../003' cannot name a file"),
-        (lambda c: view(c).update(name=""), "'' cannot name a file"),
+        (lambda c: view(c).update(name="../003"), "'../003' is not a valid file name"),
+        (lambda c: view(c).update(name=""), "'' is not a valid file name"),
         (lambda c: view(c).update(name="000"), "have the same name"),
         (lambda c: view(c).update(exposure=0), "exposure and white balance are not all positive"),
         (
             lambda c: view(c).update(white_balance=[1, -1, 1]),
             "exposure and white balance are not all positive",
         ),
-        (lambda c: view(c)["camera"].update(w2c=[1] * 16), "no rotation and translation"),
+        (lambda c: view(c)["camera"].update(w2c=[1] * 16), "not a rotation and a translation"),
         (lambda c: view(c)["camera"].update(width=0), "width: not a positive whole number"),
         (lambda c: view(c)["camera"].update(fx=0), "focal length is not positive"),
         (

@@ -153,21 +153,21 @@ def test_pixels_at_which_a_lens_shows_nothing_are_told_and_look_away() -> None:
     seen_by = barrel(0.3)
     pinhole = Camera(*FOCAL, *CENTRE_PIXEL, 30, 20, camera_pose(2, 6))
     rays = CameraRays([pinhole, seen_by])
-    assert rays.shown(0).shape == (600,)
-    assert rays.shown(0).all()
+    assert rays.has_ray(0).shape == (600,)
+    assert rays.has_ray(0).all()
     rows, columns = np.mgrid[: SIZE[1], : SIZE[0]]
     radius = (
         np.hypot(columns.ravel() + 0.5 - CENTRE_PIXEL[0], rows.ravel() + 0.5 - CENTRE_PIXEL[1]) / FOCAL[0]
     )
     edge = 2 / 3 / np.sqrt(3 * 0.3)
-    shown = rays.shown(1).numpy()
-    assert shown[radius < edge - 0.01].all()
-    assert not shown[radius > edge + 0.01].any()
-    assert 0.1 < 1 - shown.mean() < 0.3
+    with_ray = rays.has_ray(1).numpy()
+    assert with_ray[radius < edge - 0.01].all()
+    assert not with_ray[radius > edge + 0.01].any()
+    assert 0.1 < 1 - with_ray.mean() < 0.3
     directions = camera_rays(seen_by).directions.numpy()
     axis = seen_by.w2c[2, :3]
-    assert np.allclose(directions[~shown], -axis, atol=1e-6)
-    assert (directions[shown] @ axis > 0).all()
+    assert np.allclose(directions[~with_ray], -axis, atol=1e-6)
+    assert (directions[with_ray] @ axis > 0).all()
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])

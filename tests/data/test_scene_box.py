@@ -103,5 +103,5 @@ def test_masks_with_nothing_in_common_are_refused(tmp_path: Path) -> None:
         corner = np.zeros((48, 64), np.uint8)
         corner[:6, :6] = 255
         write_png(view.mask, corner)
-    with pytest.raises(UserError, match="no place in common"):
+    with pytest.raises(UserError, match="lies in all masks"):
         find_box(some)

@@ -95,7 +95,7 @@ def test_a_few_wrong_masks_do_not_matter_and_many_do():
     assert (two & ~whole).sum() == 0
     assert (
         find_hull([*broken[:20], *outlines[20:]], resolution=32)
-        == "the masks have next to no place in common"
+        == "the masks have almost no region in common"
     )
 
 
@@ -128,9 +128,9 @@ def test_a_hole_that_views_look_through_is_open():
 def test_what_is_no_body_is_told():
     outlines = ring(10)
     white = [replace(outline, inside=np.ones_like(outline.inside)) for outline in outlines]
-    assert find_hull(white, resolution=32) == "what the masks show reaches beyond the scene box"
+    assert find_hull(white, resolution=32) == "the masks show something that extends beyond the scene box"
     black = [replace(outline, inside=np.zeros_like(outline.inside)) for outline in outlines]
-    assert find_hull(black, resolution=32) == "the masks have next to no place in common"
+    assert find_hull(black, resolution=32) == "the masks have almost no region in common"
 
 
 def test_the_signed_distance_of_a_slab():

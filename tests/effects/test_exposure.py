@@ -12,10 +12,10 @@ import torch
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.effects.asked import read_asked
 from neilfpp_method.effects.exposure import judge_gains, measure_exposures
-from neilfpp_method.effects.looks import note_exposures
 from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.request import parse_effects
+from neilfpp_method.effects.review import record_exposures
 from neilfpp_method.evaluate.map_metrics import exposed_alike
 from neilfpp_method.fields.exposure import at_mean_exposure
 from neilfpp_method.hosts.volsdf import VolSdfHost
@@ -62,11 +62,11 @@ def test_photographs_that_are_exposed_alike_need_no_gains(tmp_path):
     capture = photographs(tmp_path / "sphere", True, np.zeros((VIEWS, 3)))
     pixels, plan = (
         PixelDataset(capture, capture.train_views),
-        Plan.begin(read_asked("auto"), preset("fast")),
+        Plan.begin(parse_effects("auto"), preset("fast")),
     )
     found = exposures_of(capture, pixels)
     assert abs(found.measured.value) < 0.005
-    note_exposures(plan, found)
+    record_exposures(plan, found)
     decision = plan.newest("exposure")
     assert (decision.on, decision.by) == (False, "files")
     assert plan.config_of_model.optimizer.exposure == 0.0
@@ -81,11 +81,11 @@ def test_photographs_that_are_exposed_alike_need_no_gains(tmp_path):
 
 def test_without_a_cloud_nothing_is_known(tmp_path):
     capture = dataclasses.replace(load_capture(make_capture(tmp_path / "sphere")), point_cloud=None)
-    plan = Plan.begin(read_asked("auto"), preset("fast"))
-    note_exposures(plan, exposures_of(capture, PixelDataset(capture, capture.train_views)))
+    plan = Plan.begin(parse_effects("auto"), preset("fast"))
+    record_exposures(plan, exposures_of(capture, PixelDataset(capture, capture.train_views)))
     assert not plan.is_on("exposure")
-    asked = Plan.begin(read_asked("+exposure"), preset("paper-mlp"))
-    note_exposures(asked, None)
+    asked = Plan.begin(parse_effects("+exposure"), preset("paper-mlp"))
+    record_exposures(asked, None)
     assert asked.is_on("exposure")
     assert asked.config_of_model.optimizer.exposure > 0
 

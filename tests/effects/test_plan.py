@@ -10,12 +10,12 @@ import torch
 
 from neilfpp_method.cli import main
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.effects.asked import check_asked, read_asked
-from neilfpp_method.effects.disagreement import ShownSurface, shading_disagreement
-from neilfpp_method.effects.looks import _shown_surface, after_fit, look_at_surface
+from neilfpp_method.effects.disagreement import RenderedSurface, shading_disagreement
 from neilfpp_method.effects.material import JUDGED
 from neilfpp_method.effects.measurement import Measurement, mean_of
 from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.request import check_effects, parse_effects
+from neilfpp_method.effects.review import _rendered_surface, record_lamps, review_surface
 from neilfpp_method.effects.visibility import self_visibility
 from neilfpp_method.errors import UserError
 from neilfpp_method.fields import environment
@@ -69,9 +69,9 @@ def test_a_ball_sees_nothing_of_itself_so_nothing_is_traced():
     config = solved_light(tiny_config())
     config = dataclasses.replace(config, shading=dataclasses.replace(config.shading, hit_share=0.2))
     named = "auto," + ",".join(f"+{name}" for name in (*JUDGED, "joint-stage"))
-    model, plan = sphere_model(config), Plan.begin(read_asked(named), config)
+    model, plan = sphere_model(config), Plan.begin(parse_effects(named), config)
     torch.manual_seed(0)
-    (decision,) = look_at_surface(plan, model, OnePicture(), step=4)
+    (decision,) = review_surface(plan, model, OnePicture(), step=4)
     assert not decision.on
     assert decision.evidence.samples > 100
 
@@ -104,7 +104,7 @@ def counted(lobe: Lobe, calls: Counter) -> Lobe:
 
 
 def asked_of_the_lobe(effects: str, monkeypatch) -> Counter:
-    config = Plan.begin(read_asked(effects), solved_light(tiny_config())).config
+    config = Plan.begin(parse_effects(effects), solved_light(tiny_config())).config
     calls = Counter()
     monkeypatch.setitem(LOBES, config.shading.lobe, counted(LOBES[config.shading.lobe], calls))
     model = sphere_model(
@@ -124,7 +124,7 @@ def test_a_lobe_that_is_off_is_not_asked(monkeypatch):
 
 
 def test_an_even_light_is_not_looked_up_and_is_one_source(monkeypatch):
-    config = Plan.begin(read_asked("all,-environment-map"), solved_light(tiny_config())).config
+    config = Plan.begin(parse_effects("all,-environment-map"), solved_light(tiny_config())).config
     model = sphere_model(
         dataclasses.replace(config, shading=dataclasses.replace(config.shading, hit_share=0.2))
     )
@@ -143,7 +143,7 @@ def test_an_even_light_is_not_looked_up_and_is_one_source(monkeypatch):
 
 
 def test_white_light_has_one_channel():
-    config = Plan.begin(read_asked("all,-coloured-light"), solved_light(tiny_config())).config
+    config = Plan.begin(parse_effects("all,-coloured-light"), solved_light(tiny_config())).config
     model = sphere_model(
         dataclasses.replace(config, shading=dataclasses.replace(config.shading, hit_share=0.2))
     )
@@ -157,7 +157,7 @@ def test_white_light_has_one_channel():
 
 
 def test_without_reflection_there_is_nothing_that_needs_it():
-    plan = Plan.begin(read_asked("auto,-reflection"), preset("fast"))
+    plan = Plan.begin(parse_effects("auto,-reflection"), preset("fast"))
     config = plan.config
     assert not config.shading.specular
     assert not config.brdf.metals
@@ -167,7 +167,7 @@ def test_without_reflection_there_is_nothing_that_needs_it():
 
 
 def test_advice_changes_nothing_and_is_said():
-    plan = Plan.begin(read_asked("auto"), preset("fast"))
+    plan = Plan.begin(parse_effects("auto"), preset("fast"))
     worthless = Measurement("error", 0.0, 0.001, 0.01, 100)
     assert worthless.favours(True) is False
     for name in ("reflection", "environment-map", "coloured-light", "varying-roughness"):
@@ -180,7 +180,7 @@ def test_advice_changes_nothing_and_is_said():
 
 
 def test_nothing_varies_so_no_slope_is_asked():
-    config = Plan.begin(read_asked("as-set,-metals,-varying-roughness"), tiny_config()).config
+    config = Plan.begin(parse_effects("as-set,-metals,-varying-roughness"), tiny_config()).config
     config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, smoothness=1.0))
     assert "smoothness" not in active_losses(Stage.MATERIAL_INIT, config)
     assert "smoothness" in active_losses(Stage.MATERIAL_INIT, changed(config, {"brdf.metals": True}))
@@ -188,22 +188,24 @@ def test_nothing_varies_so_no_slope_is_asked():
 
 def test_shading_that_is_as_good_as_r_leaves_nothing_to_the_joint_stage():
     model = sphere_model(tiny_config()).eval()
-    seen = _shown_surface(model, sphere_batch(400))
+    seen = _rendered_surface(model, sphere_batch(400))
     observed, radiance = seen.observed, seen.radiance
     assert len(radiance) > 50
     material = model.materials(observed.position)
     samples = model.config.shading.eval_samples
     shaded = model.shade(observed.position, observed.normal, observed.wo, material, samples).color.detach()
-    same = ShownSurface(dataclasses.replace(observed, pixel=shaded), shaded)
+    same = RenderedSurface(dataclasses.replace(observed, pixel=shaded), shaded)
     assert shading_disagreement(model, same).value == 0
-    worse = shading_disagreement(model, ShownSurface(dataclasses.replace(observed, pixel=radiance), radiance))
+    worse = shading_disagreement(
+        model, RenderedSurface(dataclasses.replace(observed, pixel=radiance), radiance)
+    )
     off = (shaded - radiance).abs() / (radiance + 0.1 * model.units.physical)
     assert worse.value == pytest.approx(off.clamp_max(1).mean().item(), rel=1e-4)
 
 
 def test_evidence_is_revised_and_said():
     config = preset("fast")
-    plan = Plan.begin(read_asked("auto"), config)
+    plan = Plan.begin(parse_effects("auto"), config)
     few = Measurement("directions", 0.2, 0.01, 0.01, 400)
     assert plan.decide("inter-reflection", few, 4).on
     gone = plan.decide("inter-reflection", Measurement("directions", 0.001, 0.0005, 0.01, 400), 8)
@@ -217,14 +219,16 @@ def test_evidence_is_revised_and_said():
 
 
 def test_lamps_are_noted_when_the_choice_changes():
-    plan = Plan.begin(read_asked("auto"), preset("fast"))
-    assert after_fit(plan, Evidence(0.001, 0.002, 200), 0, 5)[0].on is False
-    assert after_fit(plan, Evidence(0.001, 0.002, 200), 0, 9) == []
-    (found,) = after_fit(plan, Evidence(0.1, 0.002, 200), 2, 14)
+    plan = Plan.begin(parse_effects("auto"), preset("fast"))
+    assert record_lamps(plan, Evidence(0.001, 0.002, 200), 0, 5)[0].on is False
+    assert record_lamps(plan, Evidence(0.001, 0.002, 200), 0, 9) == []
+    (found,) = record_lamps(plan, Evidence(0.1, 0.002, 200), 2, 14)
     assert found.on
     assert found.reason.startswith("revised")
     assert plan.config.light.kind == "auto"  # the solver goes on choosing
-    assert after_fit(Plan.begin(read_asked("-lamps"), preset("fast")), Evidence(0.1, 0.0, 200), 1, 5) == []
+    assert (
+        record_lamps(Plan.begin(parse_effects("-lamps"), preset("fast")), Evidence(0.1, 0.0, 200), 1, 5) == []
+    )
 
 
 def test_the_standard_error_is_that_of_the_mean():
@@ -235,7 +239,7 @@ def test_the_standard_error_is_that_of_the_mean():
 
 def test_names_switch_settings():
     config = preset("fast")
-    none = Plan.begin(read_asked("none"), config).config
+    none = Plan.begin(parse_effects("none"), config).config
     assert (none.shading.specular, none.light.environment_height, none.light.monochrome) == (False, 1, True)
     assert (none.brdf.metals, none.brdf.varying_roughness, none.train.joint_steps) == (False, False, 0)
     assert (none.inter_reflection.mode, none.light.kind, none.background.kind) == (
@@ -243,14 +247,16 @@ def test_names_switch_settings():
         "distant",
         "constant",
     )
-    everything = Plan.begin(read_asked("all,-lamps"), config).config
+    everything = Plan.begin(parse_effects("all,-lamps"), config).config
     assert (everything.inter_reflection.mode, everything.light.kind) == ("hard", "distant")
-    assert Plan.begin(read_asked("as-set"), config).config == config
+    assert Plan.begin(parse_effects("as-set"), config).config == config
     free = tiny_config()
     assert (
-        Plan.begin(read_asked("as-set"), free).config == Plan.begin(read_asked("auto"), free).config == free
+        Plan.begin(parse_effects("as-set"), free).config
+        == Plan.begin(parse_effects("auto"), free).config
+        == free
     )
-    assert Plan.begin(read_asked("none,+inter-reflection"), none).config.inter_reflection.mode == "hard"
+    assert Plan.begin(parse_effects("none,+inter-reflection"), none).config.inter_reflection.mode == "hard"
 
 
 @pytest.mark.parametrize(
@@ -267,12 +273,12 @@ def test_names_switch_settings():
 )
 def test_bad_names_get_one_line(text, complaint):
     with pytest.raises(UserError, match=complaint):
-        check_asked(read_asked(text), preset("fast"))
+        check_effects(parse_effects(text), preset("fast"))
 
 
 def test_a_free_light_has_no_lamps_to_switch():
     with pytest.raises(UserError, match="free at every point"):
-        check_asked(read_asked("+lamps"), tiny_config())
+        check_effects(parse_effects("+lamps"), tiny_config())
 
 
 def test_a_bad_name_ends_the_command(tmp_path, capsys):

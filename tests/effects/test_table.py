@@ -5,16 +5,16 @@ from __future__ import annotations
 import pytest
 from rich.console import Console
 
-from neilfpp_method.effects.asked import read_asked
 from neilfpp_method.effects.plan import Decision, Plan
+from neilfpp_method.effects.request import parse_effects
 from neilfpp_method.effects.table import rows, table
 from neilfpp_method.settings.presets import PRESETS, preset
 
 
 @pytest.mark.parametrize("name", list(PRESETS))
-@pytest.mark.parametrize("asked", ["auto", "as-set", "none", "all"])
-def test_no_word_is_broken_at_80_columns(name, asked):
-    plan = Plan.begin(read_asked(asked), preset(name))
+@pytest.mark.parametrize("effects", ["auto", "as-set", "none", "all"])
+def test_no_word_is_broken_at_80_columns(name, effects):
+    plan = Plan.begin(parse_effects(effects), preset(name))
     console = Console(width=80, markup=False, highlight=False)
     with console.capture() as captured:
         console.print(table(plan))
@@ -25,7 +25,7 @@ def test_no_word_is_broken_at_80_columns(name, asked):
 
 
 def test_a_long_file_name_is_shown_in_full():
-    plan = Plan.begin(read_asked("auto"), preset("fast"))
+    plan = Plan.begin(parse_effects("auto"), preset("fast"))
     name = "photographs-of-a-teapot-in-the-garden.exr"
     plan.decisions.append(Decision(0, "background", True, "files", name))
     console = Console(width=80, markup=False, highlight=False)

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import pytest
 
-from neilfpp_method.effects.asked import read_asked
 from neilfpp_method.effects.catalogue import EFFECTS
 from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.request import parse_effects
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.lighting import solve
 from neilfpp_method.lighting.fit import fit_light
@@ -28,7 +28,7 @@ def settings(effects: str) -> NeilfConfig:
     config = changed(
         solved_light(tiny_config()), {"shading.hit_share": 0.2, "optimizer.exposure": EXPOSURE_RATE}
     )
-    return Plan.begin(read_asked(effects), config).config
+    return Plan.begin(parse_effects(effects), config).config
 
 
 @pytest.mark.parametrize("lamps", [True, False])

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from neilfpp_method.fields.background import InvertedSphere
-from neilfpp_method.settings.types import BackgroundConfig
+from neilfpp_method.settings.types import BackgroundConfig, FrequencyConfig, HashGridConfig
 
+WAVES, GRID = FrequencyConfig(), HashGridConfig(levels=4, log2_entries=10, max_resolution=32)
 CONFIG = BackgroundConfig(layers=2, width=16, samples=8)
 
 
@@ -21,10 +22,11 @@ def rays(radius: float, count: int = 20) -> tuple[torch.Tensor, torch.Tensor]:
     return origins, directions
 
 
+@pytest.mark.parametrize("encoding", [WAVES, GRID])
 @pytest.mark.parametrize("density", [-50.0, 0.0, 3.0, 50.0])
-def test_a_constant_colour_is_seen_whatever_the_density(density):
+def test_a_constant_colour_is_seen_whatever_the_density(density, encoding):
     torch.manual_seed(0)
-    field = InvertedSphere(CONFIG, radius=3.0, scale=2.0)
+    field = InvertedSphere(CONFIG, encoding, radius=3.0, scale=2.0)
     with torch.no_grad():
         field.trunk.layers[-1].bias[0] = density
         field.head.layers[-1].weight.zero_()
@@ -34,7 +36,7 @@ def test_a_constant_colour_is_seen_whatever_the_density(density):
 
 
 def test_samples_lie_on_the_rays_in_equal_steps_of_inverse_radius():
-    field = InvertedSphere(CONFIG, radius=2.0, scale=1.0).double()
+    field = InvertedSphere(CONFIG, WAVES, radius=2.0, scale=1.0).double()
     seen = []
     field.position.register_forward_hook(lambda _, given, __: seen.append(given[0]))
     origins, directions = rays(2.0)
@@ -49,17 +51,34 @@ def test_samples_lie_on_the_rays_in_equal_steps_of_inverse_radius():
     torch.testing.assert_close(travelled, along * directions[:, None])
 
 
+def test_a_hash_grid_encodes_the_contraction_of_the_same_points():
+    waves, grid = (InvertedSphere(CONFIG, encoding, radius=2.0, scale=1.0) for encoding in (WAVES, GRID))
+    charts, contracted = [], []
+    waves.position.register_forward_hook(lambda _, given, __: charts.append(given[0]))
+    grid.position.register_forward_hook(lambda _, given, __: contracted.append(given[0]))
+    origins, directions = (t.float() for t in rays(2.0))
+    waves(origins, directions), grid(origins, directions)
+    unit, inverse = charts[0].split((3, 1), -1)
+    points = unit / inverse
+    distance = points.norm(dim=-1, keepdim=True) / 2.0  # in radii of the scene sphere
+    # Barron et al. 2022, eq. 10
+    expected = (2 - 1 / distance) * unit
+    torch.testing.assert_close(contracted[0].view(20, 8, 3), expected)
+    assert contracted[0].norm(dim=-1).min() > 1.0
+    assert contracted[0].norm(dim=-1).max() < 2.0
+
+
 @pytest.mark.parametrize("start", [(0.25, 0.2, 0.15), (1.0, 0.5, 0.04)])
 def test_it_starts_as_the_colour_that_it_is_told(start):
     torch.manual_seed(0)
-    field = InvertedSphere(CONFIG, radius=3.0, scale=2.0, start=torch.tensor(start))
+    field = InvertedSphere(CONFIG, WAVES, radius=3.0, scale=2.0, start=torch.tensor(start))
     color = field(*(t.float() for t in rays(3.0)))
     torch.testing.assert_close(color, torch.tensor(start).expand(20, 3), rtol=0.02, atol=1e-3)
 
 
 @pytest.mark.parametrize("start", [0.0, 2.0, 5.0])
 def test_a_colour_that_it_cannot_reach_leaves_it_able_to_learn(start):
-    field = InvertedSphere(CONFIG, radius=3.0, scale=2.0, start=torch.full((3,), start))
+    field = InvertedSphere(CONFIG, WAVES, radius=3.0, scale=2.0, start=torch.full((3,), start))
     color = field(*(t.float() for t in rays(3.0)))
     color.sum().backward()
     assert ((color > 0.01) & (color < 1.99)).all()
@@ -71,7 +90,7 @@ def test_two_samples_by_hand():
     it.
     """
     torch.manual_seed(0)
-    field = InvertedSphere(BackgroundConfig(layers=2, width=16, samples=2), radius=4.0, scale=1.0)
+    field = InvertedSphere(BackgroundConfig(layers=2, width=16, samples=2), WAVES, radius=4.0, scale=1.0)
     with torch.no_grad():
         field.trunk.layers[-1].weight[0].zero_()
         field.trunk.layers[-1].bias[0] = 0  # softplus(0) = ln 2

@@ -110,9 +110,9 @@ BROKEN_SCENES = {
     "ragged extrinsic": (extrinsic([[1, 0], [0]]), "extrinsic: not 16 or 4×4 finite numbers"),
     "extrinsic of text": (extrinsic("eye"), "extrinsic: not 16 or 4×4 finite numbers"),
     "extrinsic with NaN": (extrinsic([float("nan")] * 16), "extrinsic: not 16 or 4×4 finite numbers"),
-    "mirror": (extrinsic(MIRROR), "003.exr: the extrinsic is no rotation and translation"),
-    "scaled rotation": (extrinsic(np.diag([2, 2, 2, 1]).tolist()), "the extrinsic is no rotation"),
-    "projective": (extrinsic([*np.eye(4)[:3].tolist(), [0, 0, 1, 0]]), "the extrinsic is no rotation"),
+    "mirror": (extrinsic(MIRROR), "003.exr: the extrinsic matrix is not a rotation and a translation"),
+    "scaled rotation": (extrinsic(np.diag([2, 2, 2, 1]).tolist()), "the extrinsic matrix is not a rotation"),
+    "projective": (extrinsic([*np.eye(4)[:3].tolist(), [0, 0, 1, 0]]), "extrinsic matrix is not a rotation"),
     "negative focal": (intrinsic(focal=[-25.0, 25.0]), "003.exr: the focal length is not positive"),
     "zero focal": (intrinsic(focal=0), "003.exr: the focal length is not positive"),
     "focal of almost nothing": (intrinsic(focal=1e-300), "003.exr: the camera has a focal length below"),
@@ -172,7 +172,7 @@ def test_the_file_that_is_meant_is_not_clear(tmp_path: Path) -> None:
     images = root / "inputs" / "images"
     (images / "003.exr").rename(images / "003.tif")
     write_png(images / "003.png", (FLAT * 255).astype(np.uint8))
-    refused(root, "003.exr: not there, and 003.tif and 003.png could both be meant")
+    refused(root, "003.exr: does not exist, and 003.tif and 003.png are both possible")
 
 
 def test_two_images_of_one_name(tmp_path: Path) -> None:

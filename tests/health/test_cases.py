@@ -12,7 +12,7 @@ from neilfpp_method.health.cases import (
     surface_findings,
     verdict_of,
 )
-from neilfpp_method.health.look import Look
+from neilfpp_method.health.measure import SurfaceMeasurement
 
 
 def cases(findings) -> list[str]:
@@ -30,12 +30,12 @@ def cases(findings) -> list[str]:
     ],
 )
 def test_a_surface_is_there_and_sharp_or_it_is_said(opaque, sharp, found):
-    assert cases(surface_findings(Look(100, opaque, sharp, None), 7)) == found
+    assert cases(surface_findings(SurfaceMeasurement(100, opaque, sharp, None), 7)) == found
 
 
 @pytest.mark.parametrize(("share", "found"), [(None, []), (0.2, []), (0.8, ["material_at_bounds"])])
 def test_a_material_at_its_bounds_is_said(share, found):
-    assert cases(material_findings(Look(100, 1.0, 1.0, share), 7)) == found
+    assert cases(material_findings(SurfaceMeasurement(100, 1.0, 1.0, share), 7)) == found
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def test_a_count_beyond_its_limit_is_said(function, good, bad, case):
 
 
 def test_the_verdict_is_the_worst_finding():
-    fog = surface_findings(Look(100, 1.0, 0.0, None), 1)
+    fog = surface_findings(SurfaceMeasurement(100, 1.0, 0.0, None), 1)
     doubt = few_light_points(3, 1)
     assert verdict_of([]) == "sound"
     assert verdict_of(doubt) == "doubtful"

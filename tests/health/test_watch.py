@@ -9,7 +9,7 @@ import torch
 
 from neilfpp_method.cli import main
 from neilfpp_method.errors import UserError
-from neilfpp_method.health.look import look
+from neilfpp_method.health.measure import measure_surface
 from neilfpp_method.health.watch import Watch
 from neilfpp_method.schedule import STAGES, Stage
 from neilfpp_method.settings.presets import PRESETS
@@ -73,7 +73,7 @@ def test_steps_that_shade_nothing_are_counted_in_material_stages():
 
 def test_a_look_leaves_the_model_in_its_mode():
     model = sphere_model().train()
-    assert look(model, PIXELS, with_material=True).at_bound == 0.0
+    assert measure_surface(model, PIXELS, with_material=True).at_bound == 0.0
     assert model.training
 
 

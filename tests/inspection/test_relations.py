@@ -10,16 +10,21 @@ import numpy as np
 import pytest
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.inspection.relations import Stand, duplicates, exposure_factors, stand
+from neilfpp_method.inspection.relations import (
+    CameraPlacement,
+    camera_placement,
+    duplicates,
+    exposure_factors,
+)
 from tests.data.make_capture import DISTANCE, SCALE, make_capture
 
 
-def ring(count: int) -> Stand:
+def ring(count: int) -> CameraPlacement:
     """Cameras on a circle, looking inwards."""
     azimuth = 2 * np.pi * np.arange(count) / count
     outward = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(count)], axis=1)
     none = np.zeros(count, bool)
-    return Stand(3 * outward, -outward, none, none, 1.0, 360 / count)
+    return CameraPlacement(3 * outward, -outward, none, none, 1.0, 360 / count)
 
 
 def test_a_jump_is_told_from_a_slow_change() -> None:
@@ -53,14 +58,16 @@ def test_duplicates_survive_compression_size_and_brightness() -> None:
 
 def test_where_cameras_stand(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path, views=12))
-    where = stand(capture)
-    assert not where.away.any()
-    assert not where.within.any()
-    assert np.allclose(np.linalg.norm(where.centres, axis=1), DISTANCE / SCALE)
+    placement = camera_placement(capture)
+    assert not placement.away.any()
+    assert not placement.within.any()
+    assert np.allclose(np.linalg.norm(placement.centres, axis=1), DISTANCE / SCALE)
     assert np.allclose(
-        where.axes, -where.centres / np.linalg.norm(where.centres, axis=1, keepdims=True), atol=1e-9
+        placement.axes,
+        -placement.centres / np.linalg.norm(placement.centres, axis=1, keepdims=True),
+        atol=1e-9,
     )
-    one = stand(replace(capture, views=capture.views[:1]))
+    one = camera_placement(replace(capture, views=capture.views[:1]))
     cap = (1 - np.cos(np.radians(30))) / 2  # the share of the sphere within 30° of a direction
     assert one.coverage == pytest.approx(cap, abs=2e-3)
 
@@ -70,4 +77,4 @@ def test_a_camera_shifted_out_of_the_picture_looks_away(tmp_path: Path) -> None:
     view = capture.views[1]
     off = replace(view, camera=replace(view.camera, cx=view.camera.width + 0.5))
     edge = replace(view, camera=replace(view.camera, cx=view.camera.width - 0.5))
-    assert stand(replace(capture, views=(view, off, edge))).away.tolist() == [False, True, False]
+    assert camera_placement(replace(capture, views=(view, off, edge))).away.tolist() == [False, True, False]

@@ -20,7 +20,7 @@ fixed = {"width": 2, "with_jacobian": True, "block": kernels.BLOCK}
 for number in ("fp32", "fp64"):
     arrays = ("points", "table", "features", "jacobian", "gradient")
     kind_of = dict.fromkeys(arrays, "*" + number) | {"grid": "*i64"}
-    for kernel in (kernels._interpolate, kernels._add_to_table, kernels._pull_to_points):
+    for kernel in (kernels._interpolate, kernels._add_to_table, kernels._point_gradient):
         names = [parameter.name for parameter in kernel.params]
         kinds = {name: "constexpr" if name in fixed else kind_of.get(name, "i32") for name in names}
         source, target = ASTSource(kernel, kinds, fixed), GPUTarget("cuda", 80, 32)

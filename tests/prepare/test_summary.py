@@ -34,7 +34,8 @@ def test_lines_have_the_figures():
     assert "fx 500" in lines[1]
     assert "77 points" in lines[2]
     assert (
-        lines[3] == "radius of the scene: 1.5, told by the cameras' focus, as the points reach far beyond it"
+        lines[3] == "radius of the scene: 1.5, from the point that the cameras look at, because the points "
+        "extend far beyond it"
     )
     assert lines[4] == "note: careful"
     assert "with the poses" in Summary((), (), (), 5, 0, "none", 1.0, "box", ()).lines[0]

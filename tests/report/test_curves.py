@@ -17,7 +17,7 @@ from neilfpp_method.report.curves import (
     quality_curve,
     work_bars,
 )
-from neilfpp_method.train.quality import Look
+from neilfpp_method.train.quality import QualityCheck
 
 
 def points(svg: str) -> list[list[tuple[float, float]]]:
@@ -25,13 +25,13 @@ def points(svg: str) -> list[list[tuple[float, float]]]:
     return [[tuple(map(float, point.split(","))) for point in line.split()] for line in lines]
 
 
-def test_looks_lie_on_the_axes_that_are_drawn():
-    looks = [
-        Look(10, "sdf_init", 0.0, 20.0, None, 0.1),
-        Look(20, "joint", 50.0, 25.0, 22.0, 0.1),
-        Look(30, "joint", 100.0, 30.0, 24.0, 0.1),
+def test_checks_lie_on_the_axes_that_are_drawn():
+    checks = [
+        QualityCheck(10, "sdf_init", 0.0, 20.0, None, 0.1),
+        QualityCheck(20, "joint", 50.0, 25.0, 22.0, 0.1),
+        QualityCheck(30, "joint", 100.0, 30.0, 24.0, 0.1),
     ]
-    svg = quality_curve(looks)
+    svg = quality_curve(checks)
     radiance, physical = points(svg)
     bottom, right = HEIGHT - BOTTOM, WIDTH - RIGHT
     middle = (LEFT + right) / 2, (TOP + bottom) / 2
@@ -40,7 +40,7 @@ def test_looks_lie_on_the_axes_that_are_drawn():
     assert "R 30.0 dB" in svg
     assert "PBR 24.0 dB" in svg
     assert quality_curve([]) is None
-    assert len(points(quality_curve(looks[:1]))) == 1  # no material yet
+    assert len(points(quality_curve(checks[:1]))) == 1  # no material yet
 
 
 def test_bars_are_as_long_as_the_work_took():
@@ -56,7 +56,7 @@ def test_bars_are_as_long_as_the_work_took():
 
 
 def test_labels_of_curves_that_end_at_one_place_do_not_overlap():
-    svg = quality_curve([Look(10, "material_init", 5.0, 22.3, 22.4, 0.1)])
+    svg = quality_curve([QualityCheck(10, "material_init", 5.0, 22.3, 22.4, 0.1)])
     heights = [float(y) for y in re.findall(r'y="([^"]*)"[^>]*>(?:R|PBR) [0-9.]+ dB<', svg)]
     assert len(heights) == 2
     assert abs(heights[0] - heights[1]) >= LABEL_HEIGHT

@@ -12,8 +12,8 @@ from rich.console import Console
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.held_back import PATCHES, hold_back
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.effects.asked import Asked
 from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.health.watch import Watch
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
@@ -73,7 +73,7 @@ def small_training(root: Path, out: Path, config: NeilfConfig, patches: int = PA
     model = build_model(capture, scene_facts(capture, pixels, config), config)
     fabric, listener = Fabric(accelerator="cpu", devices=1), Listener()
     solver, watch = model.light_solver(), Watch(pixels.sample(64), listener.warn)
-    plan = Plan.begin(Asked("as-set"), config)
+    plan = Plan.begin(EffectRequest("as-set"), config)
     quiet = (lambda: False, lambda model, stage: None, "")
     quality = Quality(hold_back(pixels, config.train.seed, patches), capture.hdr)
     return Training(out, config, model, pixels, fabric, listener, *quiet, solver, watch, plan, quality)

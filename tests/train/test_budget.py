@@ -13,9 +13,9 @@ from rich.console import Console
 from neilfpp_method.budget.plan import Costs, StageCost
 from neilfpp_method.cli import main
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.effects.asked import Asked, read_asked
-from neilfpp_method.effects.looks import MOST_PIXELS, look_at_light
 from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.request import EffectRequest, parse_effects
+from neilfpp_method.effects.review import MOST_PIXELS, review_light
 from neilfpp_method.errors import Stopped, UserError
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.timing.ledger import Ledger
@@ -24,7 +24,7 @@ from neilfpp_method.train.budget_record import BudgetPlan, read_budget
 from neilfpp_method.train.budgeted import planned_effects
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.run import load_checkpoint, load_run
-from neilfpp_method.train.trial import Trial, try_out
+from neilfpp_method.train.trial import Trial, run_trial
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import small_config, small_training, solved_light
 from tests.train.test_resume import interrupt_at
@@ -51,7 +51,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> None:
     stages = {name.replace("steps", "init").replace("joint_init", "joint"): n for name, n in STEPS.items()}
     costs = Costs({stage: StageCost(steps=n, **cost) for stage, n in stages.items()}, reserve=0.0)
     monkeypatch.setattr(command, "Ledger", ticking)
-    monkeypatch.setattr(budgeted, "try_out", lambda *_: Trial(costs, places=0.0, light_pixels=0))
+    monkeypatch.setattr(budgeted, "run_trial", lambda *_: Trial(costs, places=0.0, light_pixels=0))
 
 
 def run(data: Path | None, out: Path, resume: bool = False, **options) -> str:
@@ -68,7 +68,7 @@ def trained_steps(out: Path) -> int:
 
 
 def test_a_run_keeps_to_its_budget_though_steps_take_longer_than_the_trial_said(tmp_path, capture, clock):
-    said = run(capture, tmp_path / "run", budget=120.0, effects=read_asked("auto"))
+    said = run(capture, tmp_path / "run", budget=120.0, effects=parse_effects("auto"))
     plan = read_budget(tmp_path / "run")
     assert plan.took == pytest.approx(120.0, rel=0.1)
     first, last = plan.revisions[0], plan.revisions[-1]
@@ -138,10 +138,10 @@ def test_a_run_without_a_budget_has_none(tmp_path, capture, clock):
 def test_a_trial_measures_every_stage_that_has_steps(capture):
     config = solved_light(small_config(sdf_steps=100, material_steps=0, joint_steps=50))
     state = load_capture(capture)
-    trial = try_out(
+    trial = run_trial(
         state,
         config,
-        Asked("auto"),
+        EffectRequest("auto"),
         torch.device("cpu"),
         0.2,
         most_for_places=1e9,
@@ -160,8 +160,15 @@ def test_a_trial_measures_every_stage_that_has_steps(capture):
 
 def test_evidence_that_takes_too_long_is_not_looked_for(capture):
     config = solved_light(small_config(sdf_steps=0))
-    trial = try_out(
-        load_capture(capture), config, Asked("auto"), torch.device("cpu"), 0.05, 1e-9, 1e-9, report=False
+    trial = run_trial(
+        load_capture(capture),
+        config,
+        EffectRequest("auto"),
+        torch.device("cpu"),
+        0.05,
+        1e-9,
+        1e-9,
+        report=False,
     )
     assert trial.places == 0.0
     assert list(trial.costs.stages) == ["material_init", "joint"]
@@ -173,8 +180,8 @@ def test_the_first_light_is_part_of_the_plan_and_takes_as_many_pixels_as_there_i
     many = load_capture(make_capture(tmp_path / "many", views=9))
 
     def trial(most_for_light: float) -> Trial:
-        return try_out(
-            many, config, Asked("auto"), torch.device("cpu"), 0.05, 1e-9, most_for_light, report=False
+        return run_trial(
+            many, config, EffectRequest("auto"), torch.device("cpu"), 0.05, 1e-9, most_for_light, report=False
         )
 
     whole = trial(1e9)
@@ -190,8 +197,8 @@ def test_the_first_light_is_part_of_the_plan_and_takes_as_many_pixels_as_there_i
 def test_without_time_for_the_first_light_training_starts_from_an_even_one(tmp_path):
     capture = make_capture(tmp_path / "many", views=9)
     training = small_training(capture, tmp_path / "run", solved_light(small_config(sdf_steps=0)))
-    plan = Plan.begin(read_asked("auto"), training.config)
-    assert look_at_light(plan, training.model, training.pixels, 0, most=0) == ([], None)
+    plan = Plan.begin(parse_effects("auto"), training.config)
+    assert review_light(plan, training.model, training.pixels, 0, most=0) == ([], None)
     planned = BudgetPlan(60.0, "usual", Costs({}), places_looked_at=True, light_pixels=0)
     planned_effects(planned, plan)
     assert "20% of the budget" in plan.newest("long-tails").reason
@@ -199,8 +206,15 @@ def test_without_time_for_the_first_light_training_starts_from_an_even_one(tmp_p
 
 def test_what_settings_decide_is_not_tried(capture):
     config = small_config(joint_steps=0)
-    trial = try_out(
-        load_capture(capture), config, Asked("as-set"), torch.device("cpu"), 0.05, 1.0, 1.0, report=False
+    trial = run_trial(
+        load_capture(capture),
+        config,
+        EffectRequest("as-set"),
+        torch.device("cpu"),
+        0.05,
+        1.0,
+        1.0,
+        report=False,
     )
     assert list(trial.costs.stages) == ["sdf_init", "material_init"]
     assert trial.costs.stages["material_init"].fit == 0.0  # a light that is free is not solved for

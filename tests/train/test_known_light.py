@@ -17,7 +17,7 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.lighting.solver import NothingToSolve
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.settings.types import FreeLightConfig, LightFitConfig, MapLightConfig, NeilfConfig
-from neilfpp_method.train.light_record import LightFit, in_words, read_fits, write_fits
+from neilfpp_method.train.light_record import LightFit, light_summary, read_fits, write_fits
 from neilfpp_method.train.run import load_run
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import small_config
@@ -61,7 +61,7 @@ def test_an_exported_map_is_trained_under_and_no_longer_needed(capture, tmp_path
     assert train(capture, first) == 0
     said = capfd.readouterr().out
     record = read_fits(first, before=10**9)
-    assert f"light: {in_words(mapped_config().light, record)}" in said
+    assert f"light: {light_summary(mapped_config().light, record)}" in said
     assert [fit.step for fit in record] == sorted({fit.step for fit in record})
     assert len(record) >= 3
     assert read_fits(first, before=record[1].step) == record[:1]
@@ -137,19 +137,19 @@ FITS = [LightFit(0, 0.021, 0.004, 204, 3), LightFit(100, -0.001, 0.003, 204, 0)]
 def test_the_record_says_why():
     auto = MapLightConfig(kind="auto")
     assert (
-        in_words(auto, FITS)
+        light_summary(auto, FITS)
         == "an environment map without lamps (error +0.1 ± 0.3 % at 204 held-back points with lamps)"
     )
     assert (
-        in_words(auto, FITS[:1])
+        light_summary(auto, FITS[:1])
         == "an environment map and 3 near lamps (error −2.1 ± 0.4 % at 204 held-back points with lamps)"
     )
     given = dataclasses.replace(auto, map="sky.exr")
-    assert in_words(given, [dataclasses.replace(FITS[0], lamps=1)]).startswith(
+    assert light_summary(given, [dataclasses.replace(FITS[0], lamps=1)]).startswith(
         "the given environment map and 1 near lamp ("
     )
-    assert in_words(auto, []) == "an environment map"
-    assert in_words(FreeLightConfig(), []) == "a field that is free at every point"
+    assert light_summary(auto, []) == "an environment map"
+    assert light_summary(FreeLightConfig(), []) == "a field that is free at every point"
 
 
 @pytest.mark.parametrize(

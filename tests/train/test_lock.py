@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.train.lock import LOCK, alone_in
+from neilfpp_method.train.lock import LOCK, run_lock
 from neilfpp_method.train.run import check_free
 
-HOLDER = "import sys, time; from pathlib import Path; from neilfpp_method.train.lock import alone_in\n" \
-    "with alone_in(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)"  # fmt: skip
+HOLDER = "import sys, time; from pathlib import Path; from neilfpp_method.train.lock import run_lock\n" \
+    "with run_lock(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)"  # fmt: skip
 
 
 def holder(folder: Path) -> subprocess.Popen[str]:
@@ -28,31 +28,31 @@ def test_the_second_is_refused_until_the_first_is_gone(tmp_path):
     with holder(folder) as process:
         with (
             pytest.raises(UserError, match=rf"another training is running .*\(process {process.pid}\)"),
-            alone_in(folder),
+            run_lock(folder),
         ):
             pytest.fail("two at once")
         assert (folder / LOCK).exists()
         process.send_signal(signal.SIGKILL)
     assert (folder / LOCK).exists()  # nobody could take it away
-    with alone_in(folder):
+    with run_lock(folder):
         pass
     assert not (folder / LOCK).exists()
 
 
 def test_it_is_let_go_of_after_an_error(tmp_path):
     for _ in range(2):
-        with pytest.raises(ZeroDivisionError), alone_in(tmp_path):
+        with pytest.raises(ZeroDivisionError), run_lock(tmp_path):
             raise ZeroDivisionError
     assert not list(tmp_path.iterdir())
 
 
 def test_other_processes_of_one_training_are_let_in(tmp_path, monkeypatch):
-    with alone_in(tmp_path):
+    with run_lock(tmp_path):
         monkeypatch.setenv("LOCAL_RANK", "1")
-        with alone_in(tmp_path):
+        with run_lock(tmp_path):
             pass
         monkeypatch.setenv("LOCAL_RANK", "0")
-        with pytest.raises(UserError), alone_in(tmp_path):
+        with pytest.raises(UserError), run_lock(tmp_path):
             pytest.fail("two at once")
 
 

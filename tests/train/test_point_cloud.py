@@ -11,7 +11,7 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.schedule import Stage
 from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.presets import fixed_geometry, preset
-from neilfpp_method.train.build import build_model, cloud_in_words, scene_facts
+from neilfpp_method.train.build import build_model, cloud_summary, scene_facts
 from tests.data.make_capture import make_capture
 from tests.scenes import tiny_config
 
@@ -33,7 +33,7 @@ def test_the_cloud_is_in_the_loss_of_fast(capture):
     terms = model.losses(pixels.sample(8), Stage.SDF_INIT)
     # The sphere of the start is no sphere of 0.8: points lie off it.
     assert terms["point_cloud"].values.max() > 0.05
-    assert "oriented_pcd.ply supervises the geometry" in cloud_in_words(capture, config)
+    assert "oriented_pcd.ply supervises the geometry" in cloud_summary(capture, config)
 
 
 def test_a_capture_without_a_cloud_goes_without_it(capture):
@@ -41,9 +41,9 @@ def test_a_capture_without_a_cloud_goes_without_it(capture):
     config = changed(tiny_config(), {"loss.point_cloud": 0.1})
     model, pixels = built(without, config)
     assert "point_cloud" not in model.losses(pixels.sample(8), Stage.SDF_INIT)
-    assert "from the images alone" in cloud_in_words(without, config)
+    assert "from the images alone" in cloud_summary(without, config)
 
 
 def test_nothing_is_said_where_no_cloud_is_asked_for(capture):
-    assert cloud_in_words(capture, changed(preset("fast"), {"loss.point_cloud": 0.0})) is None
-    assert cloud_in_words(capture, fixed_geometry(preset("fast"))) is None
+    assert cloud_summary(capture, changed(preset("fast"), {"loss.point_cloud": 0.0})) is None
+    assert cloud_summary(capture, fixed_geometry(preset("fast"))) is None

@@ -1,4 +1,4 @@
-"""Held-back pixels are looked at while a run trains, and the training is the same without."""
+"""Held-back pixels are measured while a run trains, and the training is the same without."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.train import quality
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.loop import train
-from neilfpp_method.train.quality import FILE, MAX_SHARE, Look, Quality, read_looks
+from neilfpp_method.train.quality import FILE, MAX_SHARE, Quality, QualityCheck, read_checks
 from tests.data.make_capture import make_capture
 from tests.scenes import sphere_batch, sphere_model
 from tests.train.small_runs import differences, small_config, small_training, solved_light
@@ -33,8 +33,8 @@ def train_here(data, out, resume=False, **settings):
     run_training(data=data, out=out, config=config, resume=resume, console=Console(quiet=True), **options)
 
 
-def test_looks_change_nothing_and_a_resumed_run_goes_on_with_them(tmp_path, capture, monkeypatch):
-    """A look after every step, against none but at the ends of stages; and against a run that was stopped."""
+def test_checks_change_nothing_and_a_resumed_run_goes_on_with_them(tmp_path, capture, monkeypatch):
+    """Checks after every step, checks only at the ends of stages, and a run that was stopped."""
     train_here(capture, tmp_path / "seldom")
     monkeypatch.setattr(quality, "MIN_STEPS", 1)
     monkeypatch.setattr(quality, "MAX_SHARE", 1.0)
@@ -45,17 +45,17 @@ def test_looks_change_nothing_and_a_resumed_run_goes_on_with_them(tmp_path, capt
             train_here(capture, tmp_path / "stopped")
     train_here(None, tmp_path / "stopped", resume=True)
 
-    assert [look.step for look in read_looks(tmp_path / "seldom")] == [4, 8, 12]
-    looks = read_looks(tmp_path / "often")
-    assert [look.step for look in looks] == list(range(1, 13))
-    assert [look.physical is None for look in looks] == [True] * 4 + [False] * 8
-    assert all(later.seconds > look.seconds for look, later in pairwise(looks))
+    assert [check.step for check in read_checks(tmp_path / "seldom")] == [4, 8, 12]
+    checks = read_checks(tmp_path / "often")
+    assert [check.step for check in checks] == list(range(1, 13))
+    assert [check.physical is None for check in checks] == [True] * 4 + [False] * 8
+    assert all(later.seconds > check.seconds for check, later in pairwise(checks))
     for name in ("seldom", "stopped"):
         assert differences(state(tmp_path / name), state(tmp_path / "often")) == []
-    again = read_looks(tmp_path / "stopped")
-    assert [look.step for look in again] == list(range(1, 13))
-    assert [look.radiance for look in again] == [look.radiance for look in looks]
-    assert [look.step for look in read_looks(tmp_path / "often", before=7)] == list(range(1, 8))
+    again = read_checks(tmp_path / "stopped")
+    assert [check.step for check in again] == list(range(1, 13))
+    assert [check.radiance for check in again] == [check.radiance for check in checks]
+    assert [check.step for check in read_checks(tmp_path / "often", before=7)] == list(range(1, 8))
 
 
 def test_the_psnr_is_that_of_clipped_srgb_values():
@@ -69,36 +69,36 @@ def test_the_psnr_is_that_of_clipped_srgb_values():
         shown = quality.tone_map(maps.rgb_volume)
         batch.color.copy_(shown + torch.where(shown > 0.5, -off, off))
         watch = Quality(batch, hdr=False)
-        watch.look_when_due(model.train(), StagePosition(Stage.JOINT, 4, 4), 12, 1.0)
-        assert watch.looks[0].radiance == pytest.approx(-20 * math.log10(off), abs=1e-3)
-        assert watch.looks[0].physical is not None
+        watch.check_when_due(model.train(), StagePosition(Stage.JOINT, 4, 4), 12, 1.0)
+        assert watch.checks[0].radiance == pytest.approx(-20 * math.log10(off), abs=1e-3)
+        assert watch.checks[0].physical is not None
         assert model.training
 
 
-def test_looks_are_seldom_and_cheap(monkeypatch):
+def test_checks_are_seldom_and_cheap(monkeypatch):
     monkeypatch.setattr(quality, "_decibels", lambda *_: (20.0, None))
     watch = Quality(sphere_batch(4), hdr=True)
     model = sphere_model()
     for number in range(1, 3001):
-        watch.look_when_due(model, StagePosition(Stage.SDF_INIT, number, 3000), number, 1e9)
-    assert [look.step for look in watch.looks] == list(range(300, 3001, 300))
+        watch.check_when_due(model, StagePosition(Stage.SDF_INIT, number, 3000), number, 1e9)
+    assert [check.step for check in watch.checks] == list(range(300, 3001, 300))
     for number in range(1, 501):
-        watch.look_when_due(model, StagePosition(Stage.JOINT, number, 500), 3000 + number, 1e9)
-    assert [look.step for look in watch.looks[10:]] == [3200, 3400, 3500]
+        watch.check_when_due(model, StagePosition(Stage.JOINT, number, 500), 3000 + number, 1e9)
+    assert [check.step for check in watch.checks[10:]] == [3200, 3400, 3500]
     # Looks that have cost too much wait, but for the one at the end of a stage.
-    watch = Quality(sphere_batch(4), True, [Look(10, "sdf_init", 10.0, 1.0, None, took=1.0)])
-    for seconds, looks in ((0.9 / MAX_SHARE, 1), (1.1 / MAX_SHARE, 2)):
-        watch.look_when_due(model, StagePosition(Stage.JOINT, 400, 900), 1000, seconds)
-        assert len(watch.looks) == looks
-    watch.look_when_due(model, StagePosition(Stage.JOINT, 900, 900), 1500, 1.0)
-    assert watch.looks[-1].step == 1500
+    watch = Quality(sphere_batch(4), True, [QualityCheck(10, "sdf_init", 10.0, 1.0, None, took=1.0)])
+    for seconds, checks in ((0.9 / MAX_SHARE, 1), (1.1 / MAX_SHARE, 2)):
+        watch.check_when_due(model, StagePosition(Stage.JOINT, 400, 900), 1000, seconds)
+        assert len(watch.checks) == checks
+    watch.check_when_due(model, StagePosition(Stage.JOINT, 900, 900), 1500, 1.0)
+    assert watch.checks[-1].step == 1500
 
 
-def test_a_capture_too_small_is_not_looked_at(tmp_path):
+def test_a_capture_too_small_is_not_checked(tmp_path):
     training = small_training(make_capture(tmp_path / "sphere", size=(8, 6)), tmp_path, small_config())
     assert not len(training.quality.pixels)
     train(training)
-    assert read_looks(tmp_path) == []
+    assert read_checks(tmp_path) == []
     assert json.loads((tmp_path / FILE).read_text())["pixels"] == 0
 
 
@@ -120,4 +120,4 @@ def test_a_capture_too_small_is_not_looked_at(tmp_path):
 def test_a_damaged_record_is_named(tmp_path, damage):
     (tmp_path / FILE).write_text(json.dumps(damage))
     with pytest.raises(UserError, match=r"quality\.json"):
-        read_looks(tmp_path)
+        read_checks(tmp_path)

@@ -20,7 +20,7 @@ import torch
 from rich.console import Console
 
 from neilfpp_method.cli import main
-from neilfpp_method.effects.asked import read_asked
+from neilfpp_method.effects.request import parse_effects
 from neilfpp_method.errors import Stopped, UserError
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train import loop
@@ -325,7 +325,7 @@ def test_what_evidence_decided_is_read_from_the_run(tmp_path, capture, monkeypat
     that was not.
     """
     config = solved_light(small_config())
-    asked = read_asked("auto")
+    asked = parse_effects("auto")
     run(capture, tmp_path / "whole", config, effects=asked)
     with monkeypatch.context() as patch:
         interrupt_at(patch, 2, 6)
@@ -348,4 +348,4 @@ def test_what_evidence_decided_is_read_from_the_run(tmp_path, capture, monkeypat
     assert (loaded.config.inter_reflection.mode == "off") == (not decided[-1]["on"])
     assert loaded.model.config == loaded.config
     with pytest.raises(UserError, match="its effects are 'auto'"):
-        run(None, tmp_path / "run", resume=True, effects=read_asked("none"))
+        run(None, tmp_path / "run", resume=True, effects=parse_effects("none"))

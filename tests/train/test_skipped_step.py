@@ -15,7 +15,7 @@ from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.structures import LossTerm
 from neilfpp_method.train.first_not_finite import OriginsOfNotFinite
 from neilfpp_method.train.loop import train
-from neilfpp_method.train.rerun import in_words, rerun_step
+from neilfpp_method.train.rerun import rerun_step, rerun_summary
 from neilfpp_method.train.run import CaptureSource, create_run
 from neilfpp_method.train.skipped import FOLDER, MAX_KEPT, load_step
 from neilfpp_method.train.training import Training
@@ -75,7 +75,7 @@ def test_a_loss_that_is_not_finite(training, monkeypatch, step):
     assert "aten.div.Tensor" in found.origin.operation
     assert found.origin.derivative_of is None
     assert found.origin.rows == (3,)
-    assert "first operation: aten.div.Tensor" in in_words(found)
+    assert "first operation: aten.div.Tensor" in rerun_summary(found)
 
 
 def test_a_gradient_that_is_not_finite_names_the_line_of_its_operation(training, monkeypatch):
@@ -121,7 +121,7 @@ def test_a_rerun_repeats_the_step_bit_for_bit(training, monkeypatch):
     )
     found = rerun_step(training.path, 6)
     assert found.finite
-    assert "finite now" in in_words(found)
+    assert "finite now" in rerun_summary(found)
     assert training.model.replay.ring.full  # points of earlier steps were shaded
     assert values[6].keys() == again[0].keys()
     for name, value in values[6].items():

@@ -124,7 +124,8 @@ def test_masks_that_make_no_body_are_a_warning(masked):
     plain, _ = started(masked, settings("sphere"))
     model, told = started(masked, settings())
     assert (
-        told.text == "warning: geometry starts as a sphere: what the masks show reaches beyond the scene box"
+        told.text
+        == "warning: geometry starts as a sphere: the masks show something that extends beyond the scene box"
     )
     assert all(torch.equal(a, b) for a, b in zip(weights(plain), weights(model), strict=True))
 

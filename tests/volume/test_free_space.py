@@ -11,7 +11,7 @@ import torch
 
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.structures import RayBatch
-from neilfpp_method.volume.free_space import FreeSpace, cameras_within, free_radius
+from neilfpp_method.volume.free_space import FreeSpace, free_balls
 from tests.scenes import tiny_config
 
 
@@ -20,18 +20,42 @@ def ring(count: int, distance: float) -> torch.Tensor:
     return distance * torch.stack([angle.cos(), angle.sin(), torch.zeros(count)], -1)
 
 
+def shell(radius: float) -> torch.Tensor:
+    """Points all over a sphere around the origin."""
+    return radius * torch.nn.functional.normalize(
+        torch.randn(20_000, 3, generator=torch.Generator().manual_seed(0)), dim=-1
+    )
+
+
 def test_no_ball_reaches_the_unit_sphere_and_none_is_larger_than_a_quarter_of_the_way():
-    distance = torch.linspace(0.0, 10.0, 1001)
-    free = free_radius(distance)
-    assert (distance - free)[distance >= 1].min() >= 1.0 - 1e-6
-    assert (free[distance < 1] == 0).all(), "cameras among the objects say nothing"
-    assert (free <= 0.25 * distance).all()
-    assert free_radius(torch.tensor([1.2, 2.0])).tolist() == pytest.approx([0.2, 0.5])
+    cameras = torch.linspace(0.0, 10.0, 1001)[:, None] * torch.tensor([0.0, 0.6, 0.8])
+    balls = free_balls(cameras, None, radius=20.0)
+    distance = balls.center.norm(dim=-1)
+    assert distance.min() > 1.0, "cameras among the objects say nothing"
+    assert (distance - balls.radius).min() >= 1.0 - 1e-6
+    assert (balls.radius <= 0.25 * distance + 1e-6).all()
+    assert free_balls(ring(1, 1.2), None, 1.75).radius.tolist() == pytest.approx([0.2])
+    assert free_balls(ring(1, 2.0), None, 1.75).radius.tolist() == pytest.approx([0.5])
+
+
+def test_points_tell_how_much_space_is_free():
+    cameras = ring(6, 1.8)
+    assert free_balls(cameras, shell(0.9), 1.75).radius == pytest.approx(
+        torch.full((6,), 0.8 * 0.9), rel=0.02
+    )
+    assert free_balls(cameras, shell(0.3), 1.75).radius == pytest.approx(torch.full((6,), 0.8)), (
+        "no ball reaches into the unit sphere"
+    )
+    stray = torch.cat([shell(0.9), cameras + 0.01])
+    assert free_balls(cameras, stray, 1.75).radius.min() > 0.7, "stray points are left out"
+    beside = torch.cat([shell(0.9), cameras[:1].repeat(300, 1) + 0.05])
+    assert free_balls(cameras, beside, 1.75).radius.argmin() == 0
+    assert free_balls(cameras, beside, 1.75).radius.min() < 0.1
 
 
 def test_cameras_far_away_leave_the_scene_as_it_is():
     near, far = ring(6, 1.8), ring(6, 2.4)  # 2.4 − 0.6 = 1.8 lies beyond the scene sphere
-    assert torch.equal(cameras_within(torch.cat([near, far]), 1.75), near)
+    assert torch.equal(free_balls(torch.cat([near, far]), None, 1.75).center, near)
     config = tiny_config()
     assert VolSdfHost(config, 3.0, "constant", cameras=far).free_space is None
     assert VolSdfHost(config, 3.0, "constant", cameras=0.5 * near).free_space is None
@@ -39,9 +63,10 @@ def test_cameras_far_away_leave_the_scene_as_it_is():
 
 def test_the_depth_is_that_of_the_deepest_ball():
     cameras = torch.cat([ring(9, 1.5), ring(5, 1.9) + torch.tensor([0.0, 0.0, 0.4])])
-    space = FreeSpace(cameras, 1.75)
+    balls = free_balls(cameras, None, 1.75)
+    space = FreeSpace(balls, 1.75)
     x = 1.75 * (2 * torch.rand(3000, 3, generator=torch.Generator().manual_seed(0)) - 1)
-    truth = (free_radius(cameras.norm(dim=-1)) - (x[:, None] - cameras).norm(dim=-1)).amax(dim=-1)
+    truth = (balls.radius - (x[:, None] - balls.center).norm(dim=-1)).amax(dim=-1)
     found = space(x)
     cell = 3.5 / 63
     assert (found.depth <= truth + 1e-6).all()

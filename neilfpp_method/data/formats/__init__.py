@@ -1,1 +1,1 @@
-"""Layouts that others write, each read, and some written, by a module of its own."""
+"""Readers and writers of the capture layouts of other projects, one module each."""

@@ -26,7 +26,7 @@ def check_sizes(folder: Path) -> None:
     """Check that each binary file of a model is as long as its counts say.
 
     Raises:
-        ValueError: a file is shorter than it says.
+        ValueError: a file is shorter than its header states.
     """
     for name, record_end in RECORDS.items():
         path = folder / f"{name}.bin"
@@ -39,9 +39,9 @@ def check_sizes(folder: Path) -> None:
             for _ in range(count):
                 offset = record_end(data, offset)
                 if offset > len(data):
-                    raise ValueError(f"{path.name} is shorter than it says")
+                    raise ValueError(f"{path.name} is shorter than its header states")
         except (error, IndexError) as end:
-            raise ValueError(f"{path.name} is shorter than it says") from end
+            raise ValueError(f"{path.name} is shorter than its header states") from end
 
 
 def _camera(data: bytes, offset: int) -> int:

@@ -1,8 +1,9 @@
-"""Arrays of numbers from a pickle that a stranger may have written.
+"""Read arrays of numbers from a pickle of an untrusted source.
 
-A pickle is a program, and the usual reader runs it. This one knows the five names by which NumPy pickles an
-array, gives each a stand-in of its own that only notes down what it is handed, and refuses all other names:
-nothing that a file says is called, and NumPy itself sees no more than checked bytes in the end.
+A pickle is a program that the usual reader executes. This reader accepts only the five names that NumPy uses
+to pickle an array, and replaces each by a stand-in that only records its arguments. It rejects all other
+names, so the file cannot call anything. The arrays are made from the recorded bytes after these have been
+checked.
 """
 
 from __future__ import annotations
@@ -22,15 +23,16 @@ from neilfpp_method.errors import UserError
 __all__ = ["read_pickled_arrays"]
 
 MAX_BYTES = 2**16
-"""Size of a pickle; poses and intrinsics take a few hundred bytes."""
+"""Largest size of a pickle. Poses and intrinsics take a few hundred bytes."""
 NUMBERS = ("f4", "f8", "i4", "i8")
+"""NumPy types of numbers that are accepted."""
 
 
 def read_pickled_arrays(path: Path) -> tuple[Float64[np.ndarray, " *shape"], ...]:
-    """The arrays of a pickled tuple or list of arrays of numbers.
+    """Read a pickled tuple or list of arrays of numbers.
 
     Raises:
-        UserError: it is something else, or damaged.
+        UserError: the file contains something else, or is damaged.
     """
     try:
         with path.open("rb") as file:
@@ -39,22 +41,22 @@ def read_pickled_arrays(path: Path) -> tuple[Float64[np.ndarray, " *shape"], ...
             raise ValueError("it is too large for a camera")
         for opcode, argument, _ in pickletools.genops(data):
             if opcode.name.endswith("PUT") and int(argument or 0) > len(data):
-                raise ValueError(
-                    "damaged"
-                )  # the unpickler makes room for as many objects as such a number says
-        held = _Arrays(io.BytesIO(data)).load()
-        if not isinstance(held, tuple | list):
-            raise ValueError("it is no tuple of arrays")
-        return tuple(_numbers(array) for array in held)
-    except Exception as error:  # a forged file can fail anywhere in the unpickler
+                # The unpickler would allocate memory for this number of objects.
+                raise ValueError("damaged")
+        arrays = _Arrays(io.BytesIO(data)).load()
+        if not isinstance(arrays, tuple | list):
+            raise ValueError("it is not a tuple of arrays")
+        return tuple(_numbers(array) for array in arrays)
+    except Exception as error:
+        # A forged file can raise any exception in the unpickler.
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise UserError(
-            f"{path}: no pickled arrays of numbers ({reason})", "write the camera again, as two arrays"
+            f"{path}: not pickled arrays of numbers ({reason})", "write the camera again, as two arrays"
         ) from error
 
 
 class _Type:
-    """Stands in for numpy.dtype."""
+    """Stand-in for `numpy.dtype`."""
 
     def __init__(self, name: str = "", *_: Any) -> None:
         self.name, self.order = name, "<"
@@ -64,7 +66,7 @@ class _Type:
 
 
 class _Array:
-    """Stands in for numpy.ndarray, and for what makes one."""
+    """Stand-in for `numpy.ndarray`, and for the function that constructs one."""
 
     def __init__(self, *_: Any) -> None:
         self.state: tuple | None = None
@@ -89,21 +91,23 @@ STAND_INS: dict[tuple[str, str], Callable[..., Any]] = {
     ("numpy", "dtype"): _Type,
     ("numpy.core.multiarray", "_reconstruct"): _Array,
     ("numpy.core.numeric", "_frombuffer"): _from_buffer,
-    ("_codecs", "encode"): _encode,  # how bytes are said in the oldest protocols
+    # The oldest protocols write bytes as encoded text.
+    ("_codecs", "encode"): _encode,
 }
+"""Stand-ins of the accepted names, by module and name."""
 
 
 class _Arrays(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Callable[..., Any]:
-        known = (module.replace("numpy._core", "numpy.core"), name)
-        if known not in STAND_INS:
-            raise pickle.UnpicklingError(f"it asks for {module}.{name}")
-        return STAND_INS[known]
+        key = (module.replace("numpy._core", "numpy.core"), name)
+        if key not in STAND_INS:
+            raise pickle.UnpicklingError(f"it refers to {module}.{name}")
+        return STAND_INS[key]
 
 
 def _numbers(array: Any) -> Float64[np.ndarray, " *shape"]:
     if not isinstance(array, _Array) or array.state is None:
-        raise ValueError("it holds something else")
+        raise ValueError("it contains something else")
     data, kind, shape, order = array.state
     if not isinstance(kind, _Type) or kind.name not in NUMBERS:
         raise ValueError("its numbers are of another type")

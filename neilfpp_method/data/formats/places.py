@@ -27,7 +27,7 @@ def stored(root: Path, path: Path) -> Path | None:
     existing = [inside(root, file) for file in candidates if file.is_file()]
     if len(existing) > 1:
         names = " and ".join(file.name for file in existing)
-        raise UserError(f"{path}: not there, and {names} could both be meant", "keep one of them")
+        raise UserError(f"{path}: does not exist, and {names} are both possible", "keep one of them")
     return existing[0] if existing else None
 
 

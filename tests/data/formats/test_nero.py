@@ -80,21 +80,21 @@ class Evil:
 @pytest.mark.parametrize(
     ("made", "words"),
     [
-        (lambda mark: pickle.dumps((Evil(os.mkdir, mark), K)), "it asks for posix.mkdir"),
-        (lambda mark: pickle.dumps((Evil(np.save, mark, 0), K)), "it asks for numpy.save"),
-        (lambda mark: pickle.dumps((Evil(eval, "1"), K)), "it asks for builtins.eval"),
-        (lambda mark: pickle.dumps((np.array([Path(mark)], dtype=object), K)), "it asks for "),
+        (lambda mark: pickle.dumps((Evil(os.mkdir, mark), K)), "it refers to posix.mkdir"),
+        (lambda mark: pickle.dumps((Evil(np.save, mark, 0), K)), "it refers to numpy.save"),
+        (lambda mark: pickle.dumps((Evil(eval, "1"), K)), "it refers to builtins.eval"),
+        (lambda mark: pickle.dumps((np.array([Path(mark)], dtype=object), K)), "it refers to "),
         (lambda mark: pickle.dumps((np.array(["text"]), K)), "of another type"),
-        (lambda mark: pickle.dumps((1.5, K)), "it holds something else"),
-        (lambda mark: pickle.dumps({"pose": K}), "no tuple"),
-        (lambda mark: pickle.dumps((K, K))[:-20], "no pickled arrays"),
+        (lambda mark: pickle.dumps((1.5, K)), "it contains something else"),
+        (lambda mark: pickle.dumps({"pose": K}), "not a tuple"),
+        (lambda mark: pickle.dumps((K, K))[:-20], "not pickled arrays"),
         (lambda mark: pickle.dumps((np.zeros(20_000), K)), "too large for a camera"),
         (lambda mark: b"\x80\x02Nr" + struct.pack("<I", 2**32 - 1) + b".", "damaged"),
-        (lambda mark: b"\x80\x05\x96" + struct.pack("<Q", 2**40) + b"abc.", "no pickled arrays"),
-        (lambda mark: b"", "no pickled arrays"),
+        (lambda mark: b"\x80\x05\x96" + struct.pack("<Q", 2**40) + b"abc.", "not pickled arrays"),
+        (lambda mark: b"", "not pickled arrays"),
         (
             lambda mark: pickle.dumps((K, K), 2).replace(b"K\x03K\x03\x86", b"K\x03K\x09\x86"),
-            "no pickled arrays",
+            "not pickled arrays",
         ),
     ],
 )
@@ -115,7 +115,7 @@ def test_bad_scenes_are_refused(tmp_path: Path) -> None:
     camera.write_bytes(pickle.dumps((POSES[2][:3], K + np.eye(3)[[1, 0, 2]])))
     refused(root, "2-camera.pkl: the intrinsics are not those of a pinhole")
     camera.write_bytes(pickle.dumps((2 * POSES[2][:3], K)))
-    refused(root, "2.png: the extrinsic is no rotation")
+    refused(root, "2.png: the extrinsic matrix is not a rotation")
     camera.write_bytes(good)
     (root / "3.png").rename(tmp_path / "3.png")
     refused(root, "there is no", "3.png")

@@ -180,7 +180,7 @@ def test_the_focal_length_of_a_frame_takes_precedence(
 def test_masks_and_the_box_that_they_tell(tmp_path: Path) -> None:
     scene(tmp_path)
     assert load_capture(tmp_path).scene_from == "cameras"
-    assert "guessed from the cameras alone" in load_capture(tmp_path).summary
+    assert "guessed from the cameras only" in load_capture(tmp_path).summary
 
     def add(content: dict) -> None:
         for i, frame in enumerate(content["frames"]):
@@ -256,7 +256,7 @@ def frame(content: dict) -> dict:
         ),
         (
             lambda c: frame(c).update(transform_matrix=np.diag([-1.0, 1, 1, 1]).tolist()),
-            ["002.exr: the extrinsic is no"],
+            ["002.exr: the extrinsic matrix is not"],
         ),
         (lambda c: c.pop("fl_x"), ["frames.0: no focal length"]),
         (lambda c: c.update(fl_x=-3), ["the focal length is not positive"]),
@@ -280,7 +280,7 @@ def test_an_image_on_its_side(tmp_path: Path) -> None:
     """
     refused(
         edit(scene(tmp_path), lambda c: c.update(w=HEIGHT, h=WIDTH)),
-        "18×24; turn the pixels as the image's EXIF says",
+        "18×24; rotate the pixels as the EXIF data of the image states",
     )
 
 

@@ -18,7 +18,7 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.shading.color import apply_response
 from neilfpp_method.structures import PixelBatch, RayBatch, SurfaceHits
 
-__all__ = ["FirstLook", "check_batch", "check_points", "check_rows"]
+__all__ = ["FirstBatches", "check_batch", "check_points", "check_rows"]
 
 BATCHES = 10
 """Number of batches that are checked; each check synchronises with the device."""
@@ -46,7 +46,7 @@ SIZES = 30.0
 log = logging.getLogger(__name__)
 
 
-class FirstLook:
+class FirstBatches:
     """Checks the first batches and their hits.
 
     Args:

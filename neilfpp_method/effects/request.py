@@ -10,7 +10,7 @@ from neilfpp_method.effects.catalogue import EFFECTS
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.types import NeilfConfig
 
-__all__ = ["BASES", "Asked", "check_asked", "read_asked"]
+__all__ = ["BASES", "EffectRequest", "check_effects", "parse_effects"]
 
 BASES = ("auto", "all", "none", "as-set")
 """How effects that are not named are decided: by evidence, all on, all off, or by the settings."""
@@ -21,7 +21,7 @@ ELSEWHERE = {
 
 
 @dataclass(frozen=True)
-class Asked:
+class EffectRequest:
     """The value of `--effects`.
 
     Attributes:
@@ -36,16 +36,16 @@ class Asked:
         return ",".join((self.base, *(f"{'+' if on else '-'}{name}" for name, on in self.named.items())))
 
 
-def read_asked(text: str) -> Asked:
+def parse_effects(text: str) -> EffectRequest:
     """Parse the value of `--effects`.
 
     Raises:
         UserError: if a name is unknown, has no sign, or occurs twice.
 
     Example:
-        >>> read_asked("auto,-lamps")
-        Asked(base='auto', named={'lamps': False})
-        >>> str(read_asked("+lamps"))
+        >>> parse_effects("auto,-lamps")
+        EffectRequest(base='auto', named={'lamps': False})
+        >>> str(parse_effects("+lamps"))
         'auto,+lamps'
     """
     words = [word.strip() for word in text.split(",") if word.strip()]
@@ -66,16 +66,16 @@ def read_asked(text: str) -> Asked:
         named[name] = sign == "+"
     if not text.strip():
         raise _unknown("", "the value is empty")
-    return Asked(base, named)
+    return EffectRequest(base, named)
 
 
-def check_asked(asked: Asked, config: NeilfConfig) -> None:
+def check_effects(request: EffectRequest, config: NeilfConfig) -> None:
     """Check that every named effect can be switched with these settings.
 
     Raises:
         UserError: if one cannot, or if it needs another effect that is off.
     """
-    for name, on in asked.named.items():
+    for name, on in request.named.items():
         obstacle = EFFECTS[name].obstacle(config)
         if obstacle:
             raise UserError(
@@ -83,7 +83,7 @@ def check_asked(asked: Asked, config: NeilfConfig) -> None:
                 f"leave {name} out, or change the settings",
             )
         needs = EFFECTS[name].needs
-        if on and needs and not asked.named.get(needs, asked.base != "none"):
+        if on and needs and not request.named.get(needs, request.base != "none"):
             raise UserError(
                 f"--effects +{name}: {name} requires {needs}", f"add +{needs}, or leave {name} out"
             )

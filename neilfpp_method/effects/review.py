@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.effects.disagreement import ShownSurface, shading_disagreement
+from neilfpp_method.effects.disagreement import RenderedSurface, shading_disagreement
 from neilfpp_method.effects.exposure import Exposures
 from neilfpp_method.effects.first_light import MIN_PLACES, FirstLight, find_first_light
 from neilfpp_method.effects.lobes import lobe_evidence
@@ -27,22 +27,23 @@ from neilfpp_method.structures import Observed, PixelBatch
 
 __all__ = [
     "FEWEST_PIXELS",
-    "LOOKED_AT",
-    "MIN_PHOTOGRAPHS",
+    "MIN_TRAIN_VIEWS",
     "MOST_PIXELS",
-    "after_fit",
-    "look_at_light",
-    "look_at_surface",
-    "note_exposures",
-    "note_facts",
-    "wants_surface",
+    "SURFACE_PIXELS",
+    "needs_surface",
+    "record_exposures",
+    "record_facts",
+    "record_lamps",
+    "review_light",
+    "review_material",
+    "review_surface",
 ]
 
-LOOKED_AT = 1024
+SURFACE_PIXELS = 1024
 """Number of training pixels whose surface points are measured. The standard error of a share of 1 % is then
 0.3 %.
 """
-MIN_PHOTOGRAPHS = 8
+MIN_TRAIN_VIEWS = 8
 """Minimum number of training views for an initial light: fewer do not determine its scale."""
 LIGHT_PIXELS = 4096
 """Number of training pixels whose surface points are candidates for places."""
@@ -62,7 +63,7 @@ MOST_PIXELS = PLACES * VIEWS
 """Maximum number of pixels of the places for the initial light."""
 
 
-def note_facts(plan: Plan, facts: SceneFacts) -> None:
+def record_facts(plan: Plan, facts: SceneFacts) -> None:
     """Record the decisions that follow from the files of the capture, before training."""
     if plan.newest("background") is None:
         on = facts.background == "inverted_sphere"
@@ -75,71 +76,74 @@ def note_facts(plan: Plan, facts: SceneFacts) -> None:
         plan.decisions.append(Decision(0, "response", on, "files", f"the files hold {kind}"))
 
 
-def note_exposures(plan: Plan, found: Exposures | None) -> None:
+def record_exposures(plan: Plan, exposures: Exposures | None) -> None:
     """Record the decision on gains of the photographs, before training.
 
     Args:
         plan: the plan to which the decision is added, unless it has one already.
-        found: the measured exposures; None if the capture has no point cloud.
+        exposures: the measured exposures; None if the capture has no point cloud.
     """
     if plan.newest("exposure") is not None:
         return
-    if found is None:
+    if exposures is None:
         reason = "not measured: this needs a point cloud"
         plan.decisions.append(Decision(0, "exposure", False, "files", reason))
         return
-    on, reason = found.measured.favours(chosen=False) is True, found.measured.in_words()
-    plan.decisions.append(Decision(0, "exposure", on, "files", reason, found.measured))
+    on, reason = exposures.measured.favours(chosen=False) is True, exposures.measured.summary()
+    plan.decisions.append(Decision(0, "exposure", on, "files", reason, exposures.measured))
 
 
-def wants_surface(plan: Plan) -> bool:
-    """Whether measurements at the surface could decide anything."""
+def needs_surface(plan: Plan) -> bool:
+    """Whether `review_surface` or `review_material` could decide anything."""
     return any(plan.is_open(name) for name in ("inter-reflection", *JUDGED, "joint-stage"))
 
 
 @torch.no_grad()
-def look_at_light(
+def review_light(
     plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int, most: int = MOST_PIXELS
 ) -> tuple[list[Decision], FirstLight | None]:
     """Decide on the specular lobe and on metals if these are open, and find an initial light.
 
-    The model uses the settings of the plan afterwards. The arguments are those of `look_at_surface`, and
+    The model uses the settings of the plan afterwards. The arguments are those of `review_surface`, and
     `most`, the maximum number of pixels of the places; below `FEWEST_PIXELS` nothing is measured.
 
     Returns:
         The decisions, and the initial light; the light is None if there are too few views or places, or if
         surfaces have no specular lobe.
     """
-    if len(pixels.views) < MIN_PHOTOGRAPHS or most < FEWEST_PIXELS:
-        return [], None
+    if len(pixels.views) < MIN_TRAIN_VIEWS:
+        return _not_measured(plan, step, f"fewer than {MIN_TRAIN_VIEWS} training views"), None
+    if most < FEWEST_PIXELS:
+        return _not_measured(plan, step, "the budget leaves no time for it"), None
     mode = model.training
     model.eval()
-    surface = _shown_surface(model, pixels.sample(LIGHT_PIXELS, gradients=False)).observed
+    surface = _rendered_surface(model, pixels.sample(LIGHT_PIXELS, gradients=False)).observed
     count = min(PLACES, most // USUAL_VIEWS)
     position, normal = surface.position[:count], surface.normal[:count]
     places = gather_places(model, pixels, position, normal, VIEWS).in_views(MIN_VIEWS).first(most)
     typical, decisions = model.facts.median_radiance, []
     if len(places.place.unique()) < MIN_PLACES:
         model.train(mode)
-        return [], None
+        return _not_measured(
+            plan, step, f"fewer than {MIN_PLACES} places are shown by {MIN_VIEWS} views"
+        ), None
     if plan.is_open("long-tails") and plan.newest("long-tails") is None:
         measured = lobe_evidence(places, model.scene, typical, model.brdf.metals)
-        decisions.append(plan.decide("long-tails", measured, step, must_be_earned=True))
+        decisions.append(plan.decide("long-tails", measured, step, starts_off=True))
         model.use(plan.config)
-    found = None
+    first = None
     if model.lobe is not None:
         transport = place_transport(places, model.lobe, model.scene)
         if plan.is_open("metals") and model.brdf.metals:
-            # More places than `look_at_surface` has: the error of the measurement is a third as large.
             decisions.append(plan.decide("metals", metals_evidence(places, transport, typical), step))
             model.use(plan.config)
-        found = find_first_light(places, transport, typical, model.brdf.metals)
+        first = find_first_light(places, transport, typical, model.brdf.metals)
     model.train(mode)
-    return decisions, found
+    return decisions, first
 
 
 @torch.no_grad()
-def look_at_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int) -> list[Decision]:
+def review_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int) -> list[Decision]:
     """Take the decisions that depend on the surface: before material init, and before the joint stage.
 
     Args:
@@ -153,51 +157,71 @@ def look_at_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: i
     """
     mode = model.training
     model.eval()
-    rendered = _shown_surface(model, pixels.sample(LOOKED_AT, gradients=False))
+    rendered = _rendered_surface(model, pixels.sample(SURFACE_PIXELS, gradients=False))
     surface = rendered.observed
     decisions = []
     if plan.is_open("inter-reflection"):
         measured = self_visibility(model, plan.settings.inter_reflection, surface.position, surface.normal)
         decisions.append(plan.decide("inter-reflection", measured, step))
-    names = frozenset(name for name in JUDGED if plan.is_open(name))
-    evidence = material_evidence(model, pixels, surface.position, surface.normal, names) if names else {}
-    decisions += [plan.decide(name, measured, step) for name, measured in evidence.items()]
     if plan.is_open("joint-stage") and has_material(step, plan.settings.train):
         decisions.append(plan.decide("joint-stage", shading_disagreement(model, rendered), step))
     model.train(mode)
     return decisions
 
 
-def after_fit(plan: Plan, found: Evidence | None, lit: int, step: int) -> list[Decision]:
+@torch.no_grad()
+def review_material(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int) -> list[Decision]:
+    """Take the decisions that compare fits of light and material at places, after those on lobe and metals.
+
+    The arguments and the result are those of `review_surface`.
+    """
+    names = frozenset(name for name in JUDGED if plan.is_open(name))
+    if not names:
+        return []
+    mode = model.training
+    model.eval()
+    surface = _rendered_surface(model, pixels.sample(SURFACE_PIXELS, gradients=False)).observed
+    evidence = material_evidence(model, pixels, surface.position, surface.normal, names)
+    model.train(mode)
+    return [plan.decide(name, measured, step) for name, measured in evidence.items()]
+
+
+def record_lamps(plan: Plan, evidence: Evidence | None, lit: int, step: int) -> list[Decision]:
     """Record the decision on lamps that the light solver has taken in a fit.
 
     Args:
         plan: the plan to which the decision is added.
-        found: the comparison of the fits with and without lamps; None if there was none.
+        evidence: the comparison of the fits with and without lamps; None if there was none.
         lit: number of lamps after the fit.
         step: number of steps trained so far.
 
     Returns:
         The new decision; empty if it is the same as before.
     """
-    if found is None or not plan.is_open("lamps"):
+    if evidence is None or not plan.is_open("lamps"):
         return []
     before, on = plan.newest("lamps"), lit > 0
     if before is not None and before.on == on:
         return []
-    measured = Measurement(
-        "reduction of the error at held-back points by lamps",
-        found.gain,
-        found.deviation,
-        MIN_GAIN,
-        found.points,
-    )
-    reason = measured.in_words() if before is None else f"revised: {measured.in_words()}"
+    where, threshold = ("in held-back views", 0.0) if evidence.in_views else ("at held-back points", MIN_GAIN)
+    what = f"reduction of the error {where} by lamps"
+    measured = Measurement(what, evidence.gain, evidence.deviation, threshold, evidence.points)
+    reason = measured.summary() if before is None else f"revised: {measured.summary()}"
     plan.decisions.append(Decision(step, "lamps", on, "evidence", reason, measured))
     return plan.decisions[-1:]
 
 
-def _shown_surface(model: NeilfModel, pixels: PixelBatch) -> ShownSurface:
+def _not_measured(plan: Plan, step: int, reason: str) -> list[Decision]:
+    """Record that the lobe and metals stay as they are, if they are open."""
+    open_names = [name for name in ("long-tails", "metals") if plan.is_open(name)]
+    decisions = [
+        Decision(step, name, plan.is_on(name), "evidence", f"not measured: {reason}") for name in open_names
+    ]
+    plan.decisions += decisions
+    return decisions
+
+
+def _rendered_surface(model: NeilfModel, pixels: PixelBatch) -> RenderedSurface:
     """Render pixels and keep those whose ray hits the object."""
     pixels = pixels[torch.nonzero(pixels.mask > 0.5)[:, 0]]
     parts = []
@@ -209,4 +233,4 @@ def _shown_surface(model: NeilfModel, pixels: PixelBatch) -> ShownSurface:
         normal = model.shading_normals(hits.position, hits.normal)
         parts.append((hits.position, normal, -part.directions, part.color, hits.color))
     joined = [torch.cat(column) for column in zip(*parts, strict=True)] or [pixels.color[:0]] * 5
-    return ShownSurface(Observed(*joined[:4]), joined[4])
+    return RenderedSurface(Observed(*joined[:4]), joined[4])

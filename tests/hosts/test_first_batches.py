@@ -11,12 +11,12 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.attach import attach_neilf, pixel_batch
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.first_look import BATCHES, check_points
+from neilfpp_method.hosts.first_batches import BATCHES, check_points
 from neilfpp_method.structures import RayBatch
 from tests.hosts.balls import Ball, BallHost, ball_rays
 from tests.scenes import tiny_config
 
-SAYS = "neilfpp_method.hosts.first_look"
+SAYS = "neilfpp_method.hosts.first_batches"
 
 
 def batch(rays: RayBatch, color: float = 0.4):
@@ -127,8 +127,8 @@ def test_looking_from_another_viewpoint_changes_no_random_number():
 
     def after_a_step(render: bool) -> torch.Tensor:
         neilf = attach_neilf(BallHost(drawn), tiny_config())
-        assert neilf.first_look.render is not None
-        neilf.first_look.render = neilf.first_look.render if render else None
+        assert neilf.first_batches.render is not None
+        neilf.first_batches.render = neilf.first_batches.render if render else None
         torch.manual_seed(3)
         neilf.losses(batch(ball_rays(64)), "material_init")
         return torch.rand(4)
@@ -139,7 +139,7 @@ def test_looking_from_another_viewpoint_changes_no_random_number():
 def test_a_host_of_camera_rays_is_rendered_from_no_other_viewpoint():
     host = BallHost()
     host.answers_secondary_rays = False
-    assert attach_neilf(host, tiny_config()).first_look.render is None
+    assert attach_neilf(host, tiny_config()).first_batches.render is None
 
 
 def test_directions_that_are_not_unit_are_an_error():

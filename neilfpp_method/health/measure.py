@@ -9,7 +9,7 @@ import torch
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.structures import Material, PixelBatch, SurfaceHits
 
-__all__ = ["Look", "look", "look_at_hits"]
+__all__ = ["SurfaceMeasurement", "measure_hits", "measure_surface"]
 
 OPAQUE = 0.5
 """Opacity above which a ray counts as opaque."""
@@ -18,7 +18,7 @@ AT_BOUND = 0.02
 
 
 @dataclass(frozen=True)
-class Look:
+class SurfaceMeasurement:
     """The result of a measurement; shares are between 0 and 1.
 
     Attributes:
@@ -36,7 +36,7 @@ class Look:
 
 
 @torch.no_grad()
-def look(model: NeilfModel, pixels: PixelBatch, with_material: bool) -> Look:
+def measure_surface(model: NeilfModel, pixels: PixelBatch, with_material: bool) -> SurfaceMeasurement:
     """Render training pixels and measure surface and material.
 
     Args:
@@ -47,20 +47,20 @@ def look(model: NeilfModel, pixels: PixelBatch, with_material: bool) -> Look:
     mode = model.training
     model.eval()
     hits = model.host.render(pixels[torch.nonzero(pixels.mask > 0.5)[:, 0]].rays)
-    result = look_at_hits(model, hits, with_material)
+    result = measure_hits(model, hits, with_material)
     model.train(mode)
     return result
 
 
 @torch.no_grad()
-def look_at_hits(model: NeilfModel, hits: SurfaceHits, with_material: bool) -> Look:
-    """The same as `look`, for pixels on the object that the host has already rendered."""
+def measure_hits(model: NeilfModel, hits: SurfaceHits, with_material: bool) -> SurfaceMeasurement:
+    """The same as `measure_surface`, for pixels on the object that the host has already rendered."""
     opaque = hits.opacity > OPAQUE
     sharp = opaque & hits.is_hit(model.config.shading.hit_share)
     at_bound = None
     if with_material and sharp.any():
         at_bound = _share_at_bound(model.materials(hits.position[sharp]))
-    return Look(len(hits), _share(opaque), _share(sharp[opaque]), at_bound)
+    return SurfaceMeasurement(len(hits), _share(opaque), _share(sharp[opaque]), at_bound)
 
 
 def _share(flags: torch.Tensor) -> float:
