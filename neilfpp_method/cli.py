@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import os
 import sys
@@ -16,7 +17,7 @@ from rich.console import Console
 from neilfpp_method.commands import COMMANDS
 from neilfpp_method.commands.command import Command
 from neilfpp_method.commands.ending import ended_by_signal
-from neilfpp_method.commands.mistakes import closest, mistake
+from neilfpp_method.commands.mistakes import TYRO_UNKNOWN, closest, mistake
 from neilfpp_method.data.native_signals import sigterm_delayed
 from neilfpp_method.errors import EarlyEnd, Stopped, UserError
 
@@ -116,8 +117,16 @@ def _parse(name: str, command: Command, arguments: Sequence[str]) -> Any:
         if not complaint.getvalue():
             raise
         what, meant = mistake(complaint.getvalue(), arguments)
+        folder = next(iter(arguments), "-")
+        if what == f"{TYRO_UNKNOWN} {folder}" and folder[:1] != "-" and "data" in _names(command):
+            meant = f"--data {folder}"
         see = f"see neilfpp {name} --help"
         raise UserError(what, f"did you mean {meant}? Otherwise {see}" if meant else see) from end
+
+
+def _names(command: Command) -> set[str]:
+    """The names of the options of a command."""
+    return {field.name for field in dataclasses.fields(command.options)}
 
 
 def _overview() -> str:

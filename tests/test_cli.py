@@ -305,7 +305,15 @@ def refused(capfd, arguments: list[object], *words: object, leaves: Path) -> Non
         (["train", "--test-every", "often"], ("--test-every", "'often'")),
         (["train"], ("--data",)),
         (["train", "--resume"], ("--resume needs the run's folder", "--out")),
-        (["eval"], ("The run folder", "neilfpp eval --help")),
+        (["train", "teapot"], ("teapot", "did you mean --data teapot?", "neilfpp train --help")),
+        (["eval"], ("missing: PATH (The run folder); see neilfpp eval --help",)),
+        (
+            ["prepare"],
+            (
+                "missing: PATH (Folder of photographs, with its sub-folders), ",
+                ", --out PATH (Folder of the capture); ",
+            ),
+        ),
         (["eval", "a", "b"], ("b", "neilfpp eval --help")),
         (["export", "a", "--checkpoint", "first"], ("--checkpoint", "sdf_init")),
         (["render", "a", "--views", "best"], ("--views", "test")),
@@ -506,6 +514,24 @@ def test_a_file_where_a_folder_is_wanted_and_the_reverse(tmp_path, capfd, traine
     complaint = "is a file; name a folder" if is_file else "is a folder; name a file"
     name, *rest = command
     refused(capfd, [name, trained, "--out", out, "--device", "cpu", *rest], out, complaint, leaves=tmp_path)
+
+
+def test_a_file_and_a_run_where_a_capture_is_wanted_and_the_reverse(tmp_path, capfd, capture, trained):
+    file = tmp_path / "file"
+    file.write_text("")
+    for data, complaint in ((file, "a file, not a folder"), (trained, "a run folder, not a capture")):
+        refused(capfd, ["train", "--data", data, "--out", tmp_path / "run"], data, complaint, leaves=tmp_path)
+        refused(capfd, ["inspect", data], data, complaint, leaves=tmp_path)
+    refused(capfd, ["train", "--data", capture, "--out", file], file, "is a file; name a", leaves=tmp_path)
+    for name in ("eval", "render", "relight", "export", "report", "view"):
+        refused(capfd, [name, file], file, "no run here (a file)", leaves=tmp_path)
+        refused(capfd, [name, tmp_path / "x"], "x: no run here (no such folder)", leaves=tmp_path)
+
+
+@pytest.mark.parametrize("resolution", [0, -3, 5000])
+def test_a_surface_of_no_cells_or_too_many(tmp_path, capfd, trained, resolution):
+    command = ["export", trained, "--out", tmp_path / "out", "--resolution", resolution, "--device", "cpu"]
+    refused(capfd, command, f"{resolution} cells per side; give 8 to 2048", leaves=tmp_path)
 
 
 @pytest.mark.parametrize(

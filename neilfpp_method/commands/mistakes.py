@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from itertools import pairwise
 
-__all__ = ["closest", "mistake"]
+__all__ = ["TYRO_UNKNOWN", "closest", "mistake"]
 
 TYRO_SUGGESTS = "Perhaps you meant"
 """Heading of the options that tyro suggests."""
+TYRO_MISSING = "Missing from"
+"""Beginning of tyro's message about options that are required; their names and descriptions follow."""
+NAME = re.compile("│     [^ ].*")
+"""A line of that message with the name of an option; descriptions are indented further."""
 TYRO_UNKNOWN = "Unrecognized options:"
 """Beginning of tyro's message about unknown options."""
 
@@ -42,7 +47,27 @@ def mistake(complaint: str, arguments: Sequence[str]) -> tuple[str, str | None]:
         else:
             paragraphs.append([])
     what = " ".join(paragraphs[0]).rstrip(".")
+    if what.startswith(TYRO_MISSING):
+        return _missing(complaint) or what, None
     return what, _flag_with_a_value(what, arguments) or _suggested(what, paragraphs)
+
+
+def _missing(complaint: str) -> str:
+    """The missing options, each with the first sentence of its description; empty if there is none."""
+    parts: list[list[str]] = []
+    for line in complaint.splitlines():
+        if line.startswith("│ ─"):
+            break
+        text = line.strip("│ ")
+        if NAME.match(line):
+            parts.append([text])
+        elif parts:
+            parts[-1].append(text)
+    described = (
+        f"{name} ({' '.join(text).removesuffix('(required)').split('. ')[0].rstrip('. ')})"
+        for name, *text in parts
+    )
+    return f"missing: {', '.join(described)}" if parts else ""
 
 
 def _suggested(what: str, paragraphs: Sequence[Sequence[str]]) -> str | None:

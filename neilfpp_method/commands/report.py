@@ -38,7 +38,9 @@ def run(options: Report) -> None:
     from neilfpp_method.report.write import REPORT, ReportOptions, write_report
     from neilfpp_method.train.device import pick_device
     from neilfpp_method.train.output import check_writable
+    from neilfpp_method.train.run import read_description
 
+    read_description(options.run)
     contents = ReportOptions(options.views, options.size, options.confidence)
     contents.check()
     out = options.out or options.run / REPORT

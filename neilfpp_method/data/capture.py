@@ -148,7 +148,8 @@ def load_capture(
     """
     root = Path(root)
     if not root.is_dir():
-        raise UserError(f"{root}: no such folder", "give the folder of a capture")
+        problem = "a file, not a folder" if root.exists() else "no such folder"
+        raise UserError(f"{root}: {problem}", "give the folder of a capture")
     format = format or _recognise(root)
     if format not in READERS:
         raise UserError(f"unknown capture format '{format}'", f"choose one of {', '.join(READERS)}")
@@ -174,6 +175,8 @@ def _recognise(root: Path) -> str:
     for name, reader in READERS.items():
         if reader.recognise(root):
             return name
+    if (root / "config.json").is_file() and (root / "capture.json").is_file():
+        raise UserError(f"{root}: a run folder, not a capture", "give the folder that the run was trained on")
     photographs = _photographs(root)
     if photographs:
         remedy = f"run neilfpp prepare {root} --out CAPTURE, and train on CAPTURE"

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from neilfpp_method.errors import UserError
 from neilfpp_method.export.asset.command import AssetOptions, Bar, Deviations, check_asset, export_asset
 from neilfpp_method.export.light import check_light, export_light
 from neilfpp_method.export.mesh import export_mesh, has_surface
@@ -15,6 +16,9 @@ from neilfpp_method.train.output import check_folder
 from neilfpp_method.train.run import load_run
 
 __all__ = ["run_export"]
+
+MIN_RESOLUTION, MAX_RESOLUTION = 8, 2048
+"""Bounds of the resolution; a grid of 2048³ distances takes 34 GB."""
 
 
 def run_export(
@@ -51,6 +55,11 @@ def run_export(
     Raises:
         UserError: the run does not have what is requested.
     """
+    if not MIN_RESOLUTION <= resolution <= MAX_RESOLUTION:
+        raise UserError(
+            f"a surface cannot have a grid of {resolution} cells per side",
+            f"give {MIN_RESOLUTION} to {MAX_RESOLUTION} with --resolution",
+        )
     trained = load_run(run, pick_device(device), checkpoint)
     out = out or run / "export"
     check_folder(out)

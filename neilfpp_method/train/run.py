@@ -192,9 +192,9 @@ def check_free(path: Path) -> None:
     Raises:
         UserError: if the folder contains other files, or cannot be created.
     """
-    if path.exists() and (not path.is_dir() or any(not _of_no_run(inner.name) for inner in path.iterdir())):
-        raise UserError(f"{path}: exists already", "choose another --out, or continue it with --resume")
     check_folder(path)
+    if path.exists() and any(not _of_no_run(inner.name) for inner in path.iterdir()):
+        raise UserError(f"{path}: exists already", "choose another --out, or continue it with --resume")
 
 
 def _of_no_run(name: str) -> bool:
@@ -267,9 +267,10 @@ def read_description(path: Path) -> Description:
         UserError: if the folder is no run, or a run of another version.
     """
     if not (path / "config.json").is_file():
-        raise UserError(
-            f"{path}: no run here (config.json is missing)", "give the folder that `neilfpp train` wrote"
+        missing = (
+            "config.json is missing" if path.is_dir() else "a file" if path.exists() else "no such folder"
         )
+        raise UserError(f"{path}: no run here ({missing})", "give the folder that `neilfpp train` wrote")
     stored = read_json(path / "config.json")
     if stored.get("format") != FORMAT:
         raise UserError(

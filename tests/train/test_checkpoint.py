@@ -171,8 +171,8 @@ def test_a_run_does_not_move_into_somebodys_folder(tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("Abstract")
     (tmp_path / "file").write_text("")
-    for name in ("full", "file"):
-        with pytest.raises(UserError, match=f"{name}: exists already; choose another --out"):
+    for name, complaint in (("full", "exists already; choose another --out"), ("file", "is a file; name a")):
+        with pytest.raises(UserError, match=f"{name}: {complaint}"):
             described(tmp_path / name)
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["thesis.tex"]
 
