@@ -1,7 +1,8 @@
 """Evidence for specular reflection, varying roughness, an environment map and its colours.
 
-Places that many views show are fitted with all of these effects and without each of them. The fits use most of the views and are compared at pixels of the held-back views. Lamps are not part of the
-fits, and metals are if the model has them (`effects.metals` decides).
+Places that many views show are fitted with all of these effects and without each of them. The fits use most
+of the views and are compared at pixels of the held-back views. Lamps are not part of the fits, and metals are
+if the model has them (`effects.metals` decides).
 
 The base colour of every place is free. A place without specular reflection therefore contains no information
 about the light, and the benefit of an environment map and of its colours is underestimated.
@@ -51,8 +52,8 @@ MIN_VIEWS = 4
 WORTH = 0.01
 """Reduction of the relative error above which an effect is worth its cost."""
 CARRIED_ROUNDS = 2
-"""Alternations of light and material in the fits with one roughness, which start from the fit with all effects.
-The other fits do not: the light of that fit is too good for surfaces without reflection.
+"""Alternations of light and material in the fits with one roughness, which start from the fit with all
+effects. The other fits do not: the light of that fit is too good for surfaces without reflection.
 """
 FITS = 14
 """Number of fits of this size to which the measurements at places before one stage amount (estimate): 8 fits,

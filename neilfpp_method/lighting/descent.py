@@ -43,9 +43,9 @@ def descend(
     """Minimise a loss over the unknowns and over factors ("gains") on the base colour of the points.
 
     Every point has a gain per channel; if the weight of evenness is 0, all points share it. The mean
-    logarithm of the gains is kept at 0, because the images do not determine the common scale of light and
-    base colour and the current base colour is the best estimate of it. If the cameras have seen part of the
-    light directly, that fixes the scale, and the mean is free.
+    logarithm of the gains is `objective.log_scale`, because the pixels of the points hardly determine
+    the common scale of light and base colour. If the cameras have seen part of the light directly, that fixes
+    the scale, and the mean is free.
 
     Args:
         unknowns: the tensors to optimise, in place.
@@ -66,7 +66,9 @@ def descend(
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL_RATE_SHARE ** (1 / steps))
     with torch.enable_grad():
         for _ in range(steps):
-            gain = (log_gain - log_gain.mean() if objective.sky is None else log_gain).exp()
+            gain = (
+                log_gain - log_gain.mean() + objective.log_scale if objective.sky is None else log_gain
+            ).exp()
             loss = loss_of(gain)
             if nearest is not None:
                 loss = loss + weight * unevenness(base_color * gain, nearest)

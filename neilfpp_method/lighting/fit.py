@@ -7,6 +7,7 @@ it blurs a lamp into a haze, and the base colour then compensates for the missin
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -177,8 +178,9 @@ def compare(
         target: the held-back points and their pixels.
         objective: defines the relative error.
     """
+    gain = math.exp(objective.log_scale)
     first, second = (
-        objective.relative_error(light.strength(), transport, target, 1.0).abs().clamp_max(1).mean(-1)
+        objective.relative_error(light.strength(), transport, target, gain).abs().clamp_max(1).mean(-1)
         for light, transport in zip(lights, transports, strict=True)
     )
     return first - second

@@ -22,6 +22,7 @@ from neilfpp_method.shading.color import residual, response_slope
 from neilfpp_method.structures import Indexable, Material
 
 __all__ = [
+    "DARK_FLOOR",
     "FLOOR",
     "Objective",
     "Target",
@@ -92,6 +93,7 @@ class Objective:
         config: weights of the terms.
         sky: what cameras saw of the map directly; None if they saw nothing of it.
         monochrome: whether the map has one channel for all three colours.
+        log_scale: mean logarithm of the factors that a fit applies to the base colours; 0 keeps their scale.
     """
 
     response: str
@@ -99,6 +101,7 @@ class Objective:
     config: LightFitConfig
     sky: KnownSky | None = None
     monochrome: bool = False
+    log_scale: float = 0.0
 
     def relative_error(
         self,

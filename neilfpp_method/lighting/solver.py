@@ -22,7 +22,7 @@ from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.memory import SurfaceMemory
-from neilfpp_method.lighting.objective import Objective
+from neilfpp_method.lighting.objective import DARK_FLOOR, Objective
 from neilfpp_method.lighting.sky import SkySightings
 from neilfpp_method.lighting.solve import solve_light
 from neilfpp_method.settings.facts import RadianceUnits, SceneFacts
@@ -81,7 +81,8 @@ class LightSolver(Protocol):
 
         Args:
             observed: surface points.
-            material: their material.
+            material: their material. The mean logarithm of the base colour is that of all later fits: light
+                and base colour share a scale that the fits hardly determine, and that would drift.
             scene: as in `solve`.
             judge: compares the lamps with none. They are rejected if they are worse by more than one standard
                 error.
@@ -148,6 +149,8 @@ class MapSolver(nn.Module):
         super().__init__()
         self.config, self.response, self.unit = config, facts.response, units.physical
         self.light, self.lobe = light, lobe
+        # NaN before an initial light: the current base colour then determines the scale.
+        self.register_buffer("log_mean_base_color", torch.tensor(torch.nan))
         self.memory = SurfaceMemory(config.fit.points, config.fit.every)
         # The light is only visible behind the scene if the background is open, and a known map needs no
         # observation.
@@ -185,6 +188,7 @@ class MapSolver(nn.Module):
     ) -> Evidence | None:
         """See `LightSolver.start`."""
         self.memory.wait()
+        self.log_mean_base_color.copy_(material.base_color.log().mean())
         if self.config.kind == "distant":
             return None
         environment, lamps = self.light.light, self.light.lamps
@@ -214,6 +218,11 @@ class MapSolver(nn.Module):
         first, observed = self.memory.age is None, self.memory.recall()
         return self._solve(self.light, observed, brdf(observed.position), scene, first)
 
+    def _log_scale(self, material: Material) -> float:
+        """Logarithm of the factor that gives base colours the mean of the initial light."""
+        log_mean = material.base_color.clamp_min(DARK_FLOOR).log().mean()
+        return (self.log_mean_base_color - log_mean).nan_to_num(0.0).item()
+
     def _solve(
         self,
         light: LightModel,
@@ -231,6 +240,7 @@ class MapSolver(nn.Module):
             self.config.fit,
             None if environment.even else sky,
             self.config.monochrome,
+            self._log_scale(material),
         )
         measured = solve_light(
             light,
