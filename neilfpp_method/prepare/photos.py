@@ -104,7 +104,8 @@ def survey(root: Path, response: Literal["auto", "linear", "srgb"]) -> Photos:
             linear images and images with display values.
     """
     if not root.is_dir():
-        raise UserError(f"{root}: no such folder", "give a folder of photographs")
+        problem = "is a file, not a folder" if root.exists() else "no such folder"
+        raise UserError(f"{root}: {problem}", "give a folder of photographs")
     paths = sorted(path for path in root.rglob("*") if _is_photo(path, root))
     is_linear: dict[Path, bool] = {}
     problems: dict[Path, str] = {}
