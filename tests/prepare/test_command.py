@@ -352,6 +352,8 @@ def test_a_split_that_leaves_nothing(photos, tmp_path, capfd, every):
 
 def test_no_such_folder(tmp_path, capfd):
     refused(capfd, tmp_path / "nowhere", tmp_path / "out", says="no such folder")
+    (tmp_path / "photo.jpg").write_bytes(b"")
+    refused(capfd, tmp_path / "photo.jpg", tmp_path / "out", says="is a file, not a folder")
 
 
 def test_an_output_folder_that_cannot_be_written(photos, tmp_path, capfd):
