@@ -27,6 +27,7 @@ from torch import Tensor
 
 from benchmarks.measure import hardware, revision
 from benchmarks.tables import COLUMNS, RESULTS, Result, Row, markdown, write_result
+from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.evaluate.protocols import evaluate
 from neilfpp_method.report.write import REPORT, write_report
 from neilfpp_method.schedule import Stage, stage_steps
@@ -67,8 +68,8 @@ class Options:
     host: Literal["volsdf", "mesh"] = "volsdf"
     """Geometry to be found, or given as a mesh."""
     compare: Literal["preset", "paper", "ladder"] = "paper"
-    """preset: nothing else. paper: the free light field with and without L_ref. ladder: every light with
-    every inter-reflection that goes with it.
+    """preset: nothing else, with effects by evidence as in `neilfpp train`. paper: the free light field with
+    and without L_ref. ladder: every light with every inter-reflection that goes with it.
     """
     material_steps: int | None = None
     """Steps of the stage material init; none: the preset's."""
@@ -101,7 +102,14 @@ def changed(config: NeilfConfig, room: str, **settings: object) -> NeilfConfig:
     return dataclasses.replace(config, **{room: dataclasses.replace(getattr(config, room), **settings)})
 
 
-def train(capture: Path, out: Path, config: NeilfConfig, device: str, start_from: Path | None = None) -> None:
+def train(
+    capture: Path,
+    out: Path,
+    config: NeilfConfig,
+    device: str,
+    effects: EffectRequest,
+    start_from: Path | None = None,
+) -> None:
     """A run from scratch, or from the end of another run's SDF init. A run that is there is continued."""
     if start_from is not None and not out.exists():
         branch(start_from, out, config)
@@ -110,6 +118,7 @@ def train(capture: Path, out: Path, config: NeilfConfig, device: str, start_from
         out=out,
         config=config,
         resume=out.exists(),
+        effects=None if out.exists() else effects,
         test_every=None,
         response="auto",
         device=device,
@@ -170,6 +179,8 @@ def main(options: Options) -> None:
         config = dataclasses.replace(
             config, train=dataclasses.replace(config.train, material_steps=options.material_steps)
         )
+    # Where variants are compared, none of them may leave out what another has.
+    effects = "auto" if options.compare == "preset" else "as-set"
     rows: list[Row] = []
     for capture in options.captures:
         base = options.out / capture.name
@@ -181,7 +192,8 @@ def main(options: Options) -> None:
                 else options.out / f"{capture.name}-{name.replace(', ', '-').replace(' ', '-')}"
             )
             shares_trunk = run != base and config.train.sdf_steps > 0
-            train(capture, run, settings, options.device, start_from=base if shares_trunk else None)
+            trunk = base if shares_trunk else None
+            train(capture, run, settings, options.device, EffectRequest(effects), trunk)
             figures = measure(run, config)
             final = list(figures.values())[-1]
             if settings is config:
