@@ -110,7 +110,7 @@ class InvertedSphere(nn.Module):
         """Features of the unit vectors `points` at the inverse radii `inverse`."""
         if isinstance(self.position, HashGrid):
             contracted = points * (SHELL_RADIUS - self.radius * inverse)[:, None]
-            return self.position(contracted.flatten(0, 1)).view(*points.shape[:2], -1)
+            return self.position(contracted.flatten(0, 1)).view(*points.shape[:2], self.position.width)
         chart = torch.cat((points, inverse[None, :, None].expand(len(points), -1, 1)), -1)
         return self.position(chart)
 

@@ -11,6 +11,7 @@ The free light field is learned by gradient descent instead; its solver, `Nothin
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
@@ -149,8 +150,8 @@ class MapSolver(nn.Module):
         super().__init__()
         self.config, self.response, self.unit = config, facts.response, units.physical
         self.light, self.lobe = light, lobe
-        # NaN before an initial light: the current base colour then determines the scale.
-        self.register_buffer("log_mean_base_color", torch.tensor(torch.nan))
+        # Infinite before an initial light: the current base colour then determines the scale.
+        self.register_buffer("log_mean_base_color", torch.tensor(torch.inf))
         self.memory = SurfaceMemory(config.fit.points, config.fit.every)
         # The light is only visible behind the scene if the background is open, and a known map needs no
         # observation.
@@ -221,7 +222,8 @@ class MapSolver(nn.Module):
     def _log_scale(self, material: Material) -> float:
         """Logarithm of the factor that gives base colours the mean of the initial light."""
         log_mean = material.base_color.clamp_min(DARK_FLOOR).log().mean()
-        return (self.log_mean_base_color - log_mean).nan_to_num(0.0).item()
+        log_scale = (self.log_mean_base_color - log_mean).item()
+        return log_scale if math.isfinite(log_scale) else 0.0
 
     def _solve(
         self,
