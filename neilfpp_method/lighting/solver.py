@@ -234,15 +234,12 @@ class MapSolver(nn.Module):
         first: bool,
         at_start: bool = False,
     ) -> Evidence | None:
-        sky = None if self.sky is None else self.sky.known()
         environment = light.light
+        sky = None if self.sky is None or environment.even else self.sky.known()
+        # Where cameras saw the light directly, that fixes the scale.
+        log_scale = self._log_scale(material) if sky is None else 0.0
         objective = Objective(
-            self.response,
-            self.unit,
-            self.config.fit,
-            None if environment.even else sky,
-            self.config.monochrome,
-            self._log_scale(material),
+            self.response, self.unit, self.config.fit, sky, self.config.monochrome, log_scale
         )
         measured = solve_light(
             light,

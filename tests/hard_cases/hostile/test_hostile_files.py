@@ -65,6 +65,15 @@ def test_the_same_number_does_the_same_damage() -> None:
     assert len({mutated(data, i) for i in range(50)}) > 40
 
 
+def faults_of(program: str, folder: Path) -> list:
+    """The faults that a program prints as JSON in its last line."""
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(folder)], cwd=REPOSITORY, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
 def test_the_worker_notices_what_it_is_for(tmp_path: Path) -> None:
     """A traceback, a crash and a large allocation are faults, each with its number, and the next input
     follows.
@@ -89,11 +98,7 @@ def read(folder, path):
 outcome = worker.attack(Reader(make, read), Path(sys.argv[1]) / "x", 10, 6)
 print(json.dumps([[fault[0], fault[2]] for fault in outcome.faults]))
 """
-    done = subprocess.run(
-        [sys.executable, "-c", program, str(tmp_path)], cwd=REPOSITORY, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    faults = json.loads(done.stdout.splitlines()[-1])
+    faults = faults_of(program, tmp_path)
     assert [number for number, _ in faults] == [11, 13, 15], faults
     for (_, told), word in zip(faults, ("KeyError", "MemoryError", "SIGSEGV"), strict=True):
         assert word in told
@@ -130,11 +135,7 @@ def read(folder, path):
 outcome = worker.attack(Reader(make, read), Path(sys.argv[1]) / "x", 10, 6)
 print(json.dumps([[fault[0], fault[2]] for fault in outcome.faults]))
 """
-    done = subprocess.run(
-        [sys.executable, "-c", program, str(tmp_path)], cwd=REPOSITORY, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    faults = json.loads(done.stdout.splitlines()[-1])
+    faults = faults_of(program, tmp_path)
     assert [number for number, _ in faults] == [11, 13, 14], faults
     for (_, what), word in zip(faults, ("SIGPROF", "seconds", "SIGALRM"), strict=True):
         assert word in what
