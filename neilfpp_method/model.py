@@ -74,7 +74,7 @@ class NeilfModel(nn.Module):
         host: geometry G and outgoing radiance R.
         brdf: B, the material at every point.
         light, lamps: L, the light that arrives at unoccluded points, and the small lamps near the scene.
-        gains: gain of each photograph relative to the mean; None if all photographs are taken as equal.
+        gains: gain of each photograph relative to the mean; None if all are assumed to have one exposure.
         lobe: distribution of the specular reflection; None for Lambertian surfaces.
         stages: stage table for this kind of host: active losses and trained fields of each stage.
         units: units in which the losses measure radiance.
@@ -109,7 +109,7 @@ class NeilfModel(nn.Module):
         parts = make_light(config, facts.response, facts.median_radiance / albedo)
         self.light, self.lamps = parts.light, parts.lamps
         self.use(config)
-        # The trainer of a borrowed host may move its surface in any step: then no point is reused.
+        # The trainer of a borrowed host may move its surface in any step, so no point is reused.
         surface_is_fixed = not borrowed and not self.stages[Stage.MATERIAL_INIT].moves_host
         self.replay = Replay(config.train.fresh if surface_is_fixed else 1.0, config.train.rays)
 
@@ -321,7 +321,14 @@ class NeilfModel(nn.Module):
         return smooth + (normal - normal.detach())
 
     def incident_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
-        """Linear radiance that arrives at x from wi: from light and lamps, or from surfaces before them."""
+        """Linear radiance that arrives at points along directions.
+
+        It comes from the light and the lamps, or from a surface of the scene that occludes them.
+
+        Args:
+            x: points in the scene frame.
+            wi: unit directions away from x.
+        """
         return incident_radiance(self.sources, x, wi)
 
     @doing("shading")
@@ -333,18 +340,31 @@ class NeilfModel(nn.Module):
         material: Material,
         samples: int,
     ) -> Shading:
-        """Outgoing radiance towards wo by the rendering equation, from `samples` directions per point."""
+        """Outgoing radiance towards the viewer by the rendering equation.
+
+        Args:
+            position: surface points, scene frame.
+            normal: outward unit normals.
+            wo: unit directions towards the viewer.
+            material: material at the points.
+            samples: number of incident directions per point.
+        """
         incident = self._incident(position, normal, wo, material, samples)
         return shade(material, normal, wo, incident, self.lobe)
 
     @torch.no_grad()
     def maps(self, rays: RayBatch, with_material: bool = True, hits: SurfaceHits | None = None) -> Maps:
-        """Render all maps of rays, for images and metrics. Split large images: memory grows with the rays.
+        """Render all maps of rays, for images and metrics, without gradients.
+
+        Memory grows with the number of rays, so callers split large images.
 
         Args:
-            rays: scene frame.
-            with_material: False: neither BRDF nor light is evaluated, and `rgb` is the host's color.
+            rays: rays in the scene frame.
+            with_material: if False, neither BRDF nor light is evaluated, and `rgb` is the host's color.
             hits: what the host rendered for these rays; if None, the host is rendered here.
+
+        Returns:
+            The maps, one row per ray.
         """
         hits = self.host.render(rays) if hits is None else hits.detach()
         maps = Maps.of_host(rays, hits)
