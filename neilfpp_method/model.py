@@ -321,14 +321,7 @@ class NeilfModel(nn.Module):
         return smooth + (normal - normal.detach())
 
     def incident_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
-        """Linear radiance that arrives at points along directions.
-
-        It comes from the light and the lamps, or from a surface of the scene that occludes them.
-
-        Args:
-            x: points in the scene frame.
-            wi: unit directions away from x.
-        """
+        """Linear radiance at x from wi: of the light, the lamps, or a surface that occludes them."""
         return incident_radiance(self.sources, x, wi)
 
     @doing("shading")
@@ -340,31 +333,18 @@ class NeilfModel(nn.Module):
         material: Material,
         samples: int,
     ) -> Shading:
-        """Outgoing radiance towards the viewer by the rendering equation.
-
-        Args:
-            position: surface points, scene frame.
-            normal: outward unit normals.
-            wo: unit directions towards the viewer.
-            material: material at the points.
-            samples: number of incident directions per point.
-        """
+        """Outgoing radiance towards wo by the rendering equation, from `samples` directions per point."""
         incident = self._incident(position, normal, wo, material, samples)
         return shade(material, normal, wo, incident, self.lobe)
 
     @torch.no_grad()
     def maps(self, rays: RayBatch, with_material: bool = True, hits: SurfaceHits | None = None) -> Maps:
-        """Render all maps of rays, for images and metrics, without gradients.
-
-        Memory grows with the number of rays, so callers split large images.
+        """Render all maps of rays, for images and metrics. Split large images: memory grows with the rays.
 
         Args:
             rays: rays in the scene frame.
             with_material: if False, neither BRDF nor light is evaluated, and `rgb` is the host's color.
             hits: what the host rendered for these rays; if None, the host is rendered here.
-
-        Returns:
-            The maps, one row per ray.
         """
         hits = self.host.render(rays) if hits is None else hits.detach()
         maps = Maps.of_host(rays, hits)
