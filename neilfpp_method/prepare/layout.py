@@ -130,7 +130,7 @@ def _cloud(
         except UserError as error:
             if options.cloud == "dense":
                 raise
-            no_dense = f"; no dense ones, as {error.problem}"
+            no_dense = f"; no dense points, because {error.problem}"
     else:
         no_dense = ""
     if source.posed.cloud is not None:
