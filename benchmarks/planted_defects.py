@@ -322,7 +322,7 @@ def main() -> None:
     check_host(Scene(), rays_from_above())
     found = list(outcomes())
     shown = [o for o in found if o.check is None] if "--missed" in sys.argv[1:] else found
-    print("| defect | found by | what is said |\n|---|---|---|")
+    print("| defect | found by | message |\n|---|---|---|")
     for outcome in shown:
         said = outcome.message.partition("\n")[0]
         print(f"| {outcome.defect} | {outcome.check or '**nothing**'} | {said} |")
