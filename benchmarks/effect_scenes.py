@@ -1,6 +1,7 @@
 """Three small captures with known effects of light, rendered by Mitsuba 3.
 
     python -m benchmarks.effect_scenes build/effect-scenes --variant llvm_ad_rgb
+
     lambertian   a convex ball of eight Lambertian paints under a coloured sky with a sun
     lamp         a shiny ball and a dull box on a floor under an even white sky, with a white lamp
     bowl         a bowl with four coloured walls of equal roughness, under a grey sky with a bright window

@@ -1,6 +1,7 @@
 """Cost of the signed distance, its normal and their backward pass with a hash grid, by three implementations.
 
     python -m benchmarks.kernels [--points 32768] [--repeats 9] [--device cpu]
+
 - naive: straightforward torch; the normal is autograd's gradient of the distance, which the loss
   differentiates once more.
 - reference: the analytic Jacobian and the explicit reverse pass of the package, in torch.
