@@ -345,7 +345,7 @@ def pixel_batch(origins: Tensor, directions: Tensor, color: Tensor, mask: Tensor
         origins: ray origins (N, 3), scene frame.
         directions: unit ray directions (N, 3).
         color: pixel values (N, 3), linear or sRGB as declared to `attach_neilf`.
-        mask: 1 on the object and 0 off it (N,); if None, all pixels may show the object.
+        mask: 1 on the object and 0 off it (N,). None: all pixels may show the object.
 
     Raises:
         UserError: a tensor has another shape, or holds integers.

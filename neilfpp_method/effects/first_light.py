@@ -57,7 +57,7 @@ METAL_FITS = 3
 of them, each with half the usual number of rounds.
 """
 MEASURED = 2000
-"""Number of pixels of the matrix products that `seconds_of_pixel` times."""
+"""Pixels of the products from which `seconds_of_pixel` is estimated."""
 REST = 0.3
 """Share that tracing and the search for materials add to the descents of the light, on one core of a server:
 1270 pixels took 15.5 s, of which 13 s are descents by this count.

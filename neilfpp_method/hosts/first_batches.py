@@ -241,10 +241,10 @@ def check_rows(name: str, value: Tensor, count: int, width: int | None = None) -
         name: name of the tensor in messages.
         value: the tensor.
         count: number of pixels.
-        width: numbers per pixel, in a second axis; if None, one number per pixel and no second axis.
+        width: numbers per pixel, in a second axis; None: one number per pixel without a second axis.
 
     Raises:
-        UserError: it has another type or shape.
+        UserError: it does not.
     """
     if not value.is_floating_point():
         remedy = (

@@ -33,7 +33,7 @@ def lamp(position: tuple[float, float, float], intensity: float) -> Lamps:
 
 
 def lit_by(lamps: Lamps, observed: Observed, material: Material) -> Observed:
-    """The same points; the light of the lamps is added to their pixels."""
+    """The same points with the light of the lamps added to their pixels."""
     places = LampPlaces(lamps.position[: lamps.lit], lamps.axis[: lamps.lit])
     sent = from_lamps(places, lamps.radius, observed, material.roughness, LOBE, None)
     added = sent.outgoing(material, lamps.intensity[: lamps.lit])
