@@ -1,1 +1,1 @@
-"""Measurements that take minutes: each a command whose output goes into docs/."""
+"""Measurements that take minutes; each is a command whose output is shown in docs/."""

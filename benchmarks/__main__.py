@@ -42,22 +42,22 @@ class Options:
     """Measure, and compare with the committed figures."""
 
     names: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Suites; none: all."""
+    """Names of suites; default: all."""
     compare: bool = False
-    """Fail where a figure is worse than the baseline by more than its tolerance."""
+    """Exit with status 1 if a figure is worse than the baseline by more than its tolerance."""
     save: bool = False
     """Write the figures into the baseline."""
 
 
 def compare(measured: Sequence[Measurement], baseline: Mapping[str, float]) -> list[str]:
-    """The names of the figures that are worse than the baseline allows. A figure without a baseline is
-    not.
+    """The names of the figures that are worse than the baseline permits. A figure without a baseline is never
+    worse.
     """
     return [m.name for m in measured if m.name in baseline and m.worse_than(baseline[m.name])]
 
 
 def merged(measured: Sequence[Measurement], old: Mapping[str, object], machine: str) -> dict[str, object]:
-    """A baseline file with the new figures in place of those of the same name."""
+    """The contents of the baseline file after the new figures have replaced those of the same name."""
     figures = {
         **old.get("figures", {}),
         **{m.name: {k: v for k, v in asdict(m).items() if k != "name"} for m in measured},
@@ -66,7 +66,7 @@ def merged(measured: Sequence[Measurement], old: Mapping[str, object], machine: 
 
 
 def main(options: Options, console: Console) -> int:
-    """Run the suites; the exit status."""
+    """Run the suites. Returns the exit status."""
     unknown = set(options.names) - set(SUITES)
     if unknown:
         raise UserError(f"unknown benchmark '{min(unknown)}'", f"choose among {', '.join(SUITES)}")

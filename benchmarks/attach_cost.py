@@ -1,10 +1,9 @@
-"""What attaching costs a host while no material stage runs: its own step with and without the add-on, side by
-side.
+"""Cost of an attached NeILF++ while no material stage runs: a host's own step with and without it.
 
     python -m benchmarks.attach_cost
 
-The host is VolSDF in a loop of its own, borrowed by the add-on. Steps alternate between the two loops, so
-that whatever else the machine does falls on both; medians of both and their ratio are printed.
+The host is VolSDF, trained by its own loop and borrowed. Steps of the two loops alternate, so that other work
+on the machine affects both equally. The medians of both and their ratio are printed.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ STEPS = 100
 
 
 class Borrowed:
-    """A host of which the add-on sees `render` alone: its parameters belong to the loop below."""
+    """A host that offers only `render`; the loop below trains its parameters."""
 
     def __init__(self, host: VolSdfHost) -> None:
         self.render = host.render
@@ -63,7 +62,7 @@ def main() -> None:
     seconds: dict[str, list[float]] = {name: [] for name in loops}
     for number in range(STEPS):
         batch = batch_of(256)
-        # Whoever comes second finds the caches of the first: they take turns.
+        # The second loop would profit from the caches of the first, so the order alternates.
         for name, step in sorted(loops.items(), reverse=number % 2 == 1):
             torch.manual_seed(number)  # the same samples along the rays, so the same work
             started = time.perf_counter()

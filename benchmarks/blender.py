@@ -1,12 +1,12 @@
-"""The asset of a run in Blender, beside our own path tracer: what `neilfpp export --what asset` promises.
+"""Compare the exported asset of a run, rendered by Blender, with the path tracer of this package.
 
     python -m benchmarks.blender RUN --python BPY/bin/python --percent 50 --samples 128
 
-Blender is the package bpy in an environment of its own (`python -m venv BPY`, `BPY/bin/pip install bpy`):
-it asks for its own Python and NumPy. The asset's own script, `open_in_blender.py`, opens it from the GLB
-and from the USD file, and Cycles renders it under the light of the run. Our picture of the same camera is
-path traced on the run's own surface with its own material. PSNR is of what a display shows, within the
-outline of the surface by a pixel.
+Blender is the package bpy in a separate environment (`python -m venv BPY`, `BPY/bin/pip install bpy`),
+because it needs its own versions of Python and NumPy. The script of the asset, `open_in_blender.py`, opens it
+from the GLB and from the USD file, and Cycles renders it under the light of the run. The path tracer of this
+package renders the same camera with the run's own surface and material. The PSNR is that of displayed values,
+over pixels at least one pixel inside the outline of the surface.
 """
 
 from __future__ import annotations
@@ -50,22 +50,22 @@ MAX_SECONDS = 3600
 
 @dataclass
 class Options:
-    """Compare Cycles' picture of an exported asset with our own of the run."""
+    """Compare Cycles' image of an exported asset with the image of this package."""
 
     run: tyro.conf.Positional[Path]
     """A run with a surface and an environment map."""
     python: Path = Path(sys.executable)
     """A Python that has bpy."""
     camera: str | None = None
-    """A view; none: the first of the test views."""
+    """Name of a view; default: the first test view."""
     percent: int = 100
-    """Size of the pictures over that of the view."""
+    """Size of the images relative to the view, in per cent."""
     samples: int = 128
-    """Of a pixel, Blender's and ours."""
+    """Samples per pixel, for Blender and for this package."""
     resolution: int = 256
-    """Cells of the surface along an edge of the scene's cube, where the run has no mesh of its own."""
+    """Cells of the surface along an edge of the scene's cube, if the run has no mesh of its own."""
     out: Path | None = None
-    """Keep the asset and Blender's pictures here; none: nowhere."""
+    """Folder for the asset and Blender's images; default: they are not kept."""
 
 
 def blender_picture(
@@ -77,7 +77,7 @@ def blender_picture(
     percent: int = 100,
     samples: int = 128,
 ) -> Float[np.ndarray, "H W 3"]:
-    """Linear radiance as Cycles renders it, by the script beside the asset; behind the surface is the map.
+    """Linear radiance rendered by Cycles with the script of the asset; the map is visible behind the surface.
 
     Raises:
         UserError: that Python has no bpy, or the script fails.
@@ -97,13 +97,13 @@ def blender_picture(
 def shown_psnr(
     one: Float[np.ndarray, "H W 3"], other: Float[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]
 ) -> float:
-    """Of linear radiance as a display shows it, dB, over a mask."""
+    """PSNR of linear radiance as displayed values, over a mask, dB."""
     shown = [tone_map(torch.from_numpy(np.ascontiguousarray(side))).numpy() for side in (one, other)]
     return metrics.psnr(*shown, mask)
 
 
 def own_picture(run: Run, name: str, options: Options) -> Picture:
-    """The view by our path tracer, under the run's own light and lamps."""
+    """The view rendered by the path tracer of this package, under the run's own light and lamps."""
     if not isinstance(run.model.light, EnvironmentLight):
         raise UserError(f"{run.path}: the light of this run is no environment map", "take another run")
     view = next((view for view in run.capture.views if view.name == name), None)
@@ -116,7 +116,7 @@ def own_picture(run: Run, name: str, options: Options) -> Picture:
 
 
 def compare(options: Options, folder: Path, console: Console) -> None:
-    """Export, render both ways, and print."""
+    """Export the asset, render it with both programs, and print the comparison."""
     run = load_run(options.run, torch.device("cpu"))
     check_asset(run, ASSET)
     name = options.camera or run.capture.test_views[0].name

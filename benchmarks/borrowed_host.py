@@ -1,10 +1,11 @@
-"""A plain function with the true surface of a capture, borrowed by `attach_neilf`, beside `--host mesh`.
+"""Compare a plain function with the true surface, borrowed by `attach_neilf`, with `--host mesh`.
 
     python -m benchmarks.borrowed_host DATA/tabletop_env --save borrowed-host
 
-Both know the true surface. The mesh traces rays between surfaces itself and learns its own R. The function
-answers camera rays with a place, a normal and the mean radiance that training views show there; rays between
-surfaces go to the proxy (`hosts.proxy`). Settings, steps with a material and seed are the same.
+Both have the true surface. The mesh host traces rays between surfaces itself and learns its own R. The
+function returns the position, the normal and the mean radiance of the training views for camera rays; a proxy
+traces rays between surfaces (`hosts.proxy`). Settings, seed, and the number of steps with a material are the
+same.
 """
 
 from __future__ import annotations
@@ -40,32 +41,34 @@ from neilfpp_method.train.run import Run, load_run
 
 TABLE = "borrowed-host"
 CELLS = 160
-"""Cells along an edge of the function's memory of colours; one is about as wide as a pixel of the capture."""
+"""Cells along an edge of the function's grid of colours; a cell is about as wide as a pixel of the
+capture.
+"""
 REACH = 1.6
-"""Half the edge of that memory's cube, scene units: the table reaches beyond the unit sphere."""
+"""Half the edge of that grid's cube, scene units; the table extends beyond the unit sphere."""
 AT_ONCE = 65_536
-"""Pixels that are asked at once; bounds the memory."""
+"""Number of pixels per batch; bounds the memory."""
 
 
 @dataclass
 class Options:
-    """Measure what borrowing a plain function costs, beside the mesh host."""
+    """Compare a borrowed plain function with the mesh host."""
 
     capture: tyro.conf.Positional[Path]
     """A capture with a true mesh and true materials."""
     out: Path = Path("runs/borrowed-host")
-    """Where the run on the mesh goes."""
+    """Folder of the run on the mesh."""
     steps: int = 1500
-    """Steps with a material, of both."""
+    """Number of steps with a material, for both."""
     scale: float = 1.0
-    """Size of the test views over that of their files."""
+    """Size of the test views relative to their files."""
     save: str | None = None
-    """Keep the figures under this name in benchmarks/results; none: they are printed alone."""
+    """Name of the result file in benchmarks/results; default: the figures are only printed."""
 
 
 class TrueSurface:
-    """The function: where rays meet a mesh, its normal there, and the mean of what training views saw about
-    there.
+    """The function: hits of rays on a mesh, the normals there, and the mean colour of the training views near
+    the hits.
     """
 
     def __init__(self, mesh: MeshHost, pixels: PixelDataset) -> None:
@@ -102,7 +105,7 @@ class TrueSurface:
 
 
 def borrow(capture: Capture, pixels: PixelDataset, config: NeilfConfig, path: Path) -> Run:
-    """Train material and light on the function, in a loop as a user would write it."""
+    """Train material and light on the function, in a training loop like that of a user."""
     facts = scene_facts(capture, pixels, config)
     mesh = build_model(capture, facts, config).host
     seed_step(config.train.seed, step=-1)
@@ -137,7 +140,7 @@ def main(options: Options) -> None:
     given = dataclasses.replace(given, train=dataclasses.replace(given.train, material_steps=options.steps))
     on_mesh = options.out / options.capture.resolve().name
     begun = (on_mesh / "checkpoints" / "last.pt").exists()
-    run_training(  # a run that is finished is left as it is
+    run_training(  # a finished run is not changed
         data=None if begun else options.capture,
         out=on_mesh,
         config=None if begun else given,

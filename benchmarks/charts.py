@@ -1,4 +1,4 @@
-"""Line charts on logarithmic axes as arrays, drawn with Pillow in the manner of the report's pictures."""
+"""Line charts with logarithmic axes as arrays, drawn with Pillow in the style of the report's images."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Chart:
-    """One panel: lines by name. Lines of one name have one colour in every panel."""
+    """One panel: lines by name. Lines with the same name have the same colour in all panels."""
 
     title: str
     lines: Mapping[str, Line]
@@ -49,7 +49,7 @@ class Chart:
 def draw_charts(
     path: Path, title: str, x_name: str, y_name: str, charts: Sequence[Chart], columns: int
 ) -> None:
-    """Write panels of one kind as a PNG, with common axes and one legend, so many side by side."""
+    """Write panels with common axes and one legend as a PNG, `columns` panels side by side."""
     names = list(dict.fromkeys(name for chart in charts for name in chart.lines))
     lines = [line for chart in charts for line in chart.lines.values()]
     x_range, y_range = (
@@ -117,7 +117,7 @@ def _panel(
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """1, 2 and 5 times the powers of ten in a range of logarithms; where it is short, more of them."""
+    """1, 2 and 5 times the powers of ten in a logarithmic range; more ticks if the range is short."""
     steps = (1, 2, 5) if high - low > 0.7 else (1, 1.5, 2, 2.5, 3, 4, 5, 7)
     candidates = [
         step * 10.0**power for power in range(math.floor(low), math.ceil(high) + 1) for step in steps

@@ -42,14 +42,14 @@ class Similarity:
 
 @dataclass(frozen=True)
 class Nearest:
-    """Of each point the distance to a mesh, and the face that is nearest."""
+    """The distance of each point to a mesh, and the nearest face."""
 
     distance: Float64[np.ndarray, " N"]
     face: Int64[np.ndarray, " N"]
 
 
 def align(found: Float64[np.ndarray, "N 3"], true: Float64[np.ndarray, "N 3"]) -> Similarity:
-    """The similarity that takes points to their true places with the least squares (Umeyama 1991)."""
+    """The similarity that maps points to their true positions with the least squared error (Umeyama 1991)."""
     a, b = found - found.mean(axis=0), true - true.mean(axis=0)
     u, values, vt = np.linalg.svd(b.T @ a)
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
@@ -59,7 +59,7 @@ def align(found: Float64[np.ndarray, "N 3"], true: Float64[np.ndarray, "N 3"]) -
 
 
 def nearest(mesh: trimesh.Trimesh, points: Float64[np.ndarray, "N 3"]) -> Nearest:
-    """Exact distances to the faces on which the nearest of many samples of the surface lie."""
+    """Exact distances to the faces that contain the nearest of many samples of the surface."""
     samples, faces = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
     candidates = faces[cKDTree(samples).query(points, k=CANDIDATES)[1]]
     distance, face = np.full(len(points), np.inf), np.zeros(len(points), dtype=np.int64)

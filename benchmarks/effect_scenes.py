@@ -1,14 +1,13 @@
-"""Three small captures of which it is known what light does in them, rendered by Mitsuba 3.
+"""Three small captures with known effects of light, rendered by Mitsuba 3.
 
     python -m benchmarks.effect_scenes build/effect-scenes --variant llvm_ad_rgb
 
-    lambertian   a ball of eight paints without any gloss under a coloured sky with a sun: convex, nothing
-                 else there
-    lamp         a shiny ball and a dull box on a floor under an even white sky, and a white lamp beside them
-    bowl         a bowl with four coloured walls, all equally glossy, under a grey sky with a bright window
+    lambertian   a convex ball of eight Lambertian paints under a coloured sky with a sun
+    lamp         a shiny ball and a dull box on a floor under an even white sky, with a white lamp
+    bowl         a bowl with four coloured walls of equal roughness, under a grey sky with a bright window
 
 Each is a folder in the layout of the published captures, with its mesh, depth, normals, and materials of the
-test views. A surface without gloss has the roughness 1 in them.
+test views. A Lambertian surface has the roughness 1 there.
 """
 
 from __future__ import annotations
@@ -35,14 +34,14 @@ from neilfpp_method.errors import UserError
 __all__ = ["SCENES", "KnownScene", "write_capture"]
 
 DISTANCE = 3.4
-"""Of the cameras from the middle, world units; the scene box is the unit ball."""
+"""Distance of the cameras from the centre, world units; the scene box is the unit ball."""
 BOUNCES = 6
 TEST_EVERY = 6
 
 
 @dataclass(frozen=True)
 class KnownScene:
-    """What is there, the map over it, and how high the cameras stand, by turns, in degrees."""
+    """The parts of a scene, its environment map, and the alternating elevations of the cameras in degrees."""
 
     parts: list[Part]
     radiance: Float[np.ndarray, "H W 3"]
@@ -63,7 +62,7 @@ def lambertian() -> KnownScene:
 
 
 def lamp() -> KnownScene:
-    """Two things on a floor and a lamp between them and the cameras."""
+    """Two objects on a floor, and a lamp between them and the cameras."""
     floor = trimesh.creation.box((1.3, 1.3, 0.04))
     floor.apply_translation((0, 0, -0.32))
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.28)
@@ -80,7 +79,7 @@ def lamp() -> KnownScene:
 
 
 def bowl() -> KnownScene:
-    """A shell of half a ball, open above; each quarter has a colour."""
+    """Half of a spherical shell, open at the top; each quarter has a colour."""
     turn = np.linspace(0, math.pi / 2, 24)
     inner = np.stack([0.72 * np.sin(turn), -0.72 * np.cos(turn)], 1)
     outer = np.stack([0.8 * np.sin(turn), -0.8 * np.cos(turn)], 1)
@@ -104,7 +103,7 @@ SCENES: Mapping[str, Callable[[], KnownScene]] = {"lambertian": lambertian, "lam
 def sky(
     above: tuple[float, ...], below: tuple[float, ...], sun: tuple[float, ...], height: int = 32
 ) -> Float[np.ndarray, "H W 3"]:
-    """A map that changes evenly from above to below, with a window of 17° beside the zenith."""
+    """A map that varies smoothly from above to below, with a window of 17° near the zenith."""
     share = np.linspace(0, 1, height)[:, None, None]
     radiance = (1 - share) * np.array(above) + share * np.array(below) + np.zeros((height, 2 * height, 3))
     radiance[height // 4 - 1 : height // 4 + 2, height // 2 : height // 2 + 5] = sun
@@ -112,7 +111,7 @@ def sky(
 
 
 def camera_at(azimuth: float, elevation: float, width: int, height: int) -> Camera:
-    """A camera that looks at the middle; angles in radians."""
+    """A camera that looks at the centre; angles in radians."""
     outward = np.array(
         [
             math.cos(azimuth) * math.cos(elevation),
@@ -131,7 +130,7 @@ def camera_at(azimuth: float, elevation: float, width: int, height: int) -> Came
 
 @dataclass(frozen=True)
 class Seen:
-    """What the pixels of a view show, row by row: z-depth, 0 beside the scene, normal, number of the part."""
+    """The hits of a view's pixels, row by row: z-depth (0 without a hit), normal, and index of the part."""
 
     depth: Float[np.ndarray, "h w"]
     normal: Float[np.ndarray, "h w 3"]
@@ -139,7 +138,7 @@ class Seen:
 
 
 def look(mesh: trimesh.Trimesh, part_of_face: np.ndarray, camera: Camera) -> Seen:
-    """By rays through the middles of the pixels."""
+    """Trace rays through the pixel centres of a camera."""
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     local = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
     directions = local.reshape(-1, 3) @ camera.w2c[:3, :3]
@@ -152,7 +151,9 @@ def look(mesh: trimesh.Trimesh, part_of_face: np.ndarray, camera: Camera) -> See
 
 
 def write_capture(mi, scene: KnownScene, root: Path, views: int, size: tuple[int, int], samples: int) -> Path:
-    """Render a scene into a folder; one view in `TEST_EVERY` is kept for tests. `mi` is of `load_mitsuba`."""
+    """Render a scene into a folder; one view in `TEST_EVERY` is a test view. `mi` is the result of
+    `load_mitsuba`.
+    """
     inputs, (width, height) = root / "inputs", size
     mesh = trimesh.util.concatenate([part.mesh for part in scene.parts])
     part_of_face = np.repeat(range(len(scene.parts)), [len(part.mesh.faces) for part in scene.parts])
@@ -208,19 +209,19 @@ class Options:
     """Render the captures."""
 
     out: tyro.conf.Positional[Path]
-    """Folder; a scene becomes a folder in it."""
+    """Output folder; each scene is a sub-folder."""
     variant: str = "scalar_rgb"
-    """Of Mitsuba; llvm_ad_rgb is a hundred times faster, and needs LLVM (DRJIT_LIBLLVM_PATH)."""
+    """Variant of Mitsuba; llvm_ad_rgb is a hundred times faster and needs LLVM (DRJIT_LIBLLVM_PATH)."""
     views: int = 24
-    """Of each scene; one in six is kept for tests."""
+    """Number of views of each scene; one in six is a test view."""
     width: int = 96
-    """Pixels; the height is three quarters of it."""
+    """Width of the images in pixels; the height is three quarters of it."""
     samples: int = 256
-    """Of a pixel."""
+    """Samples per pixel."""
 
 
 def main(options: Options, console: Console) -> None:
-    """Write those that are not there yet."""
+    """Write the captures that do not exist yet."""
     mi = load_mitsuba(options.variant)
     for name, scene in SCENES.items():
         root = options.out / name

@@ -1,12 +1,12 @@
-"""What evidence decided of the effects of some captures, beside what is true of them.
+"""Compare the decisions on effects of some runs with the truth.
 
     python -m benchmarks.effect_scenes build/effect-scenes
     neilfpp train --data build/effect-scenes/bowl --host mesh --out runs/bowl
     python -m benchmarks.effect_table runs/bowl
 
-Prints a table in Markdown: a row for each effect, a column for each run, which is known by the name of its
-capture's folder. "on" or "off" is the last decision; "wrong" stands beside one that is not the truth. Then
-comes what each wrong decision rests on.
+The output is a Markdown table with a row for each effect and a column for each run, whose capture is
+identified by the name of its folder. "on" or "off" is the last decision; "wrong" marks a decision that
+contradicts the truth. The reason of each wrong decision follows below the table.
 """
 
 from __future__ import annotations
@@ -46,26 +46,26 @@ TRUE_EFFECTS: Mapping[str, set[str]] = {
     "spot_city": {"inter-reflection", "metals", *SKY, *GLOSSY},
     "spot_paint": {"inter-reflection", *SKY, *GLOSSY},
 }
-"""What is in each capture, by the name of its folder: those of `effect_scenes`, and four others."""
+"""The effects that each capture has, by the name of its folder: those of `effect_scenes`, and four others."""
 
 
 @dataclass(frozen=True)
 class Decided:
-    """The effects of a run, by name, as its `effects.json` has them, and the name of its capture."""
+    """The effects of a run by name, from its `effects.json`, and the name of its capture."""
 
     capture: str
     effects: Mapping[str, Mapping[str, Any]]
 
     def is_wrong(self, name: str) -> bool:
-        """Whether the last decision is not the truth."""
+        """Whether the last decision contradicts the truth."""
         return (self.effects[name]["decision"] == "on") != (name in TRUE_EFFECTS[self.capture])
 
 
 def read_run(path: Path) -> Decided:
-    """The decisions of a run.
+    """Read the decisions of a run.
 
     Raises:
-        UserError: the run has none, or nothing is known of its capture.
+        UserError: the run has no effects.json, or the effects of its capture are unknown.
     """
     if not (path / "effects.json").is_file():
         raise UserError(f"{path}: no effects.json", "give the folder of a run")
@@ -76,7 +76,7 @@ def read_run(path: Path) -> Decided:
 
 
 def markdown(runs: Sequence[Decided]) -> list[str]:
-    """The table, and a line for each wrong decision."""
+    """The lines of the table, and one line for each wrong decision."""
     lines = ["| effect | " + " | ".join(run.capture for run in runs) + " |", "|---" * (len(runs) + 1) + "|"]
     for name in JUDGED:
         cells = [run.effects[name]["decision"] + (" (wrong)" if run.is_wrong(name) else "") for run in runs]

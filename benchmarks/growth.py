@@ -1,12 +1,12 @@
-"""How the cost of a step grows: with rays, samples and incident directions in proportion, with views not at
-all.
+"""Growth of the cost of a step: in proportion to rays, samples and incident directions, and independent of
+views.
 
     python -m benchmarks.growth --out docs
 
-Each panel has the CPU time of a joint step of `fast` with the free light over one number, the others held, on
-rays that all meet the table of `benchmarks.joint`; the last has that of drawing 4096 pixels from so many
-views. The written table puts a straight line through each, a fixed part and one in proportion, and says how
-far the figures lie from it.
+Each panel has the CPU time of a joint step of `fast` with the free light as a function of one number, with
+the others fixed, for rays that all hit the table of `benchmarks.joint`. The last panel has the time of
+drawing 4096 pixels from so many views. For each panel, the written table has a straight line, which consists
+of a fixed and a proportional part, and the largest deviation from it.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ class Options:
     """Measure the growth of a step's cost and draw it."""
 
     out: Path = Path("runs/benchmarks")
-    """Where the figure and the table go."""
+    """Folder for the figure and the table."""
 
 
 @dataclass(frozen=True)
 class Growth:
-    """Seconds of CPU time over a number."""
+    """CPU seconds as a function of a number."""
 
     name: str
     numbers: tuple[int, ...]
@@ -64,7 +64,7 @@ class Growth:
 
 @dataclass(frozen=True)
 class StraightLine:
-    """seconds = fixed + each · number, and the largest relative distance of a figure from that."""
+    """seconds = fixed + each · number, and the largest relative deviation of a figure from it."""
 
     fixed: float
     each: float
@@ -72,7 +72,7 @@ class StraightLine:
 
 
 def straight_line(growth: Growth) -> StraightLine:
-    """The line of least relative squares."""
+    """Fit the line by least squares of relative deviations."""
     numbers, seconds = np.array(growth.numbers, dtype=float), np.array(growth.seconds)
     each, fixed = np.polyfit(numbers, seconds, 1, w=1 / seconds)
     return StraightLine(
@@ -81,7 +81,7 @@ def straight_line(growth: Growth) -> StraightLine:
 
 
 def seconds_of(function: Callable[[], object]) -> float:
-    """The median time of a call, after one that does not count."""
+    """Median time of a call, after one call that is not counted."""
     function()
     now, taken = clock(device()), []
     for number in range(STEPS):
@@ -93,13 +93,15 @@ def seconds_of(function: Callable[[], object]) -> float:
 
 
 def step_seconds(model: NeilfModel, config: NeilfConfig, rays: int) -> float:
-    """Of a joint step by other settings than the model was made with; they may change no network."""
+    """CPU time of a joint step with settings other than those of the model; they must not change a
+    network.
+    """
     model.config = model.host.config = config
     return seconds_of(step_on(model, rays_at_the_table(rays)))
 
 
 def measure() -> list[Growth]:
-    """Every panel."""
+    """Measure all panels."""
     base = free_light(preset("fast"))
     model, replace = fitted_model(base), dataclasses.replace
     base = model.config
@@ -122,7 +124,7 @@ def measure() -> list[Growth]:
 
 
 def table(growths: list[Growth]) -> str:
-    """Markdown: milliseconds, and the straight line through them."""
+    """Markdown: milliseconds, and the straight line that is fitted to them."""
     lines = []
     for growth in growths:
         line = straight_line(growth)

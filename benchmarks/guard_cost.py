@@ -1,10 +1,10 @@
-"""What the guard against steps that are not finite costs, beside the step that it guards.
+"""Cost of the check for steps that are not finite, compared with that of the step.
 
     python -m benchmarks.guard_cost
 
-Preset `fast` with its own sizes and 512 rays, on the scene in the package. The guard of `neilfpp train` keeps
-what a step begins with (`train.skipped.Moment`), takes the norm of the gradient of each field, and compares
-the numbers. Exit status 1 if it takes more than a hundredth of a step in any stage.
+It uses the preset `fast` with its own sizes and 512 rays, on the scene of the package. The check of `neilfpp
+train` stores the state before a step (`train.skipped.Moment`), computes the norm of the gradient of each
+field, and tests the values. The exit status is 1 if it takes more than a hundredth of a step in any stage.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LARGEST_SHARE = 0.01
 
 
 def main() -> int:
-    """Print the time of a step and of its guard, by stage."""
+    """Print the time of a step and of its check, by stage. Returns the exit status."""
     worst = 0.0
     print(hardware())
     for stage in Stage:

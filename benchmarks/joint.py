@@ -1,12 +1,12 @@
-"""A whole joint step: what it costs in the package, and in the plain implementation beside it.
+"""Cost of a whole joint step, in the package and in the plain implementation.
 
     python -m benchmarks joint
 
-256 rays, all of which meet the object, 128 incident directions each for the paper's networks. The scene is a
-table with two balls; each geometry is fitted to it first, so that rays converge, and traced rays hit, as in a
-scene that trains. Everything runs in one process and takes turns; a figure is the median of the CPU time that
-the process spends (of the clock on a GPU, where there is one), or of its ratio to the plain one of the same
-turn. The plain implementation runs twice: as any process starts, and with the settings that the commands make
+A step has 256 rays, all of which hit the object, with 128 incident directions each for the paper's networks.
+The scene is a table with two balls. Each geometry is fitted to it first, so that rays converge and traced
+rays hit, as during a training. The implementations alternate in one process. A figure is the median CPU time
+of the process (wall-clock time on a GPU), or the median ratio to the plain implementation in the same round.
+The plain implementation runs twice: with the default settings of a process, and with those of the commands
 (`kernels.process`).
 """
 
@@ -46,14 +46,14 @@ BALLS = (((0.2, 0.1, 0.0), 0.35), ((-0.45, 0.0, -0.1), 0.25))  # centre and radi
 
 
 def table(x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-    """Signed distance, up to the edges: a round table top and two balls on it."""
+    """Signed distance, except at the edges, of a round table top with two balls on it."""
     balls = [(x - x.new_tensor(centre)).norm(dim=-1) - radius for centre, radius in BALLS]
     top = torch.maximum((x[:, 2] + 0.4).abs() - 0.05, x[:, :2].norm(dim=-1) - 0.95)
     return torch.stack([*balls, top]).amin(0)
 
 
 def fit_table(field: SdfField) -> None:
-    """Move a distance field from the sphere that it starts as to the table."""
+    """Fit a distance field, which is initially a sphere, to the table."""
     optimizer = torch.optim.Adam(field.parameters(), lr=2e-3)
     for _ in range(FIT_STEPS):
         x = torch.rand(FIT_POINTS, 3) * 2.4 - 1.2
@@ -66,7 +66,9 @@ def fit_table(field: SdfField) -> None:
 
 
 def fitted_model(config: NeilfConfig, like: VolSdfHost | None = None) -> NeilfModel:
-    """A model whose surface is the table, sharp; fitted, or that of another host with the same networks."""
+    """A model with the table as a sharp surface, by a fit or copied from another host with the same
+    networks.
+    """
     config = dataclasses.replace(
         config,
         loss=dataclasses.replace(config.loss, point_cloud=0.0),
@@ -98,7 +100,9 @@ def rays_at_the_table(count: int) -> PixelBatch:
 
 
 def step_on(model: NeilfModel, batch: PixelBatch) -> Callable[[], None]:
-    """A joint step on a batch; the rates are 0, so every step is the same one but for its random numbers."""
+    """A joint step on a batch; the learning rates are 0, so all steps are equal except for their random
+    numbers.
+    """
     weights = active_losses(Stage.JOINT, model.config, model.stages)
     optimizer = make_optimizer(model, model.config.optimizer)
     for group in optimizer.param_groups:
@@ -115,8 +119,8 @@ def step_on(model: NeilfModel, batch: PixelBatch) -> Callable[[], None]:
 
 
 def cheap_paper() -> NeilfConfig:
-    """The networks of `paper-mlp`, with empty space skipped, and half of the cuts a round for what is left of
-    a ray (`benchmarks.sampler` has the error of that).
+    """The networks of `paper-mlp` with skipping of empty space, and half as many cuts per round on the
+    remaining part of a ray (`benchmarks.sampler` measures the error of that).
     """
     config = preset("paper-mlp")
     return dataclasses.replace(
@@ -125,8 +129,8 @@ def cheap_paper() -> NeilfConfig:
 
 
 def seconds_of(steps: Mapping[str, Callable[[], None]], fast: Mapping[str, bool]) -> dict[str, list[float]]:
-    """The times of each step, which take turns. Each comes right after another like it that does not count: a
-    training goes on with the memory and the settings of the step before.
+    """The times of each step; the steps alternate. Each timed step follows another one of its kind that is
+    not counted, because in a training the memory and the settings of the previous step are in place.
     """
     now = clock(device())
     taken: dict[str, list[float]] = {name: [] for name in steps}
@@ -160,6 +164,6 @@ def measurements() -> Iterator[Measurement]:
     plain_seconds = seconds.pop("plain")
     yield Measurement("joint/plain", statistics.median(plain_seconds), "s", "lower")
     for name, taken in seconds.items():
-        # Machines change their pace: a ratio is one of neighbours.
+        # The speed of a machine varies, so ratios are taken within a round.
         ratio = statistics.median(slow / own for slow, own in zip(plain_seconds, taken, strict=True))
         yield Measurement(f"joint/plain over {name}", ratio, "×", "higher", tolerance=0.5)

@@ -1,15 +1,15 @@
-"""What the signed distance, its normal and their backward pass cost behind a hash grid, by three routes side
-by side.
+"""Cost of the signed distance, its normal and their backward pass with a hash grid, by three implementations.
 
     python -m benchmarks.kernels [--points 32768] [--repeats 9] [--device cpu]
 
-- naive: straightforward torch; the normal is autograd's gradient of the distance, differentiated once more by
-  the loss.
-- reference: the analytic Jacobian and the hand-written adjoint of the package, in torch.
+- naive: straightforward torch; the normal is autograd's gradient of the distance, which the loss
+  differentiates once more.
+- reference: the analytic Jacobian and the explicit reverse pass of the package, in torch.
 - fastest: the same with the compiled loops (CPU) or Triton's kernels (CUDA).
 
-All three compute one loss of one field, and their gradients are compared before anything is timed. Routes
-take turns, so that whatever else the machine does falls on all; medians and their ratios are printed.
+All three compute the same loss of the same field, and their gradients are compared before the timing. The
+implementations alternate, so that other work on the machine affects all of them equally. Medians and their
+ratios are printed.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SAMPLES = 32  # points of one ray: neighbours in memory are neighbours in space,
 def naive_encode(
     x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpec
 ) -> Float[Tensor, "N F"]:
-    """A hash grid as one writes it down: eight weighted rows a level."""
+    """A hash grid in straightforward torch: eight weighted rows per level."""
     features = []
     for level, resolution in enumerate(spec.resolutions):
         scaled = x01.clamp(0, 1) * resolution
@@ -71,7 +71,7 @@ def naive_step(field: SdfField, x: Float[Tensor, "N 3"]) -> None:
 
 
 def analytic_step(field: SdfField, x: Float[Tensor, "N 3"]) -> None:
-    """The same by the package."""
+    """The same with the analytic derivatives of the package."""
     sample = field.with_gradient(x)
     loss_on(sample.distance, sample.gradient).backward()
 
@@ -81,7 +81,7 @@ def loss_on(distance: Float[Tensor, " N"], gradient: Float[Tensor, "N 3"]) -> Fl
 
 
 def encode_alone(field: SdfField, x: Float[Tensor, "N 3"]) -> None:
-    """The grid's share: features, Jacobian, and the gradient of the table."""
+    """The hash grid only: features, Jacobian, and the gradient of the table."""
     grid = field.encoding
     encoded = encode(x / (2 * RADIUS) + 0.5, grid.table, grid.spec, jacobian=True)
     torch.autograd.backward((encoded.features, encoded.jacobian), (encoded.features, encoded.jacobian))
@@ -90,7 +90,7 @@ def encode_alone(field: SdfField, x: Float[Tensor, "N 3"]) -> None:
 def with_backend(
     step: Callable[[SdfField, Tensor], None], backend: str
 ) -> Callable[[SdfField, Tensor], None]:
-    """A step of which the grid is computed by a backend."""
+    """A step whose grid is computed by a given backend."""
 
     def chosen(field: SdfField, x: Float[Tensor, "N 3"]) -> None:
         field.encoding.spec = dataclasses.replace(field.encoding.spec, backend=backend)
@@ -131,21 +131,21 @@ def measure(
 
 
 def _fresh(route: Callable[[SdfField, Tensor], None], field: SdfField, x: Float[Tensor, "N 3"]) -> None:
-    """A route from no gradients, as in a step of training."""
+    """A step that starts without gradients, as in a training."""
     field.zero_grad()
     route(field, x)
 
 
 @dataclass
 class Options:
-    """Time the three routes."""
+    """Time the three implementations."""
 
     points: int = 32_768
-    """Points of a step."""
+    """Number of points per step."""
     repeats: int = 9
-    """Steps that count."""
+    """Number of timed steps."""
     device: str = "cpu"
-    """Where to run."""
+    """Device to compute on."""
 
 
 def main(options: Options) -> None:

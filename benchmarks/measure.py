@@ -1,4 +1,4 @@
-"""What a benchmark says, and how time and memory are measured."""
+"""The figures of benchmarks, and the measurement of time and memory."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class Measurement:
     """A figure that is compared with the committed one.
 
     Attributes:
-        name: what is measured, unique in the suite.
+        name: the measured quantity, unique in the suite.
         value: the figure.
-        unit: of the value; "×" for a ratio within one run, which other machines share.
-        better: which way is better.
-        tolerance: relative change for the worse that is not yet worse; none for a figure that no other
-            machine shares, which is shown and never fails.
+        unit: unit of the value; "×" for a ratio within one run, which is comparable between machines.
+        better: whether higher or lower values are better.
+        tolerance: relative deterioration that is permitted; None for a figure that is not comparable between
+            machines, which is shown and never fails.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Measurement:
     tolerance: float | None = None
 
     def worse_than(self, baseline: float) -> bool:
-        """Whether the value lies on the wrong side of a baseline, by more than the tolerance."""
+        """Whether the value is worse than a baseline by more than the tolerance."""
         if self.tolerance is None:
             return False
         if self.better == "lower":
@@ -54,13 +54,13 @@ class Measurement:
 
 
 def device() -> torch.device:
-    """Where suites run: on a GPU where there is one. The committed baseline is a CPU's."""
+    """Device of the suites: a GPU if there is one. The committed baseline was measured on a CPU."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def clock(where: torch.device) -> Callable[[], float]:
-    """Seconds: of this process's own on a CPU, which others may share; of the clock, with all work done, on a
-    GPU.
+    """A clock in seconds: CPU time of this process on a CPU, which other processes may share; wall-clock time
+    after all work is done on a GPU.
     """
     if where.type != "cuda":
         return time.process_time
@@ -75,11 +75,11 @@ def clock(where: torch.device) -> Callable[[], float]:
 def median_seconds(
     *functions: Callable[[], object], repetitions: int = 7, where: torch.device | None = None
 ) -> list[float]:
-    """The median duration of each function, after one call that does not count; `where` they run, if not on
-    `device()`.
+    """The median duration of each function, after one call that is not counted; `where` is their device, by
+    default `device()`.
 
-    They take turns, so that whatever else the machine does falls on all of them: their ratios are worth more
-    than their durations.
+    The functions alternate, so that other work on the machine affects all of them equally: their ratios are
+    more reliable than their durations.
     """
     now = clock(where or device())
     for function in functions:
@@ -94,13 +94,13 @@ def median_seconds(
 
 
 def hardware() -> str:
-    """The machine in a line."""
+    """Description of the machine in one line."""
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     return f"{_processor()}, {torch.get_num_threads()} thread(s), GPU {gpu}, torch {torch.__version__}"
 
 
 def revision() -> str:
-    """The commit that is measured, short; with a plus where files differ from it; "unknown" outside a
+    """Short hash of the measured commit, with a plus if files differ from it; "unknown" outside of a
     repository.
     """
     try:
@@ -134,8 +134,8 @@ def _processor() -> str:
 
 
 def yardstick() -> None:
-    """Work that a machine does about as fast as ours: products of matrices and sines, some hundredths of a
-    second.
+    """Work whose speed on a machine is similar to that of this package: products of matrices and sines, some
+    hundredths of a second.
     """
     x = torch.ones(2048, 256, device=device())
     weight = torch.full((256, 256), 1e-3, device=device())
@@ -144,8 +144,8 @@ def yardstick() -> None:
 
 
 def in_yardsticks(function: Callable[[], object], repetitions: int) -> float:
-    """The duration of a function, in durations of `yardstick`: a figure that machines share better than
-    seconds.
+    """The duration of a function in units of that of `yardstick`, which is more comparable between machines
+    than seconds.
     """
     taken, unit = median_seconds(function, yardstick, repetitions=repetitions)
     return taken / unit

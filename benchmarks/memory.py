@@ -1,12 +1,12 @@
-"""Peak memory of a training over views × megapixels.
+"""Peak memory of a training as a function of views and megapixels.
 
     python -m benchmarks.memory --sizes 4x2 16x2
     python -m benchmarks.memory --sizes 100x12 --scale 1 --data captures/teapot
 
-Each entry is a capture of so many views of so many megapixels, made by resampling the views of another one,
-and a process of its own that trains a few steps of the preset `fast` on it. Printed is the most that the
-process held (resident memory, pages of mapped files included), the size of the files that hold the pixels,
-and what 19 bytes a pixel of float32 planes would take.
+For each size, the views of another capture are resampled to a capture of so many views and megapixels, and a
+separate process trains a few steps of the preset `fast` on it. The output has the peak memory of the process
+(resident memory, including pages of mapped files), the size of the pixel files, and the size of float32
+planes at 19 bytes per pixel.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from neilfpp_method.settings.presets import preset
 from neilfpp_method.train.command import run_training
 
 FLOAT_PLANES = 19
-"""Bytes to a pixel of colours, masks and gradients in float32 and bool, as they were held before."""
+"""Bytes per pixel of colours, masks and gradients in float32 and bool, as they were stored earlier."""
 
 
 @dataclass
@@ -45,20 +45,20 @@ class Options:
     """Measure peak memory."""
 
     sizes: tuple[str, ...] = ("4x2", "16x2")
-    """VIEWSxMEGAPIXELS each."""
+    """Sizes as VIEWSxMEGAPIXELS."""
     scale: float | None = 1.0
-    """Of the training, as `neilfpp train --scale`; none: its default."""
+    """Value of `neilfpp train --scale`; default of the training if not given."""
     data: Path | None = None
-    """The capture whose views are resampled; none: the demo's."""
+    """Capture whose views are resampled; default: that of the demo."""
     steps: int = 20
-    """Steps of the training."""
+    """Number of training steps."""
     save: str | None = None
-    """Keep the figures under this name in benchmarks/results, for the table of docs/performance.md."""
+    """Name of the result file in benchmarks/results, for the table of docs/performance.md."""
 
 
 def enlarged(source: Path, out: Path, views: int, megapixels: float) -> Path:
-    """A capture of `views` views of about `megapixels` million pixels: those of another one in turn,
-    resampled.
+    """A capture of `views` views of about `megapixels` million pixels, resampled from those of another
+    capture in turn.
     """
     capture = load_capture(source, test_every=0)
     listed = []
@@ -89,7 +89,9 @@ def enlarged(source: Path, out: Path, views: int, megapixels: float) -> Path:
 
 
 def train_small(data: Path, out: Path, scale: float | None, steps: int) -> None:
-    """Some steps of the preset `fast`, and the peak of this process, bytes, as the last line."""
+    """Train some steps of the preset `fast`, and print the peak memory of this process, bytes, as the last
+    line.
+    """
     config = preset("fast")
     train = dataclasses.replace(config.train, sdf_steps=steps, material_steps=0, joint_steps=0)
     run_training(
@@ -108,7 +110,7 @@ def train_small(data: Path, out: Path, scale: float | None, steps: int) -> None:
 
 
 def main(options: Options) -> None:
-    """Measure each size; print the table, and keep it where that is asked for."""
+    """Measure each size, print the table, and store it if requested."""
     rows = []
     for size in options.sizes:
         count, megapixels = int(size.split("x")[0]), float(size.split("x")[1])

@@ -1,9 +1,8 @@
-"""A scene of the path tracer, rendered by Mitsuba 3 (Jakob et al. 2022): an implementation that shares no
-line with ours.
+"""A scene of the path tracer, rendered by Mitsuba 3 (Jakob et al. 2022), an independent implementation.
 
-The BRDF of METHOD §1 is no plugin of Mitsuba, so it is written here once more, in Mitsuba's own language:
-local frames, its conventions (`si.wi` is the viewer, `wo` the light), its samplers. Meshes, camera, map and
-path integrator are Mitsuba's.
+Mitsuba has no plugin for the BRDF of METHOD §1, so the BRDF is implemented here in Mitsuba's own language,
+with its local frames, its conventions (`si.wi` is the viewer, `wo` the light), and its samplers. Meshes,
+camera, map and path integrator are Mitsuba's.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ BSDF = "neilfpp"
 
 @dataclass(frozen=True)
 class Part:
-    """A mesh of one material; flat normals. A surface without a roughness is Lambertian."""
+    """A mesh of one material, with flat normals. A surface without a roughness is Lambertian."""
 
     mesh: trimesh.Trimesh
     base_color: tuple[float, float, float]
@@ -36,7 +35,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Lamp:
-    """A ball that sends one radiance from all of its surface, and that cameras do not see."""
+    """A ball whose whole surface emits the same radiance, and that cameras do not see."""
 
     position: tuple[float, float, float]
     radius: float
@@ -44,10 +43,10 @@ class Lamp:
 
 
 def load_mitsuba(variant: str):
-    """Mitsuba, set to a variant, and with the BRDF of METHOD §1 registered.
+    """Load Mitsuba in a variant, and register the BRDF of METHOD §1.
 
     Raises:
-        UserError: it is not installed, or the variant does not run here.
+        UserError: it is not installed, or the variant does not run on this machine.
     """
     try:
         import mitsuba as mi
@@ -147,7 +146,9 @@ def _material(part: Part) -> dict[str, object]:
 
 
 def _register(mi) -> None:
-    """METHOD §1 with the paper's lobe as a BSDF; directions by the cosine and by the lobe in halves."""
+    """Register METHOD §1 with the paper's lobe as a BSDF; half of the directions are sampled by cosine, half
+    by the lobe.
+    """
     import drjit as dr
 
     class Neilf(mi.BSDF):

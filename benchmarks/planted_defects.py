@@ -1,10 +1,10 @@
-"""How many defects of a host `check_host` finds: a whole host, spoiled in one way at a time.
+"""The share of planted defects of a host that `check_host` finds: one defect at a time in a correct host.
 
-    python -m benchmarks.planted_defects              the table, as docs/hosts.md has it
-    python -m benchmarks.planted_defects --missed     those alone that nothing finds
+    python -m benchmarks.planted_defects              print the table of docs/hosts.md
+    python -m benchmarks.planted_defects --missed     print only the defects that are not found
 
-The host is a ball with a learned radius and learned colours above a disc, seen from all sides of the upper
-half.
+The host is a ball with a learned radius and learned colours above a disc, viewed from all sides of the upper
+half space.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FLOOR, DISC = -0.4, 0.9
 
 
 def rays_from_above(count: int = 300, seed: int = 0) -> RayBatch:
-    """Rays from a half sphere of radius 2.5 to places on and about the scene."""
+    """Rays from a half sphere of radius 2.5 to points on the scene and near it."""
     generator = torch.Generator().manual_seed(seed)
     origins = normalize(torch.randn(count, 3, generator=generator), dim=-1) * torch.tensor([1.0, 1.0, 0.5])
     origins = 2.5 * normalize(torch.cat((origins[:, :2], origins[:, 2:].abs() + 0.3), -1), dim=-1)
@@ -39,7 +39,7 @@ def rays_from_above(count: int = 300, seed: int = 0) -> RayBatch:
 
 
 class Scene(nn.Module):
-    """The whole host; `defect` spoils what it renders."""
+    """The correct host; `defect` changes what it renders."""
 
     def __init__(self, defect: Callable[[Scene, RayBatch], Outputs] | None = None) -> None:
         super().__init__()
@@ -50,7 +50,7 @@ class Scene(nn.Module):
         self.calls = 0
 
     def clean(self, rays: RayBatch, near: float = 0.0, far: float = torch.inf) -> Outputs:
-        """What a host should say; surfaces nearer than `near` or beyond `far` are not seen."""
+        """The correct result; surfaces nearer than `near` or beyond `far` are ignored."""
         o, d = rays.origins, rays.directions
         middle = -(o * d).sum(-1)
         square = middle.square() - o.square().sum(-1) + self.radius**2
@@ -77,7 +77,7 @@ class Scene(nn.Module):
         }
 
     def render(self, rays: RayBatch) -> SurfaceHits | SimpleNamespace:
-        """What the host contract asks for, but for the defect."""
+        """The result of the host contract, changed by the defect."""
         self.calls += 1
         outputs = self.clean(rays) if self.defect is None else self.defect(self, rays)
         try:
@@ -92,7 +92,7 @@ Change = Callable[[RayBatch, Outputs], Mapping[str, object]]
 
 
 def after(change: Change) -> Callable[[Scene, RayBatch], Outputs]:
-    """A defect of what is handed out."""
+    """A defect that changes the returned outputs."""
 
     def defect(host: Scene, rays: RayBatch) -> Outputs:
         outputs = host.clean(rays)
@@ -102,18 +102,18 @@ def after(change: Change) -> Callable[[Scene, RayBatch], Outputs]:
 
 
 def along(rays: RayBatch, outputs: Outputs, factor: Tensor | float) -> Mapping[str, Tensor]:
-    """Positions at so many times their distance."""
+    """Positions at `factor` times their distance."""
     return {"position": rays.origins + factor * (outputs["position"] - rays.origins)}
 
 
 def z_depth(rays: RayBatch, outputs: Outputs) -> Mapping[str, Tensor]:
-    """Of cameras that look at the scene's middle."""
+    """Positions from the z-depth of cameras that look at the scene's centre."""
     axis = normalize(-rays.origins, dim=-1)
     return along(rays, outputs, (axis * rays.directions).sum(-1, keepdim=True))
 
 
 def noisy(normal: Tensor, position: Tensor, degrees: float) -> Tensor:
-    """Turned by so many degrees, by directions that follow from the place."""
+    """Normals rotated by so many degrees, in directions that depend on the position."""
     wave = torch.sin(
         91.7 * position @ torch.tensor([[1.0, 2.3, -1.7], [0.7, -1.9, 2.9], [2.1, 1.1, 1.3]]).to(position)
     )
@@ -126,7 +126,7 @@ def hit_of(outputs: Outputs) -> Tensor:
 
 
 def with_call(work: Callable[[Scene], object]) -> Callable[[Scene, RayBatch], Outputs]:
-    """A defect of conduct."""
+    """A defect with a side effect."""
 
     def defect(host: Scene, rays: RayBatch) -> Outputs:
         work(host)
@@ -171,14 +171,14 @@ def recomputed(rays: RayBatch, outputs: Outputs) -> Mapping[str, Tensor]:
 
 
 def scaled(host: Scene, rays: RayBatch, factor: float, shift: float) -> Outputs:
-    """The scene in another frame, with rays of that frame."""
+    """The scene in another frame, with rays in that frame."""
     by = torch.tensor([shift, 0.0, 0.0])
     outputs = host.clean(RayBatch((rays.origins - by) / factor, rays.directions))
     return outputs | {"position": outputs["position"] * factor + by}
 
 
 def coarse(host: Scene, rays: RayBatch) -> Outputs:
-    """A darker image where no gradient is asked for."""
+    """A darker image if gradients are disabled."""
     outputs = host.clean(rays)
     return outputs if torch.is_grad_enabled() else outputs | {"color": 0.9 * outputs["color"]}
 
@@ -190,7 +190,7 @@ def inside_out(host: Scene, rays: RayBatch) -> Outputs:
 
 
 OWN = torch.Generator()
-"""Random numbers that no seed of the loop reaches."""
+"""A generator that is independent of the seed of the loop."""
 
 DEFECTS: Mapping[str, Callable[[Scene, RayBatch], Outputs]] = {
     # shapes and types
@@ -283,7 +283,7 @@ DEFECTS: Mapping[str, Callable[[Scene, RayBatch], Outputs]] = {
 
 
 def in_camera(rays: RayBatch, normal: Tensor) -> Tensor:
-    """In a frame whose third axis leads to the scene's middle."""
+    """Normals in a frame whose third axis points to the scene's centre."""
     z = normalize(-rays.origins, dim=-1)
     x = normalize(torch.linalg.cross(z, torch.tensor([0.0, 0.0, 1.0]).expand_as(z)), dim=-1)
     return torch.stack([(normal * axis).sum(-1) for axis in (x, torch.linalg.cross(z, x), z)], -1)
@@ -294,7 +294,7 @@ def in_camera(rays: RayBatch, normal: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a defect: the check that found it, or none, and what it said."""
+    """The result for a defect: the check that found it, or None, and its message."""
 
     defect: str
     check: str | None
@@ -302,7 +302,7 @@ class Outcome:
 
 
 def outcomes() -> Iterator[Outcome]:
-    """Plant one defect after the other."""
+    """Plant the defects one after the other."""
     for name, defect in DEFECTS.items():
         host, rays = Scene(defect), rays_from_above()
         grad = torch.is_grad_enabled()
@@ -322,7 +322,7 @@ def main() -> None:
     check_host(Scene(), rays_from_above())
     found = list(outcomes())
     shown = [o for o in found if o.check is None] if "--missed" in sys.argv[1:] else found
-    print("| defect | found by | what is said |\n|---|---|---|")
+    print("| defect | found by | message |\n|---|---|---|")
     for outcome in shown:
         said = outcome.message.partition("\n")[0]
         print(f"| {outcome.defect} | {outcome.check or '**nothing**'} | {said} |")

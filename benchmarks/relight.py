@@ -45,18 +45,18 @@ class Options:
     """Compare the path tracer with Mitsuba."""
 
     variant: str = "scalar_rgb"
-    """Of Mitsuba; llvm_ad_rgb is a hundred times faster, and needs LLVM (DRJIT_LIBLLVM_PATH)."""
+    """Variant of Mitsuba; llvm_ad_rgb is a hundred times faster and needs LLVM (DRJIT_LIBLLVM_PATH)."""
     width: int = 48
-    """Pixels; the height is three quarters of it."""
+    """Width of the images in pixels; the height is three quarters of it."""
     spp: int = 64
-    """Samples of a pixel, ours."""
+    """Samples per pixel of this package."""
     reference_spp: int | None = None
-    """Mitsuba's; none: as many as ours."""
+    """Samples per pixel of Mitsuba; default: the same number."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Shares of the mean radiance; see above. Seconds are of one picture each."""
+    """Figures relative to the mean radiance (see the module's docstring), and seconds per image."""
 
     error: float
     noise: float
@@ -82,7 +82,7 @@ def corner_parts() -> list[Part]:
 
 
 def sunny_map(height: int = 32) -> Float[Tensor, "H W 3"]:
-    """A sky that darkens downwards, with a sun of three texels."""
+    """A sky that becomes darker downwards, with a sun of three texels."""
     sky = torch.linspace(1.0, 0.2, height)[:, None, None].expand(height, 2 * height, 3) * torch.tensor(
         [0.7, 0.9, 1.2]
     )
@@ -91,7 +91,7 @@ def sunny_map(height: int = 32) -> Float[Tensor, "H W 3"]:
 
 
 def corner_camera(width: int) -> Camera:
-    """From the front and above."""
+    """A camera in front of the corner and above it."""
     height = round(width * 0.75)
     eye, forward = np.array([0.0, -2.6, 1.3]), np.array([0.0, 2.6, -1.0]) / math.hypot(2.6, 1.0)
     right = np.array([1.0, 0.0, 0.0])
@@ -102,7 +102,7 @@ def corner_camera(width: int) -> Camera:
 
 
 def scene_of(parts: list[Part], sky: Sky) -> Scene:
-    """The parts as the path tracer takes them: each point has the material of the part that it lies on."""
+    """The parts as a scene of the path tracer: each point has the material of the part on which it lies."""
     triangles = torch.from_numpy(np.concatenate([part.mesh.triangles for part in parts]).astype(np.float32))
     rows = torch.tensor([[*part.base_color, part.roughness, part.metallic] for part in parts])
     centres = torch.tensor([[-0.35, 0.0, 0.301], [0.35, -0.05, 0.301]])
@@ -118,7 +118,9 @@ def scene_of(parts: list[Part], sky: Sky) -> Scene:
 
 
 def agreement(variant: str, width: int, spp: int, reference_spp: int, bounces: int) -> Agreement:
-    """How far our picture of the corner is from Mitsuba's, and two of Mitsuba's from one another."""
+    """Differences between this package's image of the corner and Mitsuba's, and between two images of
+    Mitsuba.
+    """
     mi = load_mitsuba(variant)
     parts, radiance, camera = corner_parts(), sunny_map(), corner_camera(width)
     begun = time.perf_counter()

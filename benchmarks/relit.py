@@ -55,31 +55,31 @@ TABLE = "relit"
 
 @dataclass
 class Options:
-    """Measure runs, the truth and a baseline under a light that is not the one of training."""
+    """Measure runs, the truth and a baseline under a light other than that of training."""
 
     capture: Path
     """A capture with a mesh and with true materials of its test views."""
     under: Path
-    """Its test views under another light: envmap.exr, and images/."""
+    """The test views under another light: envmap.exr and images/."""
     runs: tuple[Path, ...] = ()
     """Runs on this capture."""
     exchange: bool = False
-    """Also each run with the true base colour, and with the true roughness and metallic."""
+    """Also measure each run with the true base colour, and with the true roughness and metallic."""
     spp: int = 64
-    """Samples of a pixel."""
+    """Samples per pixel."""
     denoise: bool = False
     """Denoise the pictures (needs the extra `denoise`)."""
     resolution: int = 512
-    """Cells of the traced mesh along an edge of the scene's cube, where a run has no mesh of its own."""
+    """Cells of the traced mesh along an edge of the scene's cube, if a run has no mesh of its own."""
     save: str | None = None
-    """Keep the figures under this name in benchmarks/results."""
+    """Name of the result file in benchmarks/results; default: none is written."""
 
 
 # ------------------------------------------------------------------------------------------------------ truth
 
 
 def true_materials(capture: Capture) -> Materials:
-    """The material of any point: that of the nearest one that a test view shows.
+    """The material of any point: that of the nearest point in a test view.
 
     Raises:
         UserError: the capture has no true depth and materials.
@@ -103,10 +103,10 @@ def true_materials(capture: Capture) -> Materials:
 
 
 def true_surface(capture: Capture) -> Surface:
-    """The mesh of a capture with the normals that the mesh host gives it.
+    """The mesh of a capture with the normals of the mesh host.
 
     Raises:
-        UserError: the capture has none.
+        UserError: the capture has no mesh.
     """
     mesh: Mesh | None = Truth(capture).mesh()
     if mesh is None:
@@ -119,7 +119,7 @@ def true_surface(capture: Capture) -> Surface:
 
 
 def scenes(options: Options, capture: Capture) -> Iterator[tuple[str, Scene]]:
-    """What is rendered, by the names of the rows; a run is read when it is its turn."""
+    """The rendered scenes by the names of the rows; a run is read when it is needed."""
     sky, materials = read_map(options.under / "envmap.exr", "ours").sky, true_materials(capture)
     yield "true material", Scene(true_surface(capture), materials, SPHERICAL_GAUSSIAN, sky)
     for path in options.runs:
@@ -135,7 +135,7 @@ def scenes(options: Options, capture: Capture) -> Iterator[tuple[str, Scene]]:
 
 
 def mixed(run: Run, truth: Materials, *names: str) -> Materials:
-    """The material of a run with some of its parameters from the truth."""
+    """The material of a run with some parameters replaced by the truth."""
 
     def materials(x: Float[Tensor, "N 3"]) -> Material:
         known = truth(x)
@@ -145,10 +145,10 @@ def mixed(run: Run, truth: Materials, *names: str) -> Materials:
 
 
 def measure(options: Options, say: Callable[[str], None]) -> list[Row]:
-    """The rows: the baseline first.
+    """Measure all rows, the baseline first.
 
     Raises:
-        UserError: a file is missing or is not what it should be.
+        UserError: a file is missing or invalid.
     """
     if options.denoise:
         check_denoiser()
@@ -176,7 +176,7 @@ def measure(options: Options, say: Callable[[str], None]) -> list[Row]:
 
 
 def figures(found: Comparison, title: str) -> dict[str, float]:
-    """Those of the table, under the names of the relit pictures."""
+    """The figures of the table, under the names of the relit images."""
     renamed = {
         key.replace(title, "relight", 1): value for key, value in found.figures.items() if title in key
     }
@@ -184,12 +184,12 @@ def figures(found: Comparison, title: str) -> dict[str, float]:
 
 
 def capture_name(options: Options) -> str:
-    """What a row is about: the capture, and the light."""
+    """The capture and the light of a row."""
     return f"{options.capture.name} under {options.under.name}"
 
 
 def described(row: Row) -> str:
-    """A row as a line."""
+    """One line for the console."""
     return f"{row.name}: " + ", ".join(
         f"{COLUMNS[key].title} {value:.2f}" for key, value in row.figures.items()
     )

@@ -48,7 +48,7 @@ from neilfpp_method.train.run import (
 
 STAGES = {"material_init": "material stage", "joint": "joint stage"}
 TABLES = {"volsdf": "found-geometry", "mesh": "given-geometry"}
-"""Of each host, the table of docs/results.md."""
+"""Table of docs/results.md for each host."""
 
 
 @dataclass
@@ -58,27 +58,27 @@ class Options:
     captures: tyro.conf.Positional[tuple[Path, ...]]
     """Folders of captures."""
     out: Path = Path("runs/results")
-    """Where the runs and results.json go."""
+    """Folder for the runs and results.json."""
     save: str | None = None
-    """Keep the figures under this name in benchmarks/results, for the tables of docs/results.md; none: in
-    --out alone.
+    """Name of the result file in benchmarks/results, for the tables of docs/results.md; default: the figures
+    are only written to --out.
     """
     preset: str = "fast"
-    """Which settings."""
+    """Preset of the settings."""
     host: Literal["volsdf", "mesh"] = "volsdf"
-    """Geometry to be found, or given as a mesh."""
+    """Geometry is recovered (volsdf), or given (mesh)."""
     compare: Literal["preset", "paper", "ladder"] = "paper"
     """preset: nothing else, with effects by evidence as in `neilfpp train`. paper: the free light field with
     and without L_ref. ladder: every light with every inter-reflection that goes with it.
     """
     material_steps: int | None = None
-    """Steps of the stage material init; none: the preset's."""
+    """Number of steps of material init; default: that of the preset."""
     device: str = "auto"
-    """Where to train."""
+    """Device to train on."""
 
 
 def variants(config: NeilfConfig, which: str) -> dict[str, NeilfConfig]:
-    """What is compared; the first is the preset as it is."""
+    """The compared settings by name; the first is the unchanged preset."""
     if which == "preset":
         return {"preset": config}
     free = free_light(config)
@@ -98,7 +98,7 @@ def variants(config: NeilfConfig, which: str) -> dict[str, NeilfConfig]:
 
 
 def changed(config: NeilfConfig, room: str, **settings: object) -> NeilfConfig:
-    """The same settings but for these of a room."""
+    """The same settings with some of a group changed."""
     return dataclasses.replace(config, **{room: dataclasses.replace(getattr(config, room), **settings)})
 
 
@@ -110,7 +110,7 @@ def train(
     effects: EffectRequest,
     start_from: Path | None = None,
 ) -> None:
-    """A run from scratch, or from the end of another run's SDF init. A run that is there is continued."""
+    """Train a run from scratch or from the end of another run's SDF init; an existing run is continued."""
     if start_from is not None and not out.exists():
         branch(start_from, out, config)
     run_training(
@@ -128,9 +128,7 @@ def train(
 
 
 def branch(trunk: Path, out: Path, config: NeilfConfig) -> None:
-    """A run that stands at the end of SDF init, with the host of the trunk and a material and a light that
-    have not moved.
-    """
+    """Create a run at the end of SDF init with the host of the trunk, and an untrained material and light."""
     described = read_description(trunk)
     saved = load_checkpoint(trunk / "checkpoints" / "sdf_init.pt")
     seed_step(config.train.seed, step=-1)
@@ -143,7 +141,7 @@ def branch(trunk: Path, out: Path, config: NeilfConfig) -> None:
     }
     model.load_state_dict(own | shared)
     optimizer = make_optimizer(model, config.optimizer)
-    # So far only the host has moved: its moments are all that the optimiser knows, and its parameters come
+    # So far only the host is trained: the optimizer has only its moments, and its parameters come
     # first.
     optimizer.load_state_dict(optimizer.state_dict() | {"state": saved["optimizer"]["state"]})
     create_run(out, config, described.source, described.facts)
@@ -152,7 +150,7 @@ def branch(trunk: Path, out: Path, config: NeilfConfig) -> None:
 
 
 def is_like(value: object, other: object) -> bool:
-    """Whether both are tensors of one shape."""
+    """Whether both are tensors of the same shape."""
     return isinstance(value, Tensor) and isinstance(other, Tensor) and value.shape == other.shape
 
 
@@ -172,14 +170,14 @@ def measure(out: Path, config: NeilfConfig) -> dict[str, dict[str, float]]:
 
 def main(options: Options) -> None:
     """Train, measure, and write the result file."""
-    # The clouds of captures with known truth are of the true surface, which is to be found.
+    # The point clouds of captures with known truth lie on the true surface, which must be recovered.
     config = changed(preset(options.preset), "loss", point_cloud=0.0)
     config = fixed_geometry(config) if options.host == "mesh" else config
     if options.material_steps is not None:
         config = dataclasses.replace(
             config, train=dataclasses.replace(config.train, material_steps=options.material_steps)
         )
-    # Where variants are compared, none of them may leave out what another has.
+    # Compared variants must simulate the same effects.
     effects = "auto" if options.compare == "preset" else "as-set"
     rows: list[Row] = []
     for capture in options.captures:
@@ -209,7 +207,7 @@ def main(options: Options) -> None:
                 for stage, values in figures.items()
             ]
             write_report(run, run / REPORT)
-        # After every capture, so that what is measured is kept where a later one fails.
+        # Written after every capture, so that figures are kept if a later capture fails.
         table = "light-ladder" if options.compare == "ladder" else TABLES[options.host]
         result = Result(
             table,
@@ -225,7 +223,7 @@ def main(options: Options) -> None:
 
 
 def seconds_until(stage: str, seconds: dict[str, float]) -> float:
-    """How long training took to the end of a stage."""
+    """Training time until the end of a stage, in seconds."""
     stages = list(seconds)
     return sum(seconds[name] for name in stages[: stages.index(stage) + 1])
 

@@ -1,11 +1,11 @@
-"""What finding the surface costs: queries of G per ray, by the error-bounded sampler on whole rays and on
-what is not empty.
+"""Cost of finding the surface: queries of G per ray by the error-bounded sampler, on whole rays and with
+skipping of empty space.
 
     python -m benchmarks sampler
 
-The table of `benchmarks.joint` behind the grid of `fast`, with the samples and rounds of the paper's presets.
-Queries of the cached path include the one per ray that tests the grid's promise, and the ray's share of the
-grid, which is sampled once in `MAX_LIFE` steps of 4096 rays.
+The scene is the table of `benchmarks.joint` with the grid of `fast`, with the samples and rounds of the
+paper's presets. The queries with skipping include the one per ray that checks the grid, and the ray's share
+of the sampling of the grid, which is done once in `MAX_LIFE` steps of 4096 rays.
 """
 
 from __future__ import annotations
@@ -44,9 +44,7 @@ def table_host(skip_empty: bool = True) -> VolSdfHost:
 
 
 def queries_per_ray(host: VolSdfHost, rays: RayBatch) -> float:
-    """How often G is asked for a distance alone, per ray of a rendering; the grid of empty space is there
-    already.
-    """
+    """Number of queries of only the distance, per rendered ray; the grid of empty space is sampled before."""
     asked = []
     plain = host.sdf
     host.sdf = lambda x: asked.append(len(x)) or plain(x)
@@ -59,8 +57,8 @@ def queries_per_ray(host: VolSdfHost, rays: RayBatch) -> float:
 
 
 def measurements() -> Iterator[Measurement]:
-    """By scale and way: queries, and how far hits lie from those of whole rays that are sampled without
-    random numbers.
+    """By scale and method: queries, and the distance of hits from those of whole rays that are sampled
+    without random numbers.
     """
     rays = rays_at_the_table(RAYS).rays
     share_of_grid = RESOLUTION**3 / (MAX_LIFE * preset("paper-ngp").train.rays)
@@ -93,8 +91,8 @@ def measurements() -> Iterator[Measurement]:
 
 
 def with_cuts(host: VolSdfHost, cuts: int) -> VolSdfHost:
-    """The host with so many first and further cuts a ray; where it skips empty space it takes half of those
-    that are set.
+    """The host with so many cuts per ray in the first and in further rounds; with skipping of empty space it
+    uses half of the set number.
     """
     cuts = cuts if host.empty_space is None else 2 * cuts
     volume = dataclasses.replace(host.config.volume, initial_samples=cuts)

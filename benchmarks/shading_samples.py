@@ -54,12 +54,12 @@ class Options:
     captures: tyro.conf.Positional[tuple[Path, ...]]
     """Folders of captures."""
     out: Path = Path("runs/benchmarks")
-    """Where the figure and the table go."""
+    """Folder for the figure and the table."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """M pairs of a point and a view, with the light at each, and a map of its mean."""
+    """M pairs of a point and a view, with the light at each point, and a map of the mean light."""
 
     normal: Float[Tensor, "M 3"]
     wo: Float[Tensor, "M 3"]
@@ -68,7 +68,7 @@ class Scene:
     map: EnvironmentLight
 
     def shade(self, roughness: float, samples: IncidentSamples) -> Float[Tensor, "M 3"]:
-        """The estimate of the outgoing radiance of a surface with this roughness."""
+        """Estimate of the outgoing radiance of a surface with this roughness."""
         even = torch.full_like(self.material.roughness, roughness)
         material = Material(self.material.base_color, even, self.material.metallic)
         return shade(
@@ -91,7 +91,7 @@ Draw = Callable[[Scene, float, int], IncidentSamples]
 
 @torch.no_grad()
 def scene_of(field: LightField, views: int = VIEWS) -> Scene:
-    """The true light field of a capture, seen from the first of its directions."""
+    """The true light field of a capture, viewed from the first of its directions."""
     light = true_light(field.wi, field.incident)
     rows = torch.arange(len(field.position)).repeat_interleave(views)
     wo = field.wo[:, :views].reshape(-1, 3)
@@ -99,7 +99,7 @@ def scene_of(field: LightField, views: int = VIEWS) -> Scene:
 
 
 def _mean_map(field: LightField, light: TrueLight) -> EnvironmentLight:
-    """The mean of the light over the points that a direction is above the horizon of."""
+    """Mean of the light over the points for which a direction is above the horizon."""
     mean = EnvironmentLight(MAP_ROWS, 1.0)
     wi = map_directions(*mean.log_radiance.shape[1:]).to(field.normal)
     above = (field.normal @ wi.reshape(-1, 3).T > 0)[..., None]
@@ -109,7 +109,7 @@ def _mean_map(field: LightField, light: TrueLight) -> EnvironmentLight:
 
 
 def techniques() -> dict[str, Draw]:
-    """The samplers that are compared, by name; the first is the paper's."""
+    """The compared samplers by name; the first is the paper's."""
 
     def plain(kind: str) -> Draw:
         return lambda scene, roughness, count: sample_directions(

@@ -36,7 +36,7 @@ SHARP = 3e-3  # β of a surface that counts as trained, scene units
 
 
 def config_of(name: str) -> NeilfConfig:
-    """A preset for the scene in the package, which has no point cloud, with a surface that can be shaded."""
+    """A preset for the scene of the package, which has no point cloud, with a surface that can be shaded."""
     config = preset(name)
     return dataclasses.replace(
         config,
@@ -60,13 +60,13 @@ def model_of(name: str) -> NeilfModel:
 
 
 def pixels_of(rays: int) -> PixelBatch:
-    """So many pixels, always the same, that steps may be compared."""
+    """So many pixels, the same in every call, so that steps can be compared."""
     seed_step(0, 0)
     return _pixels().sample(rays)
 
 
 def step_of(model: NeilfModel, stage: Stage, rays: int = RAYS) -> Callable[[], None]:
-    """A training step, as the loop takes it; always on the same pixels, that steps may be compared."""
+    """A training step as in the loop, always on the same pixels, so that steps can be compared."""
     config = model.config
     weights = active_losses(stage, config, model.stages)
     optimizer = make_optimizer(model, config.optimizer)
@@ -86,13 +86,15 @@ def step_of(model: NeilfModel, stage: Stage, rays: int = RAYS) -> Callable[[], N
 
 
 def warm_up(model: NeilfModel, step: Callable[[], None]) -> None:
-    """Take steps of a material stage until it renders no more than it does in the long run."""
+    """Run steps of a material stage until the replay buffer is full and the number of rendered rays is
+    constant.
+    """
     while model.replay.share > model.replay.fresh:
         step()
 
 
 def peak_mebibytes(name: str) -> float:
-    """What a joint step of a model adds, at its peak, to the memory of the process. Linux alone tells."""
+    """Peak memory that a joint step of a model adds to the process, MiB. Only Linux reports it."""
     step = step_of(model_of(name), Stage.JOINT)
     (PROCESS / "clear_refs").write_text("5")  # the peak so far is forgotten
     before = _resident("VmRSS")

@@ -1,14 +1,15 @@
-"""The method as one writes it down from the paper, in plain torch: the yardstick of whole steps.
+"""A plain implementation of the method in torch, written directly from the paper: the reference for whole
+steps.
 
-The networks, their weights, the losses and the order of a step are those of the package; what is computed is
-the same. How it is computed is not:
+The networks, their weights, the losses and the order of a step are those of the package, and the results are
+the same. The computation differs:
 
 - softplus units by torch;
 - normals, Hessians and gradients of the material by autograd, which a loss on them differentiates once more;
-- every ray in every round of VolSDF's Algorithm 1 until all rays of the batch have converged, and no space
-  skipped;
-- every traced ray of L_ref rendered, whether or not it meets anything;
-- every pair of a point and a direction through the whole network of the light.
+- every ray in every round of VolSDF's Algorithm 1 until all rays of the batch have converged, without
+  skipping of empty space;
+- every traced ray of L_ref is rendered, whether or not it can hit anything;
+- every pair of a point and a direction passes through the whole network of the light.
 """
 
 from __future__ import annotations
@@ -107,7 +108,7 @@ class PlainBrdf(nn.Module):
 
 
 class PlainLight(nn.Module):
-    """L, asked for one pair of a point and a direction at a time."""
+    """L, evaluated for every pair of a point and a direction separately."""
 
     def __init__(self, field: IncidentLightField) -> None:
         super().__init__()
@@ -123,8 +124,8 @@ class PlainLight(nn.Module):
 
 
 class PlainHost(VolSdfHost):
-    """VolSDF with its sampler as published: a batch of rays takes a round more as long as one of them asks
-    for it.
+    """VolSDF with its sampler as published: all rays of a batch take another round as long as one of them
+    needs it.
     """
 
     def __init__(self, config: NeilfConfig, radiance_scale: float, background: str) -> None:
@@ -150,8 +151,8 @@ class PlainHost(VolSdfHost):
 
 
 def straightforward(model: NeilfModel) -> NeilfModel:
-    """A model with the weights of another, whose host is VolSDF and whose light is the paper's, that computes
-    plainly.
+    """A model with the weights of another, whose host is VolSDF and whose light is the paper's, with the
+    plain implementation.
     """
     config = replace(
         model.config,

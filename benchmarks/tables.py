@@ -40,7 +40,9 @@ MARKED = re.compile(r"(<!-- table: ([\w-]+)((?: \w+)*) -->\n).*?(<!-- end -->)",
 
 @dataclass(frozen=True)
 class Column:
-    """How a figure is shown: the head of its column, and how many decimals; none: three digits that count."""
+    """How a figure is shown: the heading of its column, and the number of decimals; if None, three
+    significant digits.
+    """
 
     title: str
     decimals: int | None = 2
@@ -89,7 +91,7 @@ COLUMNS: Mapping[str, Column] = {
 
 @dataclass(frozen=True)
 class Row:
-    """One run: `figures` by the names in `COLUMNS`; `capture` is empty where a table is not about
+    """One run: `figures` by the names in `COLUMNS`; `capture` is empty in tables that are not about
     captures.
     """
 
@@ -102,7 +104,7 @@ class Row:
 class Result:
     """The rows of one command.
 
-    `commit` is the version that was measured; in files older than this format, the one that first held the
+    `commit` is the measured version; in files older than this format, the version that first contained the
     figures.
     """
 
@@ -114,10 +116,10 @@ class Result:
 
 
 def read_results(folder: Path = RESULTS) -> list[Result]:
-    """Every result file of a folder, in the order of their names.
+    """Read every result file of a folder, in the order of their names.
 
     Raises:
-        UserError: a file is not what the module's docstring says.
+        UserError: a file does not have the format of the module's docstring.
     """
     return [_read(path) for path in sorted(folder.glob("*.json"))]
 
@@ -144,7 +146,7 @@ def _read(path: Path) -> Result:
 
 
 def write_result(path: Path, result: Result) -> None:
-    """Write a result file; figures that no table shows are left out."""
+    """Write a result file; figures without a column are left out."""
     rows = [
         {**({"capture": row.capture} if row.capture else {}), "name": row.name}
         | {"figures": {name: row.figures[name] for name in COLUMNS if name in row.figures}}
@@ -183,7 +185,7 @@ def markdown(results: Sequence[Result], shown: Sequence[str] = ()) -> str:
 
 
 def _made_by(results: Sequence[Result]) -> list[str]:
-    """A line for each command: with which versions and on which machines it ran."""
+    """One line for each command, with the versions and machines on which it ran."""
     runs: dict[str, list[str]] = {}
     for result in results:
         runs.setdefault(result.command, []).append(f"{result.commit} on {result.machine}")
@@ -203,10 +205,10 @@ def _code(command: str) -> str:
 
 
 def filled(document: str, results: Sequence[Result]) -> str:
-    """A document with the tables that the results say.
+    """The document with its tables generated from the results.
 
     Raises:
-        UserError: the document has a table of which there is no result.
+        UserError: the document has a table without a result file.
     """
 
     def table(match: re.Match[str]) -> str:
@@ -235,7 +237,7 @@ class Options:
 
 
 def main(options: Options) -> int:
-    """The exit status."""
+    """Write or check the tables. Returns the exit status."""
     results = read_results()
     stale = 0
     for path in DOCUMENTS:

@@ -51,27 +51,27 @@ FIGURES = {
 
 @dataclass
 class Options:
-    """Train presets on captures whose truth is known, and measure them on the way."""
+    """Train presets on captures with known truth, and measure them during the training."""
 
     captures: tyro.conf.Positional[tuple[Path, ...]]
     """Folders of captures."""
     presets: tuple[str, ...] = ("fast", "paper-ngp", "paper-mlp")
-    """Which settings."""
+    """Names of presets."""
     cap: float = 3600.0
-    """Seconds after which a preset is stopped, `fast` alone excepted."""
+    """Seconds after which a preset is stopped, except `fast`."""
     first: float = 15.0
-    """Seconds to the first mark."""
+    """Seconds until the first measurement."""
     views: int = 2
-    """Test views that are rendered at a mark."""
+    """Number of test views that are rendered for a measurement."""
     device: str = "auto"
-    """Where to train."""
+    """Device to train on."""
     out: Path = Path("runs/benchmarks")
-    """Where the figure and the table go."""
+    """Folder for the figure and the table."""
 
 
 @dataclass(frozen=True)
 class Mark:
-    """What was measured after so many seconds of training."""
+    """A measurement after so many seconds of training."""
 
     seconds: float
     step: int
@@ -80,7 +80,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class Curve:
-    """The marks of a preset, and the steps that it would take in full."""
+    """The measurements of a preset, and the number of steps of its complete training."""
 
     marks: tuple[Mark, ...]
     steps: int
@@ -98,7 +98,7 @@ class Curve:
 def curve(
     root: Path, config: NeilfConfig, cap: float, first: float, views: int, device: torch.device
 ) -> Curve:
-    """Train a preset until its end or the cap, and measure it at the marks and at the end."""
+    """Train a preset until its end or the time limit, and measure it at the marks and at the end."""
     capture = load_capture(root)
     pixels = PixelDataset(capture, capture.train_views, device=device)
     facts = scene_facts(capture, pixels, config)
@@ -170,7 +170,7 @@ def table(curves: Mapping[str, Curve]) -> str:
 
 
 def charts(capture: Path, curves: Mapping[str, Curve]) -> list[Chart]:
-    """A panel for each figure; unfinished curves are named so."""
+    """A panel for each figure; the names of unfinished curves say so."""
     titled = {name if c.finished else f"{name}, unfinished": c for name, c in curves.items()}
     lines = {figure: {name: c.line(figure) for name, c in titled.items()} for figure in FIGURES}
     panels = {figure: {name: line for name, line in found.items() if line} for figure, found in lines.items()}

@@ -1,5 +1,4 @@
-"""What a traced ray of L_ref costs: looked up in the cached grid and rendered where it may hit, against
-rendered anyway.
+"""Cost of a traced ray of L_ref: looked up in the grid and rendered only if it may hit, or always rendered.
 
     python -m benchmarks trace
 
@@ -29,7 +28,7 @@ HIT_SHARE = 0.8
 
 
 def measurements() -> Iterator[Measurement]:
-    """Time per ray by both ways, how many rays are rendered, and how many hits are overlooked."""
+    """Time per ray by both methods, the number of rendered rays, and the share of missed hits."""
     settings = dataclasses.replace(preset("paper-ngp").inter_reflection, rays_per_point=1.0)
     plain, cached = table_host(skip_empty=False), table_host()
     with torch.no_grad(), computing_fast():
@@ -53,7 +52,7 @@ def measurements() -> Iterator[Measurement]:
 
 
 class _Recorder:
-    """A host that remembers the rays that it is asked for."""
+    """A host that records the rays that it renders."""
 
     def __init__(self, host: VolSdfHost) -> None:
         self.host, self.surface_width = host, host.surface_width

@@ -1,7 +1,8 @@
-"""The true light of a capture as a function: what arrives at its surface points from any direction.
+"""The true light of a capture as a function: the radiance that arrives at its surface points from any
+direction.
 
-The truth is known along 4096 directions a point. Between them it is interpolated on a grid with one vertex
-per direction, so that sums over few and over very many directions are estimates of one and the same integral.
+The truth is known along 4096 directions per point. Between them it is interpolated on a grid with one vertex
+per direction, so that sums over any number of directions estimate the same integral.
 """
 
 from __future__ import annotations

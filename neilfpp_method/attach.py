@@ -62,7 +62,7 @@ class AttachedNeilf(nn.Module):
     Attributes:
         model: the method itself.
         proxy: traces rays between surfaces if the host cannot do it cheaply; `proxy.report()` measures its
-            error. None: the host traces them, or the settings need none.
+            error. None if the host traces these rays itself, or if the settings trace no rays.
         light_solver: stores surface points of the training steps and solves for the light at intervals.
         missing: the optional methods that the host does not have, and the consequence of each.
         step_guard: skips steps of guarded optimizers (`guard`) whose losses or gradients are not finite.
@@ -291,9 +291,9 @@ def attach_neilf(
             borrowed host (one without `parameter_groups`), so that the material starts at step 0.
         response: meaning of pixel values: "linear" (HDR) or "srgb" (LDR).
         median_radiance: median linear luminance of the object in the images; sets the initial light.
-        radiance_scale: largest radiance of the host. None: 3 for HDR, 1 for LDR.
-        open_scene: whether pixels of rays that miss the scene show the distant light, to which an environment
-            map is then fitted, and not a backdrop.
+        radiance_scale: largest radiance of the host; if None, 3 for HDR and 1 for LDR.
+        open_scene: whether pixels of rays that miss the scene show the distant light; an environment map is
+            then fitted to these pixels as well. False if they show a backdrop.
 
     Returns:
         A module with the losses, maps and parameters of material and light.

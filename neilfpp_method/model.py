@@ -74,7 +74,7 @@ class NeilfModel(nn.Module):
         host: geometry G and outgoing radiance R.
         brdf: B, the material at every point.
         light, lamps: L, the light that arrives at unoccluded points, and the small lamps near the scene.
-        gains: gain of each photograph relative to the mean; None if all photographs are taken as equal.
+        gains: gain of each photograph relative to the mean; None if all are assumed to have one exposure.
         lobe: distribution of the specular reflection; None for Lambertian surfaces.
         stages: stage table for this kind of host: active losses and trained fields of each stage.
         units: units in which the losses measure radiance.
@@ -109,7 +109,7 @@ class NeilfModel(nn.Module):
         parts = make_light(config, facts.response, facts.median_radiance / albedo)
         self.light, self.lamps = parts.light, parts.lamps
         self.use(config)
-        # The trainer of a borrowed host may move its surface in any step: then no point is reused.
+        # The trainer of a borrowed host may move its surface in any step, so no point is reused.
         surface_is_fixed = not borrowed and not self.stages[Stage.MATERIAL_INIT].moves_host
         self.replay = Replay(config.train.fresh if surface_is_fixed else 1.0, config.train.rays)
 
@@ -321,7 +321,7 @@ class NeilfModel(nn.Module):
         return smooth + (normal - normal.detach())
 
     def incident_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
-        """Linear radiance that arrives at x from wi: from light and lamps, or from surfaces before them."""
+        """Linear radiance at x from wi: of the light, the lamps, or a surface that occludes them."""
         return incident_radiance(self.sources, x, wi)
 
     @doing("shading")
@@ -342,8 +342,8 @@ class NeilfModel(nn.Module):
         """Render all maps of rays, for images and metrics. Split large images: memory grows with the rays.
 
         Args:
-            rays: scene frame.
-            with_material: False: neither BRDF nor light is evaluated, and `rgb` is the host's color.
+            rays: rays in the scene frame.
+            with_material: if False, neither BRDF nor light is evaluated, and `rgb` is the host's color.
             hits: what the host rendered for these rays; if None, the host is rendered here.
         """
         hits = self.host.render(rays) if hits is None else hits.detach()

@@ -195,7 +195,7 @@ class Incident(Indexable):
         Args:
             drawn: the sampled directions with their pdf.
             radiance: linear incident radiance.
-            source: origin of each sample; None: `Source.LIGHT` for all.
+            source: origin of each sample; if None, `Source.LIGHT` for all.
         """
         weight = 1 / (drawn.pdf.clamp_min(PDF_FLOOR) * drawn.pdf.shape[1])
         if source is None:
@@ -317,10 +317,17 @@ class StepResult(NamedTuple):
 
 @dataclass(frozen=True)
 class Maps:
-    """All maps of an image, one row per ray; colors are linear.
+    """All maps of an image, one row per ray; colors are linear RGB.
 
-    `rgb` is shaded by the rendering equation and `rgb_volume` is the host's color. For a ray without a
-    surface, `rgb` equals `rgb_volume` and the material is 0.
+    Attributes:
+        rgb: color by the rendering equation; equal to `rgb_volume` for a ray without a surface.
+        rgb_volume: color that the host renders.
+        diffuse, specular: the two parts of the shaded radiance; 0 without a surface.
+        base_color, roughness, metallic: the material, each in [0, 1]; 0 without a surface.
+        normal: unit normal in the scene frame, as used for shading; the host's blended normal without a
+            surface.
+        depth: distance of the hit along the ray, scene units.
+        opacity: sum of the rendering weights, in [0, 1].
     """
 
     rgb: Float[Tensor, "N 3"]

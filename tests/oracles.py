@@ -1,4 +1,4 @@
-"""Independent references in float64 NumPy and SciPy: formulas as they are printed, quadrature, statistics."""
+"""Independent references in float64 NumPy and SciPy: published formulas, quadrature, and statistics."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Array = np.ndarray
 
 
 def distribution(lobe: str, cos_h: Array, r: Array) -> Array:
-    """D as METHOD §1 prints it."""
+    """D as in METHOD §1."""
     if lobe == "spherical_gaussian":
         return np.exp(2 / r**4 * (cos_h - 1)) / (np.pi * r**4)
     alpha = r**2
@@ -25,7 +25,7 @@ def distribution(lobe: str, cos_h: Array, r: Array) -> Array:
 
 
 def masking(lobe: str, cos_i: Array, cos_o: Array, r: Array) -> Array:
-    """G, the cosines not cancelled; for GGX from Smith's Λ = (√(1 + α² tan²θ) − 1)/2."""
+    """G without cancelled cosines; for GGX from Smith's Λ = (√(1 + α² tan²θ) − 1)/2."""
     if lobe == "spherical_gaussian":
         shadowing, occlusion = (2 * c / ((2 - r**2) * c + r**2) for c in (cos_i, cos_o))
         return shadowing * occlusion

@@ -1,4 +1,4 @@
-"""Small things to train on and look at, shared by the tests."""
+"""Small scenes that several tests share."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neilfpp_method.structures import PixelBatch, RayBatch
 
 
 def tiny_config(**changes) -> NeilfConfig:
-    """The preset `fast`, cut down to milliseconds a step."""
+    """The preset `fast`, reduced to milliseconds per step."""
     config = free_light(preset("fast"))
     small = dataclasses.replace(
         config,
@@ -65,7 +65,7 @@ def sphere_batch(count: int = 48, spread: float = 0.8, color: float = 0.3) -> Pi
 
 
 def meet_ball(rays: RayBatch, radius: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where rays meet a ball about the origin, (N, 3), and whether they do, 1 or 0."""
+    """Positions at which rays hit a ball around the origin, (N, 3), and whether they do, 1 or 0."""
     along = -(rays.origins * rays.directions).sum(-1)
     square = along.square() - rays.origins.square().sum(-1) + radius**2
     position = rays.origins + (along - square.clamp_min(0).sqrt())[:, None] * rays.directions

@@ -1,4 +1,4 @@
-"""The house has one direction of flow: no import, read from the sources, runs against it."""
+"""Data flows in one direction: the imports in the sources follow the order of the layers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SOURCES = {
     for path in sorted(ROOT.rglob("*.py"))
 }
 
-# A room may import what stands to its left, and itself; rooms of one step know nothing of one another. Lower
+# A package may import packages to its left and itself; packages of one layer do not import each other. Lower
 # is right.
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "structures", "timing"),
@@ -38,7 +38,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("commands",),
     ("cli",),
 )
-# Rooms that keep out of more than their layer says. Data is read and prepared without a network in sight,
+# Packages that are stricter than their layer. Data is read and prepared without networks,
 # settings included.
 ONLY = {
     "data": {"errors", "structures", "shading.color"},
@@ -52,7 +52,7 @@ MAX_AT_THE_TOP = 8
 
 
 def room(module: str) -> str:
-    """The longest name in `LAYERS` that a module belongs to; none: the empty string."""
+    """The longest name in `LAYERS` that a module belongs to; empty if there is none."""
     name = module.removeprefix(f"{PACKAGE}.")
     rooms = [r for layer in LAYERS for r in layer if f"{name}.".startswith(f"{r}.")]
     return max(rooms, key=len, default="")
@@ -63,7 +63,7 @@ def layer(name: str) -> int:
 
 
 def imports(tree: ast.AST, module: str = "") -> Iterator[str]:
-    """Every module that a source imports, wherever in it; of the package only modules, not the names in
+    """Every module that a source imports, at any place in it; from the package only modules, not the names in
     them.
     """
     for node in ast.walk(tree):
@@ -77,7 +77,7 @@ def imports(tree: ast.AST, module: str = "") -> Iterator[str]:
 
 
 def backward(module: str, imported: str) -> bool:
-    """Whether an import runs against the order."""
+    """Whether an import contradicts the order."""
     here, there = room(module), room(imported)
     if here == there:
         return False
@@ -100,12 +100,12 @@ def source(request) -> tuple[str, ast.AST]:
     return request.param, ast.parse(SOURCES[request.param].read_text())
 
 
-def test_every_module_has_its_place(source):
+def test_every_module_belongs_to_a_layer(source):
     module, _ = source
     assert module == PACKAGE or room(module), f"{module} stands in no layer"
 
 
-def test_no_arrow_runs_backwards(source):
+def test_no_import_contradicts_the_order(source):
     module, tree = source
     if module == PACKAGE:
         assert not [
@@ -118,7 +118,7 @@ def test_no_arrow_runs_backwards(source):
     assert not wrong, f"{module} may not import {wrong}"
 
 
-def test_no_two_modules_need_each_other():
+def test_there_are_no_import_cycles():
     graph = {
         module: {name for name in imports(ast.parse(path.read_text())) if name in SOURCES and name != module}
         for module, path in SOURCES.items()
@@ -129,7 +129,7 @@ def test_no_two_modules_need_each_other():
     TopologicalSorter(graph).prepare()  # raises CycleError
 
 
-def test_only_the_plugin_knows_nerfstudio(source):
+def test_only_the_plugin_imports_nerfstudio(source):
     module, tree = source
     if not module.startswith((f"{PACKAGE}.plugin", f"{PACKAGE}.hosts.nerfstudio")):
         assert not [name for name in imports(tree) if name.split(".")[0] == "nerfstudio"]
@@ -140,7 +140,7 @@ def test_devices_follow_the_inputs(source):
     assert not [name for name, _ in calls(tree) if name.endswith(".cuda")]
 
 
-def test_nothing_unpickles_what_it_did_not_write(source):
+def test_no_untrusted_file_is_unpickled(source):
     _, tree = source
     for name, call in calls(tree):
         assert name not in ("pickle.load", "pickle.loads")
@@ -193,11 +193,11 @@ def test_modules_are_short(source):
         ("model", "cli", True),
     ],
 )
-def test_the_order_is_the_order(module, imported, wrong):
+def test_the_order_is_checked_in_both_directions(module, imported, wrong):
     assert backward(f"{PACKAGE}.{module}", f"{PACKAGE}.{imported}") == wrong
 
 
-def test_imports_are_found_wherever_they_stand():
+def test_imports_are_found_at_any_place():
     text = "import a.b\nfrom neilfpp_method import losses\n"
     text += "def f():\n  from neilfpp_method.data.images import write_png"
     assert list(imports(ast.parse(text))) == ["a.b", f"{PACKAGE}.losses", f"{PACKAGE}.data.images"]

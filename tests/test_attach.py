@@ -1,4 +1,4 @@
-"""The method on top of somebody else's model, in somebody else's loop."""
+"""The method attached to a host and a training loop outside of the package."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_three_lines_in_a_foreign_loop():
 
 
 @pytest.mark.parametrize("kind", [Ball, BallHost])
-def test_a_borrowed_host_is_none_of_the_modules_business(kind):
+def test_a_borrowed_host_is_not_part_of_the_module(kind):
     host = kind().eval()
     neilf = attach_neilf(host, tiny_config())
     mine = {id(p) for p in neilf.parameters()}
@@ -91,7 +91,7 @@ def test_a_borrowed_host_is_none_of_the_modules_business(kind):
     assert host.radius.dtype == torch.float32
 
 
-def test_before_there_is_a_material_the_host_is_not_asked():
+def test_before_the_material_stage_the_host_is_not_rendered():
     def unasked(origins, directions):
         raise AssertionError("asked")
 
@@ -117,15 +117,15 @@ def test_steps_fall_into_the_stages_of_the_settings():
     assert set(neilf.losses(pixels(), Stage.JOINT).terms) == names[3]
 
 
-def test_gradients_reach_a_borrowed_host_in_the_joint_stage_alone():
+def test_gradients_reach_a_borrowed_host_only_in_the_joint_stage():
     host = Ball()
     neilf = attach_neilf(host, steps(sdf=0, material=1, joint=1))
     neilf.losses(pixels(), Stage.MATERIAL_INIT).loss.backward()
     assert all(p.grad is None for p in host.parameters())
     joint = neilf.losses(pixels(), Stage.JOINT)
     joint.loss.backward()
-    assert host.radius.grad.abs() > 0  # by way of position and normal
-    assert all(p.grad.abs().max() > 0 for p in host.paint.parameters())  # by way of the colour
+    assert host.radius.grad.abs() > 0  # through position and normal
+    assert all(p.grad.abs().max() > 0 for p in host.paint.parameters())  # through the colour
 
 
 def test_a_preset_can_be_named():
@@ -138,7 +138,7 @@ def test_a_preset_can_be_named():
         attach_neilf(BallHost(), "quick")
 
 
-def test_a_host_that_offers_its_parameters_is_trained_with_the_rest():
+def test_a_host_with_parameter_groups_is_trained_with_the_material():
     config = tiny_config()
     torch.manual_seed(0)
     host = VolSdfHost(config, 3.0, "constant")
@@ -165,7 +165,7 @@ def test_a_mesh_learns_its_light_field_with_the_material():
 # -------------------------------------------------------------------------------------------------- the parts
 
 
-def test_a_map_that_the_settings_name_lights_the_scene_and_stays(tmp_path):
+def test_a_known_map_is_used_and_not_changed(tmp_path):
     known = np.random.default_rng(0).random((6, 12, 3), dtype=np.float32) + 0.5
     write_exr(tmp_path / "sky.exr", {"RGB": known})
     config = mesh_config()
@@ -177,7 +177,7 @@ def test_a_map_that_the_settings_name_lights_the_scene_and_stays(tmp_path):
     torch.testing.assert_close(shown, torch.from_numpy(known))
 
 
-def test_in_an_open_scene_rays_that_meet_nothing_show_its_light():
+def test_in_an_open_scene_rays_that_miss_show_the_light():
     config, batch = solved_light(steps(sdf=0, material=4, joint=0)), pixels(spread=1.5)
     missed = (mesh_host(SPHERE).render(batch.rays).opacity == 0).sum()
     assert 0 < missed < len(batch)
@@ -187,7 +187,7 @@ def test_in_an_open_scene_rays_that_meet_nothing_show_its_light():
     assert attach_neilf(mesh_host(SPHERE), config).light_solver.sky is None
 
 
-def test_shading_is_that_of_the_maps_and_nothing_where_nothing_is_hit():
+def test_shading_agrees_with_the_maps_and_is_zero_for_misses():
     neilf = attach_neilf(BallHost(), tiny_config()).eval()
     batch = pixels(spread=0.9)
     hits = neilf.model.host.render(batch.rays)
@@ -200,13 +200,13 @@ def test_shading_is_that_of_the_maps_and_nothing_where_nothing_is_hit():
 
 
 class TiltedBall(BallHost):
-    """A ball that knows better normals than those of its hits."""
+    """A ball that provides smoothed normals other than those of its hits."""
 
     def smooth_normals(self, position, normal):
         return torch.nn.functional.normalize(normal + torch.tensor([0.5, 0.0, 0.0]), dim=-1)
 
 
-def test_shading_takes_the_normals_of_the_maps():
+def test_shading_uses_the_normals_of_the_maps():
     neilf = attach_neilf(TiltedBall(), tiny_config()).eval()
     batch = pixels()
     hits = neilf.model.host.render(batch.rays)
@@ -224,7 +224,7 @@ def test_material_and_light_at_points():
     assert (light > 0).all()
 
 
-def test_pixels_of_a_loop_that_knows_little():
+def test_pixel_batches_without_masks():
     rays = ball_rays(4)
     color, mask = torch.rand(4, 3), torch.tensor([1.0, 0.0, 1.0, 1.0])
     plain, masked = (pixel_batch(rays.origins, rays.directions, color, m) for m in (None, mask))
@@ -237,7 +237,7 @@ def test_pixels_of_a_loop_that_knows_little():
 # ----------------------------------------------------------------------------------------- what a host is not
 
 
-def test_what_a_host_lacks_is_said_once_and_in_one_line(caplog):
+def test_missing_capabilities_are_logged_once_in_one_line(caplog):
     with caplog.at_level(logging.WARNING):
         neilf = attach_neilf(Ball(), tiny_config())
         neilf.losses(pixels(), Stage.MATERIAL_INIT)
@@ -249,7 +249,7 @@ def test_what_a_host_lacks_is_said_once_and_in_one_line(caplog):
     assert missing_capabilities(sphere_model().host) == {}
 
 
-def test_a_nerfstudio_model_is_told_by_its_shape(monkeypatch):
+def test_a_nerfstudio_model_is_recognised_by_its_attributes(monkeypatch):
     class Adapter(BallHost):
         def __init__(self, model, response):
             super().__init__()
@@ -269,16 +269,16 @@ def test_a_nerfstudio_model_is_told_by_its_shape(monkeypatch):
     model = Model()
     neilf = attach_neilf(model, tiny_config(), response="srgb")
     assert neilf.model.host.inner.adapted == (model, "srgb")
-    assert set(neilf.parameter_groups()) == {"brdf", "light"}  # its own trainer moves it
+    assert set(neilf.parameter_groups()) == {"brdf", "light"}  # it is trained by its own trainer
 
 
-def test_what_is_no_host_is_named():
+def test_anything_but_a_host_is_refused_by_name():
     with pytest.raises(UserError, match="list is not a host; give an object with render"):
         attach_neilf([1, 2, 3])
 
 
 def spoiled(function):
-    """The ball as a bare function, with its answer replaced."""
+    """The ball as a plain function whose result is replaced."""
     ball = Ball()
 
     def field(origins, directions):
@@ -327,7 +327,7 @@ def test_a_function_may_return_a_dictionary():
         incomplete.losses(pixels(), Stage.MATERIAL_INIT)
 
 
-def test_a_colour_may_be_cut_off_where_nothing_trains_it():
+def test_a_colour_without_gradient_is_accepted_if_it_is_not_trained():
     neilf = attach_neilf(spoiled(lambda c, p, n: (c.detach(), p, n)), tiny_config())
     assert neilf.losses(pixels(), Stage.MATERIAL_INIT).loss.isfinite()
 
@@ -349,7 +349,7 @@ def test_bad_normals_of_a_host_object_are_named():
             attach_neilf(BallHost(spoil), tiny_config()).losses(pixels(), Stage.MATERIAL_INIT)
 
 
-def test_normals_are_looked_at_until_the_first_hit_and_shapes_always():
+def test_normals_are_checked_until_the_first_hit_and_shapes_always():
     spoil = {}
     neilf = attach_neilf(
         BallHost(lambda rays, outputs: {n: f(outputs[n]) for n, f in spoil.items()}), tiny_config()

@@ -1,4 +1,4 @@
-"""Steps that are not finite and surfaces that are none, in somebody else's loop."""
+"""Steps that are not finite, and missing surfaces, in a training loop outside of the package."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def material_steps(count: int):
 
 
 def attached(host: object, steps: int = 40):
-    """A guarded loop's parts."""
+    """The parts of a guarded training loop."""
     torch.manual_seed(0)
     neilf = attach_neilf(host, material_steps(steps))
     optimizer = torch.optim.Adam(neilf.param_groups(), betas=(0.9, 0.99))
@@ -41,7 +41,7 @@ def step(neilf, optimizer, number: int, spoil: float = 1.0) -> None:
     optimizer.step()
 
 
-def test_a_step_that_is_not_finite_moves_nothing_and_is_said(caplog):
+def test_a_step_that_is_not_finite_changes_nothing_and_is_logged(caplog):
     neilf, optimizer = attached(Ball())
     step(neilf, optimizer, 0)
     before = [p.detach().clone() for p in neilf.parameters()]
@@ -64,7 +64,7 @@ def test_ten_such_steps_in_a_row_end_the_training():
     assert neilf.step_guard.skipped == 10
 
 
-def test_a_surface_is_sound_and_costs_no_rendering():
+def test_the_health_of_a_surface_needs_no_rendering():
     asked = []
 
     class Counted(Ball):
@@ -80,7 +80,7 @@ def test_a_surface_is_sound_and_costs_no_rendering():
     assert len(asked) == before
 
 
-def test_fog_is_said_at_the_end_of_the_stage(caplog):
+def test_fog_is_reported_at_the_end_of_the_stage(caplog):
     def fog(rays, outputs):
         ones = torch.ones_like(rays.origins[:, 0])
         return {"opacity": ones, "concentration": 0.1 * ones}

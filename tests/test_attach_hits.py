@@ -1,5 +1,5 @@
-"""Hits that are rendered already, hosts that draw images, and everything that an attachment says or must not
-touch.
+"""Hits that are rendered already, hosts that draw images, and the messages and side effects of an
+attachment.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from tests.scenes import tiny_config
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
-    """A grid that few rays fill."""
+    """A grid of which few rays fill all cells."""
     monkeypatch.setattr(foreign, "GRID_RESOLUTION", 40)
 
 
@@ -47,7 +47,7 @@ def hard_config():
 
 
 class Counted(Ball):
-    """The ball as a function that counts the rays it is asked."""
+    """The ball as a function that counts the rays that it renders."""
 
     asked = 0
 
@@ -61,7 +61,7 @@ class Counted(Ball):
 
 
 @pytest.mark.parametrize("form", ["hits", "dictionary", "tuple"])
-def test_hits_that_are_handed_in_are_not_rendered_again_and_change_nothing(form):
+def test_given_hits_are_not_rendered_again_and_give_the_same_losses(form):
     host, rays = Counted(), ball_rays(64, 0.8)
     config = tiny_config()
     config = dataclasses.replace(
@@ -93,7 +93,7 @@ def test_hits_that_are_handed_in_are_not_rendered_again_and_change_nothing(form)
     assert host.radius.grad.abs() > 0
 
 
-def test_maps_of_hits_that_are_handed_in_are_those_of_rendered_rays():
+def test_maps_of_given_hits_agree_with_rendered_rays():
     host, rays = Counted(), ball_rays(40, 0.8)
     neilf = attach_neilf(host, tiny_config()).eval()
     hits = CallableHost(host).render(rays)
@@ -105,7 +105,7 @@ def test_maps_of_hits_that_are_handed_in_are_those_of_rendered_rays():
         torch.testing.assert_close(getattr(handed, field.name), getattr(rendered, field.name))
 
 
-def test_gradients_do_not_go_back_through_hits_in_the_material_stage():
+def test_no_gradients_flow_through_hits_in_the_material_stage():
     host, rays = Ball(), ball_rays(64)
     attach_neilf(host, tiny_config()).losses(
         pixels(rays), "material_init", CallableHost(host).render(rays)
@@ -138,7 +138,7 @@ def camera(size: int = 40) -> Camera:
 
 
 class Splats:
-    """A rasteriser: colour, z-depth and opacity of a whole view; no rays, no normals."""
+    """A rasteriser: colour, z-depth and opacity of a whole view, without rays and normals."""
 
     def __init__(self) -> None:
         self.scene = TableTop()
@@ -166,7 +166,7 @@ def test_maps_of_an_image_are_hits_with_normals_from_depth():
     assert (angle < 15).float().mean() > 0.9
 
 
-def test_a_host_of_images_learns_a_material_from_what_is_handed_in():
+def test_a_material_is_learned_from_given_image_hits():
     torch.manual_seed(0)
     view, host = camera(), Splats()
     neilf = attach_neilf(host, hard_config(), median_radiance=0.3)
@@ -193,7 +193,7 @@ def test_a_host_of_images_learns_a_material_from_what_is_handed_in():
     assert not neilf.proxy.scene_light(above, up[None]).hit.item()
 
 
-def test_a_host_that_answers_no_secondary_rays_is_asked_with_camera_rays_alone():
+def test_a_host_without_secondary_rays_renders_only_camera_rays():
     class Primary(BallHost):
         answers_secondary_rays = False
 
@@ -225,7 +225,7 @@ def test_a_host_is_never_called_without_rays():
         assert len(neilf.maps(away[:0]).rgb) == 0
 
 
-def test_attaching_leaves_the_random_state_alone():
+def test_attaching_keeps_the_random_state():
     host = Ball()
     torch.manual_seed(7)
     expected = torch.rand(3)
@@ -243,14 +243,14 @@ def test_groups_of_parameters_have_the_rates_of_the_settings():
         optimizer.add_param_group(group)
     rates = {group.get("name"): group["lr"] for group in optimizer.param_groups[1:]}
     assert rates == {"brdf": config.optimizer.brdf, "light": config.optimizer.light}
-    mapped = attach_neilf(Ball(), hard_config()).param_groups()  # a map is solved for, and has no parameters
+    mapped = attach_neilf(Ball(), hard_config()).param_groups()  # a map is fitted and has no parameters
     assert [group["name"] for group in mapped] == ["brdf"]
 
 
 # ----------------------------------------------------------------------------------------------- what is said
 
 
-def test_a_borrowed_host_starts_with_its_material_or_says_when(caplog):
+def test_a_borrowed_host_starts_with_the_material_or_logs_its_step(caplog):
     with caplog.at_level(logging.WARNING):
         now = attach_neilf(Ball())
         attach_neilf(Ball(), tiny_config())
@@ -274,7 +274,7 @@ def test_a_borrowed_host_starts_with_its_material_or_says_when(caplog):
         ({"radiance_scale": -1.0}, "radiance_scale is -1.0"),
     ],
 )
-def test_facts_that_cannot_be_right_are_named(arguments, message):
+def test_impossible_facts_are_refused_by_name(arguments, message):
     with pytest.raises(UserError, match=message):
         attach_neilf(Ball(), tiny_config(), **arguments)
 
@@ -291,7 +291,7 @@ def test_a_stage_is_one_of_three():
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
-def test_a_host_of_another_precision_is_read_and_half_of_it_is_warned_of(dtype, caplog):
+def test_a_host_of_another_precision_is_converted_and_half_is_warned_about(dtype, caplog):
     host = BallHost(lambda rays, outputs: {name: value.to(dtype) for name, value in outputs.items()})
     neilf = attach_neilf(host, tiny_config())
     with caplog.at_level(logging.WARNING, "neilfpp_method.hosts"):
@@ -304,7 +304,7 @@ def test_a_host_of_another_precision_is_read_and_half_of_it_is_warned_of(dtype, 
     assert len(said) == (dtype != torch.float64)
 
 
-def test_rays_of_another_precision_are_named():
+def test_rays_of_another_precision_are_refused():
     rays = ball_rays(4)
     batch = pixels(RayBatch(rays.origins.double(), rays.directions.double()))
     with pytest.raises(

@@ -1,4 +1,4 @@
-"""Commands that are asked to end: one line, the status that shells expect, and no half-written file."""
+"""Commands that are interrupted: one line, the exit status that shells expect, and no incomplete file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Nothing:
 
 
 def command(monkeypatch: pytest.MonkeyPatch, run: Callable[[object], None]) -> list[str]:
-    """The words of a command that does this."""
+    """The words of a command that runs this function."""
     monkeypatch.setitem(COMMANDS, "inspect", replace(COMMANDS["inspect"], options=Nothing, run=run))
     return ["inspect"]
 
@@ -40,7 +40,7 @@ def test_a_command_ends_in_one_line(monkeypatch, capfd, tmp_path, number, status
     assert signal.getsignal(number) is before
 
 
-def test_what_a_library_makes_of_ctrl_c_is_not_shown(monkeypatch, capfd):
+def test_exceptions_of_libraries_after_ctrl_c_are_not_shown(monkeypatch, capfd):
     def load(_: object) -> None:
         try:
             signal.raise_signal(signal.SIGINT)
@@ -59,7 +59,7 @@ def test_other_errors_are_shown(monkeypatch):
         main(command(monkeypatch, fail))
 
 
-def test_sigterm_waits_for_a_library_that_puts_its_own_handler_in_place():
+def test_sigterm_waits_for_a_library_that_installs_its_own_handler():
     told: list[str] = []
     before = signal.signal(signal.SIGTERM, lambda *_: told.append("ours"))
     try:
@@ -72,7 +72,7 @@ def test_sigterm_waits_for_a_library_that_puts_its_own_handler_in_place():
         signal.signal(signal.SIGTERM, before)
 
 
-def test_a_stopped_write_keeps_what_was_there(monkeypatch, tmp_path: Path):
+def test_a_stopped_write_keeps_the_old_file(monkeypatch, tmp_path: Path):
     path = tmp_path / "result.txt"
     path.write_text("whole")
 

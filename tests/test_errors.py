@@ -1,4 +1,4 @@
-"""What a person reads is one printable line, whatever files say and are called."""
+"""Messages are one printable line, whatever the names and contents of files are."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ def test_a_message_is_one_printable_line(name, shown):
     str(error).encode()
 
 
-def test_what_a_library_says_at_length_is_cut(capfd):
+def test_long_messages_of_libraries_are_shortened(capfd):
     error = UserError("a.off: " + 10_000 * "x" + "(end)", "export it again")
     assert len(error.problem) < 1600
     assert error.problem.startswith("a.off: xxx")
     assert error.problem.endswith("xx(end)")
 
 
-def test_the_command_shows_it_so(capfd):
+def test_the_command_prints_such_a_message(capfd):
     assert main(["inspect", "no\nsuch\x07folder"]) == 2
     assert capfd.readouterr().err.startswith("error: no\\nsuch\\x07folder: no such folder; ")

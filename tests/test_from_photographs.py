@@ -1,8 +1,7 @@
-"""The five commands of docs/blender.md, run one after the other as they stand there, on photographs of a
-corner.
+"""The five commands of docs/blender.md, run one after the other on photographs of a corner.
 
-What is added to them makes them short: few steps, few texels. The last one needs Blender, or a Python with
-bpy (NEILFPP_BPY); without one, the script must be where the page says.
+Options are added that make them short: few steps, few texels. The last command needs Blender, or a Python
+with bpy (NEILFPP_BPY); without one, only the presence of the script is checked.
 """
 
 from __future__ import annotations
@@ -60,8 +59,9 @@ def test_from_photographs_to_blender(tmp_path, monkeypatch):
 
 
 def opened(script: Path):
-    """What Blender renders of the scene that the script opens, from the first view, linear; none without
-    Blender."""
+    """The first view of the scene that the script opens, rendered by Blender, linear; None without
+    Blender.
+    """
     words = ["--camera", "000", "--render", "000.exr", "--percent", "50", "--samples", "2"]
     if python := os.environ.get("NEILFPP_BPY"):
         program = [python, str(script)]

@@ -1,4 +1,4 @@
-"""The losses of METHOD §4, each against a number worked out by hand."""
+"""The losses of METHOD §4, each compared with a value that is computed by hand."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_point_cloud_adds_distance_and_angle():
     assert losses.point_cloud(distance, gradient, normal).values.tolist() == pytest.approx([0.1, 0.2 + 1.0])
 
 
-def test_smoothness_fades_where_the_image_changes():
+def test_smoothness_is_weaker_where_the_image_changes():
     gradient = torch.tensor([[0.0, 3.0, 4.0]])
     term = losses.smoothness(gradient, 2.0 * gradient, torch.tensor([1.0]))
     assert term.values.item() == pytest.approx((5.0 + 10.0) * math.exp(-1.0))
@@ -56,7 +56,7 @@ def test_lambertian_is_zero_for_a_rough_dielectric_only():
     ).values.item() == pytest.approx(1.25)
 
 
-def test_mask_counts_where_it_is_known():
+def test_mask_loss_counts_only_known_pixels():
     opacity, depth = torch.full((4,), 0.75), torch.full((4,), math.e - 1)
     term = losses.mask(
         opacity, depth, torch.tensor([1.0, 0.0, 1.0, 0.5]), known=torch.tensor([1.0, 1.0, 0.0, 1.0])
@@ -64,7 +64,7 @@ def test_mask_counts_where_it_is_known():
     assert term.values.tolist() == pytest.approx([0.25, 1.0, 0.0, 0.625])
 
 
-def test_a_mask_pulls_at_what_is_opaque_and_never_without_bound():
+def test_the_gradient_of_the_mask_loss_is_nonzero_and_bounded():
     depth = torch.tensor([0.0, 0.1, 10.0, 1e4], requires_grad=True)
     opacity = -torch.expm1(-depth)
     losses.mask(opacity, depth, torch.zeros(4), torch.ones(4)).values.sum().backward()
@@ -80,7 +80,7 @@ def test_scale_gradient_keeps_the_value():
     assert not losses.scale_gradient(x, 0.0).requires_grad
 
 
-def test_a_weighted_mean_counts_what_has_weight():
+def test_a_weighted_mean_uses_the_weights():
     values = torch.tensor([[1.0, 3.0], [10.0, 30.0]])
     assert LossTerm(values, torch.tensor([[1.0], [0.0]])).mean().item() == pytest.approx(2.0)
 
@@ -93,7 +93,7 @@ def test_a_term_without_values_is_zero_with_a_zero_gradient():
 
 
 @pytest.mark.parametrize("loss", [losses.eikonal, lambda g: losses.smoothness(g, g, torch.zeros(len(g)))])
-def test_a_zero_gradient_of_the_field_is_no_trap(loss):
+def test_a_zero_gradient_of_the_field_gives_finite_gradients(loss):
     gradient = torch.zeros(2, 3, requires_grad=True)
     loss(gradient).values.sum().backward()
     assert gradient.grad.isfinite().all()

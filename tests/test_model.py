@@ -1,4 +1,6 @@
-"""The method on a host: what each step computes, what a switch saves, and what each stage moves."""
+"""The method on a host: the computations of a step, the savings of a switch, and the trained fields of each
+stage.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ from tests.scenes import sphere_batch, sphere_model, tiny_config
 
 
 def count_queries(model, run) -> Counter:
-    """Points that each field is asked for, and rays that the host renders, while `run` runs."""
+    """Numbers of points at which each field is evaluated, and of rays that the host renders, while `run`
+    runs.
+    """
     counts = Counter()
     handles = []
     for name, field in (("sdf", model.host.sdf_field), ("brdf", model.brdf)):
@@ -48,7 +52,7 @@ def _counted(function, counts, name):
     return call
 
 
-def test_an_effect_that_is_off_asks_nothing():
+def test_an_effect_that_is_off_makes_no_queries():
     base = tiny_config()
     # With β = 0.02 a quarter of a ray's weight lies further than 0.05 from its hit.
     base = dataclasses.replace(base, shading=dataclasses.replace(base.shading, hit_share=0.5))
@@ -74,14 +78,14 @@ def test_an_effect_that_is_off_asks_nothing():
     assert fewer["sdf"] < first_stage["sdf"]
 
 
-def test_a_picture_of_r_alone_asks_no_material():
+def test_an_image_of_r_evaluates_no_material():
     model = sphere_model().eval()
     counts = count_queries(model, lambda: model.maps(sphere_batch().rays, with_material=False))
     assert counts["brdf"] == counts["light"] == 0
 
 
 @pytest.mark.parametrize("stage", Stage)
-def test_a_stage_moves_what_the_table_says_and_nothing_else(stage):
+def test_a_stage_trains_exactly_the_fields_of_the_table(stage):
     moves = {
         Stage.SDF_INIT: {"geometry", "beta", "radiance"},
         Stage.MATERIAL_INIT: {"brdf", "light"},
@@ -90,7 +94,7 @@ def test_a_stage_moves_what_the_table_says_and_nothing_else(stage):
     config = tiny_config()
     model = sphere_model(config)
     optimizer = make_optimizer(model, config.optimizer)
-    # Momentum from an earlier stage must not move what this stage holds still.
+    # Momentum from an earlier stage must not change fields that this stage does not train.
     weigh(model.losses(sphere_batch(), Stage.JOINT), active_losses(Stage.JOINT, config)).loss.backward()
     optimizer.step()
     before = {name: [p.detach().clone() for p in group] for name, group in model.parameter_groups().items()}
@@ -113,7 +117,9 @@ def test_the_first_render_matches_the_median_of_the_images():
 
 
 def test_pbr_colour_of_a_white_furnace():
-    """Under light of 1 from everywhere a Lambertian surface shows its base colour, whatever the host."""
+    """Under light of 1 from all directions the colour of a Lambertian surface is its base colour, with any
+    host.
+    """
     config = tiny_config()
     config = dataclasses.replace(config, shading=dataclasses.replace(config.shading, specular=False))
     model = sphere_model(config).eval()
@@ -123,9 +129,7 @@ def test_pbr_colour_of_a_white_furnace():
 
 
 class Room:
-    """A host: a closed room whose walls, 2 scene units from the origin, all send out their own normal as a
-    colour.
-    """
+    """A host: a closed room whose walls, 2 scene units from the origin, have their own normal as radiance."""
 
     def render(self, rays: RayBatch) -> SurfaceHits:
         along = (rays.origins * rays.directions).sum(-1)
@@ -135,7 +139,7 @@ class Room:
         return SurfaceHits(position / 2.0, position, -position / 2.0, ones, ones)
 
 
-def test_traced_light_is_what_the_wall_sends_back():
+def test_traced_light_is_the_radiance_of_the_wall():
     torch.manual_seed(0)
     position, normal = torch.zeros(500, 3), torch.tensor([[0.0, 0.0, 1.0]]).expand(500, 3)
     settings = dataclasses.replace(tiny_config().inter_reflection, rays_per_point=2.5, offset=1e-4)
@@ -150,7 +154,7 @@ def test_traced_light_is_what_the_wall_sends_back():
 
 
 class Recorder(Room):
-    """The room with a surface layer of a width; keeps the rays that it was asked for."""
+    """The room with a surface layer of a given width; records the rays that it renders."""
 
     def __init__(self, width: float) -> None:
         self.width = torch.tensor(width)
@@ -163,7 +167,7 @@ class Recorder(Room):
         return super().render(rays)
 
 
-def test_a_ray_starts_further_out_towards_grazing_and_for_a_thicker_surface():
+def test_a_ray_starts_further_out_at_grazing_angles_and_for_thicker_layers():
     host, settings = Recorder(0.003), dataclasses.replace(tiny_config().inter_reflection, rays_per_point=1.0)
     normal = torch.tensor([[0.0, 0.0, 1.0]]).expand(200, 3)
     trace_light(host, torch.zeros(200, 3), normal, settings, 0.8)
@@ -172,8 +176,8 @@ def test_a_ray_starts_further_out_towards_grazing_and_for_a_thicker_surface():
 
 
 def test_no_ray_starts_further_out_than_the_published_bound():
-    """β = 0.03 asks for 0.14 of height: 0.73 at 79°. From 46° on the bound of 0.2 would start a ray within
-    the layer.
+    """β = 0.03 requires a height of 0.14, which is 0.73 along the ray at 79°. From 46° on, the bound of 0.2
+    would start a ray within the layer.
     """
     torch.manual_seed(0)
     host, settings = Recorder(0.03), dataclasses.replace(tiny_config().inter_reflection, rays_per_point=1.0)
@@ -186,7 +190,7 @@ def test_no_ray_starts_further_out_than_the_published_bound():
 
 
 def test_a_light_without_colour_is_compared_by_luminance():
-    """Red, green and blue of one luminance are all met by the grey light of that luminance."""
+    """Red, green and blue radiance of equal luminance agree with a grey light of that luminance."""
     config = tiny_config()
     model = sphere_model(
         dataclasses.replace(config, light=dataclasses.replace(config.light, monochrome=True))
@@ -242,7 +246,7 @@ def test_material_gradients_reach_the_geometry_by_their_scales():
     assert geometry_moves(0.0, 0.1)
 
 
-def test_a_batch_without_a_hit_trains_what_it_can():
+def test_a_batch_without_a_hit_trains_the_remaining_fields():
     model = sphere_model()
     batch = sphere_batch(spread=0.3)
     away = dataclasses.replace(batch, directions=-batch.directions)
@@ -262,7 +266,7 @@ def test_shading_has_two_parts():
 
 
 class HalfRoom(Room):
-    """The room, but only where z < 0 does a ray meet its wall."""
+    """The room, in which rays hit the wall only where z < 0."""
 
     def render(self, rays: RayBatch) -> SurfaceHits:
         hits = super().render(rays)
@@ -270,7 +274,7 @@ class HalfRoom(Room):
         return dataclasses.replace(hits, opacity=met, concentration=met)
 
 
-def test_hard_inter_reflection_asks_the_scene_first_and_the_light_for_the_rest():
+def test_hard_inter_reflection_uses_the_scene_for_hits_and_the_light_otherwise():
     config = tiny_config()
     hard = dataclasses.replace(config.inter_reflection, mode="hard", offset=1e-4)
     distant = MapLightConfig(kind="distant")
@@ -284,8 +288,10 @@ def test_hard_inter_reflection_asks_the_scene_first_and_the_light_for_the_rest()
     torch.testing.assert_close(arriving[~below], sky[~below])
 
 
-def test_an_sdf_host_sees_itself_by_its_grid():
-    """From a point on a sphere no direction meets it again; from between two plates every steep one does."""
+def test_an_sdf_host_traces_its_grid():
+    """From a point on a sphere no direction hits it again; from between two plates every steep direction hits
+    one.
+    """
     config = tiny_config()
     hard = dataclasses.replace(config.inter_reflection, mode="hard")
     config = dataclasses.replace(config, inter_reflection=hard)
@@ -299,13 +305,13 @@ def test_an_sdf_host_sees_itself_by_its_grid():
     assert not host.scene_light(on_sphere, up).hit.any()
     towards = host.scene_light(3.0 * out / 2, -up)
     assert towards.hit[0, 0]
-    # What it brings is what R sends from there.
+    # The radiance is that of R at the hit.
     hits = host.render(RayBatch(3.0 * out / 2, -out))
     torch.testing.assert_close(towards.radiance[0, 0], hits.color[0], atol=0.05, rtol=0.0)
     assert not towards.radiance.requires_grad
 
 
-def test_the_tracing_grid_is_renewed_as_the_geometry_moves_and_survives_a_checkpoint():
+def test_the_tracing_grid_is_sampled_again_and_is_in_checkpoints():
     config = tiny_config()
     hard = dataclasses.replace(config.inter_reflection, mode="hard")
     model = sphere_model(dataclasses.replace(config, inter_reflection=hard))
@@ -321,8 +327,8 @@ def test_the_tracing_grid_is_renewed_as_the_geometry_moves_and_survives_a_checkp
 
 @pytest.mark.parametrize("kind", ["free", "distant", "auto"])
 @pytest.mark.parametrize("sampler", ["fibonacci", "mis"])
-def test_every_light_goes_with_every_kind_of_sampling(kind, sampler):
-    """Under light of one radiance from everywhere, a surface shows the same by each."""
+def test_every_light_works_with_every_sampler(kind, sampler):
+    """Under light of equal radiance from all directions, all samplers give the same result."""
     config = tiny_config()
     off = dataclasses.replace(config.inter_reflection, mode="off")
     config = dataclasses.replace(
@@ -343,7 +349,7 @@ def test_every_light_goes_with_every_kind_of_sampling(kind, sampler):
     )
 
 
-def test_a_lamp_shines_where_nothing_stands_before_it():
+def test_a_lamp_lights_only_unoccluded_points():
     config = tiny_config()
     hard = dataclasses.replace(config.inter_reflection, mode="hard", offset=1e-4)
     light = MapLightConfig(kind="auto", environment_height=8)
@@ -353,18 +359,18 @@ def test_a_lamp_shines_where_nothing_stands_before_it():
     half = torch.full((2, 1), 0.5)
     material = Material(half.expand(2, 3), half, half)
     before = model.shade(x, up, up, material, 64)
-    # One lamp above, where there is nothing, and one below, beyond the wall at 2.
+    # One lamp above, which is not occluded, and one below, behind the wall at 2.
     model.lamps.place(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -2.5]]), torch.ones(2, 3))
     after = model.shade(x, up, up, material, 64)
     gained = (after.diffuse - before.diffuse)[:, 0]
-    # Towards a lamp at distance 1, straight above: (1 − m) b/π · I/d².
+    # A lamp at distance 1 in the direction of the normal: (1 − m) b/π · I/d².
     assert gained[0].item() == pytest.approx(0.25 / math.pi, rel=0.02)
     assert gained[1].item() == pytest.approx(0.0, abs=1e-6)
     seen = model.incident_light(x[:1], torch.tensor([[[0.0, 0.0, 1.0]]]))[0, 0]
     assert (seen > model.lamps.radiance()[0]).all()
 
 
-def test_l_ref_cannot_teach_a_map():
+def test_l_ref_cannot_train_a_map():
     config = tiny_config()
     config = dataclasses.replace(config, light=MapLightConfig(kind="distant"))
     with pytest.raises(UserError, match="soft inter-reflection"):

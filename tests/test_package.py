@@ -1,4 +1,4 @@
-"""What a package promises to who installs it: its public names, its types, its licence."""
+"""The interface of the installed package: its public names, its types, its licence."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ROOT = Path(__file__).parent.parent
 
 
 def test_dir_shows_the_public_names():
-    """Before any of them is loaded, so in a process of its own; and each name is there."""
+    """Before any of them is loaded, so in a separate process; and each name exists."""
     asks = "import sys, neilfpp_method as n; print(*dir(n)); sys.exit('torch' in sys.modules)"
     shown = subprocess.run(
         [sys.executable, "-c", asks], capture_output=True, text=True, timeout=60, check=True
@@ -23,7 +23,7 @@ def test_dir_shows_the_public_names():
     assert all(getattr(neilfpp_method, name) is not None for name in neilfpp_method.__all__)
 
 
-def test_a_run_says_what_it_holds():
+def test_the_docstring_of_a_run_lists_its_attributes():
     for name in Run.__dataclass_fields__:
         assert f"        {name}: " in (Run.__doc__ or "")
 

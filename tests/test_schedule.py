@@ -1,4 +1,4 @@
-"""The stage table (METHOD §4) and what follows from it."""
+"""The stage table (METHOD §4), and the losses and rates that follow from it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from neilfpp_method.settings.presets import PRESETS, preset
 from neilfpp_method.settings.types import OptimizerConfig, TrainConfig
 from neilfpp_method.structures import LossTerm
 
-# Table 1 of the paper, in its own words.
+# Table 1 of the paper.
 TABLE = {
     Stage.SDF_INIT: "volume eikonal hessian surface point_cloud",
     Stage.MATERIAL_INIT: "inter_reflection physical smoothness lambertian",
@@ -43,7 +43,7 @@ def test_the_joint_stage_lowers_hessian_and_surface():
     assert (first["surface"], last["surface"]) == (1e-3, 1e-4)
 
 
-def test_the_weight_of_the_hessian_grows_in_sdf_init_alone():
+def test_the_weight_of_the_hessian_grows_only_in_sdf_init():
     config = preset("fast")
     weights = [active_losses(Stage.SDF_INIT, config, share=share) for share in (0.0, 0.5, 1.0)]
     growth = config.loss.hessian_growth
@@ -58,7 +58,7 @@ def factors(config: OptimizerConfig, stage: Stage, steps: list[int], length: int
     return [rate_factor(config, StagePosition(stage, step, length)) for step in steps]
 
 
-def test_rates_fall_smoothly_or_in_drops():
+def test_rates_decrease_smoothly_or_in_drops():
     config = OptimizerConfig(joint=0.5, final=(0.01, 0.1, 0.01), drops=(0, 1, 2))
     assert factors(config, Stage.SDF_INIT, [0, 50, 100], 100) == pytest.approx([1.0, 0.1, 0.01])
     assert factors(config, Stage.MATERIAL_INIT, [0, 49, 50, 99, 100], 100) == pytest.approx(
@@ -105,7 +105,7 @@ def test_the_separate_pipeline_has_no_joint_stage():
     assert stage_at(5, config).stage is Stage.MATERIAL_INIT
 
 
-def test_weigh_adds_up_and_refuses_what_has_no_weight():
+def test_weigh_sums_terms_and_refuses_those_without_weight():
     terms = {"volume": LossTerm(torch.tensor([1.0, 3.0])), "eikonal": LossTerm(torch.tensor([10.0]))}
     total = weigh(terms, {"volume": 2.0, "eikonal": 0.1})
     assert total.loss.item() == pytest.approx(2.0 * 2.0 + 0.1 * 10.0)
@@ -137,7 +137,7 @@ def test_an_unknown_preset_is_named():
         preset("turbo")
 
 
-def test_the_surface_is_bound_to_become_thin_in_sdf_init_and_to_stay_so():
+def test_the_surface_width_is_bounded_from_sdf_init_on():
     fast = preset("fast").volume
     widths = [surface_width_limit(fast, StagePosition(Stage.SDF_INIT, k, 100)) for k in (0, 50, 99)]
     assert widths[0] == pytest.approx(fast.beta_init)

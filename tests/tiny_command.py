@@ -20,7 +20,7 @@ from tests.train.small_runs import small_config
 
 
 def record(folder: Path) -> None:
-    """Have the training loop write down what it computes."""
+    """Make the training loop write what it computes."""
     rank = os.environ.get("LOCAL_RANK", "0")
     norms, train = loop.gradient_norms, command.train
 

@@ -1,4 +1,6 @@
-"""Nerfstudio on a CPU, offline. None of this is needed where torchvision and tiny-cuda-nn run on a GPU."""
+"""Nerfstudio on a CPU without a network. None of this is needed if torchvision and tiny-cuda-nn run on a
+GPU.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ pytest.importorskip(
     "nerfstudio", reason="nerfstudio is not installed here: `make test-nerfstudio` has its own environment"
 )
 
-# torchvision's wheels are CUDA builds: beside a CPU torch two of its operators have no schema, and its import
+# torchvision's wheels are CUDA builds: with a CPU build of torch two operators have no schema, and its import
 # fails.
 OPERATORS = torch.library.Library("torchvision", "DEF")
 OPERATORS.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
@@ -23,7 +25,7 @@ from nerfstudio.fields import sdf_field  # noqa: E402
 
 
 class TorchEncoding(HashEncoding):
-    """The hash grid that nerfstudio's SDF field asks of tiny-cuda-nn, in plain torch."""
+    """The hash grid that nerfstudio's SDF field takes from tiny-cuda-nn, in plain torch."""
 
     def __init__(self, n_input_dims: int, encoding_config: dict) -> None:
         del n_input_dims
@@ -40,7 +42,7 @@ class TorchEncoding(HashEncoding):
 
 
 class NoLpips(torch.nn.Module):
-    """Nerfstudio's models build LPIPS, which downloads AlexNet; no test asks for its value."""
+    """Nerfstudio's models build LPIPS, which downloads AlexNet; no test uses its value."""
 
     def __init__(self, **_: object) -> None:
         super().__init__()

@@ -26,7 +26,7 @@ TRAIN, TEST = (0, 5, 10, 15, 20, 25, 30, 35), (4, 29)
 
 
 def reduced_tabletop(root: Path) -> Path:
-    """The package's table top in a fifth of its size: eight views to learn from and two to test on."""
+    """The demo table top at a fifth of its size: eight training views and two test views."""
     scene = json.loads((demo_scene() / "inputs" / "sfm_scene.json").read_text())
     tracks, files = scene["camera_track_map"]["images"], scene["image_path"]["file_paths"]
     kept = [str(i) for i in (*TRAIN, *TEST)]
@@ -46,8 +46,8 @@ def reduced_tabletop(root: Path) -> Path:
 
 
 def small_settings(**steps: int) -> NeilfConfig:
-    """The tiny settings with the light of the preset, solved for every third step; four steps a stage but for
-    `steps`.
+    """The tiny settings with the light of the preset, fitted at every third step, and four steps per stage
+    unless `steps` changes it.
     """
     config, usual = small_config(**steps), preset("fast")
     fit = LightFitConfig(points=48, every=3, steps=5)
@@ -62,7 +62,7 @@ def small_settings(**steps: int) -> NeilfConfig:
 def trainer_config(
     data: Path, out: Path, settings: NeilfConfig, host: str | None = None, method: str = "neilfpp"
 ) -> TrainerConfig:
-    """What `ns-train neilfpp --data … --pipeline.model.host …` parses to."""
+    """The configuration that `ns-train neilfpp --data … --pipeline.model.host …` is parsed to."""
     config = copy.deepcopy(all_methods[method])
     model, pixels = config.pipeline.model, config.pipeline.datamanager
     model.neilf, model.host = settings, host
@@ -74,20 +74,20 @@ def trainer_config(
 
 
 def ns_train(config: TrainerConfig) -> Path:
-    """Train in this process; the folder of the run."""
+    """Train in this process; returns the folder of the run."""
     config.viewer.quit_on_train_completion = True
     train.main(config)
     return config.get_base_dir()
 
 
 def checkpoint(run: Path) -> dict:
-    """The last checkpoint of a run, which holds nothing but tensors and plain values."""
+    """The last checkpoint of a run, which contains only tensors and plain values."""
     path = sorted((run / "nerfstudio_models").glob("*.ckpt"))[-1]
     return torch.load(path, map_location="cpu", weights_only=True)
 
 
 def weights(run: Path) -> dict[str, Any]:
-    """The state of a run by its names in `NeilfModel`."""
+    """The state of a run with the names of `NeilfModel`."""
     prefix = "_model.neilf."
     return {
         key.removeprefix(prefix): t

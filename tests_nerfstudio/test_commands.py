@@ -1,4 +1,4 @@
-"""The plugin among nerfstudio's commands: it is listed, and where it is broken nothing else is."""
+"""The plugin among nerfstudio's commands: it is listed, and if it is broken, the other methods still work."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_the_methods_and_the_dataparser_are_found() -> None:
     assert set(method_configs) <= set(all_methods), "nerfstudio's own methods are all there"
 
 
-def test_every_entry_point_of_the_package_leads_somewhere() -> None:
+def test_every_entry_point_of_the_package_exists() -> None:
     for group, known in (
         ("nerfstudio.method_configs", all_methods),
         ("nerfstudio.dataparser_configs", all_dataparsers),
@@ -50,8 +50,8 @@ def test_the_command_line_reaches_the_settings() -> None:
 
 
 @pytest.mark.parametrize("dependency", ["OpenEXR", "nerfstudio"])
-def test_a_broken_dependency_raises_nowhere(dependency: str) -> None:
-    # A module that is None in sys.modules cannot be imported: as if it were missing or broken.
+def test_a_broken_dependency_raises_no_error(dependency: str) -> None:
+    # A module that is None in sys.modules cannot be imported, as if it were missing.
     code = (
         f"import sys, tests_nerfstudio.conftest; sys.modules['{dependency}'] = None\n"
         "from importlib.metadata import entry_points\n"

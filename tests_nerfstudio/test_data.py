@@ -1,6 +1,4 @@
-"""What nerfstudio is given of a capture: the same rays and the same pixels that the standalone loop learns
-from.
-"""
+"""The data that nerfstudio gets from a capture: the same rays and pixels as in the standalone loop."""
 
 from __future__ import annotations
 
@@ -60,7 +58,7 @@ def test_rays_of_nerfstudio_are_the_rays_of_the_capture(root: Path) -> None:
             torch.testing.assert_close(theirs.directions, ours.directions, atol=1e-5, rtol=0)
 
 
-def test_the_transform_leads_from_the_world_to_the_scene(root: Path) -> None:
+def test_the_transform_maps_the_world_to_the_scene(root: Path) -> None:
     outputs = parsed(root)
     point = np.array([1.0, 2.0, 3.0])
     transform = outputs.dataparser_transform.double().numpy()
@@ -68,7 +66,7 @@ def test_the_transform_leads_from_the_world_to_the_scene(root: Path) -> None:
     np.testing.assert_allclose(moved, (point - CENTRE) / SCALE, atol=1e-6)
 
 
-def test_each_drawn_pixel_brings_its_color_and_its_facts(root: Path) -> None:
+def test_each_drawn_pixel_has_its_color_and_loss_inputs(root: Path) -> None:
     manager = CaptureDataManagerConfig(
         dataparser=CaptureParserConfig(data=root), train_num_rays_per_batch=400
     ).setup()
@@ -86,7 +84,7 @@ def test_each_drawn_pixel_brings_its_color_and_its_facts(root: Path) -> None:
     assert 0.0 < drawn.mask.mean() < 1.0, "pixels off the object are drawn too"
 
 
-def test_a_step_learns_from_the_pixels_of_the_same_step_of_the_standalone_loop(root: Path) -> None:
+def test_a_step_uses_the_pixels_of_the_same_step_of_the_standalone_loop(root: Path) -> None:
     manager = CaptureDataManagerConfig(
         dataparser=CaptureParserConfig(data=root), train_num_rays_per_batch=64
     ).setup()
@@ -103,7 +101,7 @@ def test_a_step_learns_from_the_pixels_of_the_same_step_of_the_standalone_loop(r
         assert torch.equal(drawn.directions, expected.directions)
 
 
-def test_pixels_that_are_marked_as_invalid_are_not_drawn(tmp_path: Path) -> None:
+def test_invalid_pixels_are_not_drawn(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path, background=0.3))
     valid = np.full((HEIGHT, WIDTH), 255, np.uint8)
     valid[:, :9] = 0
@@ -122,14 +120,14 @@ def test_pixels_that_are_marked_as_invalid_are_not_drawn(tmp_path: Path) -> None
         assert (batch["indices"][:, 2] >= 9).all()
 
 
-def test_object_mask_and_validity_are_not_taken_for_one_another(tmp_path: Path) -> None:
+def test_object_mask_and_validity_are_separate(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path, background=0.3))
     rows, columns = np.indices((HEIGHT, WIDTH))
     facts = {"mask": rows < 6, "valid": columns < 9}
     for name, values in facts.items():
         write_png(tmp_path / f"{name}.png", np.where(values, 255, 0).astype(np.uint8))
     paths = {name: tmp_path / f"{name}.png" for name in facts}
-    # The last view has no mask: nothing is known of its object.
+    # The last view has no mask, so its object is unknown.
     views = [dataclasses.replace(view, **paths) for view in capture.views]
     views[-1] = dataclasses.replace(views[-1], mask=None)
     write_capture(tmp_path, dataclasses.replace(capture, views=tuple(views)), response="linear", test=())
@@ -143,7 +141,7 @@ def test_object_mask_and_validity_are_not_taken_for_one_another(tmp_path: Path) 
         assert np.array_equal(item["valid"][..., 0].numpy(), facts["valid"])
 
 
-def test_another_dataparser_serves_as_well(root: Path) -> None:
+def test_another_dataparser_works(root: Path) -> None:
     outputs = parsed(root)
     other = PixelDataset(capture := capture_of(as_another_dataparser(outputs)), capture.views)
     ours = PixelDataset(load_capture(root), load_capture(root).train_views)
@@ -162,7 +160,7 @@ LENSES = {
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_lenses_bend_rays_alike(tmp_path: Path, model: str) -> None:
+def test_lenses_give_the_same_rays(tmp_path: Path, model: str) -> None:
     plain = load_capture(make_capture(tmp_path))
     lens = Lens(model, LENSES[model])
     views = tuple(
@@ -182,7 +180,7 @@ def test_lenses_bend_rays_alike(tmp_path: Path, model: str) -> None:
 @pytest.mark.parametrize(
     ("model", "words"), [("FOV", "no lens FOV"), ("THIN_PRISM_FISHEYE", "no lens THIN_PRISM")]
 )
-def test_lenses_that_nerfstudio_has_not_are_refused(tmp_path: Path, model: str, words: str) -> None:
+def test_lenses_that_nerfstudio_lacks_are_refused(tmp_path: Path, model: str, words: str) -> None:
     plain = load_capture(make_capture(tmp_path))
     lens = Lens(model, (0.5,) if model == "FOV" else (0.01,) * 8)
     views = tuple(
@@ -216,12 +214,12 @@ def test_other_layouts_are_read_and_a_format_can_be_forced(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
-def test_what_nerfstudio_makes_of_a_colmap_model_is_read(tmp_path: Path, model: str) -> None:
+def test_a_colmap_model_converted_by_nerfstudio_is_read(tmp_path: Path, model: str) -> None:
     write_model(material(tmp_path), reconstruction(colmap_camera(model)))
     colmap_to_json(tmp_path / "sparse" / "0", tmp_path)
     first, theirs = load_capture(tmp_path, "colmap"), load_capture(tmp_path, "transforms")
     applied = np.array(json.loads((tmp_path / "transforms.json").read_text())["applied_transform"])
-    assert not np.allclose(applied, np.eye(4)[:3])  # they turn the world
+    assert not np.allclose(applied, np.eye(4)[:3])  # the world is rotated
     points = torch.from_numpy(POINTS)
     turned = points @ torch.from_numpy(applied[:, :3]).T + torch.from_numpy(applied[:, 3])
     assert [view.name for view in theirs.views] == [view.name for view in first.views]
@@ -229,13 +227,13 @@ def test_what_nerfstudio_makes_of_a_colmap_model_is_read(tmp_path: Path, model: 
         torch.testing.assert_close(
             project(new.camera, turned).pixel, project(old.camera, points).pixel, atol=1e-4, rtol=0
         )
-    assert theirs.scene_from == "points"  # those of their sparse_pc.ply, in the turned frame
+    assert theirs.scene_from == "points"  # from sparse_pc.ply, in the rotated frame
     np.testing.assert_allclose(
         theirs.normalisation.centre, applied[:, :3] @ first.normalisation.centre, atol=0.1
     )
 
 
-def test_nerfstudio_reads_what_is_written_for_it(tmp_path: Path) -> None:
+def test_nerfstudio_reads_the_exported_capture(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path / "in", hdr=False, masks=True))
     config = NerfstudioDataParserConfig(
         data=write_transforms(capture, tmp_path / "out"),
@@ -254,12 +252,12 @@ def test_nerfstudio_reads_what_is_written_for_it(tmp_path: Path) -> None:
             torch.testing.assert_close(theirs.directions, ours.directions, atol=1e-5, rtol=0)
 
 
-def test_views_are_not_rescaled_in_silence(root: Path) -> None:
+def test_rescaled_views_are_refused(root: Path) -> None:
     with pytest.raises(UserError, match="scale the capture"):
         CaptureDataset(parsed(root), scale_factor=0.5)
 
 
-def test_without_test_views_nerfstudio_still_has_one_to_show(tmp_path: Path) -> None:
+def test_without_test_views_nerfstudio_gets_a_training_view(tmp_path: Path) -> None:
     outputs = (
         CaptureParserConfig(data=make_capture(tmp_path, test=None), test_every=0)
         .setup()

@@ -1,4 +1,4 @@
-"""Nerfstudio's models as hosts: one whose every output is known, and the real NeuS and nerfacto."""
+"""Nerfstudio's models as hosts: a model whose outputs are known, and the real NeuS and nerfacto."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests_nerfstudio.runs import checkpoint, ns_train, small_settings, trainer_
 
 @pytest.fixture(autouse=True)
 def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Looks of a few rays: NeuS takes half a minute for 512 on a busy core."""
+    """Measurements with few rays: NeuS takes half a minute for 512 rays on a busy core."""
     monkeypatch.setattr(proxy, "ROUNDS", 1)
     monkeypatch.setattr(proxy, "ROUND", 16)
     monkeypatch.setattr(plugin_model, "CHECKED_PIXELS", 16)
@@ -42,7 +42,7 @@ DRAWN = 0.5
 
 
 class Ball(Model):
-    """A ball about CENTRE that draws its normals and one grey; what misses it has no weight."""
+    """A ball around CENTRE with normals and a single grey value; a ray that misses it has no weight."""
 
     def populate_modules(self) -> None:
         self.grey = nn.Parameter(torch.tensor(DRAWN))
@@ -67,7 +67,9 @@ class Ball(Model):
 
 
 class ColorCodedBall(Ball):
-    """As nerfacto has it: normals as colours, and a depth without gradient beside the expected one."""
+    """Outputs like those of nerfacto: normals as colours, and a depth without gradient in addition to the
+    expected depth.
+    """
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, torch.Tensor]:
         outputs = super().get_outputs(ray_bundle)
@@ -81,7 +83,7 @@ def ball(kind: type[Model] = Ball) -> Model:
 
 
 def rays() -> RayBatch:
-    """Towards the scene's origin, from three sides, and one past everything."""
+    """Rays towards the scene's origin from three sides, and one that misses everything."""
     origins = torch.tensor([[0.0, 0.0, 3.0], [2.0, 1.0, 0.5], [-1.0, 2.0, -2.0], [0.0, 0.0, 3.0]])
     targets = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.1, 0.1], [0.2, 0.0, 0.0], [9.0, 0.0, 3.0]])
     return RayBatch(origins, normalize(targets - origins, dim=-1))
@@ -104,14 +106,14 @@ def test_hits_are_in_the_scene_frame(kind: type[Model]) -> None:
     assert hits.is_hit(0.8).tolist() == [True, True, True, False]
 
 
-def test_what_is_drawn_becomes_linear_radiance() -> None:
+def test_rendered_colors_become_linear_radiance() -> None:
     # sRGB 0.5 is ((0.5 + 0.055) / 1.055) ** 2.4 = 0.2140 linear.
     assert NerfstudioHost(ball()).render(rays()).color[0, 0].item() == pytest.approx(0.2140, abs=1e-4)
     linear = NerfstudioHost(ball(), response="linear", radiance_scale=4.0)
     assert linear.render(rays()).color[0, 0].item() == pytest.approx(2.0)
 
 
-def test_a_gradient_reaches_the_model_but_not_what_it_never_trains() -> None:
+def test_gradients_reach_only_the_trained_parameters() -> None:
     host = NerfstudioHost(ball())
     host.render(rays()).color.sum().backward()
     assert host.model.grey.grad.abs() > 0
@@ -148,7 +150,7 @@ ARGUMENTS = {
 }
 
 
-def test_neus_starts_as_a_sphere_and_the_host_sees_it() -> None:
+def test_the_initial_sphere_of_neus_is_rendered() -> None:
     torch.manual_seed(0)
     host = NerfstudioHost(build_foreign("neus", ARGUMENTS).model).eval()
     hits = host.render(
@@ -162,7 +164,7 @@ def test_neus_starts_as_a_sphere_and_the_host_sees_it() -> None:
 
 
 @pytest.mark.parametrize(("name", "own"), [("neus", "eikonal"), ("nerfacto", "interlevel")])
-def test_a_host_asks_its_own_losses_of_itself_where_a_gradient_flows(name: str, own: str) -> None:
+def test_own_losses_are_computed_if_the_host_is_trained(name: str, own: str) -> None:
     torch.manual_seed(0)
     host = NerfstudioHost(build_foreign(name, ARGUMENTS).model, own_losses=True).train()
     batch = sphere_batch(8)
@@ -216,7 +218,7 @@ def test_the_stages_run_on_a_method_of_nerfstudio(name: str, tmp_path: Path) -> 
         return any(not torch.equal(before[key], after[key]) for key in before if key.startswith(prefix))
 
     first, second, third = ends
-    # Material init leaves the host where SDF init brought it; the joint stage moves both.
+    # Material init does not change the host; the joint stage trains both.
     assert not moved(first, second, "host.inner.model.field")
     assert moved(first, second, "brdf.")
     assert moved(first, second, "light.log_radiance"), "a map is solved for, as on our own hosts"
@@ -230,9 +232,7 @@ def test_the_stages_run_on_a_method_of_nerfstudio(name: str, tmp_path: Path) -> 
     assert kept["_model.proxy._extra_state"]["steps"] == 7
 
 
-def test_a_foreign_host_says_what_traces_its_rays_and_where_neilfpp_cannot_follow(
-    tmp_path: Path, capsys
-) -> None:
+def test_a_foreign_host_logs_the_proxy_and_unsupported_commands(tmp_path: Path, capsys) -> None:
     settings = small_settings(sdf_steps=1, material_steps=1, joint_steps=0)
     data = make_capture(tmp_path / "capture", size=(8, 6), test=(0, 1))
     run = ns_train(trainer_config(data, tmp_path / "run", settings, host="neus"))

@@ -1,4 +1,6 @@
-"""What `ns-train neilfpp` keeps beside its `config.yml`, and what this package's own commands make of it."""
+"""The run folder that `ns-train neilfpp` writes beside its `config.yml`, and this package's commands on
+it.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,7 @@ def test_the_run_folder_holds_the_weights_of_the_checkpoint(run: Path) -> None:
     assert differences(weights(run), dict(loaded.model.state_dict())) == []
 
 
-def test_the_commands_take_the_configuration_for_the_run(run: Path) -> None:
+def test_the_commands_accept_the_configuration(run: Path) -> None:
     config = str(run / "config.yml")
     assert main(["export", config, "--what", "mesh", "--resolution", "32"]) == 0
     assert main(["eval", config]) == 0
@@ -48,9 +50,7 @@ def test_a_configuration_without_a_run_folder_is_refused(tmp_path: Path, capsys)
     assert "no run folder neilfpp/ beside it" in capsys.readouterr().err
 
 
-def test_a_training_that_was_begun_in_nerfstudio_is_continued_outside(
-    data: Path, run: Path, tmp_path: Path
-) -> None:
+def test_a_training_begun_in_nerfstudio_is_continued_outside(data: Path, run: Path, tmp_path: Path) -> None:
     config = trainer_config(data, tmp_path, small_settings())
     config.max_num_iterations = 6
     first = ns_train(config) / "neilfpp"
@@ -60,14 +60,14 @@ def test_a_training_that_was_begun_in_nerfstudio_is_continued_outside(
     assert differences(weights(run), continued) == []
 
 
-def test_health_is_looked_at(run: Path) -> None:
+def test_health_is_checked(run: Path) -> None:
     for folder in (run, run / "neilfpp"):
         findings = read_findings(folder)
         assert findings is not None
         assert verdict_of(findings) in ("sound", "doubtful", "failed")
 
 
-def test_a_step_that_is_not_finite_is_left_out(data: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+def test_a_step_that_is_not_finite_is_skipped(data: Path, tmp_path: Path, capsys, monkeypatch) -> None:
     losses = NeilfMethod.get_loss_dict
 
     def spoilt(self: NeilfMethod, *arguments: object) -> dict[str, torch.Tensor]:

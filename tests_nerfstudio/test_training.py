@@ -1,4 +1,4 @@
-"""`ns-train neilfpp` through all three stages, and every command that follows it, on a reduced table top."""
+"""`ns-train neilfpp` through all three stages, and the commands that follow it, on a reduced table top."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from tests_nerfstudio.runs import (
     with_steps,
 )
 
-# Which part of the model each field of the loss table is.
+# The part of the model for each field of the loss table.
 FIELDS = {
     "geometry": "host.sdf_field.",
     "beta": "host.density.",
@@ -49,7 +49,7 @@ FIELDS = {
     "light": "light.",
 }
 SETTINGS = small_settings()
-# L_ref with a gradient for R: in material init R stays all the same.
+# L_ref with a gradient into R, which nevertheless is not trained in material init.
 L_REF = dataclasses.replace(SETTINGS.inter_reflection, radiance_gradient=1.0, rays_per_point=4.0)
 FREE = free_light(dataclasses.replace(SETTINGS, inter_reflection=L_REF))
 
@@ -74,7 +74,7 @@ def train_for(data: Path, out: Path, iterations: int, settings: NeilfConfig = SE
 
 
 @pytest.mark.parametrize("settings", [SETTINGS, FREE], ids=["solved light", "free light"])
-def test_each_stage_moves_its_fields_and_no_others(data: Path, tmp_path: Path, settings: NeilfConfig) -> None:
+def test_each_stage_trains_only_its_fields(data: Path, tmp_path: Path, settings: NeilfConfig) -> None:
     ends = [weights(train_for(data, tmp_path / str(n), n, settings)) for n in (1, 4, 8, 12)]
     # The first is one step into SDF init; the others are the ends of the stages.
     for stage, before, after in zip(Stage, ends, ends[1:], strict=False):
@@ -87,14 +87,14 @@ def test_each_stage_moves_its_fields_and_no_others(data: Path, tmp_path: Path, s
 
 
 @pytest.mark.parametrize("kind", ["auto", "distant_near"])
-def test_a_run_that_is_resumed_ends_as_one_that_was_not(data: Path, tmp_path: Path, kind: str) -> None:
+def test_a_resumed_run_ends_like_an_uninterrupted_one(data: Path, tmp_path: Path, kind: str) -> None:
     settings = dataclasses.replace(SETTINGS, light=dataclasses.replace(SETTINGS.light, kind=kind))
     whole = ns_train(trainer_config(data, tmp_path / "whole", settings))
-    # The light is solved for at steps 4, 7 and 10: what it is to be solved from next is half there.
+    # The light is fitted at steps 4, 7 and 10; the memory for the next fit is half full here.
     first = train_for(data, tmp_path / "first", 6, settings)
     config = trainer_config(data, tmp_path / "second", settings)
     config.load_dir = first / "nerfstudio_models"
-    # Nerfstudio would run as many iterations again; the stages end where they end.
+    # Nerfstudio would run the same number of iterations again; training must end with the last stage.
     second = ns_train(config)
     assert differences(checkpoint(whole)["pipeline"], checkpoint(second)["pipeline"]) == []
     assert differences(checkpoint(whole)["optimizers"], checkpoint(second)["optimizers"]) == []
@@ -104,7 +104,7 @@ def test_a_run_that_is_resumed_ends_as_one_that_was_not(data: Path, tmp_path: Pa
         assert before["lamps._extra_state"]["lit"] > 0, "there were lamps to be saved"
 
 
-def test_a_map_that_is_known_is_shown_once_and_then_part_of_the_run(data: Path, tmp_path: Path) -> None:
+def test_a_known_map_is_read_once_and_then_part_of_the_run(data: Path, tmp_path: Path) -> None:
     file, radiance = (
         tmp_path / "map.exr",
         np.random.default_rng(0).uniform(0.5, 2.0, (6, 12, 3)).astype(np.float32),
@@ -144,12 +144,12 @@ def test_the_same_scene_seed_and_steps_give_the_same_quality_in_both_loops(
     own = evaluate(Run(tmp_path, settings, capture, standalone.model.facts, standalone.model.eval(), steps))
     for theirs, ours in {"psnr": "pbr_psnr", "volume_psnr": "volume_psnr"}.items():
         assert own[ours] > 10.0, "something was learnt, or there is nothing to compare"
-        # The weights are the same; the rays that nerfstudio evaluates with are so but for rounding.
+        # The weights are the same; the rays of nerfstudio's evaluation differ only by rounding.
         assert ns[theirs] == pytest.approx(own[ours], abs=0.05), theirs
 
 
 @pytest.mark.parametrize(("settings", "descends"), [(SETTINGS, {"brdf"}), (FREE, {"brdf", "light"})])
-def test_on_a_given_mesh_material_and_light_alone_are_trained(
+def test_on_a_given_mesh_only_material_and_light_are_trained(
     tmp_path: Path, settings: NeilfConfig, descends: set[str]
 ) -> None:
     tiny = fixed_geometry(settings)
@@ -211,7 +211,7 @@ def test_ns_render_writes_material_maps_as_raw_floats(run: Path, tmp_path: Path)
     assert (tmp_path / "test" / "base_color").is_dir()
 
 
-def test_before_there_is_a_material_none_is_shown(data: Path, tmp_path: Path) -> None:
+def test_before_the_material_stage_no_material_is_shown(data: Path, tmp_path: Path) -> None:
     run = train_for(data, tmp_path, 3)
     _, pipeline, _, _ = eval_setup(run / "config.yml")
     camera, _ = pipeline.datamanager.next_eval_image(0)
@@ -221,7 +221,7 @@ def test_before_there_is_a_material_none_is_shown(data: Path, tmp_path: Path) ->
         assert not outputs[name].any()
 
 
-def test_figures_count_the_pixels_of_the_object_that_are_valid(run: Path) -> None:
+def test_figures_count_valid_pixels_of_the_object(run: Path) -> None:
     _, pipeline, _, _ = eval_setup(run / "config.yml")
     model = pipeline.model
     image = torch.full((12, 12, 3), 0.5)
@@ -257,5 +257,5 @@ def test_light_on_a_wall_is_its_irradiance_over_pi(run: Path, monkeypatch) -> No
     one, three = torch.ones(1, 1), torch.ones(1, 3)
     maps = Maps(three, three, three, three, three, one, one, up, one, one)
     light = model._incident_light(RayBatch(2.0 * up, -up), maps)
-    # ∫ cos θ · cos θ dω over the hemisphere is 2π/3; a lattice of 8 directions comes near.
+    # ∫ cos θ · cos θ dω over the hemisphere is 2π/3; a lattice of 8 directions is close to it.
     torch.testing.assert_close(light, torch.full((1, 3), 2.0 / 3.0), atol=0.05, rtol=0)

@@ -1,4 +1,4 @@
-"""`ns-viewer` shows a picture of the scene to whoever connects."""
+"""`ns-viewer` sends images of the scene to its clients."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def free_port() -> int:
 
 @contextmanager
 def ns_viewer(config: Path, port: int) -> Iterator[None]:
-    """The command in a process of its own: it never ends by itself."""
+    """The command in a separate process; it does not end by itself."""
     code = "import tests_nerfstudio.conftest; from nerfstudio.scripts.viewer import run_viewer"
     code += "; run_viewer.entrypoint()"
     options = [
@@ -64,10 +64,10 @@ def test_a_frame_arrives(tmp_path: Path) -> None:
 
 
 def first_frame(port: int, patience: float = 120.0) -> bytes:
-    """The first picture that the server sends to somebody who moves about.
+    """The first image that the server sends to a client whose camera moves.
 
-    Nerfstudio hears of a client by its first camera, and only then listens to its cameras: one that stood
-    still might have been seen too early.
+    Nerfstudio registers a client by its first camera and only then listens to its cameras, so a camera that
+    does not move may be sent too early.
     """
     end = time.monotonic() + patience
     while True:
@@ -87,7 +87,7 @@ def first_frame(port: int, patience: float = 120.0) -> bytes:
 
 
 def camera(z: float) -> bytes:
-    """What a client says of its camera."""
+    """The camera message of a client."""
     message = ViewerCameraMessage(
         (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, z), 0.8, 1.0, (0.0, 0.0, 0.0), (0.0, -1.0, 0.0)
     )
@@ -95,7 +95,7 @@ def camera(z: float) -> bytes:
 
 
 def heard_within(server: ClientConnection, seconds: float) -> Iterator[dict]:
-    """All messages of the next while."""
+    """All messages within the next seconds."""
     end = time.monotonic() + seconds
     with suppress(TimeoutError):
         while (left := end - time.monotonic()) > 0:

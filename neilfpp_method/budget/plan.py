@@ -33,7 +33,7 @@ MIN_SHARE = 0.1
 200 steps and fits the light once; fewer give no recognisable result.
 """
 MAX_SHARE = 8.0
-"""Largest share of the steps of the settings. More steps were never tried."""
+"""Largest share of the steps of the settings. The effect of more steps was not measured."""
 TRUSTED_STEPS = 40
 """Weight of the trial's measurement in the mean time of a step, in steps of the run."""
 SPARE = 1.15

@@ -56,9 +56,10 @@ def terminal() -> Console:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
-    """A progress bar of the share done. Once the pace is known, it prints how long the whole work takes.
+    """A progress bar; yields a function that takes the share of the work that is done, from 0 to 1.
 
-    If the work fails, the bar is removed: the error is then all that the command prints.
+    When the total time can be estimated and is long, it is printed once. If the work fails, the bar is
+    removed, so that the command prints only the error.
     """
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -87,9 +88,9 @@ def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
 
 @dataclass
 class _Pace:
-    """Estimates once how long work takes that began at the time `began`.
+    """Estimates once the total time of work that began at the time `began`.
 
-    The first share is not counted, because loading and compiling go before it.
+    The time up to the first share is not extrapolated, because it contains loading and compiling.
     """
 
     began: float

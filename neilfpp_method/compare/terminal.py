@@ -13,7 +13,7 @@ from neilfpp_method.compare.write import Comparison
 __all__ = ["tables_of"]
 
 ARROWS = {"higher": " ↑", "lower": " ↓", "neither": ""}
-"""Suffix of a row's title that tells which way is better."""
+"""Suffix of a row's title, which shows whether higher or lower values are better."""
 MARK = " *"
 """Suffix of a figure that cannot be compared with the others."""
 TITLE_WIDTH = 32

@@ -20,16 +20,16 @@ class Effect:
     Attributes:
         name: name on the command line and in `effects.json`.
         title: description for the report.
-        is_on: whether given settings simulate the effect or leave it to evidence.
+        is_on: function of the settings: whether they simulate the effect or leave it to evidence.
         on: the settings that switch it on.
         off: the settings that switch it off.
-        obstacle: why it cannot be switched with given settings; empty if it can.
-        cost: what it costs while material is trained.
-        risk: what goes wrong if it is left out although the scene has it.
-        not_measured: why no evidence is collected with given settings; empty if it is.
-        advised: whether evidence is shown but never changes the effect, because it cannot show reliably that
-            the effect is not needed.
-        needs: the effect without which this one does not exist; empty if there is none.
+        obstacle: function of the settings: the reason why the effect cannot be switched; empty if it can.
+        cost: function of the settings: the additional computation while material is trained.
+        risk: the error of the result if the effect is left out although the scene has it.
+        not_measured: function of the settings: the reason why no evidence is collected; empty if it is.
+        advised: whether evidence is reported but never changes the effect, because it cannot show reliably
+            that the effect is not needed.
+        needs: name of the effect that this one requires; empty if it requires none.
         solved: whether the light solver decides the effect at every fit, so that evidence changes no
             setting.
     """

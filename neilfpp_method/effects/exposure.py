@@ -1,8 +1,8 @@
 """Evidence for unequal exposure or white balance of the photographs.
 
-The points of the capture's point cloud are looked up in every photograph that faces them. The model is that
-a point has a colour, and a photograph a gain per channel. Absolute rather than squared errors are minimised,
-so that a view in which the point is occluded or has a highlight has little influence.
+The points of the capture's point cloud are looked up in every photograph that faces them. In the model each
+point has one colour, and each photograph one gain per channel. Absolute rather than squared errors are
+minimised, so that a view in which the point is occluded or has a highlight has little influence.
 
 Reflections can look like exposure: a table that mirrors a window in some photographs is brighter there at
 all of its points. But a gain belongs to the photograph, whereas such a reflection depends on the orientation

@@ -2,10 +2,10 @@
 
 Training alternates between light and material. If it starts from a uniform grey material under an even
 light, it often converges to a wrong solution: the initial material has no sharp highlights, so the first
-fitted light is blurred, and under a blurred light the surfaces learn to be rough and dark. At a thousand
-places all values can be tried instead: each roughness and metallic of a grid at each place, and several
-values of the scale that the images leave open between light and base colour. Held-back views select the
-scale.
+fitted light is blurred, and under a blurred light the surfaces learn to be rough and dark. For only a
+thousand places it is possible to try all values instead: every roughness and metallic of a grid at each
+place, and several values of the scale factor between light and base colour, which the images do not
+determine. Held-back views select the scale.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ MIN_PLACES = 100
 FOLDS = 5
 """One in this many views is held back."""
 SCALES = (0.1, 0.15, 0.22, 0.33, 0.5, 0.7)
-"""Geometric means of the base colour that are tried: about those of charcoal to snow."""
+"""Geometric means of the base colour that are tried, from about that of charcoal to about that of snow."""
 FIRST_SCALE = 0.33
 """The scale that is fitted first, from an even light; every other fit starts from that of the nearest scale.
 """
@@ -51,9 +51,13 @@ CARRIED_ROUNDS = 2
 
 
 LOBE_FITS = 3.6
-"""Fits to all pixels that take as long as evidence for the lobe: eight shorter ones to three quarters."""
+"""Time of the evidence for the lobe in units of a fit to all pixels: four pairs of fits to three quarters of
+them, each with half the usual number of rounds.
+"""
 METAL_FITS = 3.8
-"""Fits to all pixels that take as long as evidence for metals: eight shorter ones to four fifths."""
+"""Time of the evidence for metals in units of a fit to all pixels: four pairs of fits to four fifths of them,
+each with half the usual number of rounds.
+"""
 MEASURED = 2000
 """Pixels of the products from which `seconds_of_pixel` is estimated."""
 REST = 0.3
@@ -144,16 +148,16 @@ def find_first_light(places: Places, transport: Transport, typical: float, metal
 
 
 def seconds_of_pixel(device: torch.device, with_lobe: bool, with_metals: bool) -> float:
-    """Estimate how long the search takes here for each pixel that places have.
+    """Estimate the time of `find_first_light` on this machine per pixel of the places, in seconds.
 
     Args:
-        device: where it is done.
-        with_lobe: whether evidence for the lobe of highlights is measured, too.
-        with_metals: whether evidence for metals is measured, too.
+        device: device of the computation.
+        with_lobe: whether to include the time of evidence for the lobe of highlights.
+        with_metals: whether to include the time of evidence for metals.
     """
     whole = FIRST_STEPS + (ROUNDS - 1) * STEPS
     carried = CARRIED_ROUNDS * STEPS
-    # The scales, the two fits with and without lamps, and the final one to all views.
+    # One fit per scale, two fits with and without lamps, and the final fit to all views.
     steps = (1 - 1 / FOLDS) * (whole + (len(SCALES) + 1) * carried) + carried
     steps += (LOBE_FITS * with_lobe + METAL_FITS * with_metals) * whole
     return (1 + REST) * steps * seconds_of_step(MEASURED, device) / MEASURED

@@ -1,9 +1,9 @@
 """Evidence for the lamps of an initial light, from held-back views of surface places.
 
-The light solver looks for lamps among points of one view each. A lamp that compensates for the painted
-colours of a region also explains held-back points of that region. But lamps are also mirrored, and a mirror
-image moves from view to view. So the base colours of all places are fitted again beside the lamps, and the
-fits with and without lamps are compared in held-back views.
+The light solver looks for lamps at points of which each has a single view. A lamp that compensates for the
+painted colours of a region also explains held-back points of that region. Glossy surfaces, however, also
+reflect a lamp as a highlight, which moves from view to view. The base colours of all places are therefore
+fitted again together with the lamps, and the fits with and without lamps are compared in held-back views.
 """
 
 from __future__ import annotations

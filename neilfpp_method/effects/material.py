@@ -1,8 +1,8 @@
 """Evidence for specular reflection, varying roughness, an environment map and its colours.
 
 Places that many views show are fitted with all of these effects and without each of them. The fits use most
-of the views and are compared at pixels of the held-back views. Lamps are not part of the fits, and metals are
-if the model has them (`effects.metals` decides).
+of the views and are compared at pixels of the held-back views. The fits have no lamps; they have metals if
+the model has them (`effects.metals` decides).
 
 The base colour of every place is free. A place without specular reflection therefore contains no information
 about the light, and the benefit of an environment map and of its colours is underestimated.
@@ -56,8 +56,8 @@ CARRIED_ROUNDS = 2
 effects. The other fits do not: the light of that fit is too good for surfaces without reflection.
 """
 FITS = 14
-"""Number of fits of this size to which the measurements at places before one stage amount (estimate): 8 fits,
-6 that take a quarter of the time, and the noise of lobe sampling.
+"""Time of all measurements at places before one stage, in units of the time of one fit of this size
+(estimate): 8 fits, 6 that take a quarter of the time, and the noise of lobe sampling.
 """
 REST = 0.5
 """Time of all work other than descent, as a share of that of descent (estimate)."""

@@ -1,12 +1,13 @@
-"""Evidence for metals, from the places of the initial light: many places tell what few leave open.
+"""Evidence for metals, measured at the places of the initial light, which are numerous enough to decide.
 
-A dark glossy paint under a bright light explains one view of a metal. The change of a place from view to view
-tells them apart, so places are fitted to most views with metals and without, and the fits are compared in
-held-back views.
+A dark glossy paint under a bright light looks like a metal in a single view. The change of a place from view
+to view distinguishes the two, so places are fitted to most views with metals and without, and the fits are
+compared in held-back views.
 
-All places count. Where there is no metal, the freedom to use metals is used for errors of other kinds, which
-makes held-back views worse; a tenth of metal is enough to outweigh this. Only the places that the fit
-classifies as metal would decide wrongly: most of these are wrongly classified if there is little metal.
+The mean over all places decides. At places without metal, a fit with metals uses them to compensate for other
+errors, which increases the error in held-back views; if a tenth of the places are metal, their benefit
+outweighs this. A mean over only those places that the fit classifies as metal would be misleading: if there
+is little metal, most of them are classified wrongly.
 """
 
 from __future__ import annotations
@@ -23,13 +24,18 @@ __all__ = ["metals_evidence"]
 FOLDS = 5
 """Number of folds of the views; one fold is held back at a time."""
 TURNS = 4
-"""Number of folds that are held back in turn. One leaves an error as large as the harm of metals to paint."""
+"""Number of folds that are held back in turn. With only one, the standard error would be as large as the
+increase of the error that metals cause in a scene without metal.
+"""
 ROUNDS = 3
-"""Alternations of light and material in a fit: half of the usual number separate metal from paint as well."""
+"""Alternations of light and material in a fit: half of the usual number distinguishes metal from paint
+equally well.
+"""
 SCALE = 0.33
 """Mean base colour of both fits. The comparison does not depend on the scale of light and base colour."""
 WORTH = 0.0
-"""Threshold for the reduction of the relative error: metals cost nothing, so only harm counts against them.
+"""Threshold for the reduction of the relative error. Metals take no additional time, so they are left out
+only if they increase the error.
 """
 
 

@@ -1,8 +1,8 @@
 """Evidence for importance sampling of the specular lobe: the reduction of the noise of a shaded pixel.
 
-A rough surface gains nothing, because its lobe is about as wide as the cosine. So places with fitted light
-and material are shaded repeatedly with and without lobe sampling, with as many directions as in a training
-step, and the standard deviations of the results are compared.
+On a rough surface lobe sampling reduces no noise, because the lobe is about as wide as the cosine. So places
+with fitted light and material are shaded repeatedly with and without lobe sampling, with as many directions
+as in a training step, and the standard deviations of the results are compared.
 """
 
 from __future__ import annotations

@@ -279,7 +279,8 @@ def _best_material(
     """Choose roughness and metallic of each place from all pairs of the grids, under a fixed light.
 
     For each pair, the base colour of a place is the best one by iteratively reweighted least squares;
-    outgoing radiance is linear in it. The pair with the smallest error at the place and its neighbours wins.
+    outgoing radiance is linear in it. The pair with the smallest error at the place and its neighbours is
+    chosen.
     """
     layers = torch.stack([part.float() @ fit.radiance for part in transport.sources]) + transport.scene
     diffuse, unit = layers[0], places.observed.pixel + FLOOR * typical

@@ -1,6 +1,6 @@
 """Surface places, each with the pixels of the training views that show it.
 
-The change of a place from view to view is what distinguishes materials.
+Materials are distinguished by the change of a place's pixels from view to view.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ class Decision:
     """A decision whether an effect is simulated.
 
     Attributes:
-        step: training step from which on it holds.
+        step: training step from which on the decision applies.
         effect: name of the effect, a key of `EFFECTS`.
         on: whether the effect is simulated.
         by: origin of the decision: the option `--effects` ("asked"), the settings, the files of the capture
@@ -39,7 +39,7 @@ class Decision:
 
     @property
     def before_training(self) -> bool:
-        """Whether it was taken before the model was built."""
+        """Whether the decision was made before the model was built."""
         return self.by != "evidence"
 
 
@@ -67,7 +67,7 @@ class Plan:
     Attributes:
         request: the value of `--effects`.
         settings: the settings of the run before any decision.
-        decisions: all decisions in order; the newest one on each effect holds.
+        decisions: all decisions in order; the newest one on each effect applies.
     """
 
     request: EffectRequest
@@ -119,7 +119,7 @@ class Plan:
         return next((d for d in reversed(self.decisions) if d.effect == name), None)
 
     def is_on(self, name: str) -> bool:
-        """Whether an effect is simulated; an open effect is as the settings have it."""
+        """Whether an effect is simulated; for an open effect, whether the settings switch it on."""
         newest = self.newest(name)
         return newest.on if newest else EFFECTS[name].is_on(self.settings)
 

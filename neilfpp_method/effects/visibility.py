@@ -2,8 +2,8 @@
 
 If a cosine-weighted share q of the hemisphere of a point is occluded, then under an even light a share q of
 its irradiance is missing or comes from other surfaces. Under light from a single direction, the probability
-that the point is in shadow is q on average over the directions. The mean q is thus the relative error that
-is made if shadows and inter-reflection are left out. It is 0 for a convex body.
+that the point is in shadow is q on average over the directions. The mean q is therefore the relative error
+of leaving out shadows and inter-reflection. It is 0 for a convex body.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ The error model has two parts:
 - Errors that are independent between views: noise, and residuals that the model does not explain. Their size
   is measured from the run's own residuals.
 - Errors of the estimated light, which all views of a point share. The incident radiance is uncertain per
-  patch of directions, and by a common factor. More views do not reduce these errors; light that varies over
-  directions does, and so does a specular lobe that moves across it.
+  patch of directions, and by a common factor. More views do not reduce these errors. They are smaller if the
+  light varies over directions, and if the specular lobes of different views cover different parts of it.
 
 An error that all points share is a scale of the base colour, which no image can determine and which is not
 counted. Each patch therefore contributes in proportion to the difference between the share of light that a

@@ -53,7 +53,7 @@ def _log(title: str, meaning: str) -> Entry:
 def _ratio(title: str) -> Entry:
     meaning = (
         "Error of the half of the pixels with the smaller expected error, over that of the other half; "
-        "1 is chance."
+        "1 means no better than chance."
     )
     return Entry(title, "%.2f", "lower", meaning)
 

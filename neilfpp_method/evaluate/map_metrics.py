@@ -26,7 +26,7 @@ __all__ = [
 ]
 
 CONFIDENCE_PIXELS = 8192
-"""Number of test pixels, evenly spread, at which the error is compared with the expected error."""
+"""Number of evenly spread test pixels at which the error is compared with the expected error."""
 
 Pairs = Sequence[tuple[RenderedView, KnownView]]
 """Test views as rendered and as captured."""

@@ -66,7 +66,7 @@ def light_metrics(run: Run, field: LightField, mesh: Mesh | None) -> dict[str, f
     Args:
         run: the run, with a material.
         field: the true light field.
-        mesh: the true surface, which tells the occluded directions, or None.
+        mesh: the true surface, from which occluded directions are computed; or None.
     """
     estimate, true = _incident_light(run, field), field.incident.numpy()
     ratio = metrics.log_ratio(estimate.reshape(-1, 3), true.reshape(-1, 3))

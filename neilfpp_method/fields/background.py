@@ -53,7 +53,7 @@ class InvertedSphere(nn.Module):
         encoding: kind and sizes of the position encoding.
         radius: radius of the scene sphere.
         scale: largest radiance.
-        start: initial linear RGB, the same in all directions. None: half of the largest radiance.
+        start: initial linear RGB, the same in all directions; if None, half of the largest radiance.
     """
 
     def __init__(

@@ -123,7 +123,7 @@ def position_encoding(
     Args:
         config: kind and sizes.
         radius: radius of the scene sphere, which contains the positions.
-        log2_entries: binary logarithm of the table size of one grid level; None: `config.log2_entries`.
+        log2_entries: binary logarithm of the table size of one grid level; if None, `config.log2_entries`.
     """
     if isinstance(config, FrequencyConfig):
         return FrequencyEncoding(POSITION_OCTAVES)

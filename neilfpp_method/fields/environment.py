@@ -52,8 +52,8 @@ class EnvironmentLight(nn.Module):
     The map is a buffer, not a parameter: outgoing radiance is linear in its radiance, so `lighting` solves
     for it.
 
-    An even light (`even`) has the same radiance from all directions: all texels are equal, and there is
-    nothing to sample by importance.
+    An even light (`even`) has the same radiance from all directions: all texels are equal, and importance
+    sampling has no use.
 
     Args:
         height: rows of the map; it has twice as many columns.
@@ -92,7 +92,7 @@ class EnvironmentLight(nn.Module):
 
     @torch.no_grad()
     def at_most(self, height: int) -> EnvironmentLight:
-        """This light, or, if its map has more rows, a light with `height` rows of area means."""
+        """Return this light, or a copy reduced to `height` rows by area means if its map has more."""
         _, rows, columns = self.log_radiance.shape
         if rows <= height:
             return self
@@ -143,7 +143,7 @@ class EnvironmentLight(nn.Module):
     def _texel_shares(self) -> Float[Tensor, "H W"]:
         """Share of each texel in all light: its mean interpolated radiance times its solid angle.
 
-        A neighbor of a bright texel gets its share, because interpolation makes it bright, too.
+        The interpolation also brightens the neighbors of a bright texel, so their probability is higher.
         """
         solid_angle = self._texel_solid_angles()
         mean = luminance(self.log_radiance.permute(1, 2, 0).exp())

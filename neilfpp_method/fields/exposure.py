@@ -47,7 +47,7 @@ def at_mean_exposure(
     """Pixel values as at the mean exposure of the photographs, in the capture's response.
 
     Args:
-        gains: gains of the photographs; None: pixels are returned unchanged.
+        gains: gains of the photographs; if None, pixels are returned unchanged.
         color: pixel values.
         view: index of the view of each pixel.
         response: "linear" or "srgb".

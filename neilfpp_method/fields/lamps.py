@@ -76,7 +76,7 @@ class Lamps(nn.Module):
         Args:
             position: centers, scene frame.
             intensity: power per solid angle, on the axis if there is one.
-            axis: unit axes, or zeros; None: all lamps are isotropic.
+            axis: unit axes, or zeros; if None, all lamps are isotropic.
         """
         self.lit = min(len(position), len(self.position))
         self.position.zero_()[: self.lit] = position[: self.lit]

@@ -44,7 +44,7 @@ SKIP_FROM = 4
 
 @dataclass(frozen=True)
 class Activation:
-    """An activation function, the same with its derivative, and the initialisation of the layer before it."""
+    """An activation function, a function of its value and derivative, and the initialisation of its layer."""
 
     value: Callable[[Tensor], Tensor]
     with_slope: Callable[[Tensor], UnitSample]
@@ -94,7 +94,7 @@ class Mlp(nn.Module):
         width: units per hidden layer.
         activation: activation of the hidden layers.
         skip: index of the layer that gets the input concatenated to its own; `skip = layers` is the output
-            layer. None: no layer.
+            layer. If None, no layer does.
         output_scale: factor on the initial weights of the output layer.
 
     Raises:

@@ -72,7 +72,7 @@ class SdfField(nn.Module):
             method: "analytic" differentiates `with_gradient` by autograd. It is exact, but a trilinear
                 function has no curvature along the axes inside a cell. "finite_difference" takes forward
                 differences of the gradient over one cell of the finest grid (for frequencies, 0.02 rad of
-                the highest one), and so includes the kinks between cells. None: analytic for frequencies,
+                the highest one), and so includes the kinks between cells. If None, analytic for frequencies,
                 finite differences for a hash grid.
         """
         method = method or (

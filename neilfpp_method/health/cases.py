@@ -107,7 +107,7 @@ def surface_findings(measured: SurfaceMeasurement, step: int) -> list[Finding]:
                 "no_surface",
                 True,
                 step,
-                f"{measured.opaque:.0%} of the object's pixels show anything at all",
+                f"only {measured.opaque:.0%} of the object's pixels show a surface",
                 "a scene box that misses the object, or masks that are inverted",
                 "look at the picture of `neilfpp inspect`",
             )
@@ -120,8 +120,8 @@ def surface_findings(measured: SurfaceMeasurement, step: int) -> list[Finding]:
                 step,
                 f"only {measured.sharp:.0%} of the rays that show something meet one surface: the scene is "
                 "fog",
-                "a scene box that holds the cameras, or too few views, steps or masks",
-                "look at `neilfpp inspect`, give masks, or more --config.train.sdf-steps",
+                "a scene box that contains the cameras, or too few views, steps or masks",
+                "look at `neilfpp inspect`, give masks, or increase --config.train.sdf-steps",
             )
         ]
     return []
@@ -137,8 +137,8 @@ def material_findings(measured: SurfaceMeasurement, step: int) -> list[Finding]:
             False,
             step,
             f"the base colour of {measured.at_bound:.0%} of the surface is black or white",
-            "a light whose scale is off",
-            "give the light with --light, or look at docs/light.md",
+            "a light with a wrong scale",
+            "give the light with --light, or read docs/light.md",
         )
     ]
 
@@ -153,7 +153,7 @@ def nothing_shaded(steps: int, step: int) -> list[Finding]:
             True,
             step,
             f"no surface point was shaded for {steps} steps, so material and light learn nothing",
-            "a surface that never condensed",
+            "a distance field that never formed a surface",
             "look at the preview of SDF init in the run's folder",
         )
     ]
@@ -168,9 +168,9 @@ def few_light_points(points: int, step: int) -> list[Finding]:
             "few_light_points",
             False,
             step,
-            f"the light was fitted to {points} surface points; nothing is said of lamps",
+            f"the light was fitted to only {points} surface points, without a decision about lamps",
             "masks or a surface that leave few pixels to shade",
-            "look at the previews, or take more --config.train.rays",
+            "look at the previews, or increase --config.train.rays",
         )
     ]
 

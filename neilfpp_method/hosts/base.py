@@ -100,7 +100,7 @@ class KnowsMisses(Protocol):
 @runtime_checkable
 class KnowsRadiance(Protocol):
     """A host that can evaluate its radiance at surface points. Without it the proxy of a host that traces no
-    rays returns the mean radiance that training rays saw there.
+    rays returns the mean radiance of the training rays that hit there.
     """
 
     def radiance(self, x: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
@@ -128,7 +128,7 @@ class HasSurfaceWidth(Protocol):
 
 @runtime_checkable
 class LimitsSurfaceWidth(Protocol):
-    """A host whose soft layer can be kept thin. Without it nothing keeps a surface from staying fog."""
+    """A host whose soft layer can be kept thin. Without it a surface may remain fog."""
 
     def limit_surface_width(self, width: float) -> None:
         """Lower the width of the layer to `width` (scene units) if it is larger."""

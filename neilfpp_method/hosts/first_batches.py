@@ -27,7 +27,9 @@ UNIT = 1e-3
 OFF_RAY = 0.02
 """Largest distance of a hit from its ray, relative to its distance from the origin of the ray."""
 MAX_OFF = 0.5
-"""Largest share of hits that may be off their rays or have normals that face away. A few blended hits do."""
+"""Largest permitted share of hits that are off their rays or have normals that face away from the viewer.
+Blending over two surfaces causes a few such hits in a correct host.
+"""
 REACH = 1.5
 """Median distance of hits from the origin above which the scene is too large, scene units. An object in the
 unit sphere may stand on a ground.
@@ -41,7 +43,7 @@ APART = 0.01
 MOVED = 0.4
 """Largest share of points that may be farther apart; some are occluded from the other viewpoint."""
 SIZES = 30.0
-"""Factor between the median of the pixels and `median_radiance` above which they do not belong together."""
+"""Factor between the median of the pixels and `median_radiance` above which one of them is probably wrong."""
 
 log = logging.getLogger(__name__)
 

@@ -67,7 +67,7 @@ class ForeignHost(nn.Module):
     Args:
         host: a `Host` or an `ImageHost`.
         borrowed: whether the host belongs to another trainer, so that it must not become a submodule.
-        proxy: traces rays between surfaces; None: the host renders them.
+        proxy: traces rays between surfaces; if None, the host renders them.
     """
 
     def __init__(self, host: object, borrowed: bool, proxy: SurfaceProxy | None = None) -> None:

@@ -27,7 +27,7 @@ class CallableHost:
         self.name = getattr(function, "__qualname__", type(function).__name__)
 
     def render(self, rays: RayBatch) -> SurfaceHits:
-        """Call the function. Of a tuple, opacity and concentration are 1 for a hit and 0 for a miss.
+        """Call the function. If it returns a tuple, opacity and concentration are 1 for a hit, 0 for a miss.
 
         Raises:
             UserError: it does not return tensors of the right shape on the device of the rays.

@@ -49,9 +49,9 @@ def image_hits(
         depth: depth of the surface along the camera's axis (z-depth), scene units. Divide blended depths by
             the opacity first.
         opacity: opacity of each pixel; below ½ the pixel is a miss.
-        normal: outward normals of any length, scene frame. None: they are computed from the depths of
+        normal: outward normals of any length, scene frame; if None, they are computed from the depths of
             neighboring pixels.
-        along_ray: whether `depth` is a distance along the ray instead.
+        along_ray: whether `depth` is the distance along the ray instead of the z-depth.
 
     Raises:
         UserError: a map has another size than the camera.

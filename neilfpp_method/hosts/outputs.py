@@ -22,9 +22,9 @@ UNIT = 1e-2
 class OutputCheck:
     """Rejects invalid outputs of a host.
 
-    Shapes, types, devices and the gradient graph are checked in every step, which costs nothing. Normals are
-    checked until a batch with a hit has passed; later steps that are not finite are left to the training
-    loop.
+    Shapes, types, devices and the gradient graph are checked in every step, without synchronising with the
+    device. Normals are checked until a batch with a hit has passed; the training loop handles later values
+    that are not finite.
 
     Args:
         host: the host whose outputs are checked.

@@ -93,7 +93,7 @@ class SurfaceProxy(nn.Module):
         radius: half the edge of the cube that contains the scene, scene units.
         resolution: vertices of the grid along an edge.
         hit_share: smallest concentration of a hit.
-        radiance: radiance of the host at surface points x towards wo; None: the mean observed radiance.
+        radiance: radiance of the host at surface points x towards wo; if None, the mean observed radiance.
     """
 
     def __init__(
@@ -103,8 +103,8 @@ class SurfaceProxy(nn.Module):
         self.radius = radius
         self.resolution = resolution
         self.hit_share = hit_share
-        # Columns: position, normal, radiance, and the step that saw the point. A zero normal marks a removed
-        # point.
+        # Columns: position, normal, radiance, and the step in which the point was observed. A zero normal
+        # marks a removed point.
         self.points = Ring(POINTS, 10)
         self.steps = 0
         self._radiance = radiance

@@ -1,10 +1,11 @@
 """A test suite of the host contract for authors of hosts: `check_host(host, rays)`.
 
-`testing_geometry` checks that surfaces look the same from several viewpoints, `testing_conduct` how the host
-behaves; the other checks are here. docs/hosts.md lists which of a set of planted defects the suite finds.
+`testing_geometry` checks that surfaces are the same from several viewpoints. `testing_conduct` checks that
+results do not depend on the batch and that rendering has no side effects. The other checks are in this
+module. docs/hosts.md lists which of a set of planted defects the suite finds.
 
-The suite cannot find out whether colors are linear, which would need a photograph with known radiance. It
-does find the most common symptom: colors that are clipped at 1.
+The suite cannot determine whether colors are linear, which would need a photograph with known radiance. It
+does detect the most common symptom: colors that are clipped at 1.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def check_host(
         host: the host, or a function (origins, directions) → (color, position, normal). Its train/eval mode
             is not changed.
         rays: some hundred rays in the scene frame, from outside of the object; several must hit it.
-        parameters: the parameters that the host trains; None: all its parameters, if it is a module.
+        parameters: the parameters that the host trains; if None, all its parameters, if it is a module.
 
     Raises:
         ContractBroken: the host breaks the contract (an AssertionError that names the host and the defect).

@@ -13,9 +13,13 @@ from neilfpp_method.structures import RayBatch, SurfaceHits
 __all__ = ["CONDUCT_CHECKS"]
 
 RESTLESS = 0.005
-"""Largest median change of positions between two calls, scene units, plus the width of a soft layer."""
+"""Largest permitted median change of positions between two calls, in scene units. The width of the soft layer
+is added to it.
+"""
 SPREAD = 3.0
-"""Largest difference between a part of a batch and the whole, relative to that between two calls."""
+"""Largest permitted difference between a ray rendered in a part of a batch and in the whole batch, relative
+to the difference between two calls.
+"""
 
 
 def _one_ray(case: Case) -> None:

@@ -1,6 +1,6 @@
 """Checks that a surface is the same from other viewpoints: from the side, from afar, from close by.
 
-They find wrong depths, wrong normals and rays that are lost.
+They detect wrong depths, wrong normals, and rays that miss a surface that they should hit.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ from neilfpp_method.structures import RayBatch
 __all__ = ["GEOMETRY_CHECKS"]
 
 APART = 0.01
-"""Largest distance between the hits of two views of one point, scene units, plus twice the layer's width."""
+"""Largest permitted distance between the hits of one point in two views, in scene units. Twice the width of
+the soft layer is added to it.
+"""
 AGREE = 0.6
 """Smallest share of points that agree in both views. The others may be occluded or on a silhouette."""
 NEAR = 0.05

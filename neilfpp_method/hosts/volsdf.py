@@ -36,7 +36,9 @@ scene (published code: 8192 and 4096 points).
 HIT_RADIUS = 0.05
 """The concentration of a hit is the rendering weight within this distance of it, scene units (METHOD §2)."""
 SURFACE_WIDTH = {"scene": 10.0, "rays": 0.05}
-"""Width ε of the smoothed delta of L_surf by `loss.points`, scene units; "scene" has the published one."""
+"""Width ε of the smoothed delta of L_surf by `loss.points`, scene units; that of "scene" is the published
+value.
+"""
 GRID_LIFE = 100
 """Training steps of the geometry after which the distance grid is sampled again."""
 SPARE_WEIGHT = 1e-6

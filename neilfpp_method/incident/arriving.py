@@ -22,8 +22,8 @@ class Sources:
     Attributes:
         light: an environment map, or a light field that is free at every point.
         lamps: small lamps near the scene, possibly none lit.
-        scene: traces the scene's own surfaces, which occlude light and lamps. None: nothing is traced, and
-            the light field itself holds all that arrives at a point.
+        scene: traces the scene's own surfaces, which occlude light and lamps. If None, nothing is traced, and
+            the light field is all the light that arrives at a point.
     """
 
     light: Light
@@ -34,7 +34,7 @@ class Sources:
 def arriving(sources: Sources, x: Float[Tensor, "N 3"], drawn: IncidentSamples) -> Incident:
     """Compute the light that arrives at surface points along sampled directions and from the lamps.
 
-    Lamps are not seen by the sampled directions. Each lamp adds a direction of its own, with a shadow ray if
+    The sampled directions do not hit lamps. Each lamp adds a direction of its own, with a shadow ray if
     there is a scene. The sum over all directions of weight · radiance · f · cos θ then estimates the integral
     of the rendering equation.
 

@@ -19,13 +19,13 @@ from neilfpp_method.structures import RayBatch
 __all__ = ["TracedLight", "trace_light"]
 
 MAX_ANGLE_DEG = 80.0
-"""Largest angle of a ray from the normal. At larger angles a ray stays in the soft layer of its own surface,
-and brings little light.
+"""Largest angle of a ray from the normal, degrees. At larger angles a ray stays in the soft layer of its own
+surface, and contributes little light.
 """
 MAX_START = 0.2
 """Largest distance of the start of a ray from its surface point, scene units (published code). A ray that has
-to start further away is left out: it could start behind a neighboring surface, and closer to its point it
-would hit the soft layer that it leaves.
+to start further away is left out: it could start behind a neighboring surface, and if it started closer, it
+would hit the soft layer of its own surface.
 """
 
 
@@ -33,7 +33,7 @@ would hit the soft layer that it leaves.
 class TracedLight:
     """Traced rays: their surface points and directions, the incident radiance, and which rays hit.
 
-    Rays that would start too far away, or that the host knows to miss, are left out.
+    It does not contain rays that would start too far away, nor rays that the host knows to miss.
     """
 
     position: Float[Tensor, "K 3"]

@@ -1,10 +1,10 @@
 """Gradient descent on a light, together with a factor on the base colour of every surface point.
 
-The base colour was learned under the previous light. A lamp in the wrong place therefore leaves its glow in
-the base colour, and a fit with that base colour would put the lamp in the same place again. So a fit keeps
-only the mean base colour. At each point the base colour is free, under a prior that it resembles that of the
-neighbouring points: surfaces mostly consist of few materials, and light changes slowly along them (Land and
-McCann 1971, "Lightness and Retinex Theory").
+The base colour was learned under the previous light. The error of a lamp in the wrong place is therefore
+compensated by the base colour, and a fit with that base colour would put the lamp in the same place again. So
+a fit keeps only the mean base colour. At each point the base colour is free, under a prior that it resembles
+that of the neighbouring points: surfaces mostly consist of few materials, and light changes slowly along them
+(Land and McCann 1971, "Lightness and Retinex Theory").
 """
 
 from __future__ import annotations

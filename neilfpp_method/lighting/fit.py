@@ -1,8 +1,9 @@
 """Fit an environment map and lamps to the pixels of remembered surface points.
 
 Once the transport to these points is computed (`lighting.transport`), a hundred steps on the light cost less
-than a hundred training steps. Stochastic descent during training sees few and noisy samples of every texel:
-it blurs a lamp into a haze, and the base colour then compensates for the missing shadows. A fit does not.
+than a hundred training steps. Stochastic gradient descent during training would use few and noisy samples of
+every texel: it blurs a lamp over many texels, and the base colour then compensates for the missing shadows. A
+fit avoids this.
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ GAIN_RATE = 0.1
 """Learning rate of the logarithms of the factors on base colour, as a multiple of `RATE`."""
 MIN_REACH = 0.05
 """A lamp whose contribution at intensity 1 is below this share of the mean over all lamps gets no intensity:
-a lamp that hardly any point sees, such as one behind a wall, fits the images with any intensity.
+a lamp that is visible from hardly any point, such as one behind a wall, fits the images with any intensity.
 """
 MIN_GAIN = 0.01
 """Smallest reduction of the mean relative error for which lamps are kept."""
 MIN_POINTS = 20
 """Smallest number of held-back points from which a decision is made."""
 MIN_VISIBLE_SHARE = 0.05
-"""Share of the points that must see a texel for the images to determine it. Texels below this share are
-determined by the smoothness prior only.
+"""Share of the points from which a texel must be visible for the images to determine it. Texels below this
+share are determined by the smoothness prior only.
 """
 FIRST_SHARE = 0.1
 """Initial contribution of all candidate lamps together, as a share of the light that a typical point
@@ -63,7 +64,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Comparison of a light with lamps against one without, where neither was fitted.
+    """Comparison of a light with lamps against one without, on data to which neither was fitted.
 
     Attributes:
         gain: mean reduction of the relative error by the lamps.
@@ -135,7 +136,7 @@ def fit_light(start: Light, transport: Transport, target: Target, objective: Obj
     is_reachable = reach > MIN_REACH * reach.mean()
     first = FIRST_SHARE / max(1, len(reach))
     root = (start.intensity * reach).clamp_min(first).sqrt().requires_grad_()
-    # Sources that no point sees are left out of the sums: half of the texels if the scene is a table top.
+    # Sources that are visible from no point are left out of the sums: half of the texels for a table top.
     reaching_any = torch.nonzero(transport.sources.amax((0, 1)))[:, 0]
     transport = transport.select_sources(reaching_any)
     mean_transport = transport.sources[0].mean(0)

@@ -13,7 +13,9 @@ from neilfpp_method.structures import Observed
 __all__ = ["SurfaceMemory"]
 
 FIRST_WAIT = 4
-"""Steps before the first fit even if the memory is not full yet: until then the light is only a guess."""
+"""Steps before the first fit even if the memory is not full yet: until then the light has its initial
+value.
+"""
 
 
 class SurfaceMemory(nn.Module):

@@ -38,8 +38,8 @@ FLOOR = 0.1
 mostly noise.
 """
 OUTLIER = 0.1
-"""Relative error at which the loss changes from quadratic to linear. Some points are explained by no light,
-for example where the geometry is wrong.
+"""Relative error at which the loss changes from quadratic to linear. There are points that no light explains,
+for example if the geometry is wrong there.
 """
 SKY = 1.0
 """Weight, relative to the data term, of the deviation of the map's log radiance from what cameras saw of it
@@ -188,7 +188,7 @@ def nearest_points(position: Float[Tensor, "N 3"]) -> Int[Tensor, "N K"]:
 def unevenness(base_color: Float[Tensor, "N 3"], nearest: Int[Tensor, "N K"]) -> Float[Tensor, ""]:
     """Mean |difference of log base colour| between neighbours.
 
-    The absolute value makes a sharp edge as cheap as a gradual change of the same total size.
+    Because of the absolute value, a sharp edge costs as much as a gradual change of the same total size.
     """
     logarithm = base_color.clamp_min(DARK_FLOOR).log()
     difference = logarithm[:, None] - logarithm[nearest]

@@ -26,12 +26,14 @@ FOLDS = 5
 between them; for the first decision every fold is held back in turn.
 """
 BLOCKS_OF_FOLD = 6
-"""Number of blocks of neighbouring points in a fold. Neighbours share the errors of their material, so a
-lamp that compensates for such errors would also be confirmed by held-back neighbours of the fitted points.
+"""Number of blocks of neighbouring points in a fold. The materials of neighbours have similar errors, so a
+lamp that compensates for such errors also lowers the error at held-back neighbours of the fitted points.
 Blocks are therefore held back as a whole.
 """
 KNOWN_ROWS = 32
-"""Rows to which a known map is reduced when only lamps are fitted: every texel is traced from every point."""
+"""Rows to which a known map is reduced when only lamps are fitted, because every texel is traced from every
+point.
+"""
 
 
 @torch.no_grad()
@@ -61,8 +63,8 @@ def solve_light(
             lamps are used if they lower the error at points held back from both fits (`Evidence.favours`).
         first: whether this is the first decision between the two.
         lamps_if_undecided: use lamps even if their gain is not significant, unless it is significantly too
-            small. The error of a superfluous lamp can be undone: surfaces learn under it, and a later fit
-            removes it. A missing lamp cannot: its glow becomes base colour, and no later fit adds it.
+            small. A later fit removes a superfluous lamp, but does not add a missing one: by then its light
+            is part of the learned base colour.
 
     Returns:
         The comparison of the fits with and without lamps; None if the settings decide.
@@ -116,7 +118,7 @@ def solve_light(
     merged = merge(places, found.intensity, from_candidates.sources[0].mean(0), len(lamps.position))
     map_light = from_map.with_strength(unknown.exp().flatten(1).t())
     merged = settle_lamps(merged, lamps.radius, map_light, observed, target, lobe, scene, objective)
-    # The map was fitted together with the candidates, so it is fitted again with the refined lamps.
+    # The map was fitted together with the candidates, so it must be fitted again with the refined lamps.
     from_merged = from_lamps(merged.places, lamps.radius, observed, material.roughness, lobe, scene)
     found = fit_light(Light(unknown, merged.intensity), from_map.concatenate(from_merged), target, objective)
     unknown.copy_(found.log_radiance)

@@ -236,7 +236,7 @@ class MapSolver(nn.Module):
     ) -> Evidence | None:
         environment = light.light
         sky = None if self.sky is None or environment.even else self.sky.known()
-        # Where cameras saw the light directly, that fixes the scale.
+        # If cameras saw the light directly, their pixels fix the scale.
         log_scale = self._log_scale(material) if sky is None else 0.0
         objective = Objective(
             self.response, self.unit, self.config.fit, sky, self.config.monochrome, log_scale

@@ -87,9 +87,9 @@ class Transport:
 class _SumOverSources(torch.autograd.Function):
     """sources @ strength: (K, N, T) @ (T, 3) → (K, N, 3).
 
-    The backward pass of autograd for `strength` multiplies by the transposed sources and reads them against
-    their order in memory. The pass below reads them in order, which is faster, and a fit spends most of its
-    time here.
+    The backward pass of autograd for `strength` multiplies by the transposed sources, which it does not read
+    in the order of memory. The pass below reads them in order, which is faster; a fit spends most of its time
+    here.
     """
 
     @staticmethod
@@ -148,9 +148,9 @@ def from_texels_at(
 ) -> Transport:
     """The transport from the texels of a map at several roughnesses, to N pixels that show P surface points.
 
-    One random direction per point and texel is traced, whatever the number of pixels and roughnesses. It
-    decides what blocks the texel. The BRDF of each pixel is evaluated in another random direction in the
-    texel, so that the pixels of a point have independent errors.
+    One random direction per point and texel is traced, regardless of the number of pixels and roughnesses.
+    What it hits occludes the whole texel. The BRDF of each pixel is evaluated in another random direction
+    within the texel, so that the pixels of a point have independent errors.
 
     Args:
         environment: as in `from_texels`.

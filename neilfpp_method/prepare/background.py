@@ -32,7 +32,7 @@ def in_background(
     token = pycolmap.CancellationToken()
     outcome: list[Result] = []
     failure: list[BaseException] = []
-    # Not Thread.join: after an interruption by Ctrl-C it takes the thread for ended (CPython 3.11).
+    # Thread.join is not used: after an interruption by Ctrl-C, CPython 3.11 treats the thread as ended.
     ended = threading.Event()
 
     def work() -> None:

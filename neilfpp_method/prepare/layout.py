@@ -123,14 +123,14 @@ def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
 def _cloud(
     source: Source, prepared: Capture, options: Prepare, after: Step, open_bar: Bars
 ) -> tuple[WorldPoints, str]:
-    """The oriented points, and where they come from, in words."""
+    """The oriented points, and a description of their source for the summary."""
     if options.cloud == "dense" or (options.cloud == "auto" and source.posed.cloud is None):
         try:
             return _dense(prepared, options, after, open_bar), "dense: plane-sweep stereo"
         except UserError as error:
             if options.cloud == "dense":
                 raise
-            no_dense = f"; no dense ones, as {error.problem}"
+            no_dense = f"; no dense points, because {error.problem}"
     else:
         no_dense = ""
     if source.posed.cloud is not None:

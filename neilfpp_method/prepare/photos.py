@@ -34,7 +34,7 @@ FILM_WIDTH = 36.0
 
 @dataclass(frozen=True)
 class Photo:
-    """The file of a photograph and what its header says.
+    """The file of a photograph and the contents of its header.
 
     Attributes:
         name: name of the view that the photograph becomes.

@@ -51,7 +51,7 @@ class Summary:
         cameras: the estimated cameras, as in `describe_cameras`.
         views: number of views.
         points: number of points of the oriented cloud.
-        cloud: origin of the cloud, in words.
+        cloud: description of the origin of the cloud.
         radius: radius of the scene's sphere, world units.
         scene_from: origin of the scene's sphere.
         remarks: notes for the user.

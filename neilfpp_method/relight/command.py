@@ -51,7 +51,7 @@ TURNTABLE = "turntable"
 SAMPLES = 64
 """Default number of samples per pixel, if neither --spp nor --seconds is given."""
 MAX_BOUNCES = 64
-"""Largest number of bounces. After that many, a path carries less than a thousandth of its radiance."""
+"""Largest number of bounces, after which a path carries less than a thousandth of its radiance."""
 FORMAT = 1
 """Version of the format of the records."""
 

@@ -69,7 +69,7 @@ def scene_box(corners: Sequence[float], normalisation: Normalisation) -> Box:
 
 
 def with_edits(materials: Materials, edits: Sequence[Edit], limits: Sequence[Limit] = ()) -> Materials:
-    """Apply edits at the points that are inside of all limits; a later edit of a parameter wins."""
+    """Apply edits at the points inside of all limits; a later edit of a parameter replaces an earlier one."""
     if not edits:
         return materials
 

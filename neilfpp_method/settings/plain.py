@@ -44,7 +44,7 @@ def from_dict(kind: type[Config], values: Mapping[str, Any], where: str = "confi
 def changed(config: Config, values: Mapping[str, Any], where: str = "config") -> Config:
     """Return settings with some values changed.
 
-    A part (light, host, encoding) whose `kind` changes starts from the defaults of its new kind.
+    A part (light, host, encoding) whose `kind` changes gets the defaults of its new kind.
 
     Args:
         config: a dataclass of settings.

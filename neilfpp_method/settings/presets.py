@@ -1,5 +1,5 @@
-"""The presets: the published settings (`docs/paper.md`), `fast` for a laptop's CPU, and
-`balanced` and `best`, which take longer.
+"""The presets: the published settings (`docs/paper.md`), `fast` for a laptop's CPU, and the slower `balanced`
+and `best`.
 
 Each preset is a mapping of the settings in which it differs from another one.
 """
@@ -184,7 +184,7 @@ def fast() -> NeilfConfig:
     return changed(NeilfConfig(), FAST)
 
 
-# Beside fast.
+# Differences from fast.
 BALANCED: Mapping[str, Any] = {
     "preset": "balanced",
     "encoding.log2_entries": 17,
@@ -210,7 +210,7 @@ def balanced() -> NeilfConfig:
     return changed(fast(), BALANCED)
 
 
-# Beside balanced.
+# Differences from balanced.
 BEST: Mapping[str, Any] = {
     "preset": "best",
     "encoding.levels": 10,

@@ -64,7 +64,7 @@ class OutgoingRadianceConfig:
     """Network of R: position, direction, normal and feature of G → linear RGB (METHOD §5)."""
 
     positions: Literal["raw", "encoded"] = "raw"
-    """raw: R gets the plain position and sees detail through the feature of G. encoded: R has an encoding of
+    """raw: R gets the plain position, and detail comes from the feature of G. encoded: R has an encoding of
     its own, of the kind that `encoding` names; a host without features (a mesh) always uses it.
     """
     direction: Literal["outgoing", "mirrored"] = "outgoing"
@@ -275,7 +275,7 @@ class InterReflectionConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the losses (METHOD §4), relative to L_phys, which has 1. 0 switches a loss off."""
+    """Weights of the losses (METHOD §4), relative to L_phys, whose weight is 1. 0 switches a loss off."""
 
     unit: Literal["activation", "median"] = "activation"
     """Unit of radiance. activation (the paper): the range of R's output for L_vol, 1 for the other losses.

@@ -1,1 +1,1 @@
-"""Measure time by kind of work: code marks its work, and a ledger that listens adds up the seconds."""
+"""Measure time by kind of work: code marks its work, and an active ledger adds up the seconds."""

@@ -113,7 +113,7 @@ def check_same(row: Row) -> None:
 def _compared(
     config: NeilfConfig, source: CaptureSource, budget: float | None, effects: str
 ) -> dict[str, object]:
-    """What has to be the same for two runs to be the same row, by name."""
+    """The values, by name, that must agree for a run folder to belong to a row."""
     capture = {f"capture.{name}": value for name, value in asdict(source).items()}
     settings = flat_settings(to_dict(replace(config, train=with_steps(config.train, {}))))
     return {**capture, **settings, "--effects": effects, "the budget in seconds": budget}

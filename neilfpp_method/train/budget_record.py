@@ -53,7 +53,7 @@ class BudgetPlan:
             decides open effects of material and light.
         light_pixels: maximum number of pixels for the search of the initial light; 0 for no search; None for
             the number without a budget.
-        revisions: all plans in order, from the one before training; the last one holds.
+        revisions: all plans in order, beginning with that before training; the last one applies.
         took: time of the whole command including the report, in seconds; None until it has ended.
     """
 

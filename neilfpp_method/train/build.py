@@ -31,12 +31,13 @@ __all__ = ["build_model", "cloud_summary", "exposures_of", "scene_facts", "show_
 LDR_SCALE = 1.0
 """Largest radiance that R can represent for LDR input, as published: the scale of its sigmoid."""
 LDR_ROOM = 2.0
-"""The same if losses are measured in units of the image. Clipped pixels are only lower bounds of radiance,
-and an underexposed photograph shows radiance above the clipping level of the others.
+"""Largest radiance of R for LDR input if losses are measured in units of the image. Clipped pixels are only
+lower bounds of radiance, and an underexposed photograph shows radiance above the clipping level of the
+others.
 """
 HDR_MEDIANS = 20.0
-"""The same for HDR input, in medians of the images, because radiance has no absolute unit. The paper's value
-of 3 is about twenty times the median of a well exposed image.
+"""Largest radiance of R for HDR input, in units of the median of the images, because radiance has no absolute
+unit. The paper's value of 3 is about twenty times the median of a well exposed image.
 """
 BRIGHT_QUANTILE = 0.999
 """R also reaches this quantile of the radiance of HDR images. The brightest pixels are excluded because a

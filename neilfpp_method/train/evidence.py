@@ -101,7 +101,7 @@ def _review_effects(run: Training, model: NeilfModel, step: int, review: Review,
         model: its model.
         step: number of steps trained so far.
         review: takes the measurements.
-        stream: selects the random numbers of these measurements, which are none of a training step.
+        stream: selects the random numbers of these measurements, so that no training step uses the same.
     """
     if not needs_surface(run.plan):
         return

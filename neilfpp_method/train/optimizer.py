@@ -50,7 +50,7 @@ def set_rates(
         config: the learning rates and their schedule.
         position: the stage and the step within it.
         background_waits: whether the background field stays fixed for the first part of SDF init
-            (`config.background_from`). It must not if structure from motion has found points behind the
+            (`config.background_from`). Must be False if structure from motion has found points behind the
             scene: a constant colour does not represent such a background, and training would explain it by
             density within the scene instead.
     """
@@ -62,9 +62,9 @@ def set_rates(
 
 
 def limit_surface_width(host: Host, config: VolumeConfig, position: StagePosition) -> None:
-    """Keep the surface of a host as thin as the schedule asks for (`schedule.surface_width_limit`).
+    """Limit the width of a host's surface to that of the schedule (`schedule.surface_width_limit`).
 
-    Hosts whose surface is not a soft layer of their own are left alone.
+    Hosts whose surface has no soft layer that can be limited are not changed.
     """
     if isinstance(host, LimitsSurfaceWidth):
         host.limit_surface_width(surface_width_limit(config, position))

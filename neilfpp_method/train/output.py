@@ -1,4 +1,4 @@
-"""Where commands write: the default folder of a run, and checks before there is work to lose."""
+"""Output paths of commands: the default folder of a run, and checks that run before any computation."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Measure the quality of a training while it runs, at held-back pixels (`data.held_back`).
 
-The pixels are rendered as evaluation renders test views, so the PSNR is that of `volume_psnr` and
-`pbr_psnr`: clipped and encoded as sRGB. A check is made after every tenth of a stage, but at least
+The pixels are rendered as evaluation renders test views, and the PSNR is computed like `volume_psnr` and
+`pbr_psnr`, from clipped values encoded as sRGB. A check is made after every tenth of a stage, but at least
 `MIN_STEPS` steps after the previous check, and at the end of each stage. Checks within a stage are postponed
 while all checks together have taken more than `MAX_SHARE` of the time of the run. The record is
 `RUN/quality.json`; its key `looks` holds the checks.

@@ -1,4 +1,4 @@
-"""How a training is stopped, and how it is continued."""
+"""Stop a training on Ctrl-C or SIGTERM, and make the command line that continues it."""
 
 from __future__ import annotations
 

@@ -61,9 +61,11 @@ LOOSE = 1e-3
 value of the settings no point would be shaded and no light fitted.
 """
 WARM_RAYS = 32
-"""Rays that are rendered first, which includes work that a picture needs once."""
+"""Number of rays that are rendered before the timing starts, so that work that a picture needs only once is
+not timed.
+"""
 PICTURE_RAYS = 1024
-"""Rays from whose time that of a preview is estimated."""
+"""Number of rays that are timed to estimate the time of a preview."""
 REPORT = 12.0
 """Time of the report as a multiple of that of a preview (estimate). A preview has an eighth of the pixels of
 the report's views; the rest is for the surface of the report.
@@ -76,7 +78,7 @@ class Trial:
 
     Attributes:
         costs: costs of the training.
-        places: time of the measurements at places within these costs, in seconds; 0 if there are none.
+        places: the part of these costs that measurements at places take, in seconds; 0 if there are none.
         light_pixels: number of pixels for which the search of the initial light has time; 0 if there is no
             time for it; None if the training does not search.
     """

@@ -1,4 +1,4 @@
-"""The viewer beside a training: a process of its own that follows the run's checkpoints."""
+"""The viewer during a training: a separate process that shows the newest checkpoint of the run."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ __all__ = ["viewer_beside"]
 
 HOST = "127.0.0.1"
 ENDED = (0, 130)
-"""Exit statuses of a viewer that was ended: Ctrl-C reaches both processes."""
+"""Exit statuses of a viewer that was stopped on purpose; Ctrl-C reaches both processes."""
 PATIENCE = 10.0
-"""Seconds that the viewer has to end before it is killed."""
+"""Seconds after which a viewer that was asked to end is killed."""
 
 
 @contextmanager
 def viewer_beside(
     run: Path, port: int, device: str, say: Callable[[str], None]
 ) -> Iterator[subprocess.Popen]:
-    """Serve `neilfpp view RUN --follow` while the body trains, and end it afterwards. Yields its process.
+    """Serve `neilfpp view RUN --follow` while the context trains, and end it afterwards. Yields its process.
 
-    The viewer reads files only: what it does, and whether it fails, changes nothing of the training.
+    The viewer only reads files, so nothing that it does, and no failure of it, affects the training.
 
     Args:
         run: the run's folder, which need not exist yet.
-        port: on this machine.
-        device: where the viewer computes.
-        say: prints a line.
+        port: port of the page on this machine.
+        device: device on which the viewer computes.
+        say: prints a line for the user.
 
     Raises:
         UserError: viser is not installed, or the port is not free.

@@ -1,7 +1,7 @@
 """The session of one browser: its controls, its camera, and the images that it shows.
 
-A change of a control or the camera becomes a request to the `Painter`, whose images become the background of
-the browser's scene. Sessions share the model and use it in turns.
+When a control or the camera changes, a request is sent to the `Painter`, whose images become the background
+of the browser's scene. Sessions share the model and take turns in using it.
 """
 
 from __future__ import annotations

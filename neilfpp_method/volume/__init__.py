@@ -1,1 +1,1 @@
-"""Volume rendering: where a ray meets the scene, its density there, where to sample, how to add up."""
+"""Volume rendering: intersection with the scene sphere, density, samplers along rays, and compositing."""

@@ -48,7 +48,7 @@ def laplace_depth(
     With u = sdf/β an antiderivative of Ψ(−u) is F(u) = min(u, 0) − ½ e^{−|u|}, so an interval of width δ has
     the depth (δ/β) (F(u₁) − F(u₀)) / (u₁ − u₀). For a constant SDF this is δ σ.
 
-    VolSDF uses δ times the density of the first sample instead. Rays that graze a surface then come out too
+    VolSDF uses δ times the density of the first sample instead. Rays that graze a surface are then too
     opaque, because the density of the last sample near the surface extends into the empty space behind it.
 
     Args:

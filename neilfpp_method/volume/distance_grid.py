@@ -23,7 +23,9 @@ GRID_RESOLUTION = 96
 CHUNK = 65_536
 """Points per evaluation of the field when a grid is sampled; limits memory."""
 STEPS = 40
-"""Maximum number of steps of a ray. A ray that has not ended by then grazes a surface: a miss."""
+"""Maximum number of steps of a ray. A ray that has not ended by then grazes a surface; it counts as a
+miss.
+"""
 HIT_CELLS = 0.25
 """Distance below which a ray hits, in cells: about the interpolation error."""
 
@@ -54,7 +56,7 @@ def look_up(grid: Float[Tensor, "R R R"], radius: float, x: Float[Tensor, "P 3"]
 
 @dataclass(frozen=True)
 class GridHits:
-    """Distances along rays, and whether they hit the surface before leaving the cube."""
+    """Distances along rays in scene units, and whether they hit the surface before leaving the cube."""
 
     distance: Float[Tensor, " P"]
     hit: Bool[Tensor, " P"]
@@ -69,11 +71,12 @@ def trace_grid(
 ) -> GridHits:
     """Sphere-trace rays: each step is the interpolated distance, but at least a quarter of a cell.
 
-    On a CPU compiled loops do it. On other devices all rays take all steps together, without synchronisation.
+    On a CPU each ray runs in a compiled loop. On other devices all rays take all steps together, without
+    synchronisation.
 
     Args:
-        grid: sampled distances.
-        radius: half the edge of the cube.
+        grid: sampled distances, scene units.
+        radius: half the edge of the cube, scene units.
         origins: starts of the rays, inside the cube.
         directions: unit directions.
     """

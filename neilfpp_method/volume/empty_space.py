@@ -119,10 +119,10 @@ class EmptySpace(nn.Module):
     ) -> Bool[Tensor, " N"]:
         """Which rays may hit a surface, for rays that start at a surface.
 
-        The start of such a ray is never empty, so `narrow` does not help. But a ray enters a surface where
-        the distance decreases. So a ray may hit if the distance decreases along it in a part that is not
-        certainly empty. This is less certain than `narrow`: a surface within one or two cells of the start
-        may be missed. It costs only grid look-ups.
+        The start of such a ray is never empty, so `narrow` would skip nothing. The distance decreases where a
+        ray approaches a surface, however. So a ray may hit if the distance decreases along it in a part that
+        is not certainly empty. This is less reliable than `narrow`: a surface within one or two cells of the
+        start may be missed. It costs only grid look-ups.
         """
         self._renew(sdf)
         edges = self._edges(interval)

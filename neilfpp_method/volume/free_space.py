@@ -2,8 +2,8 @@
 
 A single view is explained as well by fog in front of its camera as by the surface that it shows. If cameras
 are inside the space that may have density, training finds the fog first. So a ball around every camera is cut
-out of the scene, for the rays of all views: new views, which are among the others, see no fog either. A point
-cloud tells how large the balls may be, because nothing of the scene is much closer to a camera than the
+out of the scene, for the rays of all views: new views from among the cameras then show no fog either. A point
+cloud determines the size of the balls, because nothing of the scene is much closer to a camera than the
 closest points.
 """
 
@@ -19,19 +19,20 @@ __all__ = ["FREE_SHARE", "OBJECT_RADIUS", "FreeBalls", "FreeSpace", "FreeSpaceSa
 
 FREE_SHARE = 0.25
 """Radius of the ball around a camera without a point cloud, relative to its distance from the scene's center:
-0.45 scene units for a camera at 1.8, the median distance if the scene box was determined by what the cameras
-look at.
+0.45 scene units for a camera at 1.8, the median distance if the scene box was computed from the focus of the
+cameras.
 """
 CLEAR_SHARE = 0.8
 """Radius of the ball around a camera relative to its distance from the closest points of a cloud."""
 CLOSEST_SHARE = 1e-3
-"""Share of the points that may be closer to a camera than the closest points: stray ones."""
+"""Share of the points that are treated as outliers: they may be closer to a camera than "the closest points".
+"""
 MEASURED_POINTS = 100_000
 """Maximum number of points whose distances from the cameras are computed."""
 OBJECT_RADIUS = 1.0
 """Radius of the ball that contains the object, scene units; no free ball reaches into it."""
 RESOLUTION = 64
-"""Vertices along an edge of the grid that stores the decisive camera of each place."""
+"""Vertices along an edge of the grid, which stores for each vertex the ball that is deepest there."""
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,10 @@ def free_balls(
         points: a point cloud of the scene, scene frame; None if there is none.
         radius: radius of the scene sphere, scene units.
 
-    >>> cameras = torch.tensor([[0.5, 0.0, 0.0], [1.2, 0.0, 0.0], [2.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
-    >>> free_balls(cameras, None, radius=1.75).radius.tolist()
-    [0.20000004768371582, 0.5]
+    Example:
+        >>> cameras = torch.tensor([[0.5, 0.0, 0.0], [1.2, 0.0, 0.0], [2.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
+        >>> free_balls(cameras, None, radius=1.75).radius.tolist()
+        [0.20000004768371582, 0.5]
     """
     distance = cameras.norm(dim=-1)
     if points is None or not len(points):

@@ -13,7 +13,7 @@ __all__ = ["Interval", "sphere_interval"]
 
 @dataclass(frozen=True)
 class Interval:
-    """A part of each ray, as distances from its origin: 0 ≤ near ≤ far."""
+    """A part of each ray, as distances from its origin in scene units: 0 ≤ near ≤ far."""
 
     near: Float[Tensor, " N"]
     far: Float[Tensor, " N"]
@@ -32,7 +32,7 @@ def sphere_interval(
     Args:
         origins: ray origins, scene frame.
         directions: unit vectors.
-        radius: scene units.
+        radius: radius of the sphere, scene units.
     """
     closest = -(origins * directions).sum(dim=-1)
     # Not ‖o‖² − m²: for distant cameras this difference of large squares loses digits.

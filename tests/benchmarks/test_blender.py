@@ -1,7 +1,8 @@
-"""An exported asset in Blender (bpy), beside our own path tracer; skipped where there is no bpy.
+"""Render an exported asset in Blender (bpy) and compare it with the package's path tracer; skipped without
+bpy.
 
-NEILFPP_BPY names a Python that has it: bpy asks for its own Python and NumPy, so it has an environment of its
-own.
+NEILFPP_BPY names a Python that has bpy. It is a separate environment, because bpy needs its own versions of
+Python and NumPy.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ VIEW = "001"
 
 
 def rough_paint(x: torch.Tensor) -> Material:
-    """No metal anywhere."""
+    """A material without metal."""
     wave = 0.5 + 0.3 * torch.sin(3 * x)
     return Material(wave, torch.full_like(x[:, :1], 0.7), torch.zeros_like(x[:, :1]))
 
@@ -56,7 +57,9 @@ def painted_run(folder: Path) -> Run:
 
 
 def own_picture(run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """The true ball under the run's map by our path tracer (H, W, 3), and the pixels within it (H, W)."""
+    """Image of the true ball under the run's map by the package's path tracer, (H, W, 3), and the pixels of
+    the ball, (H, W).
+    """
     mesh = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS)
     triangles = torch.tensor(np.array(mesh.triangles), dtype=torch.float32)
     surface = Surface(triangles, torch.nn.functional.normalize(triangles, dim=-1))
@@ -68,7 +71,7 @@ def own_picture(run: Run) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("source", ["glb", "usd"])
-def test_blender_shows_what_we_show(python, tmp_path, source):
+def test_blender_agrees_with_the_path_tracer(python, tmp_path, source):
     if source == "usd":
         pytest.importorskip("pxr")
     run = painted_run(tmp_path)
@@ -77,20 +80,20 @@ def test_blender_shows_what_we_show(python, tmp_path, source):
     truth, within = own_picture(run)
     assert within.sum() > 150
     assert shown_psnr(picture, truth, within) > 33
-    # Cycles takes from the diffuse part what the coat above it reflects: 3 to 4 % here.
+    # Cycles subtracts from the diffuse part what the coat reflects: 3 to 4 % here.
     np.testing.assert_allclose(picture[within].mean(0), truth[within].mean(0), rtol=0.06)
-    # A map that is turned, or colours that are decoded twice, would be far below.
+    # A rotated map, or colours that are decoded twice, would give a much lower PSNR.
     assert shown_psnr(np.roll(picture, 4, axis=1), truth, within) < 25
 
 
 @pytest.mark.slow
-def test_half_the_size(python, tmp_path):
+def test_half_the_image_size(python, tmp_path):
     write_ball(painted_run(tmp_path), tmp_path / "asset", 64, faces=300)
     out = tmp_path / "out.exr"
     assert blender_picture(python, tmp_path / "asset", VIEW, out, percent=50, samples=1).shape == (18, 24, 3)
 
 
-def test_a_python_without_bpy_is_told(tmp_path):
+def test_a_python_without_bpy_is_an_error(tmp_path):
     write_ball(painted_run(tmp_path), tmp_path / "asset", 64, faces=300)
     (tmp_path / "asset" / "bpy.py").write_text("raise ImportError('no bpy here')\n")
     with pytest.raises(UserError, match="pip install bpy"):

@@ -1,4 +1,4 @@
-"""Charts: what is drawn lies where the axes say."""
+"""Charts: lines are drawn at the positions that the axes define."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def pixels_of(path, color) -> np.ndarray:
     return found[found[:, 0] > 130]
 
 
-def test_a_line_that_falls_is_drawn_falling(tmp_path):
+def test_a_decreasing_series_is_drawn_downwards(tmp_path):
     lines = {"first": Line((1, 10, 100), (5, 5, 5)), "falling": Line((1, 10, 100), (10, 1, 0.1))}
     draw_charts(tmp_path / "chart.png", "Title", "x", "y", [Chart("panel", lines)], columns=1)
     found = pixels_of(tmp_path / "chart.png", COLORS[1])
@@ -26,7 +26,7 @@ def test_a_line_that_falls_is_drawn_falling(tmp_path):
     assert middle == pytest.approx((left[0] + right[0]) / 2, abs=4)  # equal steps of a logarithm are equal
 
 
-def test_a_name_has_one_colour_in_all_panels(tmp_path):
+def test_a_series_has_the_same_colour_in_all_panels(tmp_path):
     rising = Line((1, 2), (1, 2))
     charts = [Chart("one", {"a": rising, "b": rising}), Chart("two", {"b": rising})]
     draw_charts(tmp_path / "chart.png", "", "x", "y", charts, columns=2)

@@ -1,4 +1,4 @@
-"""The table of decided and true effects, and the captures that it is about."""
+"""The table that compares decided with true effects, and the captures that it uses."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from neilfpp_method.effects.catalogue import EFFECTS
 from neilfpp_method.errors import UserError
 
 
-def test_a_wrong_decision_is_marked_and_told(tmp_path):
+def test_a_wrong_decision_is_marked_with_its_reason(tmp_path):
     on = {"inter-reflection", "environment-map", "reflection", "metals", "lobe-sampling"}
     rows = [
         {"effect": name, "decision": "on" if name in on else "off", "reason": f"why {name}"}
@@ -36,8 +36,8 @@ def test_a_wrong_decision_is_marked_and_told(tmp_path):
         read_run(tmp_path)
 
 
-def test_a_capture_shows_what_is_there(tmp_path):
-    """The ball of radius 0.8 whose middle is 3.4 away, and as bright as its paint under its sky."""
+def test_a_rendered_capture_shows_the_ball(tmp_path):
+    """The ball of radius 0.8 at distance 3.4 is in the images, as bright as its paint under its sky."""
     pytest.importorskip("mitsuba")
     scene = dataclasses.replace(lambertian(), radiance=np.ones((8, 16, 3)))
     root = write_capture(load_mitsuba("scalar_rgb"), scene, tmp_path / "ball", 3, (12, 9), samples=16)
@@ -51,6 +51,6 @@ def test_a_capture_shows_what_is_there(tmp_path):
     assert len(capture.train_views) == 2
 
 
-def test_the_bowl_is_closed_and_its_quarters_are_of_one_size():
+def test_the_bowl_is_closed_and_its_quarters_have_equal_size():
     areas = [part.mesh.area for part in bowl().parts]
     assert max(areas) == pytest.approx(min(areas), rel=1e-3)

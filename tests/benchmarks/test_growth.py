@@ -1,4 +1,4 @@
-"""The line through a growth, on figures whose line is known."""
+"""The straight line that is fitted to a cost, on figures with a known line."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from benchmarks.growth import Growth, straight_line, table
 
 
-def test_a_straight_line_is_found_and_what_is_none_shows():
+def test_a_straight_line_is_found_and_deviations_are_reported():
     numbers = (1, 2, 4, 8)
     line = straight_line(Growth("a", numbers, tuple(0.5 + 0.25 * n for n in numbers)))
     assert (line.fixed, line.each, line.off) == pytest.approx((0.5, 0.25, 0.0), abs=1e-12)

@@ -1,5 +1,5 @@
-"""What whole steps are timed on: rays that meet the table, a distance field that is it, and queries that are
-all counted.
+"""The benchmark of whole steps: all rays meet the table, the distance field represents it, and all queries
+are counted.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def test_all_rays_meet_the_table():
     assert table(rays.origins + depth[:, None] * rays.directions).abs().max() < 2e-3
 
 
-def test_the_fit_brings_a_field_to_the_table_and_another_host_takes_it_over(monkeypatch):
+def test_a_field_is_fitted_to_the_table_and_copied_to_another_host(monkeypatch):
     monkeypatch.setattr(joint, "FIT_STEPS", 60)
     config = dataclasses.replace(
         tiny_config(), loss=dataclasses.replace(tiny_config().loss, hessian_joint=0.0)
@@ -52,7 +52,7 @@ def test_every_query_of_the_sampler_is_counted(monkeypatch):
     assert said[0].sdf_queries >= host.config.volume.initial_samples
 
 
-def test_steps_take_turns_and_each_comes_after_one_like_it():
+def test_steps_alternate_and_each_follows_one_of_its_kind():
     calls = []
     taken = seconds_of(
         {"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, {"a": False, "b": True}

@@ -1,4 +1,4 @@
-"""What counts as worse than a baseline, and what a saved baseline holds."""
+"""The comparison of figures with a baseline, and the contents of a saved baseline."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from neilfpp_method.errors import UserError
         ("higher", 9.0, False),
     ],
 )
-def test_worse_is_a_matter_of_direction_and_tolerance(better, value, worse):
+def test_worse_depends_on_direction_and_tolerance(better, value, worse):
     assert Measurement("a", value, "×", better, tolerance=0.2).worse_than(1.0) == worse
     assert not Measurement("a", value, "×", better).worse_than(1.0)
 
 
-def test_a_comparison_names_what_is_worse_and_overlooks_what_is_new():
+def test_a_comparison_names_worse_figures_and_ignores_new_ones():
     measured = [Measurement(name, 2.0, "×", "lower", tolerance=0.5) for name in ("slower", "same", "new")]
     assert compare(measured, {"slower": 1.0, "same": 2.0, "gone": 0.1}) == ["slower"]
 
@@ -41,7 +41,7 @@ def test_a_saved_baseline_keeps_the_figures_that_were_not_measured():
     assert new["figures"]["replaced"] == {"value": 2.0, "unit": "×", "better": "higher", "tolerance": 0.1}
 
 
-def test_durations_are_medians_and_turns_are_taken():
+def test_durations_are_medians_of_alternating_runs():
     calls = []
 
     def work() -> None:

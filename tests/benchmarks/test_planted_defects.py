@@ -1,4 +1,4 @@
-"""The contract suite finds what is planted, by the check that the table of docs/hosts.md names."""
+"""The contract suite finds each planted defect, by the check that the table of docs/hosts.md names."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def found() -> dict[str, str | None]:
     return result
 
 
-def test_the_whole_host_passes():
+def test_the_host_without_defects_passes():
     assert check_host(Scene(), rays_from_above()).hits > 150
 
 
-def test_all_but_what_nobody_can_see_is_found(found):
-    """Without a photograph of known radiance nobody can tell what a colour should be."""
+def test_all_defects_but_wrong_colours_are_found(found):
+    """Without a photograph of known radiance, wrong colours cannot be detected."""
     missed = {name for name, check in found.items() if check is None}
     assert missed == {"colours in display values", "red and blue exchanged"}
     assert len(found) == len(DEFECTS) >= 55

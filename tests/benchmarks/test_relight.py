@@ -1,4 +1,6 @@
-"""The path tracer against an implementation that shares no line with it, where Mitsuba is installed."""
+"""Compare the path tracer with Mitsuba, an independent implementation; skipped if Mitsuba is not
+installed.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +16,8 @@ from neilfpp_method.relight.film import Budget, render_picture
 from neilfpp_method.relight.sky import Sky
 
 
-def test_a_picture_of_the_corner_is_mitsubas(tmp_path):
-    """Under a smooth sky, turned by its azimuth: a wrong axis or a lost bounce would change every pixel by
-    tenths."""
+def test_an_image_of_the_corner_agrees_with_mitsuba(tmp_path):
+    """Under a smooth, rotated sky. A wrong axis or a missing bounce would change every pixel by tenths."""
     pytest.importorskip("mitsuba")
     mi = load_mitsuba("scalar_rgb")
     radiance = relight.sunny_map(8).clamp_max(1.2)
@@ -35,7 +36,7 @@ def test_a_picture_of_the_corner_is_mitsubas(tmp_path):
     assert np.abs(other - theirs).mean() > 0.2 * mean
 
 
-def test_without_mitsuba_it_says_so(monkeypatch):
+def test_without_mitsuba_there_is_an_error(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "mitsuba", None)
     with pytest.raises(UserError, match="pip install mitsuba"):
         load_mitsuba("scalar_rgb")

@@ -1,6 +1,4 @@
-"""The steps that are timed are steps: in every stage what should move gets a gradient, so no stage is timed
-empty.
-"""
+"""The timed steps are complete steps: in every stage, each trained field gets a gradient."""
 
 from __future__ import annotations
 
@@ -11,7 +9,7 @@ from neilfpp_method.schedule import Stage
 
 
 @pytest.mark.parametrize("stage", Stage)
-def test_a_step_reaches_what_its_stage_moves(stage):
+def test_a_step_gives_gradients_to_the_trained_fields(stage):
     model = model_of("fast")
     before = {name: value.clone() for name, value in model.state_dict().items() if name.startswith("brdf.")}
     step_of(model, stage, rays=64)()

@@ -1,4 +1,4 @@
-"""The yardstick computes what the package computes: losses and gradients of one step agree, on the same
+"""The plain implementation computes the same as the package: losses and gradients of a step agree on the same
 directions.
 """
 
@@ -20,7 +20,7 @@ from tests.scenes import sphere_batch, sphere_model, tiny_config
 
 
 def small_paper():
-    """The paper's kinds of networks, made small."""
+    """The networks of the paper, with small sizes."""
     config, tiny = paper_mlp(), tiny_config()
     return dataclasses.replace(
         config,
@@ -39,7 +39,7 @@ def double(batch: PixelBatch) -> PixelBatch:
 
 
 def test_losses_and_gradients_agree():
-    """In evaluation mode, where only what is traced and where Hessians are taken is drawn at random."""
+    """In evaluation mode, in which only the traced rays and the points of the Hessians are random."""
     names = ("volume", "eikonal", "surface", "physical", "smoothness", "lambertian")
     model = sphere_model(small_paper())
     found = []
@@ -72,6 +72,6 @@ def test_hessians_and_traced_light_agree():
     torch.manual_seed(0)
     theirs = trace_light(plain.host, 1.5 * out, -out, settings, hit_share=0.8)
     assert ours.hit.equal(theirs.hit)
-    # A ray that has converged takes no more cuts in the package: both know its opacity up to ε, not to the
+    # The package adds no cuts to a converged ray: both opacities are accurate to ε, not to the
     # last digit.
     torch.testing.assert_close(ours.radiance, theirs.radiance, rtol=0.0, atol=1e-3)

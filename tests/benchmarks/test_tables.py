@@ -1,4 +1,4 @@
-"""Tables in documents say what the result files say."""
+"""Tables in documents agree with the result files."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ CUBE = Result(
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
 def test_the_documents_are_up_to_date(path):
-    """`python -m benchmarks.tables` mends it."""
+    """`python -m benchmarks.tables` updates them."""
     document = path.read_text("utf-8")
     assert "<!-- table: " in document
     assert filled(document, read_results()) == document
 
 
-def test_every_result_file_is_shown():
+def test_every_result_file_has_a_table():
     documents = "".join(path.read_text("utf-8") for path in DOCUMENTS)
     for result in read_results():
         assert f"<!-- table: {result.table}" in documents
@@ -44,7 +44,7 @@ def test_a_table():
     ]
 
 
-def test_a_marker_chooses_figures_and_the_rest_of_a_document_stays():
+def test_a_marker_selects_figures_and_other_text_is_unchanged():
     document = "before\n<!-- table: t seconds -->\nold\n<!-- end -->\nafter"
     head, *_, end, after = filled(document, [BALL]).splitlines()
     assert (head, end, after) == ("before", "<!-- end -->", "after")
@@ -53,13 +53,13 @@ def test_a_marker_chooses_figures_and_the_rest_of_a_document_stays():
     assert filled(filled(document, [BALL]), [BALL]) == filled(document, [BALL])
 
 
-def test_what_is_written_is_read(tmp_path):
+def test_a_written_result_is_read_back(tmp_path):
     write_result(tmp_path / "b.json", CUBE)
     write_result(tmp_path / "a.json", BALL)
     assert read_results(tmp_path) == [BALL, CUBE]
 
 
-def test_figures_that_no_table_shows_are_left_out(tmp_path):
+def test_figures_without_a_column_are_left_out(tmp_path):
     row = Row("one", {"seconds": 1.0, "temperature": 20.0})
     write_result(tmp_path / "a.json", Result("t", "abc1234", "make ball", "a CPU", (row,)))
     assert read_results(tmp_path)[0].rows[0].figures == {"seconds": 1.0}
@@ -76,7 +76,7 @@ def test_figures_that_no_table_shows_are_left_out(tmp_path):
         ),
     ],
 )
-def test_a_file_that_is_none(tmp_path, change, words):
+def test_an_invalid_result_file_is_refused(tmp_path, change, words):
     write_result(tmp_path / "a.json", BALL)
     content = json.loads((tmp_path / "a.json").read_text())
     (tmp_path / "a.json").write_text(json.dumps({**content, **change}))
@@ -91,12 +91,12 @@ def test_a_file_that_is_none(tmp_path, change, words):
         ("<!-- table: t colour -->", "no figure 'colour'"),
     ],
 )
-def test_a_table_that_cannot_be(marker, words):
+def test_an_invalid_marker_is_refused(marker, words):
     with pytest.raises(UserError, match=words):
         filled(f"{marker}\n<!-- end -->", [BALL])
 
 
-def test_columns_have_titles_of_their_own():
-    """Of the figures that can stand in one table."""
+def test_column_titles_are_unique():
+    """Among the figures that can appear in one table."""
     titles = [column.title for name, column in COLUMNS.items() if not name.startswith("confidence_")]
     assert len(set(titles)) == len(titles)

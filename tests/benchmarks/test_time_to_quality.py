@@ -1,4 +1,4 @@
-"""Curves of quality over time: taken on a few steps, drawn and put into a table."""
+"""Curves of quality over time: measured in a few steps, drawn, and written as a table."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def measured() -> Curve:
     )
 
 
-def test_marks_come_until_the_end_and_the_material_when_it_has_begun(measured):
+def test_measurements_continue_to_the_end_and_include_the_material_stage(measured):
     assert measured.finished
     assert [mark.step for mark in measured.marks] == sorted({mark.step for mark in measured.marks})
     assert all(a.seconds < b.seconds for a, b in zip(measured.marks, measured.marks[1:], strict=False))
@@ -28,7 +28,7 @@ def test_marks_come_until_the_end_and_the_material_when_it_has_begun(measured):
     assert set(measured.marks[-1].figures) == set(FIGURES)
 
 
-def test_a_cap_ends_a_curve_and_says_so():
+def test_a_time_limit_ends_a_curve_and_is_noted():
     capped = curve(demo_scene(), tiny_config(), cap=1e-6, first=1.0, views=1, device=torch.device("cpu"))
     assert [mark.step for mark in capped.marks] == [1]
     assert not capped.finished
@@ -36,14 +36,14 @@ def test_a_cap_ends_a_curve_and_says_so():
     assert list(time_to_quality.charts(Path("scene"), {"tiny": capped})[0].lines) == ["tiny, unfinished"]
 
 
-def test_holding_for_a_mark_changes_nothing(measured):
+def test_a_measurement_does_not_change_the_training(measured):
     again = curve(
         demo_scene(), tiny_config(), cap=float("inf"), first=1e9, views=1, device=torch.device("cpu")
     )
     assert again.marks[-1].figures == pytest.approx(measured.marks[-1].figures)
 
 
-def test_a_figure_that_is_not_there_yet_is_a_dash():
+def test_a_missing_figure_is_a_dash():
     marks = (Mark(1.0, 5, {"volume_psnr": 20.0}), Mark(2.0, 10, {"volume_psnr": 21.0, "roughness_psnr": 9.0}))
     measured = Curve(marks, 10)
     assert "| p | 1 | 5 of 10 | 20.00 | – | – | – | – |" in table({"p": measured})

@@ -1,5 +1,5 @@
-"""The true light as a function: it holds at the known directions, and integrals of it are those of what is
-known.
+"""The true light as a function: it reproduces the known directions, and its integrals agree with the known
+ones.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from neilfpp_method.structures import Material
 
 
 def smooth(wi):
-    """A light without corners, of three colours."""
+    """A smooth light with three different channels."""
     return torch.stack((1 + wi[..., 0], 2 + wi[..., 1] * wi[..., 2], 1.5 - 0.5 * wi[..., 2]), -1)
 
 
@@ -39,7 +39,7 @@ def test_known_directions_keep_their_radiance():
     torch.testing.assert_close(second, light.radiance(inner)[1:2])
 
 
-def test_the_mean_over_the_hemisphere_is_that_of_the_truth():
+def test_the_mean_over_the_hemisphere_is_the_true_mean():
     field = sky()
     light = true_light(field.wi, field.incident)
     few = combine([(fibonacci(field.normal), 512)], stochastic=True).wi
@@ -47,9 +47,9 @@ def test_the_mean_over_the_hemisphere_is_that_of_the_truth():
 
 
 @pytest.mark.parametrize("name", list(techniques()))
-def test_every_sampler_comes_near_the_reference(name):
-    """Smooth light on a rough surface: 256 directions are right to some per cent, and more are better than
-    few.
+def test_every_sampler_approaches_the_reference(name):
+    """Smooth light on a rough surface: 256 directions are accurate to a few per cent, and more directions are
+    more accurate.
     """
     scene = scene_of(sky())
     few, many = error_curves(scene, 1.0, {name: techniques()[name]}, counts=(8, 256))[name].y

@@ -1,4 +1,4 @@
-"""The arithmetic of a budget, against trainings on a clock that is set by hand."""
+"""The arithmetic of a time budget, on simulated trainings with a simulated clock."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ COSTS = Costs(
 # ---------------------------------------------------------------------------------------------- at the start
 
 
-def test_a_plan_fills_the_budget_by_hand():
+def test_a_plan_uses_up_the_budget():
     # once: 3 + 6 + 4 + 4 + 10 = 27; steps: 2000·0.05 + 1500·0.1 + 100·0.22 = 272
     assert COSTS.once == pytest.approx(27.0)
     assert COSTS.all_steps == pytest.approx(272.0)
@@ -45,7 +45,7 @@ def test_a_plan_fills_the_budget_by_hand():
     assert steps_for(COSTS, share) == {"sdf_init": 1000, "material_init": 750, "joint": 50}
 
 
-def test_more_time_than_is_useful_is_not_filled():
+def test_a_budget_beyond_the_largest_share_is_not_used_up():
     assert share_for(COSTS, budget=1e6, spent=0.0) == MAX_SHARE
 
 
@@ -69,8 +69,8 @@ def test_the_smallest_budget_is_enough_and_a_round_number():
 def simulate(
     budget: float, slower: Callable[[float], float], spent: float = 5.0, every: float = 0.02
 ) -> tuple[float, dict[str, int], list[dict[str, int]]]:
-    """A training that takes what `COSTS` says times `slower` of the time that is gone; fits come every 100
-    steps. Returns its seconds, the steps of each stage, and the plans that it went by.
+    """Simulate a training whose costs are `COSTS` times `slower`, a function of the elapsed time, with a fit
+    every 100 steps. Returns its seconds, the steps of each stage, and the plans.
     """
     now = spent
     planned = steps_for(COSTS, share_for(COSTS, budget, now))
@@ -100,16 +100,16 @@ def simulate(
 
 @pytest.mark.parametrize("budget", [90.0, 150.0, 300.0, 900.0])
 @pytest.mark.parametrize("factor", [0.7, 1.0, 1.6])
-def test_a_machine_that_is_not_what_the_trial_saw(budget, factor):
-    """Within a tenth, whatever the machine does, as long as what comes at the end is as slow as the trial
-    saw by that factor.
+def test_a_machine_slower_or_faster_than_in_the_trial(budget, factor):
+    """The budget is kept within a tenth if the work at the end is slower than in the trial by the same
+    factor.
     """
     seconds, done, _ = simulate(budget, lambda now: factor)
     assert seconds == pytest.approx(budget, rel=0.1)
     assert min(done.values()) >= 1
 
 
-def test_a_machine_that_is_as_it_was_needs_no_new_plan():
+def test_a_machine_as_fast_as_in_the_trial_needs_no_new_plan():
     seconds, done, plans = simulate(300.0, lambda now: 1.0)
     assert seconds == pytest.approx(300.0, rel=0.02)
     for stage in ("sdf_init", "material_init"):
@@ -118,18 +118,18 @@ def test_a_machine_that_is_as_it_was_needs_no_new_plan():
     assert plans[0]["joint"] <= done["joint"] <= 1.2 * plans[0]["joint"]
 
 
-def test_others_come_and_go():
+def test_other_programs_start_and_end():
     seconds, _, _ = simulate(300.0, lambda now: 2.0 if 60.0 < now < 160.0 else 1.0)
     assert seconds == pytest.approx(300.0, rel=0.05)
 
 
-def test_without_new_plans_a_slow_machine_is_late():
-    """What the re-planning is for: the same machine, planned once."""
+def test_without_revisions_a_slow_machine_exceeds_the_budget():
+    """The purpose of the revisions: the same machine with a single plan."""
     seconds, _, _ = simulate(300.0, lambda now: 1.6, every=10.0)
     assert seconds > 1.3 * 300.0
 
 
-def test_when_time_is_over_the_stage_ends_and_later_ones_have_a_step():
+def test_when_the_time_is_used_up_the_stage_ends_and_later_ones_get_one_step():
     planned = {"sdf_init": 100, "material_init": 75, "joint": 5}
     late = Progress("sdf_init", 60, seconds=500.0, stepping=3.0, fitting=0.0)
     assert revised_steps(COSTS, planned, late, budget=90.0) == {
@@ -139,13 +139,13 @@ def test_when_time_is_over_the_stage_ends_and_later_ones_have_a_step():
     }
 
 
-def test_stages_that_are_over_stay():
+def test_finished_stages_are_unchanged():
     planned = {"sdf_init": 321, "material_init": 75, "joint": 5}
     at = Progress("material_init", 10, seconds=50.0, stepping=0.8, fitting=6.0)
     assert revised_steps(COSTS, planned, at, budget=500.0)["sdf_init"] == 321
 
 
-def test_a_plan_is_never_below_the_steps_that_are_over_nor_above_the_most():
+def test_a_plan_has_at_least_the_trained_steps_and_at_most_the_largest_share():
     planned = {"sdf_init": 100, "material_init": 75, "joint": 5}
     for seconds in (0.0, 1e9):
         at = Progress("joint", 5, seconds, stepping=1.0, fitting=0.0)
@@ -160,7 +160,7 @@ def test_a_plan_is_never_below_the_steps_that_are_over_nor_above_the_most():
     [preset("fast"), fixed_geometry(preset("fast")), free_light(preset("fast")), preset("paper-ngp")],
     ids=["fast", "mesh", "free", "paper"],
 )
-def test_sizes_change_what_a_step_is_and_nothing_else(config: NeilfConfig):
+def test_sizes_change_only_the_size_of_a_step(config: NeilfConfig):
     small, large = sized(config, "small"), sized(config, "large")
     assert sized(config, "usual") == config
     assert 2 * small.train.rays == config.train.rays == large.train.rays // 2
@@ -185,18 +185,18 @@ def test_a_size_follows_from_the_steps_that_fit():
 @pytest.mark.parametrize(
     ("text", "seconds"), [("90s", 90), ("10m", 600), ("1h", 3600), ("1.5m", 90), ("1h2m3s", 3723)]
 )
-def test_times_are_read(text, seconds):
+def test_durations_are_parsed(text, seconds):
     assert read_duration(text) == seconds
 
 
 @pytest.mark.parametrize(
     "text", ["", "10", "ten", "-5m", "5 minutes", "0s", "1e3s", "99999h", "5m10", "nan s"]
 )
-def test_what_is_no_time(text):
+def test_invalid_durations_are_refused(text):
     with pytest.raises(UserError, match=r"not a duration|out of range"):
         read_duration(text)
 
 
 @pytest.mark.parametrize("seconds", [1, 59, 60, 61, 600, 3540, 3600, 5400, 86_400])
-def test_times_in_words_are_read_again(seconds):
+def test_formatted_durations_are_parsed_back(seconds):
     assert read_duration(format_duration(float(seconds))) == seconds

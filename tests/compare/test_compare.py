@@ -1,4 +1,4 @@
-"""Small runs side by side: what the table says, what it marks, and what the picture shows."""
+"""Comparison of small runs: the table, its marks, and the image."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ from tests.data.make_capture import make_capture
 from tests.train.small_runs import small_config
 
 CELL, GAP, LEFT, TOP = 240, 8, 290, 206
-"""Of a sheet: width of a picture, pixels between two, and where the first one begins."""
+"""Layout of a sheet: width of an image, distance between two images, and position of the first one, in
+pixels.
+"""
 
 STEPS = [f"--config.train.{stage}-steps=2" for stage in ("sdf", "material", "joint")]
 
@@ -41,14 +43,14 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory: pytest.TempPathFactory, capture: Path) -> Path:
-    """A run of a given mesh."""
+    """A run with a given mesh."""
     out = tmp_path_factory.mktemp("runs") / "mesh"
     return train(capture, out, "--host", "mesh", "--config.train.joint-steps=0")
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory, capture: Path, given: Path) -> dict[str, Path]:
-    """Runs of one capture: found geometry with its figures, a given mesh, and one with no view held out."""
+    """Runs of one capture: recovered geometry with figures, a given mesh, and one without test views."""
     root = tmp_path_factory.mktemp("runs")
     everything = Path(shutil.copytree(given, root / "all"))
     point_at(everything, test_every=0)
@@ -56,7 +58,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory, capture: Path, given: Path
 
 
 def measured(run: Path) -> Path:
-    """The run with figures as `neilfpp eval` leaves them."""
+    """The run with figures as `neilfpp eval` writes them."""
     figures = {"pbr_psnr": 20.0, "volume_psnr": 21.0, "base_color_psnr": 12.5}
     what = {"view_names": ["000", "003"], "width": 40, "height": 30, "step": 6}
     (run / "metrics.json").write_text(json.dumps(figures | {"health": "sound"}))
@@ -66,7 +68,7 @@ def measured(run: Path) -> Path:
 
 
 def point_at(run: Path, **changes: object) -> Path:
-    """The run with its capture read in another way."""
+    """The run with changed options of reading its capture."""
     source = run / "capture.json"
     source.write_text(json.dumps(json.loads(source.read_text()) | changes))
     return run
@@ -74,7 +76,7 @@ def point_at(run: Path, **changes: object) -> Path:
 
 @pytest.fixture
 def runs(trained: dict[str, Path], tmp_path: Path) -> dict[str, Path]:
-    """Copies to spoil."""
+    """Copies that a test may change."""
     return {name: Path(shutil.copytree(path, tmp_path / "runs" / name)) for name, path in trained.items()}
 
 
@@ -90,7 +92,7 @@ def part(table: dict, kind: str, name: str = "") -> dict:
 # ------------------------------------------------------------------------------------------------- good input
 
 
-def test_runs_of_two_hosts_stand_side_by_side(runs, tmp_path, capsys):
+def test_runs_of_two_hosts_are_compared(runs, tmp_path, capsys):
     table = compare(tmp_path / "out", runs["found"], runs["mesh"], "--views", "2", "--size", "40")
     assert table["runs"] == ["found", "mesh"]
     assert table["views"] == ["000", "003"]
@@ -117,7 +119,7 @@ def test_runs_of_two_hosts_stand_side_by_side(runs, tmp_path, capsys):
         assert words in told
 
 
-def test_the_sheet_holds_the_truth_and_what_each_run_shows(runs, tmp_path, capture):
+def test_the_sheet_has_the_truth_and_the_maps_of_each_run(runs, tmp_path, capture):
     compare(tmp_path, runs["found"], runs["mesh"], "--views", "2", "--size", "40")
     sheet = (read_image(tmp_path / "compare.png").pixels * 255).round().astype(np.uint8)
     # Two sections of seven maps, three columns of cells 240 wide: 30/40 of that is 180 high.
@@ -201,7 +203,7 @@ def test_runs_of_two_captures_have_a_table_and_no_picture(runs, tmp_path):
     assert not (tmp_path / "out" / "compare.png").exists()
 
 
-def test_other_photographs_from_the_same_cameras_are_told(runs, tmp_path):
+def test_different_photographs_from_the_same_cameras_are_noted(runs, tmp_path):
     copied = make_capture(tmp_path / "copied", size=(40, 30), masks=True, test=(0, 3))
     bright = make_capture(tmp_path / "bright", size=(40, 30), masks=True, test=(0, 3), background=0.5)
     for root, told in ((copied, 0), (bright, 1)):
@@ -215,7 +217,7 @@ def test_other_photographs_from_the_same_cameras_are_told(runs, tmp_path):
 # ----------------------------------------------------------------------------------------------- unusual runs
 
 
-def test_a_run_without_test_views_shows_views_that_it_learned_from(runs, tmp_path):
+def test_a_run_without_test_views_shows_training_views(runs, tmp_path):
     table = compare(tmp_path, runs["all"], runs["found"], "--views", "2", "--size", "40")
     assert table["views"] == ["000", "005"]
     assert "all, found used the views shown here" in table["notes"][0]
@@ -223,7 +225,7 @@ def test_a_run_without_test_views_shows_views_that_it_learned_from(runs, tmp_pat
     assert image_header(tmp_path / "compare.png").width == LEFT + 3 * CELL + 2 * GAP + 40
 
 
-def test_runs_without_truth_have_figures_of_images_alone(given, tmp_path):
+def test_runs_without_truth_have_only_figures_of_images(given, tmp_path):
     root = make_capture(tmp_path / "photos", size=(40, 30), test=(0,))
     for folder in ("inputs/depth_maps", "inputs/normal_maps", "ground_truths"):
         shutil.rmtree(root / folder)
@@ -237,7 +239,7 @@ def test_runs_without_truth_have_figures_of_images_alone(given, tmp_path):
     assert part(table, "settings")["rows"] == {}
 
 
-def test_a_run_before_its_first_checkpoint_has_a_column_in_the_table_alone(runs, tmp_path):
+def test_a_run_before_its_first_checkpoint_is_only_in_the_table(runs, tmp_path):
     shutil.rmtree(runs["mesh"] / "checkpoints")
     table = compare(tmp_path, runs["found"], runs["mesh"], "--views", "1", "--size", "40")
     notes = part(table, "runs")["notes"]
@@ -252,7 +254,7 @@ def test_a_run_before_its_first_checkpoint_has_a_column_in_the_table_alone(runs,
 # -------------------------------------------------------------------------------------------------- bad input
 
 
-def test_what_is_no_run_is_told_in_one_line(runs, tmp_path, capsys):
+def test_invalid_runs_are_refused_in_one_line(runs, tmp_path, capsys):
     lone, out = tmp_path / "empty", tmp_path / "out"
     lone.mkdir()
     for arguments, told in (
@@ -281,7 +283,7 @@ def test_a_capture_that_has_moved_is_named(runs, tmp_path):
 # ------------------------------------------------------------------------------------------------------ parts
 
 
-def test_labels_tell_runs_apart():
+def test_labels_are_unique():
     assert labels_of([Path("/a/x"), Path("/a/y")]) == ["x", "y"]
     assert labels_of([Path("/a/x"), Path("/b/x"), Path("/b/y")]) == ["a/x", "b/x", "b/y"]
 

@@ -1,4 +1,4 @@
-"""A capture of many large images that takes little to make: one picture under many names."""
+"""A capture with many large images that is made quickly: one image file under many names."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.data.make_capture import camera_pose
 
 
 def make_large_capture(root: Path, views: int, size: tuple[int, int]) -> Path:
-    """The project's own folder, display values: a grey disc on a ramp, seen from all around."""
+    """The package's own layout with display values: a grey disc on a ramp, in views from all around."""
     width, height = size
     rows, columns = np.mgrid[:height, :width]
     disc = (rows - height / 2) ** 2 + (columns - width / 2) ** 2 < (0.3 * height) ** 2

@@ -1,8 +1,7 @@
-"""A tiny capture with everything known: a sphere, traced analytically, written in the layout of the NeILF
-datasets.
+"""A tiny capture whose truth is known: a sphere, traced analytically, in the layout of the NeILF datasets.
 
-Written in NumPy and apart from the package's cameras, so that it is an oracle for them. The scene frame has
-the sphere at the origin with radius RADIUS / SCALE = 0.8.
+It is written in NumPy without the package's cameras, so that it is an independent reference for them. In the
+scene frame, the sphere is at the origin and has the radius RADIUS / SCALE = 0.8.
 """
 
 from __future__ import annotations
@@ -24,12 +23,12 @@ ROUGHNESS, METALLIC = 0.6, 0.2
 
 
 def base_color(normal: np.ndarray) -> np.ndarray:
-    """The sphere's base colour, told by its normal."""
+    """The sphere's base colour as a function of its normal."""
     return 0.5 + 0.3 * normal
 
 
 def radiance(normal: np.ndarray) -> np.ndarray:
-    """What the sphere sends to every viewer, linear; above 1 where it faces the light."""
+    """The linear radiance that the sphere sends to every viewer; above 1 where it faces the light."""
     return 2.0 * base_color(normal) * (0.2 + 0.8 * np.maximum(normal @ LIGHT, 0.0))[..., None]
 
 
@@ -40,7 +39,7 @@ def srgb(linear: np.ndarray) -> np.ndarray:
 
 
 def camera_pose(i: int, views: int) -> np.ndarray:
-    """World to camera of view i: on a ring about the sphere, by turns above and below it, looking at its
+    """World to camera of view i: on a ring around the sphere, alternately above and below it, looking at its
     centre.
     """
     azimuth, elevation = 2 * np.pi * i / views, np.radians(35 if i % 2 else -10)

@@ -1,4 +1,6 @@
-"""A capture under a sky: the ground is of one colour and most of every border, and the sky another one."""
+"""A capture under a sky: the ground has one colour and covers most of the image borders; the sky has another
+one.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +15,11 @@ from tests.data.make_capture import make_capture
 
 GROUND, SKY = 0.25, (0.3, 0.5, 0.9)
 HORIZON = -0.05
-"""Height of a direction above which it meets the sky."""
+"""z component of a direction above which it shows the sky."""
 
 
 def make_sky_capture(root: Path, **options) -> Path:
-    """The sphere of `make_capture`, linear, with what lies behind it."""
+    """The sphere of `make_capture` in linear values, with ground and sky as its background."""
     capture = load_capture(make_capture(root, background=GROUND, **options))
     pixels = PixelDataset(capture, capture.views)
     for i, view in enumerate(capture.views):

@@ -1,4 +1,4 @@
-"""Brackets taken by hand: a camera that turns between the exposures of a scene of known radiance."""
+"""Handheld brackets: the camera rotates between the exposures of a scene with known radiance."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ TIMES = (1 / 32, 1 / 10, 1 / 3)
 SIZE = (240, 180)
 STILL = ((0.0, 0.0, 0.0),) * 3
 HAND = ((0.6, -0.8, 0.5), (0.0, 0.0, 0.0), (-0.7, 0.5, -0.4))
-"""Degrees about the camera's axes."""
+"""Rotations about the camera's axes, degrees."""
 
 
 def radiance(turn: tuple[float, ...], view: int = 2) -> np.ndarray:
-    """The corner as a lens shows it, whose detail is no finer than its pixels."""
+    """The corner as seen through a lens, without detail finer than a pixel."""
     w2c = np.eye(4)
     w2c[:3, :3] = cv2.Rodrigues(np.radians(turn))[0]
     fine = photograph(w2c @ pose(view, 8), (4 * SIZE[0], 4 * SIZE[1]))
@@ -34,7 +34,7 @@ def bracket(turns: tuple[tuple[float, ...], ...], curve: str = "srgb", view: int
 
 
 def true_motion(turn: tuple[float, ...]) -> float:
-    """By how many pixels a turn of the camera moves the corner that it moves most."""
+    """Largest motion, in pixels, of an image corner by a rotation of the camera."""
     k = np.array([[1.25 * SIZE[0], 0, SIZE[0] / 2], [0, 1.25 * SIZE[0], SIZE[1] / 2], [0, 0, 1]])
     corners = np.array([[[x, y] for x in (0.5, SIZE[0] - 0.5) for y in (0.5, SIZE[1] - 0.5)]])
     motion = k @ cv2.Rodrigues(np.radians(turn))[0] @ np.linalg.inv(k)
@@ -48,14 +48,14 @@ def errors(stack: Bracket, response=srgb_response) -> np.ndarray:
     return relative_error(merged.radiance, truth)[merged.valid & (truth.min(-1) > 0.15)]
 
 
-def test_what_stood_on_a_tripod_is_left_as_it_is() -> None:
+def test_a_bracket_from_a_tripod_is_unchanged() -> None:
     stack = bracket(STILL)
     aligned = align(stack)
     assert aligned.moved == 0
     assert aligned.bracket.pixels == stack.pixels
 
 
-def test_what_was_held_by_hand_comes_back() -> None:
+def test_a_handheld_bracket_is_aligned() -> None:
     stack = bracket(HAND)
     aligned = align(stack)
     assert aligned.moved == pytest.approx(max(true_motion(HAND[0]), true_motion(HAND[2])), abs=0.1)
@@ -66,14 +66,14 @@ def test_what_was_held_by_hand_comes_back() -> None:
     assert np.median(errors(stack)) > 0.05  # as it was
 
 
-def test_the_response_is_calibrated_from_what_was_held_by_hand() -> None:
+def test_the_response_is_calibrated_from_handheld_brackets() -> None:
     stacks = [align(bracket(HAND, "film", view)).bracket for view in (2, 5)]
     error = errors(stacks[0], calibrate(stacks))
     assert np.median(error) < 0.02
     assert np.quantile(error, 0.95) < 0.05
 
 
-def test_what_a_moved_image_does_not_show_is_told_by_the_others() -> None:
+def test_pixels_outside_a_moved_image_come_from_the_other_exposures() -> None:
     turns = ((0.0, 4.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     aligned = align(bracket(turns))
     assert aligned.moved > 15
@@ -86,7 +86,7 @@ def test_what_a_moved_image_does_not_show_is_told_by_the_others() -> None:
     assert np.median(relative_error(merged.radiance[:, unseen], truth[:, unseen])[shown]) < 0.01
 
 
-def test_what_shows_nothing_is_left_as_it_is() -> None:
+def test_images_without_detail_are_unchanged() -> None:
     grey = tuple(np.full((40, 60, 3), level, np.float32) for level in (0.1, 0.3, 0.8))
     assert align(Bracket(grey, TIMES)).moved == 0
     noise = tuple(

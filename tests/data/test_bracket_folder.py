@@ -1,4 +1,6 @@
-"""Folders of photographs become radiance, however the brackets are laid out; what is no bracket is named."""
+"""Folders of photographs are merged to radiance in every layout of brackets; invalid folders are refused by
+name.
+"""
 
 from __future__ import annotations
 

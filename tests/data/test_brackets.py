@@ -1,4 +1,6 @@
-"""Brackets: photographs simulated from known radiance, with a known camera, come back as that radiance."""
+"""Exposure brackets, simulated from known radiance with a known camera response, are merged to that
+radiance.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +17,7 @@ TIMES = (1 / 256, 1 / 64, 1 / 16, 1 / 4, 1.0)
 
 
 def scene(seed: int = 0, size: tuple[int, int] = (48, 64)) -> np.ndarray:
-    """Radiance over 13 stops, smooth and coloured: 0.016 to 128 in the unit in which the 1 s image clips at
-    1.
-    """
+    """Smooth coloured radiance over 13 stops: 0.016 to 128, where the 1 s exposure clips at 1."""
     height, width = size
     v, u = np.mgrid[:height, :width] / np.array([height, width]).reshape(2, 1, 1)
     stops = -6.0 + 13.0 * (0.5 + 0.3 * np.sin(9 * u + seed) * np.cos(7 * v) + 0.2 * (u - v))
@@ -26,7 +26,7 @@ def scene(seed: int = 0, size: tuple[int, int] = (48, 64)) -> np.ndarray:
 
 
 def film(light: np.ndarray) -> np.ndarray:
-    """Another camera: a gamma of 1/2.2 with a soft S on top."""
+    """Response of another camera: a gamma of 1/2.2 with a soft S-curve."""
     z = light.clip(0, 1) ** (1 / 2.2)
     return z + 0.08 * np.sin(2 * np.pi * z) / (2 * np.pi)
 
@@ -43,7 +43,7 @@ def photographs(
 
 
 def relative_error(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Beside one global scale."""
+    """Relative error after one global scale factor."""
     return np.abs(found / np.median(found / truth) / truth - 1)
 
 
@@ -51,7 +51,7 @@ def relative_error(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("curve", "levels"), [("srgb", 255), ("linear", 65_535)])
-def test_a_known_response_gives_the_radiance_back(curve: str, levels: int) -> None:
+def test_a_known_response_recovers_the_radiance(curve: str, levels: int) -> None:
     truth = scene()
     response = brackets.srgb_response if curve == "srgb" else linear_response
     merged = merge(Bracket(tuple(photographs(truth, curve, levels=levels)), TIMES), response)
@@ -62,7 +62,7 @@ def test_a_known_response_gives_the_radiance_back(curve: str, levels: int) -> No
 
 
 @pytest.mark.parametrize("curve", ["srgb", "film"])
-def test_a_calibrated_response_gives_the_radiance_back(curve: str) -> None:
+def test_a_calibrated_response_recovers_the_radiance(curve: str) -> None:
     poses = [scene(seed) for seed in range(3)]
     stacks = [Bracket(tuple(photographs(truth, curve)), TIMES) for truth in poses]
     response = calibrate(stacks)
@@ -73,7 +73,7 @@ def test_a_calibrated_response_gives_the_radiance_back(curve: str) -> None:
         assert np.median(error) < 0.006
 
 
-def test_clipped_at_every_exposure_is_a_lower_bound_and_invalid() -> None:
+def test_pixels_clipped_at_every_exposure_are_lower_bounds_and_invalid() -> None:
     truth = np.ones((4, 4, 3), np.float32)
     truth[0, 0] = [1, 1, 500]  # one channel is enough
     merged = merge(Bracket(tuple(photographs(truth, "linear")), TIMES), linear_response)
@@ -83,7 +83,7 @@ def test_clipped_at_every_exposure_is_a_lower_bound_and_invalid() -> None:
     assert merged.radiance[0, 0, 0] == pytest.approx(1, rel=0.02)
 
 
-def test_dark_at_every_exposure_is_almost_black_and_valid() -> None:
+def test_pixels_dark_at_every_exposure_are_almost_black_and_valid() -> None:
     truth = np.full((4, 4, 3), 0.01, np.float32)
     truth[0, 0] = 0
     merged = merge(Bracket(tuple(photographs(truth, "linear")), TIMES), linear_response)
@@ -112,7 +112,7 @@ def test_opencv_agrees_where_nothing_is_clipped() -> None:
     assert np.median(np.abs(ours / theirs - 1)) < 0.005
 
 
-def test_exposures_that_tell_no_response_are_refused() -> None:
+def test_exposures_that_determine_no_response_are_refused() -> None:
     same = np.random.default_rng(0).uniform(0, 1, (16, 16, 3)).astype(np.float32)
     stack = Bracket((same, same[::-1].copy(), same[:, ::-1].copy()), (1.0, 2.0, 4.0))  # noise, not light
     with pytest.raises(UserError, match="response cannot be calibrated"):

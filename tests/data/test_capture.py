@@ -1,4 +1,6 @@
-"""Captures: cameras against the projection matrix, the scene frame, the published layout, the split."""
+"""Captures: cameras compared with the projection matrix, the scene frame, the published layout, and the
+split.
+"""
 
 from __future__ import annotations
 
@@ -108,7 +110,7 @@ def test_nested_matrices_single_focals_and_other_suffixes_are_taken(tmp_path: Pa
     assert capture.views[0].mask == tmp_path / "inputs" / "masks" / "000.png"
 
 
-def test_without_a_box_the_point_cloud_says_where_the_scene_is(tmp_path: Path) -> None:
+def test_without_a_box_the_point_cloud_defines_the_scene(tmp_path: Path) -> None:
     make_capture(tmp_path)
     edit_scene(tmp_path, lambda scene: scene.pop("bbox"))
     normalisation = load_capture(tmp_path).normalisation
@@ -143,7 +145,7 @@ def test_split_numbers_are_the_numbers_of_the_scene_file(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("hdr", [True, False])
-def test_response_is_told_from_the_files_or_by_the_user(tmp_path: Path, hdr: bool) -> None:
+def test_response_comes_from_the_files_or_the_user(tmp_path: Path, hdr: bool) -> None:
     make_capture(tmp_path, hdr=hdr)
     assert load_capture(tmp_path).hdr == hdr
     assert load_capture(tmp_path, response="linear").hdr

@@ -1,4 +1,6 @@
-"""The project's own folder: what is written is read, and docs/captures.md says how without this project."""
+"""The package's own layout: written captures are read back, and the example of docs/captures.md can be
+read.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ DOCS = Path(__file__).parents[2] / "docs" / "captures.md"
 
 
 def folder(root: Path, **changes) -> Path:
-    """A capture of this project's own, made of `make_capture`'s; `changes` are of the first view."""
+    """A capture in the package's own layout, made from that of `make_capture`; `changes` apply to the first
+    view.
+    """
     made = load_capture(make_capture(root, masks=True))
     (root / "inputs" / "sfm_scene.json").unlink()
     (root / "split.json").unlink()
@@ -42,7 +46,7 @@ def edit(root: Path, change: Callable[[dict], object]) -> Path:
     return root
 
 
-def test_what_is_written_is_read(tmp_path: Path) -> None:
+def test_a_written_capture_is_read_back(tmp_path: Path) -> None:
     write_png(tmp_path / "usable.png", np.full((18, 24), 255, np.uint8))
     lens = Lens("OPENCV", (0.1, -0.01, 0.001, 0.0))
     made = load_capture(make_capture(tmp_path, masks=True))
@@ -73,13 +77,13 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
         assert replace(new, camera=old.camera) == old
 
 
-def test_the_response_can_still_be_overruled(tmp_path: Path) -> None:
+def test_the_response_can_be_overridden(tmp_path: Path) -> None:
     folder(tmp_path)
     assert load_capture(tmp_path).hdr
     assert not load_capture(tmp_path, response="srgb").hdr
 
 
-def test_the_split_can_be_overruled(tmp_path: Path) -> None:
+def test_the_split_can_be_overridden(tmp_path: Path) -> None:
     folder(tmp_path)
     assert load_capture(tmp_path).test == {"002"}
     assert load_capture(tmp_path, test_every=3).test == {"002", "005"}
@@ -104,7 +108,7 @@ def test_the_example_in_the_documentation_is_a_capture(tmp_path: Path) -> None:
     assert capture.test == set(content["test"])
 
 
-def test_a_folder_by_hand_needs_little(tmp_path: Path) -> None:
+def test_a_minimal_folder_is_read(tmp_path: Path) -> None:
     write_exr(tmp_path / "a.exr", {"RGB": np.ones((18, 24, 3), np.float32)})
     camera = {
         "fx": 20,
@@ -183,7 +187,7 @@ def test_bad_entries_are_refused(tmp_path: Path, change: Callable[[dict], object
     assert "\n" not in str(caught.value)
 
 
-def test_only_what_can_be_read_is_written(tmp_path: Path) -> None:
+def test_only_readable_captures_are_written(tmp_path: Path) -> None:
     root = folder(tmp_path / "capture")
     before = (root / "capture.json").read_bytes()
     capture = load_capture(root)

@@ -1,4 +1,4 @@
-"""pycolmap and OpenCV share a process, whichever module of ours is loaded first."""
+"""pycolmap and OpenCV work in one process, whichever module of the package is imported first."""
 
 from __future__ import annotations
 

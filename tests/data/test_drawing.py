@@ -1,4 +1,6 @@
-"""Draws of a step's pixels: the k-th of a set, shares on the object and beside it, determined by the seed."""
+"""Drawing the pixels of a step: selection of the k-th of a set, shares on and off the object, and dependence
+on the seed.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,7 @@ def padded(bits: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("count", [1, BLOCK - 1, BLOCK, BLOCK + 1, 20_000])
-def test_the_kth_pixel_of_a_set_is_the_kth(count: int) -> None:
+def test_the_kth_pixel_of_a_set_is_selected(count: int) -> None:
     bits = np.random.default_rng(count).integers(0, 16, count)
     bits[-1] = VALID | NEAR
     for of, are in ((VALID, VALID), (VALID | NEAR, VALID | NEAR), (VALID | NEAR, VALID)):
@@ -41,11 +43,11 @@ def test_shares_near_the_object_and_beside_it() -> None:
     for chosen in (near & valid, ~near & valid):  # within each, every pixel is as likely as any other
         drawn = np.bincount(numbers, minlength=50_000)[chosen]
         assert stats.chisquare(np.add.reduceat(drawn, np.arange(0, len(drawn) - 9, 10))[:-1]).pvalue > 1e-3
-    # A step may use its first pixels alone: they are no other than the rest.
+    # A step may use only its first pixels, so they must have the same distribution as the rest.
     assert stats.binomtest(int(near[numbers[:10_000]].sum()), 10_000, NEAR_SHARE).pvalue > 1e-3
 
 
-def test_where_nearly_all_is_near_draws_are_uniform() -> None:
+def test_draws_are_uniform_if_nearly_all_pixels_are_near() -> None:
     near = np.arange(5000) < 4500
     draws = PixelDraws(padded(np.where(near, NEAR, 0) | VALID), 5000)
     torch.manual_seed(5)

@@ -1,4 +1,4 @@
-"""Environment maps in: what is read, and what is refused in one line."""
+"""Reading of environment maps: valid files are read, and invalid ones are refused in one line."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def write(path: Path, pixels: np.ndarray, channels: str = "RGB") -> Path:
     return path
 
 
-def test_rows_and_columns_stay_where_they_are(tmp_path):
+def test_rows_and_columns_keep_their_order(tmp_path):
     pixels = np.arange(5 * 9 * 3).reshape(5, 9, 3)
     radiance = read_environment(write(tmp_path / "sky.exr", pixels))
     np.testing.assert_array_equal(radiance.numpy(), np.moveaxis(pixels, -1, 0))
 
 
-def test_one_channel_counts_for_all_three(tmp_path):
+def test_a_single_channel_is_copied_to_all_three(tmp_path):
     radiance = read_environment(write(tmp_path / "sky.exr", np.arange(32).reshape(4, 8), "Y"))
     assert radiance.shape == (3, 4, 8)
     assert (radiance[0] == radiance[2]).all()
@@ -47,7 +47,7 @@ def spoilt(value: float) -> np.ndarray:
         (np.ones((4, 7, 3)), "4 rows and 7 columns"),
     ],
 )
-def test_what_is_no_light_is_refused(tmp_path, pixels, complaint):
+def test_invalid_radiance_is_refused(tmp_path, pixels, complaint):
     path = write(tmp_path / "sky.exr", pixels)
     with pytest.raises(UserError, match=complaint) as caught:
         read_environment(path)
@@ -55,7 +55,7 @@ def test_what_is_no_light_is_refused(tmp_path, pixels, complaint):
     assert caught.value.remedy
 
 
-def test_ringing_of_a_filter_counts_as_black(tmp_path):
+def test_slightly_negative_texels_are_set_to_black(tmp_path):
     radiance = read_environment(write(tmp_path / "sky.exr", spoilt(-1e-3)))
     assert radiance[1, 2, 3] == 0
     assert radiance.amin() == 0

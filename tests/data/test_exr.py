@@ -1,4 +1,4 @@
-"""EXR files of renderers that store many things in one: which of them is the picture."""
+"""EXR files of renderers with many layers and parts: which of them is the image."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def written(path: Path, *parts: dict[str, np.ndarray]) -> Path:
         "layer in a part",
     ],
 )
-def test_the_picture_is_found_among_layers_and_parts(
+def test_the_image_is_found_among_layers_and_parts(
     tmp_path: Path, parts: list[dict[str, np.ndarray]]
 ) -> None:
     path = written(tmp_path / "a.exr", *parts)
@@ -69,7 +69,7 @@ def test_the_alpha_is_that_of_the_layer(tmp_path: Path) -> None:
     assert (image.alpha == 0.25).all()
 
 
-def test_layers_that_could_all_be_meant_are_refused(tmp_path: Path) -> None:
+def test_ambiguous_layers_are_refused(tmp_path: Path) -> None:
     path = written(tmp_path / "a.exr", {**DIFFUSE, **planes("View.GlossCol.", RGB)})
     for read in (image_header, read_image):
         with pytest.raises(
@@ -88,7 +88,7 @@ def test_the_size_of_every_part_is_bounded(tmp_path: Path) -> None:
             read(path)
 
 
-def test_a_file_that_is_cut_off_says_so_once(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_truncated_file_is_reported_once(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = written(tmp_path / "a.exr", planes("", RGB))
     path.write_bytes(path.read_bytes()[:-60])
     with pytest.raises(UserError, match=r"a\.exr: cannot be read \(damaged, or cut off\)"):

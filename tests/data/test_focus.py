@@ -1,4 +1,4 @@
-"""What most cameras look at: constructed cameras, whose axes meet where they are made to."""
+"""The focus of cameras, on constructed cameras whose axes meet at known points."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def looking(image: Path, eye: np.ndarray, at: np.ndarray) -> View:
 def around(
     image: Path, count: int = 24, distance: float = 4.0, arc: float = 2 * np.pi, aim: float = 0.0
 ) -> list[View]:
-    """Cameras on a part of a ring about the place, a little above it; their aim is off by up to `aim`."""
+    """Cameras on a part of a ring around the place, slightly above it; their aim deviates by up to `aim`."""
     random = np.random.default_rng(0)
     views = []
     for angle in np.arange(count) / count * arc:
@@ -44,7 +44,7 @@ def around(
 
 
 def room(count: int = 3000, half: float = 12.0) -> np.ndarray:
-    """Points on a thing at the place, and on the walls of a room about it."""
+    """Points on an object at the place and on the walls of a room around it."""
     random = np.random.default_rng(1)
     walls = random.uniform(-half, half, (count, 3))
     walls[np.arange(count), random.integers(0, 3, count)] = half * random.choice([-1, 1], count)
@@ -63,7 +63,7 @@ def test_aim_is_averaged(image):
     assert np.linalg.norm(focus.centre - PLACE) < 0.15
 
 
-def test_a_quarter_that_looks_elsewhere_moves_nothing(image):
+def test_a_quarter_of_cameras_that_look_elsewhere_has_no_influence(image):
     random = np.random.default_rng(2)
     away = [
         looking(image, PLACE + 4 * d, PLACE + 4 * d + 10 * random.normal(size=3))
@@ -74,7 +74,7 @@ def test_a_quarter_that_looks_elsewhere_moves_nothing(image):
     assert focus.looking[:24].all()
 
 
-def test_a_background_far_away_does_not_make_the_box(image):
+def test_a_distant_background_does_not_define_the_box(image):
     views, points = around(image), room()
     assert box_of_points(points).scale > 10, "the box of all points holds the cameras"
     box = find_box(views, points)
@@ -85,7 +85,7 @@ def test_a_background_far_away_does_not_make_the_box(image):
     assert min(distances) == pytest.approx(1 / REACH)
 
 
-def test_points_that_end_before_the_cameras_are_better(image):
+def test_points_that_end_before_the_cameras_define_the_box(image):
     thing = PLACE + np.random.default_rng(3).uniform(-1, 1, (500, 3))
     box = find_box(around(image), thing)
     assert box.source == "points"
@@ -93,8 +93,8 @@ def test_points_that_end_before_the_cameras_are_better(image):
 
 
 @pytest.mark.parametrize("turned", [0.0, 0.02])
-def test_forward_facing_cameras_leave_the_points_to_tell(image, turned):
-    """Side by side, all the same way but for the unsteadiness of a hand."""
+def test_points_define_the_box_of_forward_facing_cameras(image, turned):
+    """Cameras side by side that look in one direction, except for small random rotations."""
     random = np.random.default_rng(4)
     eyes = random.uniform(-1, 1, (20, 3)) * [1, 0, 1]
     views = [looking(image, eye, eye + [0, 10, 0] + 10 * turned * random.normal(size=3)) for eye in eyes]
@@ -103,7 +103,7 @@ def test_forward_facing_cameras_leave_the_points_to_tell(image, turned):
     assert find_box(views, points).source == "points"
 
 
-def test_cameras_side_by_side_that_turn_towards_a_thing_have_a_focus(image):
+def test_cameras_side_by_side_that_turn_towards_an_object_have_a_focus(image):
     focus = find_focus(around(image, count=9, arc=np.pi / 2))
     assert focus.centre == pytest.approx(PLACE, abs=1e-6)
 
@@ -117,7 +117,7 @@ def test_two_cameras(image):
     assert box_of_focus(close) is None
 
 
-def test_cameras_that_look_outwards_have_none(image):
+def test_cameras_that_look_outwards_have_no_focus(image):
     eyes = [PLACE + 0.5 * np.array([np.cos(a), np.sin(a), 0.0]) for a in np.linspace(0, 6, 12)]
     views = [looking(image, eye, PLACE + 20 * (eye - PLACE)) for eye in eyes]
     assert find_focus(views) is None

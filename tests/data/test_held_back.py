@@ -1,4 +1,4 @@
-"""Patches of training views that are never drawn: on the object, few, and the same for the same seed."""
+"""Held-back patches of training views are never drawn: on the object, few, and the same for the same seed."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_patches_are_squares_on_the_object(tmp_path):
     assert 0.8 * len(numbers) < len(held_back) <= len(numbers)
 
 
-def test_what_is_held_back_is_never_drawn_and_all_else_is(tmp_path):
+def test_held_back_pixels_are_never_drawn_and_all_others_are(tmp_path):
     pixels = dataset(tmp_path / "sphere", size=(32, 24), masks=True)
     hold_back(pixels, seed=0)
     torch.manual_seed(0)
@@ -52,8 +52,8 @@ def test_what_is_held_back_is_never_drawn_and_all_else_is(tmp_path):
     assert 0 < len(left_out(pixels)) <= MAX_SHARE * len(pixels)
 
 
-def test_pixels_that_are_left_come_as_often_as_one_another(tmp_path):
-    """Without masks, in front of a background of its own colour: all pixels are alike."""
+def test_the_remaining_pixels_are_equally_likely(tmp_path):
+    """Without masks and with a varying background, no pixel is preferred."""
     pixels = dataset(tmp_path / "sphere", size=(32, 24))
     pixels._draws._parts = None
     hold_back(pixels, seed=0)
@@ -66,7 +66,7 @@ def test_pixels_that_are_left_come_as_often_as_one_another(tmp_path):
     assert counts[left_out(pixels)].sum() == 0
 
 
-def test_the_choice_follows_from_the_seed_and_moves_no_other_random_number(tmp_path):
+def test_the_choice_depends_on_the_seed_and_uses_no_other_random_numbers(tmp_path):
     root = tmp_path / "sphere"
     one = dataset(root, size=(64, 48))
     capture = one.capture
@@ -84,7 +84,7 @@ def _left_out_with(pixels: PixelDataset, seed: int) -> np.ndarray:
     return left_out(pixels)
 
 
-def test_a_capture_too_small_gives_nothing_back(tmp_path):
+def test_nothing_is_held_back_from_a_very_small_capture(tmp_path):
     pixels = dataset(tmp_path / "sphere", size=(8, 6), views=3, masks=True)
     assert len(hold_back(pixels, seed=0)) == 0
     assert len(pixels.sample(10)) == 10

@@ -1,4 +1,4 @@
-"""Image files: what is written by one library is read back by the package, and the other way round."""
+"""Image files: files that other libraries write are read by the package, and the other way round."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_integer_samples_scale_to_one(tmp_path: Path, suffix: str, dtype: type, 
 
 
 @pytest.mark.parametrize("kind", ["8", "16", "float"])
-def test_an_alpha_that_is_opaque_everywhere_says_nothing(tmp_path: Path, kind: str) -> None:
+def test_an_alpha_that_is_opaque_everywhere_is_ignored(tmp_path: Path, kind: str) -> None:
     def alpha_of(values: np.ndarray) -> np.ndarray | None:
         if kind == "float":
             write_exr(tmp_path / "a.exr", {"RGBA": values.astype(np.float32)})
@@ -182,7 +182,7 @@ def test_written_png_is_rgb(tmp_path: Path) -> None:
         write_png(tmp_path / "no.png", RGB)
 
 
-def test_a_failed_write_leaves_the_old_file_alone(tmp_path: Path) -> None:
+def test_a_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "kept.txt"
     path.write_text("old")
 
@@ -197,7 +197,7 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-# --------------------------------------------------------------------------------------- files from strangers
+# ----------------------------------------------------------------------------------------- untrusted files
 
 
 @pytest.mark.parametrize("suffix", [".exr", ".png", ".tif", ".jpg", ".hdr"])

@@ -1,4 +1,6 @@
-"""Lenses against the libraries that define them: pycolmap for every model, OpenCV for its own."""
+"""Lenses compared with the libraries that define them: pycolmap for every model, OpenCV for its own
+models.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ from neilfpp_method.data.views import Camera, CameraRays, camera_rays, check_cam
 from neilfpp_method.errors import UserError
 from tests.data.make_capture import CENTRE, camera_pose
 
-# Coefficients as calibrations find them, by model.
+# Typical coefficients of a calibration, by model.
 COEFFICIENTS = {
     "SIMPLE_RADIAL": [-0.12],
     "RADIAL": [-0.12, 0.03],
@@ -53,7 +55,7 @@ def camera(model: str, focal: tuple[float, float] = FOCAL) -> Camera:
 
 
 def seen_points(count: int = 200) -> np.ndarray:
-    """Points about the scene's centre, which the camera of `camera_pose` looks at."""
+    """Points around the scene's centre, at which the camera of `camera_pose` looks."""
     return CENTRE + np.random.default_rng(3).uniform(-1.5, 1.5, (count, 3))
 
 
@@ -62,7 +64,7 @@ def local(points: np.ndarray) -> np.ndarray:
     return points @ w2c[:3, :3].T + w2c[:3, 3]
 
 
-def test_every_model_of_the_library_is_known() -> None:
+def test_every_model_of_the_library_is_supported() -> None:
     assert set(COEFFICIENTS) >= set(LENSES)
 
 
@@ -104,7 +106,7 @@ def test_rays_project_back_to_pixel_centres(model: str) -> None:
     assert np.abs(seen.pixel.numpy() - expected).max() < 0.01
 
 
-def test_rays_of_many_cameras_keep_apart() -> None:
+def test_rays_of_many_cameras_are_not_confused() -> None:
     lens, other = camera("OPENCV"), camera("OPENCV_FISHEYE")
     moved = Camera(*FOCAL, *CENTRE_PIXEL, *SIZE, camera_pose(4, 6), lens.lens)
     pinhole = Camera(*FOCAL, *CENTRE_PIXEL, 30, 20, camera_pose(2, 6))
@@ -119,7 +121,7 @@ def test_rays_of_many_cameras_keep_apart() -> None:
         assert torch.allclose(together.origins[i], alone.origins[p])
 
 
-def test_what_bends_nothing_is_a_pinhole() -> None:
+def test_a_lens_without_distortion_is_a_pinhole() -> None:
     assert lens_of("PINHOLE", []) is None
     assert lens_of("OPENCV", [0.0] * 4) is None
     assert lens_of("OPENCV_FISHEYE", [0.0] * 4) is not None  # the angle, not its tangent, is the radius
@@ -140,7 +142,9 @@ def test_bad_lenses_are_refused(lens: Lens, words: str) -> None:
 
 
 def barrel(strength: float) -> Camera:
-    """x·(1 − s x²) turns back at x = 1/√(3 s), where it is 2/3 of that: no ray reaches what lies beyond."""
+    """A lens with x·(1 − s x²), which decreases beyond x = 1/√(3 s). Its maximum is 2/3 of that x, and no ray
+    reaches pixels beyond it.
+    """
     return Camera(*FOCAL, *CENTRE_PIXEL, *SIZE, camera_pose(1, 6), Lens("RADIAL", (-strength, 0.0)))
 
 
@@ -149,7 +153,7 @@ def test_a_lens_that_shows_nothing_at_most_pixels_is_refused() -> None:
         camera_rays(barrel(0.8))
 
 
-def test_pixels_at_which_a_lens_shows_nothing_are_told_and_look_away() -> None:
+def test_pixels_at_which_a_lens_shows_nothing_are_marked_and_point_away() -> None:
     seen_by = barrel(0.3)
     pinhole = Camera(*FOCAL, *CENTRE_PIXEL, 30, 20, camera_pose(2, 6))
     rays = CameraRays([pinhole, seen_by])
@@ -178,7 +182,7 @@ def test_a_resampled_image_is_that_of_the_pinhole(model: str) -> None:
     assert straight_camera(straight) is straight
 
     def picture(seen_by: Camera) -> np.ndarray:
-        """A picture at infinity, smooth in the direction of view."""
+        """An image at infinity, smooth in the direction of view."""
         directions = camera_rays(seen_by).directions.numpy()
         return np.sin(4 * directions + 0.3).reshape(seen_by.height, seen_by.width, 3).astype(np.float32)
 

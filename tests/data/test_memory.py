@@ -1,4 +1,4 @@
-"""Free memory as the system and its control groups tell it, and a word where something does not fit."""
+"""Free memory according to the system and its control groups, and the error if something does not fit."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def group(folder: Path, limit: int | str, used: int, inactive: int = 0) -> None:
     (folder / "memory.stat").write_text(f"anon 5\ninactive_file {inactive}\n")
 
 
-def test_without_groups_it_is_the_system(tmp_path: Path) -> None:
+def test_without_groups_the_system_decides(tmp_path: Path) -> None:
     assert available_memory(system(tmp_path / "proc", 6 * GIB), tmp_path / "none") == 6 * GIB
 
 
@@ -56,7 +56,7 @@ def test_groups_of_version_1(tmp_path: Path) -> None:
     assert available_memory(proc, tmp_path / "groups") == 20 * GIB
 
 
-def test_nothing_is_known_elsewhere(tmp_path: Path) -> None:
+def test_other_systems_report_nothing(tmp_path: Path) -> None:
     assert available_memory(tmp_path / "none", tmp_path / "none") is None
 
 
@@ -67,7 +67,7 @@ def test_a_limit_of_the_process(tmp_path: Path, monkeypatch) -> None:
     assert available_memory(proc, tmp_path / "none") == 2 * GIB
 
 
-def test_what_does_not_fit_is_said_in_one_line() -> None:
+def test_too_little_memory_is_an_error_of_one_line() -> None:
     check_memory(GIB, "the pixels", "take fewer", free=GIB)
     with pytest.raises(UserError) as told:
         check_memory(5 * GIB, "the pixels", "take fewer", free=2 * GIB)

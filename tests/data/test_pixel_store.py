@@ -1,6 +1,4 @@
-"""The store of pixels: exact as its bits allow, found again when nothing has changed, and made anew when
-something has.
-"""
+"""The pixel store: exact to its number of bits, reused if nothing has changed, and rebuilt otherwise."""
 
 from __future__ import annotations
 
@@ -44,7 +42,7 @@ def same(one: PixelDataset, other: PixelDataset) -> bool:
 # ---------------------------------------------------------------------------------------------- what it holds
 
 
-def test_images_of_8_bits_come_back_to_the_bit(tmp_path: Path) -> None:
+def test_8_bit_images_are_stored_exactly(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path / "c", hdr=False))
     pixels, _ = opened(capture, tmp_path / "pixels")
     assert (tmp_path / "pixels" / "color.npy").stat().st_size < 3 * len(pixels) + 200
@@ -52,7 +50,7 @@ def test_images_of_8_bits_come_back_to_the_bit(tmp_path: Path) -> None:
         assert np.array_equal(pixels.view(i).color.numpy(), read_image(view.image).pixels.reshape(-1, 3))
 
 
-def test_images_of_16_bits_come_back_to_the_bit(tmp_path: Path) -> None:
+def test_16_bit_images_are_stored_exactly(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path / "c", hdr=False))
     samples = np.random.default_rng(0).integers(0, 65_536, (HEIGHT, WIDTH, 3), dtype=np.uint16)
     write_png(capture.views[3].image, samples)  # among others of 8 bits, which 16 hold as well
@@ -62,7 +60,7 @@ def test_images_of_16_bits_come_back_to_the_bit(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
-def test_radiance_comes_back_to_half_precision_in_any_unit(tmp_path: Path, unit: float) -> None:
+def test_radiance_is_stored_in_half_precision_in_any_unit(tmp_path: Path, unit: float) -> None:
     capture = load_capture(make_capture(tmp_path / "c"))
     color = unit * np.random.default_rng(0).lognormal(0, 3, (HEIGHT, WIDTH, 3)).astype(np.float32)
     write_exr(capture.views[0].image, {"RGB": color})
@@ -109,7 +107,7 @@ def test_single_pixels_are_those_of_their_views(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------- found again, made anew
 
 
-def test_a_store_is_found_again(tmp_path: Path) -> None:
+def test_an_unchanged_store_is_reused(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path / "c", masks=True))
     first, names = opened(capture, tmp_path / "pixels")
     assert len(names) == 6
@@ -136,7 +134,7 @@ def moved_camera(root: Path) -> None:
 
 
 @pytest.mark.parametrize("change", [changed_image, touched_mask, moved_camera])
-def test_what_has_changed_is_read_again(tmp_path: Path, change) -> None:
+def test_changed_files_are_read_again(tmp_path: Path, change) -> None:
     root = make_capture(tmp_path / "c", hdr=False, masks=True)
     opened(load_capture(root), tmp_path / "pixels")
     change(root)
@@ -182,7 +180,7 @@ def negative_scale(folder: Path) -> None:
 @pytest.mark.parametrize(
     "damage", [cut_off, of_other_shape, pickled, without_description, foreign_description, negative_scale]
 )
-def test_a_damaged_or_foreign_store_is_made_anew(tmp_path: Path, damage) -> None:
+def test_a_damaged_or_foreign_store_is_rebuilt(tmp_path: Path, damage) -> None:
     capture = load_capture(make_capture(tmp_path / "c"))
     opened(capture, tmp_path / "pixels")
     damage(tmp_path / "pixels")
@@ -201,7 +199,7 @@ def test_a_failure_leaves_no_half_store(tmp_path: Path) -> None:
     assert list((tmp_path / "pixels").iterdir()) == []
 
 
-def test_a_full_disk_is_told_before_anything_is_read(tmp_path: Path, monkeypatch) -> None:
+def test_a_full_disk_is_an_error_before_anything_is_read(tmp_path: Path, monkeypatch) -> None:
     capture = load_capture(make_capture(tmp_path / "c"))
     monkeypatch.setattr(pixel_store.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 10**6}))
     with pytest.raises(
@@ -211,7 +209,7 @@ def test_a_full_disk_is_told_before_anything_is_read(tmp_path: Path, monkeypatch
     assert not (tmp_path / "pixels").exists()
 
 
-def test_pages_that_were_drawn_are_given_back(tmp_path: Path, monkeypatch) -> None:
+def test_mapped_pages_are_released_after_drawing(tmp_path: Path, monkeypatch) -> None:
     capture = load_capture(make_capture(tmp_path / "c"))
     pixels, _ = opened(capture, tmp_path / "pixels")
     given_back: list[int] = []
@@ -227,7 +225,7 @@ def test_pages_that_were_drawn_are_given_back(tmp_path: Path, monkeypatch) -> No
 # ------------------------------------------------------------------------------------------------ near or far
 
 
-def test_near_the_object_is_a_disc_about_it() -> None:
+def test_pixels_near_the_object_form_a_disc_around_it() -> None:
     mask = np.zeros((100, 200), bool)
     mask[40:60, 90:110] = True
     rows, columns = np.mgrid[:100, :200]

@@ -1,4 +1,4 @@
-"""The pixel dataset: colours and rays against the analytic sphere, its statistics, and its draws."""
+"""The pixel dataset: colours and rays compared with the analytic sphere, its statistics, and its draws."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ WIDTH, HEIGHT = 24, 18
 
 
 def without_background(capture: Capture) -> Capture:
-    """The capture with a ramp added to its images, so that no two pixels tell where the object is."""
+    """The capture with a ramp added to its images, so that no constant background identifies the object."""
     for view in capture.views:
         color = OpenEXR.File(str(view.image)).channels()["RGB"].pixels
         ramp = np.linspace(0.1, 0.2, HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH, 1)
@@ -41,7 +41,7 @@ def dataset(root: Path, **options) -> PixelDataset:
 
 
 def sphere_normals(batch) -> tuple[np.ndarray, np.ndarray]:
-    """Where the rays of a batch meet the sphere at the scene's origin: hit or not, and the normal there."""
+    """For each ray of a batch, whether it hits the sphere at the scene's origin, and the normal there."""
     o, d = batch.origins.double().numpy(), batch.directions.double().numpy()
     b = (o * d).sum(-1)
     inside = b**2 - (o**2).sum(-1) + SPHERE**2
@@ -50,7 +50,7 @@ def sphere_normals(batch) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("hdr", [True, False])
-def test_rays_see_what_the_pixels_show(tmp_path: Path, hdr: bool) -> None:
+def test_rays_and_pixels_agree_with_the_sphere(tmp_path: Path, hdr: bool) -> None:
     pixels = dataset(tmp_path, hdr=hdr, masks=True)
     for batch in (*(pixels.view(i) for i in range(6)), pixels.sample(500)):
         hit, normal = sphere_normals(batch)
@@ -117,9 +117,7 @@ def test_masks(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("exposure", [1.0, 1000.0])
-def test_image_gradient_of_a_ramp_is_that_of_the_picture_whatever_its_exposure(
-    tmp_path: Path, exposure: float
-) -> None:
+def test_image_gradient_of_a_ramp_does_not_depend_on_the_exposure(tmp_path: Path, exposure: float) -> None:
     root = make_capture(tmp_path)
     x, y = np.meshgrid(np.arange(WIDTH) - (WIDTH - 1) / 2, np.arange(HEIGHT) - (HEIGHT - 1) / 2)
     display = 1.055 * 0.18 ** (1 / 2.4) - 0.055 + 0.02 * x + 0.01 * y  # about middle grey
@@ -204,7 +202,7 @@ def test_statistics_leave_invalid_pixels_out(tmp_path: Path) -> None:
     assert torch.equal(pixels.border_color(), torch.tensor([0.25, 0.25, 0.25]))
 
 
-def test_nothing_valid_is_refused(tmp_path: Path) -> None:
+def test_a_capture_without_valid_pixels_is_refused(tmp_path: Path) -> None:
     capture = marked(tmp_path, slice(0, WIDTH))
     with pytest.raises(UserError, match="no pixel is valid"):
         PixelDataset(capture, capture.views)
@@ -228,7 +226,7 @@ def test_pixels_at_which_a_lens_shows_nothing_are_never_drawn(tmp_path: Path) ->
     assert torch.equal(pixels.view(4).directions, whole.view(4).directions)
 
 
-def test_pixels_without_meaning_need_a_mark(tmp_path: Path) -> None:
+def test_invalid_pixels_must_be_marked(tmp_path: Path) -> None:
     capture = with_views(marked(tmp_path, slice(0, 2)), valid=None)
     with pytest.raises(UserError, match=r"000\.exr: 4 pixels are NaN, infinite or negative.*validity mask"):
         PixelDataset(capture, capture.views)
@@ -295,7 +293,7 @@ def test_border_color_is_linear(tmp_path: Path, hdr: bool, background: float) ->
     assert np.allclose(color, background, atol=0.004)
 
 
-def test_no_border_color_where_the_border_varies(tmp_path: Path) -> None:
+def test_no_border_color_if_the_border_varies(tmp_path: Path) -> None:
     root = make_capture(tmp_path)
     noise = np.random.default_rng(0)
     for i in range(6):
@@ -306,7 +304,7 @@ def test_no_border_color_where_the_border_varies(tmp_path: Path) -> None:
 
 
 def test_no_border_color_under_a_sky(tmp_path: Path) -> None:
-    """Most of the border is ground, the rest a sky, which no place of the scene could be."""
+    """Most of the border is ground. The rest is sky, which cannot be a part of the scene."""
     capture = load_capture(make_sky_capture(tmp_path))
     pixels = PixelDataset(capture, capture.views)
     border = pixels.border_colors()
@@ -315,8 +313,8 @@ def test_no_border_color_under_a_sky(tmp_path: Path) -> None:
     assert np.allclose(pixels.border_median(), GROUND)
 
 
-def test_a_table_that_runs_out_of_the_picture_leaves_the_border_its_color() -> None:
-    """The capture in the package: a third of the border is table."""
+def test_a_table_that_extends_beyond_the_image_does_not_change_the_border_color() -> None:
+    """The demo capture: a third of the border shows the table."""
     capture = load_capture(demo_scene())
     pixels = PixelDataset(capture, capture.train_views)
     assert (pixels.border_colors() == 0).all(-1).mean() < 0.75
@@ -357,8 +355,8 @@ def test_exact_pixels_are_those_of_the_files(tmp_path: Path) -> None:
         PixelDataset(capture, capture.views, folder=tmp_path / "pixels", exact=True)
 
 
-def test_a_mask_file_with_an_alpha_channel_is_its_alpha(tmp_path: Path) -> None:
-    """As tools that cut out objects write them: white, or the photograph, with the mask as alpha."""
+def test_the_alpha_channel_of_a_mask_file_is_the_mask(tmp_path: Path) -> None:
+    """Tools that cut out objects write such files: white, or the photograph, with the mask as alpha."""
     capture = load_capture(make_capture(tmp_path, masks=True))
     plain = PixelDataset(capture, capture.views).store.bits.copy()
     for i, view in enumerate(capture.views):

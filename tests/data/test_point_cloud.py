@@ -1,4 +1,4 @@
-"""Oriented point clouds: positions in the scene frame, unit normals, and the dialects of PLY."""
+"""Oriented point clouds: positions in the scene frame, unit normals, and variants of PLY."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_points_of_the_sphere_in_the_scene_frame(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("dialect", ["ascii", "big_endian", "colors_and_faces"])
-def test_dialects(tmp_path: Path, dialect: str) -> None:
+def test_variants_of_ply(tmp_path: Path, dialect: str) -> None:
     names = ("x", "y", "z", "nx", "ny", "nz")
     rows = np.concatenate([POSITION, NORMAL], axis=1)
     path = tmp_path / "cloud.ply"
@@ -72,7 +72,7 @@ def test_written_points_keep_their_positions(tmp_path: Path, offset: float, kind
     assert np.abs(np.asarray(mesh.vertices) - points.position).max() < 1e-6
 
 
-def test_no_points_are_written(tmp_path: Path) -> None:
+def test_an_empty_cloud_is_written(tmp_path: Path) -> None:
     path = write_oriented_ply(tmp_path / "cloud.ply", WorldPoints(np.empty((0, 3)), np.empty((0, 3))))
     assert b"element vertex 0\nproperty float x\n" in path.read_bytes()
 

@@ -1,4 +1,4 @@
-"""Camera RAW: a DNG made of known sensor values, developed by LibRaw, is those values in linear sRGB."""
+"""Camera RAW: a DNG with known sensor values, developed by LibRaw, gives these values in linear sRGB."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ XYZ_TO_SRGB = np.array(
     [[3.24045, -1.53714, -0.49853], [-0.96927, 1.87601, 0.04156], [0.05564, -0.20403, 1.05723]]
 )
 NEUTRAL = (0.5, 1.0, 0.8)
-"""What the sensor answers to white light: red at half of green."""
+"""Response of the sensor's channels to white light; red is half of green."""
 
 
 def write_dng(path: Path, light: np.ndarray, as_shot: tuple[float, float, float] = NEUTRAL) -> None:
-    """A Bayer sensor (RGGB) behind sRGB filters of the transmittance NEUTRAL; light 1 in green is its white
-    level.
+    """Write the image of a Bayer sensor (RGGB) behind sRGB filters with the transmittances NEUTRAL. Light of
+    1 in green is its white level.
     """
     channel = np.array([[0, 1], [1, 2]])[np.mgrid[:HEIGHT, :WIDTH][0] % 2, np.mgrid[:HEIGHT, :WIDTH][1] % 2]
     answer = np.take_along_axis(light * NEUTRAL, channel[..., None], axis=2)[..., 0]
@@ -51,7 +51,7 @@ def write_dng(path: Path, light: np.ndarray, as_shot: tuple[float, float, float]
 
 
 def patches() -> np.ndarray:
-    """Eight flat colours, each a column of 12 pixels."""
+    """Eight constant colours, each a column of 12 pixels."""
     rng = np.random.default_rng(0)
     return np.repeat(rng.uniform(0.1, 0.9, (1, 8, 3)), 12, axis=1).repeat(HEIGHT, axis=0)
 

@@ -1,4 +1,4 @@
-"""Views at another size: cameras against projected points, pixels against exact means over their areas."""
+"""Views at another size: cameras compared with projected points, pixels with exact means over their areas."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.data.make_capture import make_capture, radiance, srgb
 
 @pytest.mark.parametrize("lens", [None, Lens("OPENCV", (-0.1, 0.02, 1e-3, -1e-3))])
 @pytest.mark.parametrize("scale", [0.5, 0.37])
-def test_points_are_seen_at_the_scaled_place(tmp_path: Path, scale: float, lens: Lens | None) -> None:
+def test_points_project_to_the_scaled_position(tmp_path: Path, scale: float, lens: Lens | None) -> None:
     view = load_capture(make_capture(tmp_path)).views[1]
     view = replace(view, camera=replace(view.camera, lens=lens))
     small = scaled_view(view, scale)
@@ -65,7 +65,7 @@ def test_scaling_there_and_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, 1.5, float("nan")])
-def test_a_scale_that_is_none(tmp_path: Path, scale: float) -> None:
+def test_invalid_scales_are_refused(tmp_path: Path, scale: float) -> None:
     with pytest.raises(UserError, match="images cannot be scaled by"):
         at_scale(load_capture(make_capture(tmp_path)), scale)
 
@@ -80,7 +80,7 @@ def test_means_over_parts_of_pixels() -> None:
     assert np.allclose(area_average(values, 7, 4), exact, atol=1e-6)
 
 
-def test_display_values_are_averaged_as_light(tmp_path: Path) -> None:
+def test_display_values_are_averaged_in_linear_light(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path, hdr=False))
     board = (np.indices((18, 24)).sum(0) % 2 * 255).astype(np.uint8)
     write_png(capture.views[0].image, np.repeat(board[..., None], 3, axis=2))
@@ -89,8 +89,8 @@ def test_display_values_are_averaged_as_light(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("hdr", [True, False])
-def test_small_views_show_what_large_ones_do(tmp_path: Path, hdr: bool) -> None:
-    """Rays and pixels of a reduced capture against the analytic sphere."""
+def test_small_views_agree_with_large_ones(tmp_path: Path, hdr: bool) -> None:
+    """Rays and pixels of a reduced capture compared with the analytic sphere."""
     capture = at_scale(load_capture(make_capture(tmp_path, size=(240, 180), hdr=hdr, masks=True)), 0.25)
     batch = PixelDataset(capture, capture.views).view(2)
     o, d = batch.origins.double().numpy(), batch.directions.double().numpy()
@@ -105,7 +105,7 @@ def test_small_views_show_what_large_ones_do(tmp_path: Path, hdr: bool) -> None:
     assert not batch.mask.numpy()[inside < -0.15].any()
 
 
-def test_a_pixel_is_valid_where_all_that_it_covers_is(tmp_path: Path) -> None:
+def test_a_reduced_pixel_is_valid_if_all_its_sources_are(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path))
     valid = np.full((18, 24), 255, np.uint8)
     valid[5, 9] = 0
@@ -152,7 +152,7 @@ def test_the_scale_that_rays_can_use(tmp_path: Path) -> None:
     assert few.camera.width * few.camera.height == pytest.approx(PIXELS_OF_A_VIEW, rel=0.01)
 
 
-def test_a_scale_next_to_one_is_one(tmp_path: Path) -> None:
+def test_a_scale_close_to_one_is_one(tmp_path: Path) -> None:
     views = photographs(tmp_path, 1, 400, 300)
     assert scale_for_pixels(views, 119_000) == 1.0
     assert scale_for_pixels(views, 60_000) == pytest.approx(0.5**0.5, abs=1e-3)

@@ -1,4 +1,4 @@
-"""The scene box: what is known best tells it, and wrong points do not spoil it."""
+"""The scene box comes from the most reliable source, and wrong points have no influence."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ def views(root: Path, masks: bool = False, count: int = 8) -> tuple[View, ...]:
     return load_capture(make_capture(root, views=count, size=(64, 48), masks=masks)).views
 
 
-def test_points_tell_the_box_in_spite_of_outliers() -> None:
+def test_points_define_the_box_in_spite_of_outliers() -> None:
     points = np.concatenate([sphere_points(), 900 * np.eye(3)])
     box = box_of_points(points)
     assert np.allclose(box.centre, CENTRE, atol=0.03 * RADIUS)
     assert RADIUS < box.scale < 1.15 * RADIUS
 
 
-def test_the_visual_hull_holds_the_object_tightly(tmp_path: Path) -> None:
+def test_the_visual_hull_contains_the_object_closely(tmp_path: Path) -> None:
     box = find_box(views(tmp_path, masks=True, count=16)).normalisation
     assert np.allclose(box.centre, CENTRE, atol=0.15 * RADIUS)
     assert RADIUS < box.scale < 1.3 * RADIUS
     assert np.abs(sphere_points() - box.centre).max() <= box.scale
 
 
-def test_the_cameras_alone_tell_what_they_look_at(tmp_path: Path) -> None:
+def test_cameras_without_points_and_masks_define_the_box(tmp_path: Path) -> None:
     # The shorter side of the image spans 1 / 1.5 of the distance.
     box = box_of_cameras(views(tmp_path))
     assert np.allclose(box.centre, CENTRE, atol=1e-6)
     assert box.scale == pytest.approx(DISTANCE / (2 * 1.5))
 
 
-def test_the_best_source_is_taken(tmp_path: Path) -> None:
+def test_the_most_reliable_source_is_used(tmp_path: Path) -> None:
     masked, plain = views(tmp_path / "masked", masks=True), views(tmp_path / "plain")
     assert find_box(plain).source == "cameras"
     assert find_box(plain, sphere_points()).source == "points"
@@ -55,7 +55,7 @@ def test_the_best_source_is_taken(tmp_path: Path) -> None:
     assert find_box(plain, sphere_points(5)).source == "cameras"
 
 
-def test_points_beside_the_masks_do_not_count(tmp_path: Path) -> None:
+def test_points_outside_the_masks_are_ignored(tmp_path: Path) -> None:
     table = CENTRE + np.random.default_rng(1).uniform(-4, 4, (4000, 3)) * [1, 1, 0] - [0, 0, RADIUS]
     box = find_box(views(tmp_path, masks=True), np.concatenate([sphere_points(), table])).normalisation
     assert np.allclose(box.centre, CENTRE, atol=0.15 * RADIUS)
@@ -87,7 +87,7 @@ def test_opaque_images_have_no_silhouettes(tmp_path: Path) -> None:
     assert find_box([*map(opaque, masked[:9]), *masked[9:]]).source == "cameras"
 
 
-def test_cameras_that_look_one_way_or_apart_tell_nothing(tmp_path: Path) -> None:
+def test_cameras_that_look_in_one_direction_or_apart_are_refused(tmp_path: Path) -> None:
     first, second, *_ = views(tmp_path)
     with pytest.raises(UserError, match="look in one direction"):
         box_of_cameras([first, replace(second, camera=replace(second.camera, w2c=camera_pose(0, 8)))])
@@ -97,7 +97,7 @@ def test_cameras_that_look_one_way_or_apart_tell_nothing(tmp_path: Path) -> None
         box_of_cameras(away)
 
 
-def test_masks_with_nothing_in_common_are_refused(tmp_path: Path) -> None:
+def test_masks_without_a_common_region_are_refused(tmp_path: Path) -> None:
     some = views(tmp_path, masks=True)
     for view in some:
         corner = np.zeros((48, 64), np.uint8)

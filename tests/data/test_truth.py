@@ -1,4 +1,4 @@
-"""The ground truth of the sphere: depth, normals and materials against closed forms; everything is
+"""The ground truth of the sphere: depth, normals and materials compared with closed forms; every part is
 optional.
 """
 
@@ -40,7 +40,7 @@ def test_depth_normal_and_mask_of_a_view(truth: Truth) -> None:
         assert (truth.normal(views[i])[~hit] == 0).all()
 
 
-def test_material_is_linear_and_of_test_views(truth: Truth) -> None:
+def test_material_is_linear_and_exists_for_test_views(truth: Truth) -> None:
     (view,) = truth.capture.test_views
     hit, material = truth.mask(view), truth.material(view)
     expected = base_color(truth.normal(view).numpy())
@@ -50,7 +50,7 @@ def test_material_is_linear_and_of_test_views(truth: Truth) -> None:
     assert truth.material(truth.capture.train_views[0]) is None
 
 
-def test_grey_as_three_channels_is_grey(truth: Truth) -> None:
+def test_three_equal_channels_are_one(truth: Truth) -> None:
     (view,) = truth.capture.test_views
     before = truth.material(view).roughness
     path = truth.capture.root / "ground_truths" / "materials" / "roughness" / f"{view.name}.png"

@@ -1,4 +1,4 @@
-"""The visual hull of a sphere's silhouettes against the sphere, and silhouettes that make no hull."""
+"""The visual hull of a sphere's silhouettes compared with the sphere, and silhouettes without a hull."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def camera_at(eye: Sequence[float], focal: float = 1.5 * SIZE, size: int = SIZE)
 
 
 def disc(camera: Camera, centre: Sequence[float] = (0.0, 0.0, 0.0), radius: float = BALL) -> np.ndarray:
-    """The silhouette of a ball, from the angle between rays and its centre; apart from the package's
-    projection.
+    """The silhouette of a ball, from the angle between the rays and the direction to its centre, without the
+    package's projection.
     """
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     local = np.stack(
@@ -47,7 +47,7 @@ def disc(camera: Camera, centre: Sequence[float] = (0.0, 0.0, 0.0), radius: floa
 
 
 def ring(count: int, distance: float = 4.0, **camera) -> list[Outline]:
-    """Silhouettes of the ball from directions that are spread evenly over the sphere."""
+    """Silhouettes of the ball from directions that are evenly distributed over the sphere."""
     k = np.arange(count) + 0.5
     z, azimuth = 1 - 2 * k / count, k * np.pi * (3 - np.sqrt(5))
     eyes = distance * np.stack(
@@ -74,17 +74,17 @@ def test_the_hull_of_a_ball_is_the_ball(hull):
     found = hull.at(x)
     clear = truth.abs() > 1.5 * CELL
     assert torch.equal(found[clear] < 0, truth[clear] < 0)
-    # A hull is no smaller than the body, up to a cell, and 40 cones leave little beside a ball.
+    # A hull contains the body, up to one cell; that of 40 views is only slightly larger than the ball.
     assert (found - truth).abs().mean() < CELL
     assert (found - truth).max() < 1.5 * CELL
 
 
-def test_the_distance_goes_on_outside_the_cube(hull):
+def test_the_distance_is_extended_outside_the_cube(hull):
     far = torch.tensor([[3.0, 0.0, 0.0], [0.0, -2.0, 0.0]])
     assert hull.at(far).tolist() == pytest.approx([3.0 - BALL, 2.0 - BALL], abs=2 * CELL)
 
 
-def test_a_few_wrong_masks_do_not_matter_and_many_do():
+def test_a_few_wrong_masks_have_no_influence_and_many_do():
     outlines = ring(40)
     broken = [replace(outline, inside=np.roll(outline.inside, SIZE // 2, axis=1)) for outline in outlines]
     whole = visual_hull(outlines, 1.3, 32)
@@ -99,15 +99,15 @@ def test_a_few_wrong_masks_do_not_matter_and_many_do():
     )
 
 
-def test_views_that_do_not_see_a_place_have_no_say_about_it():
-    # Half of the views are close-ups, whose pictures end within the ball: white all over.
+def test_views_that_do_not_contain_a_point_are_ignored_there():
+    # Half of the views are close-ups, whose images lie within the ball and are white everywhere.
     close = ring(20, focal=6.0 * SIZE)
     assert not any(outline.complete for outline in close)
     hull = find_hull([*ring(20), *close], resolution=32)
     x = random_points(2000, 1.1)
     truth = x.norm(dim=-1) - BALL
     assert (hull.at(x) - truth).abs().mean() < 2 * CELL
-    # And with close-ups alone nobody sees where the ball ends, nor what is beside the pictures.
+    # With only close-ups, no view shows the outline of the ball or the space outside the images.
     alone = visual_hull(close, 1.3, 32)
     centre = (np.arange(32) + 0.5) * 2.6 / 32 - 1.3
     assert (
@@ -116,8 +116,8 @@ def test_views_that_do_not_see_a_place_have_no_say_about_it():
     )
 
 
-def test_a_hole_that_views_look_through_is_open():
-    # A bore along z, which the six views near that axis see through.
+def test_a_hole_that_is_visible_in_views_is_open():
+    # A bore along z, which is visible in the six views near that axis.
     along = [camera_at([0.2 * np.cos(a), 0.2 * np.sin(a), 4.0]) for a in np.arange(6.0)]
     bored = [Outline(View("bore", 0, c, Path()), disc(c) & ~disc(c, radius=0.2)) for c in along]
     hull = find_hull([*ring(30), *bored], resolution=48)
@@ -125,7 +125,7 @@ def test_a_hole_that_views_look_through_is_open():
     assert (hull.at(torch.tensor([[0.4, 0.0, 0.0], [0.0, -0.4, 0.0]])) < -0.05).all()
 
 
-def test_what_is_no_body_is_told():
+def test_masks_without_a_hull_are_reported():
     outlines = ring(10)
     white = [replace(outline, inside=np.ones_like(outline.inside)) for outline in outlines]
     assert find_hull(white, resolution=32) == "the masks show something that extends beyond the scene box"
@@ -141,7 +141,7 @@ def test_the_signed_distance_of_a_slab():
     assert distance[5:15, 10, 10] == pytest.approx(0.1 * (np.arange(5, 15) - 9.5), abs=1e-3)
 
 
-def test_agreement_is_the_share_of_those_that_can_tell():
+def test_agreement_is_a_share_of_the_views_that_contain_the_point():
     outlines = ring(8)
     points = np.array([[0.0, 0.0, 0.0], [5.0, 5.0, 5.0]])
     found = sightings(outlines, points)

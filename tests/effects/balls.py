@@ -1,4 +1,4 @@
-"""A convex ball under a made-up sky, photographed from all around: known places, material and light."""
+"""A convex ball under a synthetic sky, photographed from all around: places, material and light are known."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import Material, Observed
 
 DIRECTIONS = 8
-"""Directions in each texel that a pixel of the ball is made of."""
+"""Number of directions per texel from which a pixel of the ball is computed."""
 
 
 def sky() -> EnvironmentLight:
-    """A bright window and a dark ground."""
+    """A bright window above a dark ground."""
     environment = EnvironmentLight(ROWS, 1.0)
     radiance = torch.full((3, ROWS, 2 * ROWS), 0.3)
     radiance[:, : ROWS // 2] = 1.0
@@ -35,7 +35,7 @@ def ball(
     views: int = 9,
     environment: EnvironmentLight | None = None,
 ) -> Places:
-    """P places of the given materials, each seen in so many views, under `sky` or another map."""
+    """P places of the given materials, each in so many views, under `sky` or another map."""
     torch.manual_seed(0)
     count = len(base_color)
     normal = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1).repeat_interleave(views, 0)

@@ -1,4 +1,6 @@
-"""Photographs of unequal exposure and white balance: measured, decided, learned, and divided out."""
+"""Photographs of unequal exposure and white balance: gains are measured, decided on, learned, and divided
+out.
+"""
 
 from __future__ import annotations
 
@@ -34,15 +36,15 @@ LOG_GAINS = np.random.default_rng(3).uniform(-0.5, 0.3, (VIEWS, 3))
 
 
 def photographs(root: Path, hdr: bool, log_gains: np.ndarray):
-    """The sphere, each view times a gain of its own per channel."""
+    """The sphere; each view is multiplied by its own gain per channel."""
     capture = load_capture(make_capture(root, views=VIEWS, size=(64, 48), hdr=hdr, masks=True, test=None))
-    dark = 0.4  # of 2.0: what the sphere sends stays within the range of a display
+    dark = 0.4  # the sphere's radiance of up to 2.0 then stays in the range of a display
     for view, gain in zip(capture.views, np.exp(log_gains), strict=True):
         pixels = read_image(view.image).pixels
         if hdr:
             write_exr(view.image, {"RGB": (pixels * gain).astype(np.float32)})
         else:
-            # What is clipped in the file is not known any more, so it is darkened as it is.
+            # Clipped values of the file are unknown, so they are darkened like the others.
             linear = srgb_to_linear(torch.from_numpy(pixels)).numpy()
             write_png(view.image, np.rint(255 * srgb(dark * linear * gain)).astype(np.uint8))
     return load_capture(root, test_every=0)
@@ -58,7 +60,7 @@ def test_gains_of_photographs_are_recovered(tmp_path, hdr):
     assert found.measured.value > 0.05
 
 
-def test_photographs_that_are_exposed_alike_need_no_gains(tmp_path):
+def test_photographs_of_equal_exposure_need_no_gains(tmp_path):
     capture = photographs(tmp_path / "sphere", True, np.zeros((VIEWS, 3)))
     pixels, plan = (
         PixelDataset(capture, capture.train_views),
@@ -79,7 +81,7 @@ def test_photographs_that_are_exposed_alike_need_no_gains(tmp_path):
     assert at_mean_exposure(model.gains, batch.color, batch.view, "linear") is batch.color
 
 
-def test_without_a_cloud_nothing_is_known(tmp_path):
+def test_without_a_cloud_nothing_is_measured(tmp_path):
     capture = dataclasses.replace(load_capture(make_capture(tmp_path / "sphere")), point_cloud=None)
     plan = Plan.begin(parse_effects("auto"), preset("fast"))
     record_exposures(plan, exposures_of(capture, PixelDataset(capture, capture.train_views)))
@@ -91,8 +93,8 @@ def test_without_a_cloud_nothing_is_known(tmp_path):
 
 
 @pytest.mark.parametrize(("all_alike", "on"), [(True, True), (False, False)])
-def test_a_table_that_shines_is_no_exposure(all_alike, on):
-    """What makes a table brighter in some views and leaves all else alone goes with the table."""
+def test_a_shiny_table_is_not_an_exposure(all_alike, on):
+    """A gain that applies to the table, but not to other surfaces, is a reflection of the table."""
     generator = torch.Generator().manual_seed(0)
     place = torch.randn(300, 1, 3, generator=generator)
     factor = torch.randn(12, 3, generator=generator) * 0.3
@@ -106,7 +108,7 @@ def test_a_table_that_shines_is_no_exposure(all_alike, on):
     assert found.favours(chosen=False) is on
 
 
-def test_a_cloud_that_faces_one_way_decides_nothing():
+def test_a_cloud_with_a_single_orientation_decides_nothing():
     seen = torch.randn(12, 3).expand(300, 12, 3)
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(300, 3)
     assert judge_gains(seen, up).favours(chosen=False) is None
@@ -143,7 +145,7 @@ def exposed_model(response: str, log_gains: torch.Tensor, start: torch.Tensor | 
 
 
 @pytest.mark.parametrize("response", ["linear", "srgb"])
-def test_training_finds_gains_from_nothing(response):
+def test_training_finds_gains_from_an_initial_value_of_zero(response):
     true = torch.tensor([[0.3, 0.0, -0.2], [-0.3, 0.1, 0.2], [0.0, -0.1, 0.0]])
     model = exposed_model(response, true, start=torch.zeros(3, 3))
     batch = sphere_batch(240)
@@ -160,13 +162,13 @@ def test_training_finds_gains_from_nothing(response):
         weigh({name: terms[name] for name in weights}, weights).loss.backward()
         optimizer.step()
     found = model.gains.logarithms().detach()
-    # The prior holds them back by a little, and photographs are compared as L1.
+    # The prior reduces the gains slightly, and the photographs are compared by L1.
     torch.testing.assert_close(found, true, atol=0.03, rtol=0.0)
     torch.testing.assert_close(found.mean(0), torch.zeros(3), atol=1e-6, rtol=0.0)
 
 
 @pytest.mark.parametrize("response", ["linear", "srgb"])
-def test_shading_and_light_see_photographs_of_one_exposure(response):
+def test_shading_and_light_use_the_mean_exposure(response):
     gains = torch.tensor([[0.4, 0.0, -0.3], [-0.4, 0.0, 0.3]])
     model = exposed_model(response, gains)
     model.config = dataclasses.replace(
@@ -181,7 +183,7 @@ def test_shading_and_light_see_photographs_of_one_exposure(response):
     torch.testing.assert_close(seen, common.expand_as(seen), atol=1e-5, rtol=0.0)
 
 
-def test_gains_travel_in_the_checkpoint_and_move_with_R():
+def test_gains_are_in_checkpoints_and_train_with_R():
     model = exposed_model("linear", torch.tensor([[0.2] * 3, [-0.2] * 3]))
     assert {"gains.log_gain", "gains.start"} <= set(model.state_dict())
     moving = {stage: "exposure" in model.stages[stage].moves for stage in Stage}
@@ -196,6 +198,6 @@ def test_a_new_view_is_compared_at_its_own_exposure(response):
     image = estimate * gain
     if response == "srgb":
         image = linear_to_srgb(torch.from_numpy(image)).numpy()
-        image[0] = 1.0  # clipped: says nothing of the gain
+        image[0] = 1.0  # clipped: does not determine the gain
     mask = np.ones((6, 5), bool)
     np.testing.assert_allclose(exposed_alike(estimate, image, mask, response), estimate * gain, rtol=1e-5)

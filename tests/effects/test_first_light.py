@@ -1,4 +1,4 @@
-"""The light that training starts with, and the lobe, at places whose light and material are made up."""
+"""The initial light and the lobe, at places with synthetic light and material."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COUNT, VIEWS = 110, 7
 
 
 def patched(lobe: str) -> Places:
-    """Half paint, half metal, in colours and roughnesses of their own."""
+    """Half paint, half metal, with varying colours and roughness."""
     torch.manual_seed(1)
     base_color = 0.2 + 0.6 * torch.rand(COUNT, 3)
     roughness = torch.tensor([0.2, 0.36, 0.66]).repeat(COUNT)[:COUNT, None]
@@ -34,7 +34,7 @@ def patched(lobe: str) -> Places:
 
 
 def log_distance(log_radiance: torch.Tensor) -> float:
-    """Mean error of the logarithm of the map, by solid angle."""
+    """Mean error of the logarithm of the map, weighted by solid angle."""
     off = (log_radiance - sky().log_radiance).abs().mean(0).flatten()
     weight = sky().texel_directions(torch.zeros(1, 3)).solid_angle
     return ((off * weight).sum() / weight.sum()).item()
@@ -55,7 +55,7 @@ def test_scale_and_map_are_found_together():
     assert (found.material.base_color == found.mean.base_color).all()
 
 
-def test_views_kept_back_tell_the_lobe_that_the_images_were_made_with():
+def test_held_back_views_identify_the_lobe_of_the_images():
     torch.manual_seed(1)
     color, ones = 0.2 + 0.6 * torch.rand(60, 3), torch.ones(60, 1)
 
@@ -69,7 +69,7 @@ def test_views_kept_back_tell_the_lobe_that_the_images_were_made_with():
     assert of_gaussian.value < 0.5 * of_ggx.value
 
 
-def test_metals_are_told_from_paint_in_held_back_views():
+def test_held_back_views_distinguish_metals_from_paint():
     lobe = LOBES["ggx"]
 
     def gain(places: Places) -> Measurement:
@@ -87,13 +87,13 @@ def test_metals_are_told_from_paint_in_held_back_views():
     assert paint.value < 2 * paint.deviation
 
 
-def test_a_handful_of_places_is_no_ground_for_a_light():
+def test_too_few_places_give_no_initial_light():
     places = patched("ggx")
     few = places.where(torch.nonzero(places.place < MIN_PLACES - 1)[:, 0])
     assert find_first_light(few, place_transport(few, LOBES["ggx"], None), 1.0, metals=True) is None
 
 
-def test_lowest_is_the_foot_of_the_parabola_over_the_logarithm():
+def test_lowest_is_the_minimum_of_the_parabola_over_the_logarithm():
     def errors(foot: float) -> dict[float, float]:
         return {s: math.log(s / foot) ** 2 for s in (0.1, 0.15, 0.22, 0.33, 0.5, 0.7)}
 
@@ -102,7 +102,7 @@ def test_lowest_is_the_foot_of_the_parabola_over_the_logarithm():
     assert _lowest(errors(0.9)) == 0.7
 
 
-def test_an_untrained_field_starts_at_the_material_that_was_found():
+def test_an_untrained_field_starts_at_the_estimated_material():
     config = preset("fast")
     field = BrdfField(config.brdf, config.encoding, 1.0)
     color = torch.tensor([[0.6, 0.3, 0.1]])
@@ -113,7 +113,7 @@ def test_an_untrained_field_starts_at_the_material_that_was_found():
     torch.testing.assert_close(started.metallic, torch.tensor([[0.05]]), atol=0.02, rtol=0)
 
 
-def test_a_model_takes_the_map_that_was_found():
+def test_a_model_starts_with_the_estimated_map():
     model = sphere_model(preset("fast"))
     none = torch.zeros(0, 3)
     grey = Material(torch.full((1, 3), 0.5), torch.full((1, 1), 0.5), torch.zeros(1, 1))

@@ -1,4 +1,4 @@
-"""Lamps of the initial light are judged in held-back views: on made-up balls, with and without a lamp."""
+"""Lamps of the initial light are judged in held-back views: on synthetic balls, with and without a lamp."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_a_lamp_explains_held_back_views_only_if_there_is_one(with_lamp):
 
 
 def table_top() -> tuple[Observed, Material]:
-    """Points of a grey table under an even light and a lamp close by, and their material."""
+    """Points of a grey table under an even light and a nearby lamp, and their material."""
     torch.manual_seed(0)
     position = torch.cat((2 * torch.rand(500, 2) - 1, torch.zeros(500, 1)), 1)
     normal = torch.tensor([0.0, 0.0, 1.0]).expand(500, 3)

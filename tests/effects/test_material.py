@@ -1,4 +1,4 @@
-"""Places that many views show: what explains them, where the truth is made up."""
+"""Evidence from places that many views show, with known material and light."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def ball_of(
 
 
 def gain_of_metals(places: Places) -> tuple[float, float]:
-    """Mean error that metals save in views that are kept back, and the share of places that are then of
+    """Mean reduction of the error in held-back views by metals, and the share of places that are then
     metal.
     """
     transport = place_transport(places, LOBE, None)
@@ -63,11 +63,11 @@ def gain_of_metals(places: Places) -> tuple[float, float]:
     return errors[0] - errors[1], (metal.metallic > len(METALLICS) // 2).float().mean().item()
 
 
-def test_metal_explains_views_kept_back_of_a_metal_ball_and_not_of_a_painted_one():
+def test_metals_reduce_the_error_for_a_metal_ball_and_not_for_a_painted_one():
     of_metal, share = gain_of_metals(ball_of(1.0))
     of_paint, share_of_paint = gain_of_metals(ball_of(0.0))
     assert of_metal > 2 * WORTH
-    assert share > 0.2  # the dark side of the sky tells little
+    assert share > 0.2  # the dark side of the sky contains little information
     assert of_paint < 0.2 * WORTH
     assert share_of_paint == 0
 
@@ -78,7 +78,7 @@ def judged(places: Places, *names: str) -> dict:
     return judge_material(places, transport, typical, frozenset(names), metals=False).measured
 
 
-def test_a_shiny_ball_reflects_and_a_dull_one_does_not():
+def test_specular_reflection_is_found_on_a_shiny_ball_and_not_on_a_dull_one():
     shiny = judged(ball_of(0.0), "reflection", "environment-map", "coloured-light")
     assert shiny["reflection"].value > 0
     # A highlight of 4 % is a large part of what a dark surface sends.
@@ -88,8 +88,8 @@ def test_a_shiny_ball_reflects_and_a_dull_one_does_not():
     assert not judged(ball_of(0.0, None), "reflection")["reflection"].favours(False)
 
 
-def test_colours_of_the_light_are_told_from_those_of_paint():
-    """A red window and a blue sky: no paint of one colour looks so from all sides."""
+def test_colours_of_the_light_are_distinguished_from_paint():
+    """A red window and a blue sky: no paint of one colour looks like this from all sides."""
     window = sky()
     window.log_radiance[1:, ROWS // 4 : 3 * ROWS // 8, 10:14] -= 2.0
     window.log_radiance[0, : ROWS // 2] -= 1.0
@@ -112,7 +112,7 @@ def test_the_lobe_is_sampled_where_surfaces_are_smooth(roughness, worth_it):
     assert found.favours(False) is worth_it
 
 
-def test_one_roughness_is_the_same_everywhere_and_learns():
+def test_a_single_roughness_is_the_same_everywhere_and_is_trained():
     config = preset("fast")
     field = BrdfField(dataclasses.replace(config.brdf, varying_roughness=False), config.encoding, 1.0)
     x = torch.rand(5, 3)
@@ -124,7 +124,7 @@ def test_one_roughness_is_the_same_everywhere_and_learns():
     assert field.mlp.layers[-1].weight.grad is None
 
 
-def test_several_roughnesses_are_what_each_is_alone():
+def test_transport_at_several_roughnesses_agrees_with_each_alone():
     observed, place = ball_of(0.0).observed[:20], torch.arange(20)
     environment = EnvironmentLight(48, 1.0)
     torch.manual_seed(3)
@@ -158,7 +158,7 @@ def test_rays_are_traced_once_per_place():
     assert (transport.scene[0] > 0).any()
 
 
-def test_without_metals_metallic_is_zero_and_learns_nothing():
+def test_without_metals_metallic_is_zero_and_not_trained():
     config = preset("fast")
     field = BrdfField(config.brdf, config.encoding, 1.0)
     x = torch.rand(5, 3)
@@ -172,7 +172,7 @@ def test_without_metals_metallic_is_zero_and_learns_nothing():
     assert field.mlp.layers[-1].bias.grad is None or field.mlp.layers[-1].bias.grad[4] == 0
 
 
-def test_means_are_of_each_place():
+def test_means_are_computed_per_place():
     values = torch.tensor([1.0, 3.0, 5.0])
     nothing = Observed(*[torch.zeros(3, 3)] * 4)
     places = Places(3, torch.tensor([0, 0, 2]), torch.arange(3), nothing)

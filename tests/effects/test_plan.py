@@ -1,4 +1,4 @@
-"""What is asked of effects, what evidence makes of it, and what an effect that is off costs."""
+"""The option `--effects`, the decisions by evidence, and the cost of an effect that is off."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from tests.train.small_runs import solved_light
 
 
 def half_walls(share: float):
-    """A scene in which a `share` of all directions by the cosine, those nearest to the normal z, meet a
-    wall.
+    """A scene in which the cosine-weighted share `share` of all directions, those nearest to the normal z,
+    hits a wall.
     """
 
     def scene_light(x, wi):
-        # By the cosine cos² θ is uniform, so a share has cos² θ > 1 − share.
+        # For cosine-weighted directions cos² θ is uniform, so this share has cos² θ > 1 − share.
         hit = wi[..., 2].square() > 1 - share
         return SceneLight(hit, torch.zeros_like(wi), torch.where(hit, 1.0, torch.inf))
 
@@ -56,7 +56,7 @@ class OnePicture(PixelDataset):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
-def test_self_visibility_is_the_share_by_the_cosine(share):
+def test_self_visibility_is_the_cosine_weighted_share(share):
     model = sphere_model(solved_light(tiny_config()))
     model.host.scene_light = half_walls(share)
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(400, 3)
@@ -65,7 +65,7 @@ def test_self_visibility_is_the_share_by_the_cosine(share):
     assert found.favours(chosen=False) is (share > 0)
 
 
-def test_a_ball_sees_nothing_of_itself_so_nothing_is_traced():
+def test_a_ball_does_not_occlude_itself_so_nothing_is_traced():
     config = solved_light(tiny_config())
     config = dataclasses.replace(config, shading=dataclasses.replace(config.shading, hit_share=0.2))
     named = "auto," + ",".join(f"+{name}" for name in (*JUDGED, "joint-stage"))
@@ -91,7 +91,7 @@ def test_a_ball_sees_nothing_of_itself_so_nothing_is_traced():
 
 
 def counted(lobe: Lobe, calls: Counter) -> Lobe:
-    """The same lobe, which counts what is asked of it."""
+    """The same lobe; its calls are counted."""
 
     def count(name):
         def call(*arguments):
@@ -115,7 +115,7 @@ def asked_of_the_lobe(effects: str, monkeypatch) -> Counter:
     return calls
 
 
-def test_a_lobe_that_is_off_is_not_asked(monkeypatch):
+def test_a_lobe_that_is_off_is_not_evaluated(monkeypatch):
     assert asked_of_the_lobe("all", monkeypatch)["sample_cos_h"] > 0
     without_sampling = asked_of_the_lobe("all,-lobe-sampling", monkeypatch)
     assert without_sampling["distribution"] > 0
@@ -123,7 +123,7 @@ def test_a_lobe_that_is_off_is_not_asked(monkeypatch):
     assert not asked_of_the_lobe("all,-reflection", monkeypatch)
 
 
-def test_an_even_light_is_not_looked_up_and_is_one_source(monkeypatch):
+def test_an_even_light_has_no_look_ups_and_one_source(monkeypatch):
     config = Plan.begin(parse_effects("all,-environment-map"), solved_light(tiny_config())).config
     model = sphere_model(
         dataclasses.replace(config, shading=dataclasses.replace(config.shading, hit_share=0.2))
@@ -156,7 +156,7 @@ def test_white_light_has_one_channel():
     torch.testing.assert_close(channels, channels[:1].expand_as(channels))
 
 
-def test_without_reflection_there_is_nothing_that_needs_it():
+def test_without_reflection_all_effects_that_need_it_are_off():
     plan = Plan.begin(parse_effects("auto,-reflection"), preset("fast"))
     config = plan.config
     assert not config.shading.specular
@@ -166,7 +166,7 @@ def test_without_reflection_there_is_nothing_that_needs_it():
     assert not plan.is_open("metals")
 
 
-def test_advice_changes_nothing_and_is_said():
+def test_advice_is_reported_and_changes_nothing():
     plan = Plan.begin(parse_effects("auto"), preset("fast"))
     worthless = Measurement("error", 0.0, 0.001, 0.01, 100)
     assert worthless.favours(True) is False
@@ -179,14 +179,14 @@ def test_advice_changes_nothing_and_is_said():
     assert plan.config.shading.sampler == "no_lobe"
 
 
-def test_nothing_varies_so_no_slope_is_asked():
+def test_without_varying_material_no_gradient_is_computed():
     config = Plan.begin(parse_effects("as-set,-metals,-varying-roughness"), tiny_config()).config
     config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, smoothness=1.0))
     assert "smoothness" not in active_losses(Stage.MATERIAL_INIT, config)
     assert "smoothness" in active_losses(Stage.MATERIAL_INIT, changed(config, {"brdf.metals": True}))
 
 
-def test_shading_that_is_as_good_as_r_leaves_nothing_to_the_joint_stage():
+def test_shading_as_accurate_as_r_needs_no_joint_stage():
     model = sphere_model(tiny_config()).eval()
     seen = _rendered_surface(model, sphere_batch(400))
     observed, radiance = seen.observed, seen.radiance
@@ -203,7 +203,7 @@ def test_shading_that_is_as_good_as_r_leaves_nothing_to_the_joint_stage():
     assert worse.value == pytest.approx(off.clamp_max(1).mean().item(), rel=1e-4)
 
 
-def test_evidence_is_revised_and_said():
+def test_decisions_are_revised_and_reported():
     config = preset("fast")
     plan = Plan.begin(parse_effects("auto"), config)
     few = Measurement("directions", 0.2, 0.01, 0.01, 400)
@@ -218,14 +218,14 @@ def test_evidence_is_revised_and_said():
     assert "only 3 samples" in unknown.reason
 
 
-def test_lamps_are_noted_when_the_choice_changes():
+def test_a_decision_on_lamps_is_recorded_when_it_changes():
     plan = Plan.begin(parse_effects("auto"), preset("fast"))
     assert record_lamps(plan, Evidence(0.001, 0.002, 200), 0, 5)[0].on is False
     assert record_lamps(plan, Evidence(0.001, 0.002, 200), 0, 9) == []
     (found,) = record_lamps(plan, Evidence(0.1, 0.002, 200), 2, 14)
     assert found.on
     assert found.reason.startswith("revised")
-    assert plan.config.light.kind == "auto"  # the solver goes on choosing
+    assert plan.config.light.kind == "auto"  # the solver continues to decide
     assert (
         record_lamps(Plan.begin(parse_effects("-lamps"), preset("fast")), Evidence(0.1, 0.0, 200), 1, 5) == []
     )
@@ -234,7 +234,7 @@ def test_lamps_are_noted_when_the_choice_changes():
 def test_the_standard_error_is_that_of_the_mean():
     found = mean_of(torch.tensor([0.0, 1.0, 2.0, 3.0]), "x", 0.1)
     assert (found.value, found.deviation) == pytest.approx((1.5, (5 / 3) ** 0.5 / 2))
-    assert found.favours(True) is None  # four samples say nothing
+    assert found.favours(True) is None  # four samples are too few
 
 
 def test_names_switch_settings():

@@ -1,5 +1,5 @@
-"""What a run says of its own errors: which views it asks, what they see, and that the sum does not depend on
-how it is cut.
+"""The expected errors of a run: which views are used, which points they see, and independence from the batch
+size.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ SPHERE = RADIUS / SCALE  # radius in the scene frame
 
 
 class Ball:
-    """The sphere of `make_capture`, as a host: white, and sharp."""
+    """The sphere of `make_capture` as a white host with a sharp surface."""
 
     def render(self, rays: RayBatch) -> SurfaceHits:
         middle = -(rays.origins * rays.directions).sum(-1)
@@ -50,7 +50,7 @@ class Ball:
 
 
 def make_run(capture: Capture, mode: str = "soft") -> Run:
-    """Nothing is learned yet."""
+    """An untrained run."""
     torch.manual_seed(0)
     config = tiny_config()
     config = replace(config, inter_reflection=replace(config.inter_reflection, mode=mode))
@@ -89,7 +89,7 @@ def test_a_view_sees_the_part_of_a_sphere_that_faces_it(run: Run, mode: str):
     for i, n in enumerate(normal):
         towards = views.centres - SPHERE * n
         cosine = (towards / towards.norm(dim=-1, keepdim=True)) @ n
-        # Pixels at the rim are half off the object, and flat looks do not count.
+        # Pixels at the rim are half off the object, and grazing views are not used.
         assert (cosine > 0.2).sum() <= seen.visible[i].sum() <= (cosine > 0.05).sum()
     cosine = (seen.wo * normal[:, None]).sum(-1)
     assert (cosine[seen.visible] > 0).all()
@@ -120,7 +120,7 @@ def test_patches_add_up_to_all_light(run: Run):
 # -------------------------------------------------------------------------------------------------- deviation
 
 
-def test_it_does_not_depend_on_how_points_are_divided(run: Run, evidence, monkeypatch):
+def test_the_result_does_not_depend_on_the_batches(run: Run, evidence, monkeypatch):
     normal = on_sphere(40)
     whole = material_deviation(run.model, evidence, SPHERE * normal, normal)
     monkeypatch.setattr(confidence, "POINTS_AT_ONCE", 7)
@@ -133,7 +133,7 @@ def test_it_does_not_depend_on_how_points_are_divided(run: Run, evidence, monkey
     assert shares[-1] == 1.0
 
 
-def test_what_no_view_sees_is_a_guess(run: Run, evidence):
+def test_a_point_without_views_has_the_error_of_a_guess(run: Run, evidence):
     normal = on_sphere(60)
     with torch.no_grad():
         material = run.model.materials(SPHERE * normal)
@@ -142,22 +142,22 @@ def test_what_no_view_sees_is_a_guess(run: Run, evidence):
     torch.testing.assert_close(inside_out.base_color, prior, rtol=1e-2, atol=0.0)
     outside = material_deviation(run.model, evidence, SPHERE * normal, normal)
     seen = evidence.views.sightings(run.model, SPHERE * normal, normal, 5).visible.any(1)
-    # Those whose pixels nothing explains are a guess as well.
+    # Points whose pixels are not explained also have the error of a guess.
     assert ((outside.base_color - prior)[seen].abs() > 1e-3).float().mean() > 0.5
     torch.testing.assert_close(outside.base_color[~seen], prior[~seen], rtol=1e-2, atol=0.0)
 
 
-def test_the_better_the_images_are_explained_the_less_is_left_to_guess(run: Run, evidence):
+def test_well_explained_images_lower_the_expected_error(run: Run, evidence):
     normal = on_sphere(60)
     hopeless = replace(evidence, noise=1e4, misfit=MIN_NOISE)
     doubt = [
         material_deviation(run.model, believed, SPHERE * normal, normal).roughness.var().item()
         for believed in (hopeless, replace(evidence, noise=0.05))
     ]
-    assert doubt[0] < 1e-6 < doubt[1]  # nothing is learned: every point has the deviation of a guess
+    assert doubt[0] < 1e-6 < doubt[1]  # untrained: every point has the error of a guess
 
 
-def test_points_whose_pixels_are_not_explained_are_less_sure(run: Run, evidence):
+def test_points_with_unexplained_pixels_have_larger_errors(run: Run, evidence):
     normal = on_sphere(60)
     looks = evidence.views.sightings(run.model, SPHERE * normal, normal, 5).visible.sum(1)
     usual, off = (
@@ -168,11 +168,11 @@ def test_points_whose_pixels_are_not_explained_are_less_sure(run: Run, evidence)
     )
     assert torch.equal(usual[looks == 0], off[looks == 0])
     assert (off >= usual).all()
-    # Both are small beside what is typical, and then the looks that nobody had count for most.
+    # Both are small compared with the typical error, so the prior views dominate.
     assert (off > 1.0005 * usual)[looks > 0].float().mean() > 0.5
 
 
-def test_neighbours_agree_and_no_others(run: Run, evidence):
+def test_only_neighbours_are_smoothed(run: Run, evidence):
     apart = on_sphere(9)
     around = torch.nn.functional.normalize(
         apart[:1] + 0.01 * torch.randn(9, 3, generator=torch.Generator().manual_seed(0)), dim=-1
@@ -198,14 +198,14 @@ def test_a_run_that_shows_no_surface_has_noise_as_large_as_its_pixels(run: Run):
     assert not evidence.typical.any()
 
 
-def test_no_points_have_no_deviation(run: Run, evidence):
+def test_an_empty_batch_of_points(run: Run, evidence):
     assert len(material_deviation(run.model, evidence, torch.zeros(0, 3), torch.zeros(0, 3))) == 0
 
 
 # ------------------------------------------------------------------------------------------- maps and figures
 
 
-def test_maps_lie_on_the_surface_and_a_step_repeats_pixels(run: Run, evidence):
+def test_maps_cover_the_surface_and_a_step_repeats_pixels(run: Run, evidence):
     view = render_test_views(run)[0]
     hit = view.maps["opacity"][..., 0] > 0.5
     coarse = with_deviation(run, evidence, view, step=4)
@@ -226,7 +226,7 @@ def test_the_surface_at_pixels_is_where_the_sphere_is(run: Run):
     )
 
 
-def test_the_figures_are_of_the_maps_that_have_a_truth(run: Run):
+def test_figures_exist_for_maps_with_known_truth(run: Run):
     rendered = render_test_views(run)
     pairs = list(zip(rendered, known_test_views(run, rendered).views, strict=True))
     figures = confidence_metrics(run, pairs)
@@ -235,7 +235,7 @@ def test_the_figures_are_of_the_maps_that_have_a_truth(run: Run):
     assert confidence_metrics(replace(run, step=0), pairs) == {}
 
 
-def test_a_ratio_compares_the_surer_half_with_the_other():
+def test_the_ratio_compares_the_half_with_smaller_expected_errors():
     error = np.array([4.0, 1.0, 2.0, 3.0, 9.0])
     assert confidence_ratio(error, error) == pytest.approx(((1 + 2) / 2) / ((3 + 4 + 9) / 3))
     assert confidence_ratio(error, -error) == pytest.approx(((9 + 4) / 2) / ((1 + 2 + 3) / 3))

@@ -1,4 +1,4 @@
-"""Each metric against a number worked out by hand."""
+"""Each metric compared with a value that is computed by hand."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def image(*pixels: float) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------------- PSNR
 
 
-def test_psnr_counts_masked_pixels_alone():
+def test_psnr_counts_only_masked_pixels():
     estimate, truth = image(0.5, 9.0), image(0.4, 0.0)
     assert metrics.psnr(estimate, truth, LEFT) == pytest.approx(
         10 * math.log10(1 / 0.1**2), abs=1e-4
@@ -40,7 +40,7 @@ def test_psnr_rises_with_the_peak():
     assert metrics.psnr(estimate, truth, ALL, peak=10.0) == pytest.approx(20.0 + 20.0, abs=1e-4)
 
 
-def test_psnr_of_the_frame_counts_the_background_as_right():
+def test_psnr_of_the_frame_counts_the_background_as_correct():
     estimate, truth = image(0.5, 9.0), image(0.4, 0.0)
     halved = metrics.psnr(estimate, truth, LEFT) + 10 * math.log10(2)
     assert metrics.psnr_frame(estimate, truth, LEFT) == pytest.approx(halved)
@@ -63,7 +63,7 @@ def test_ssim_of_constant_images():
     assert metrics.ssim(estimate, truth, np.ones((16, 16), bool)) == pytest.approx(expected, abs=1e-6)
 
 
-def test_ssim_ignores_what_lies_off_the_mask():
+def test_ssim_ignores_pixels_outside_the_mask():
     truth = np.random.default_rng(0).random((24, 24, 3))
     mask = np.zeros((24, 24), dtype=bool)
     mask[6:18, 6:18] = True
@@ -99,7 +99,7 @@ def test_angular_error_keeps_small_angles():
     assert metrics.angular_error(estimate, truth, np.ones((1, 1), bool)) == pytest.approx(1e-3, rel=1e-6)
 
 
-def test_angular_error_of_nothing_is_not_a_number():
+def test_angular_error_without_normals_is_nan():
     assert math.isnan(metrics.angular_error(np.zeros((1, 2, 3)), np.zeros((1, 2, 3)), ALL))
 
 
@@ -145,7 +145,7 @@ def test_chamfer_of_parallel_planes_is_their_distance():
     other = metrics.sample_surface(square, 60_000, seed=1)
     assert metrics.chamfer(points, other).mean == pytest.approx(
         0.5 * math.sqrt(1 / 60_000), rel=0.05
-    )  # sampling alone
+    )  # the error of the sampling
 
 
 def test_samples_are_spread_by_area_and_repeat():

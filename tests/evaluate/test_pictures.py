@@ -1,4 +1,4 @@
-"""Pictures: known values in, known pixels out."""
+"""Images for display: known values give known pixels."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_depth_is_white_near_and_black_far():
     assert shown[0] == 255
     assert shown[-1] == 0
     assert shown[50] == pytest.approx(127.5, abs=1)
-    assert display("depth", flat(2.0)).shape == (4, 6, 1)  # one depth throughout divides by no zero
+    assert display("depth", flat(2.0)).shape == (4, 6, 1)  # a constant depth does not divide by zero
 
 
 def test_exposure_scales_before_clipping():
@@ -69,7 +69,7 @@ def test_error_grows_brighter():
     assert shown[0] < shown[1] < shown[2] == shown[3]
 
 
-def test_cut_out_shows_the_sheet_outside_the_mask():
+def test_cut_out_shows_the_background_outside_the_mask():
     mask = np.zeros((4, 6), dtype=bool)
     mask[1, 2] = True
     shown = cut_out(np.full((4, 6, 1), 7, dtype=np.uint8), mask)
@@ -91,7 +91,7 @@ def test_lat_long_covers_the_sphere():
 
 
 @pytest.mark.parametrize(("row", "column"), [(10, 5), (32, 100), (50, 64)])
-def test_directional_light_has_its_peak_in_its_pixel(row: int, column: int):
+def test_directional_light_peaks_in_its_pixel(row: int, column: int):
     # Row j is at θ = π (j + ½)/64, column i at φ = 2π (i + ½)/128, as an environment map's direction is
     # written.
     theta, phi = np.pi * (row + 0.5) / 64, 2.0 * np.pi * (column + 0.5) / 128

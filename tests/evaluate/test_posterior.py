@@ -1,4 +1,6 @@
-"""The posterior of a material: closed forms, and what a brute force over all parameters finds."""
+"""The posterior of a material, compared with closed forms and with an exhaustive search over all
+parameters.
+"""
 
 from __future__ import annotations
 
@@ -28,13 +30,13 @@ def material(base_color: float = 0.5, roughness: float = 0.5, metallic: float = 
 
 
 def lambertian(views: int, diffuse: float = 1.0) -> RadianceParts:
-    """Uniform light, such that D is `diffuse`, and no specular part."""
+    """Uniform light, so that D is `diffuse`, without a specular part."""
     nothing = torch.zeros(1, views, R, 3)
     return RadianceParts(torch.full((1, 3), diffuse), nothing, nothing)
 
 
 def sights(radiance: torch.Tensor, noise: float, shared: torch.Tensor | None = None) -> Observations:
-    """Of one point, from all views, the same in all channels."""
+    """Observations of one point, equal in all views and channels."""
     views = len(radiance)
     value = radiance[None, :, None].expand(1, views, 3)
     shared = torch.zeros(views, 1) if shared is None else shared
@@ -55,19 +57,19 @@ def numbers(deviation: Deviation) -> tuple[float, float, float]:
 
 @pytest.mark.parametrize("views", [1, 4, 16])
 @pytest.mark.parametrize("diffuse", [0.5, 2.0])
-def test_a_matt_surface_is_known_as_well_as_the_mean_of_its_views(views, diffuse):
+def test_a_lambertian_surface_has_the_error_of_the_mean_over_views(views, diffuse):
     seen = sights(torch.full((views,), 0.5 * diffuse), 0.02)
     base_color = numbers(expected_error(lambertian(views, diffuse), seen, material(), specular=False))[0]
     assert base_color == pytest.approx(0.02 / diffuse / math.sqrt(views), rel=1e-2)
 
 
-def test_an_estimate_that_the_views_speak_against_is_off_by_as_much():
+def test_an_estimate_that_contradicts_the_views_has_that_error():
     seen = sights(torch.full((4,), 0.7), 0.02)
     base_color = numbers(expected_error(lambertian(4), seen, material(0.5), specular=False))[0]
     assert base_color == pytest.approx(math.hypot(0.2, 0.01), rel=1e-2)
 
 
-def test_more_views_do_not_help_against_an_error_that_they_share():
+def test_more_views_do_not_reduce_a_shared_error():
     for views in (1, 16, 64):
         seen = sights(torch.full((views,), 0.5), 1e-3, torch.full((views, 1), 0.1))
         assert numbers(expected_error(lambertian(views), seen, material(), specular=False))[
@@ -75,8 +77,8 @@ def test_more_views_do_not_help_against_an_error_that_they_share():
         ] == pytest.approx(0.1, rel=2e-2)
 
 
-def test_an_error_that_is_shared_is_taken_out_of_what_does_not_follow_it():
-    # The second view does not feel the shared error: it alone says what the base colour is.
+def test_a_view_without_the_shared_error_determines_the_base_color():
+    # The shared error does not affect the second view, so this view determines the base colour.
     seen = sights(torch.tensor([0.5, 0.5]), 0.01, torch.tensor([[0.3], [0.0]]))
     assert numbers(expected_error(lambertian(2), seen, material(), specular=False))[0] == pytest.approx(
         0.01, rel=1e-2
@@ -84,14 +86,14 @@ def test_an_error_that_is_shared_is_taken_out_of_what_does_not_follow_it():
 
 
 @pytest.mark.parametrize("estimate", [(0.5, 0.5, 0.5), (0.9, 0.1, 0.0)])
-def test_what_nobody_sees_has_the_deviation_from_the_prior(estimate):
+def test_a_point_without_views_has_the_error_under_the_prior(estimate):
     seen = replace(sights(torch.full((3,), 0.4), 0.01), visible=torch.zeros(1, 3, dtype=torch.bool))
     looks = RadianceParts(torch.ones(1, 3), torch.rand(1, 3, R, 3), torch.rand(1, 3, R, 3))
     base_color, roughness, metallic = numbers(expected_error(looks, seen, material(*estimate)))
     assert base_color == pytest.approx(math.sqrt(1 / 12 + (estimate[0] - 0.5) ** 2), rel=1e-2)
     assert roughness == pytest.approx(math.sqrt(1 / 12 + (estimate[1] - 0.5) ** 2), rel=1e-2)
-    # The variance of the arcsine distribution is 1/8; on a grid that holds 0 and 1 themselves it is a little
-    # more.
+    # The variance of the arcsine distribution is 1/8; on a grid that contains 0 and 1 it is slightly
+    # larger.
     assert 1 / 8 < metallic**2 - (estimate[2] - 0.5) ** 2 < 0.15
     guess = numbers(prior_error(material(*estimate)))
     assert guess == pytest.approx(
@@ -100,7 +102,7 @@ def test_what_nobody_sees_has_the_deviation_from_the_prior(estimate):
 
 
 def test_base_color_stays_between_black_and_white():
-    # Twice as bright as white can be, and seen without doubt: the base colour is 1, and known to be.
+    # Radiance of twice the maximum, without noise: the base colour is 1, without uncertainty.
     seen = sights(torch.full((4,), 2.0), 1e-3)
     assert numbers(expected_error(lambertian(4), seen, material(1.0), specular=False))[0] < 1e-3
     assert numbers(expected_error(lambertian(4), seen, material(0.0), specular=False))[0] == pytest.approx(
@@ -126,7 +128,7 @@ def random_point(views: int = 5) -> tuple[RadianceParts, Observations]:
     )
 
 
-def test_it_is_what_trying_every_material_finds():
+def test_agrees_with_an_exhaustive_search():
     looks, seen = random_point()
     estimate = material(0.4, 0.3, 0.2)
     got = numbers(expected_error(looks, seen, estimate))
@@ -159,10 +161,8 @@ def test_it_is_what_trying_every_material_finds():
     assert got == pytest.approx([math.sqrt(e) for e in expected], rel=5e-3)
 
 
-def test_a_mirror_that_might_be_bright_paint_is_in_doubt():
-    """Where the specular part looks like the diffuse one from all sides, nothing says which of the two is
-    seen.
-    """
+def test_a_mirror_that_may_be_bright_paint_is_uncertain():
+    """If the specular part equals the diffuse part in all views, the images do not distinguish them."""
     views = 8
     same = RadianceParts(torch.ones(1, 3), torch.ones(1, views, R, 3), torch.zeros(1, views, R, 3))
     highlight = torch.linspace(0.2, 4.0, views)[None, :, None, None].expand(1, views, R, 3)
@@ -175,7 +175,7 @@ def test_a_mirror_that_might_be_bright_paint_is_in_doubt():
     assert told[2] < 0.05
 
 
-def test_roughness_is_known_from_views_that_the_lobe_moves_across_and_not_where_it_is_flat():
+def test_roughness_is_determined_by_views_across_the_lobe():
     nodes = torch.tensor(ROUGHNESS_NODES)
     views = 6
     angle = torch.linspace(0, 1.2, views)[:, None]
@@ -191,7 +191,7 @@ def test_roughness_is_known_from_views_that_the_lobe_moves_across_and_not_where_
     assert still == pytest.approx(math.sqrt(1 / 12), rel=0.02)
 
 
-def test_nothing_overflows_at_the_ends():
+def test_no_overflow_at_the_ends():
     looks, seen = random_point()
     for noise in (1e-6, 1e6):
         for radiance in (0.0, 1e4):

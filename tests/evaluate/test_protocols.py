@@ -1,4 +1,4 @@
-"""The protocols on a capture whose every number is known: a sphere that a stand-in model knows
+"""The protocols on a capture whose truth is known: a sphere, with a stand-in model that evaluates it
 analytically.
 """
 
@@ -42,7 +42,7 @@ SPHERE = scene.RADIUS / scene.SCALE  # radius in the scene frame
 
 
 class KnownSphere(NeilfModel):
-    """A model that knows the truth of `make_capture`, and errs where it is told to."""
+    """A model that returns the truth of `make_capture`, with given errors."""
 
     def __init__(self, base_color_factor: float = 1.0, light_factor: float = 1.0) -> None:
         nn.Module.__init__(self)
@@ -106,14 +106,14 @@ def captures(tmp_path_factory):
 def _few_points(monkeypatch):
     monkeypatch.setattr(scene_metrics, "SURFACE_POINTS", 20_000)
     monkeypatch.setattr(scene_metrics, "MESH_RESOLUTION", 64)
-    # The known sphere has no material to ask; what confidence is worth is tested in test_confidence.
+    # The known sphere has no material field; test_confidence tests the confidence.
     monkeypatch.setattr(protocols, "confidence_metrics", lambda run, pairs: {})
 
 
 # ----------------------------------------------------------------------------------------- a perfect estimate
 
 
-def test_pixels_that_are_marked_as_invalid_do_not_count(captures, tmp_path):
+def test_invalid_pixels_do_not_count(captures, tmp_path):
     capture = load_capture(shutil.copytree(captures.hdr, tmp_path / "hdr"))
     valid = np.full((120, 160), 255, np.uint8)
     valid[50:70, 60:100] = 0
@@ -136,7 +136,7 @@ def test_a_perfect_estimate_scores_perfectly(captures):
     figures = evaluate(make_run(load_capture(captures.hdr)))
     eight_bit = (
         10 * math.log10(12 * 255**2) - 0.5
-    )  # a rounded truth differs from the exact one by 1/(255 √12)
+    )  # the 8-bit truth differs from the exact one by 1/(255 √12)
     assert {"chamfer", "chamfer_accuracy", "chamfer_completeness", "normal_mae_deg"} <= figures.keys()
     for name in ("volume_psnr", "pbr_psnr", "volume_psnr_linear", "pbr_psnr_linear"):
         assert figures[name] > 90, name
@@ -183,7 +183,7 @@ def test_an_ldr_capture_is_compared_in_display_values(captures):
     assert "pbr_psnr_linear" not in figures
 
 
-def test_a_run_without_a_material_has_no_figures_of_one(captures):
+def test_a_run_without_a_material_has_no_material_figures(captures):
     figures = evaluate(make_run(load_capture(captures.hdr), step=0))
     assert "volume_psnr" in figures
     assert "normal_mae_deg" in figures
@@ -196,7 +196,7 @@ def test_a_lambertian_run_has_no_roughness(captures):
     assert "roughness_psnr" not in figures
 
 
-def test_without_truth_the_images_alone_are_compared(captures, tmp_path):
+def test_without_truth_only_images_are_compared(captures, tmp_path):
     root = shutil.copytree(captures.hdr, tmp_path / "bare")
     shutil.rmtree(root / "ground_truths")
     for name in ("depth_maps", "normal_maps", "model", "masks"):
@@ -207,10 +207,10 @@ def test_without_truth_the_images_alone_are_compared(captures, tmp_path):
     assert evaluate(run).keys() == {f"{kind}_{name}" for kind in ("volume", "pbr") for name in names}
 
 
-def test_true_depth_chooses_the_pixels_and_else_the_masks(captures, tmp_path):
+def test_true_depth_selects_the_pixels_otherwise_the_masks(captures, tmp_path):
     assert protocol(make_run(load_capture(captures.hdr)))["mask_source"] == "true depth"
     root = shutil.copytree(captures.hdr, tmp_path / "masked")
-    (root / "inputs" / "depth_maps" / "005.exr").unlink()  # one that is missing is missing for all
+    (root / "inputs" / "depth_maps" / "005.exr").unlink()  # if one depth map is missing, none is used
     run = make_run(load_capture(root))
     assert protocol(run)["mask_source"] == "capture masks"
     by_depth = known_test_views(make_run(load_capture(captures.hdr)), ()).views
@@ -232,7 +232,7 @@ def test_images_smaller_than_the_window_have_no_ssim(tmp_path):
 # -------------------------------------------------------------------------------------------------- rendering
 
 
-def test_views_are_rendered_whole_in_chunks(captures):
+def test_whole_views_are_rendered_in_chunks(captures):
     capture = load_capture(captures.hdr)
     run = make_run(capture)
     view = render_view(run, 5)
@@ -256,7 +256,7 @@ def test_progress_ends_at_one_and_views_can_be_shared(captures):
     calls = len(run.model.sizes)
     assert evaluate(run, shares.append, rendered) == evaluate(run)
     assert shares == [1.0]
-    assert len(run.model.sizes) == 2 * calls  # the first of the two rendered nothing
+    assert len(run.model.sizes) == 2 * calls  # the first of the two calls rendered nothing
     evaluate(run, shares.append)
     assert shares[-1] == 1.0
     assert shares[1:] == sorted(shares[1:])
@@ -274,7 +274,7 @@ def test_surface_points_lie_on_the_sphere(captures):
 
 
 @pytest.mark.parametrize("kind", ["hdr", "ldr"])
-def test_the_observed_color_is_what_the_point_sends(captures, kind):
+def test_the_observed_color_is_the_radiance_of_the_point(captures, kind):
     run = make_run(load_capture(getattr(captures, kind)))
     points = torch.cat([surface_points(run.capture, known) for known in known_test_views(run, ()).views])
     normal = points.double().numpy() / SPHERE
@@ -284,21 +284,21 @@ def test_the_observed_color_is_what_the_point_sends(captures, kind):
     eyes = np.stack([view.camera.c2w[:, 3] - scene.CENTRE for view in run.capture.train_views]) / scene.SCALE
     to_eyes = eyes - points.numpy()[:, None]
     cosines = (to_eyes * normal[:, None]).sum(-1) / np.linalg.norm(to_eyes, axis=-1)
-    plain = cosines.max(-1) > 0.4  # the others are seen at grazing angles or not at all
+    plain = cosines.max(-1) > 0.4  # the other points are visible only at grazing angles or not at all
     assert plain.mean() > 0.7
     # Pixels are 0.04 radii apart. A view from behind, taken for one that sees the point, would err by up to
     # 1.6.
     assert error[plain].max() < 0.05
 
 
-def test_a_point_that_no_view_sees_takes_the_mean(captures):
+def test_a_point_without_views_gets_the_mean_color(captures):
     capture = load_capture(captures.hdr)
     seen, hidden = torch.tensor([[SPHERE, 0.0, 0.0]]), torch.zeros(1, 3)
     observed = mean_observed_color(capture, torch.cat([seen, hidden]))
     assert observed[1] == pytest.approx(observed[0])
 
 
-def test_baselines_on_the_same_pixels(captures):
+def test_baselines_use_the_same_pixels(captures):
     capture = load_capture(captures.hdr)
     run = make_run(capture)
     figures = evaluate(run)
@@ -337,8 +337,8 @@ def test_light_that_is_too_bright_by_a_factor(captures):
     assert figures["incident_light_log_mae_scaled"] == pytest.approx(0.0, abs=1e-3)
 
 
-def test_occluded_directions_are_those_that_meet_the_scene(captures):
-    # A roof one unit above the points, on the side of +x alone.
+def test_occluded_directions_hit_the_scene(captures):
+    # A roof one unit above the points, only on the side of +x.
     roof = Mesh(
         torch.tensor([[0.1, -5, 1], [9, -5, 1], [9, 5, 1], [0.1, 5, 1]]), torch.tensor([[0, 1, 2], [0, 2, 3]])
     )
@@ -353,7 +353,7 @@ def test_occluded_directions_are_those_that_meet_the_scene(captures):
     assert figures["incident_light_log_mae"] == pytest.approx(2 / 5, abs=1e-3)
 
 
-def test_a_ray_does_not_meet_the_surface_that_it_leaves(captures):
+def test_a_ray_does_not_hit_the_surface_at_its_start(captures):
     floor = Mesh(torch.tensor([[-5.0, -5, 0], [5, -5, 0], [0, 5, 0]]), torch.tensor([[0, 1, 2]]))
     run = make_run(load_capture(captures.hdr))
     assert "incident_light_log_mae_occluded" not in light_metrics(
@@ -361,7 +361,7 @@ def test_a_ray_does_not_meet_the_surface_that_it_leaves(captures):
     )
 
 
-def test_the_light_field_of_a_capture_is_read_and_asked_in_chunks(captures, tmp_path):
+def test_the_light_field_of_a_capture_is_evaluated_in_chunks(captures, tmp_path):
     root = shutil.copytree(captures.hdr, tmp_path / "lit")
     field = light_field(torch.nn.functional.normalize(torch.randn(50_000, 3), dim=-1).tolist(), points=7)
     (root / "light").mkdir()
@@ -382,7 +382,7 @@ def test_the_light_field_of_a_capture_is_read_and_asked_in_chunks(captures, tmp_
 # ------------------------------------------------------------------------------------------------------- file
 
 
-def test_metrics_are_flat_and_their_protocol_lies_beside_them(captures, tmp_path):
+def test_metrics_are_flat_and_their_protocol_is_a_second_file(captures, tmp_path):
     run = make_run(load_capture(captures.hdr))
     path = tmp_path / "new" / "metrics.json"
     write_metrics(path, run, {"volume_psnr": 30.5})
@@ -390,5 +390,5 @@ def test_metrics_are_flat_and_their_protocol_lies_beside_them(captures, tmp_path
     assert json.loads((path.parent / "metrics-protocol.json").read_text())["mask_source"] == "true depth"
     with pytest.raises(ValueError, match="JSON"):
         write_metrics(path, run, {"volume_psnr": math.nan})
-    assert json.loads(path.read_text())["volume_psnr"] == 30.5  # the old file stands
+    assert json.loads(path.read_text())["volume_psnr"] == 30.5  # the old file is kept
     assert {p.name for p in path.parent.iterdir()} == {"metrics.json", "metrics-protocol.json"}

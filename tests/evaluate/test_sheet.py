@@ -1,5 +1,5 @@
-"""The contact sheet and the renders of a small run: a sphere, untrained, before a capture whose truth is
-known.
+"""The contact sheet and the rendered files of a small run: an untrained sphere on a capture with known
+truth.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def test_contact_sheet_shows_views_and_light(root: Path, tmp_path: Path):
     assert sheet.std() > 5
 
 
-def test_a_run_without_material_shows_geometry_alone(root: Path):
+def test_a_run_without_material_shows_only_geometry(root: Path):
     titles = [row.title for section in sections_of(make_run(root, step=4)) for row in section.rows]
     assert titles == ["Image", "Normal"]
 
@@ -80,7 +80,7 @@ def test_maps_without_truth_have_no_truth_column(root: Path, tmp_path: Path):
     assert all(len(row.pictures) == 2 for row in blind[1].rows)
 
 
-def test_pictures_stand_beside_their_truth_with_their_difference(root: Path):
+def test_maps_are_shown_beside_truth_and_error(root: Path):
     run = make_run(root)
     roughness = sections_of(run)[0].rows[3]
     truth, estimate, error = roughness.pictures[:3]
@@ -109,7 +109,7 @@ def test_albedo_scale_undoes_a_factor_per_channel(root: Path):
 
 
 def write_light_field(root: Path, sky: Callable[[np.ndarray], np.ndarray]) -> None:
-    """Three points with known light: what arrives is `sky`, everywhere."""
+    """Three points at which the incident light is `sky` in all directions."""
     generator = np.random.default_rng(0)
     wi = generator.normal(size=(3, 6000, 3))
     wi /= np.linalg.norm(wi, axis=-1, keepdims=True)
@@ -132,7 +132,7 @@ def write_light_field(root: Path, sky: Callable[[np.ndarray], np.ndarray]) -> No
     )
 
 
-def test_known_light_stands_beside_the_estimate_of_it(root: Path, tmp_path: Path, monkeypatch):
+def test_known_light_is_shown_beside_the_estimate(root: Path, tmp_path: Path, monkeypatch):
     lit = Path(shutil.copytree(root, tmp_path / "lit"))
     write_light_field(lit, lambda wi: 1.0 + 0.5 * wi)
     run = make_run(lit)
@@ -165,7 +165,7 @@ def test_without_known_light_points_of_the_surface_are_shown(root: Path):
         assert np.linalg.norm(position) == pytest.approx(0.6, abs=0.15)
 
 
-def test_rings_are_about_the_lamps_above_the_surface(root: Path, tmp_path: Path):
+def test_rings_mark_the_lamps_above_the_surface(root: Path, tmp_path: Path):
     lit = Path(shutil.copytree(root, tmp_path / "lit"))
     write_light_field(lit, lambda wi: 0 * wi + 1.0)  # at the world's origin, facing along x, y and z
     run = make_run(lit)
@@ -184,19 +184,19 @@ def test_rings_are_about_the_lamps_above_the_surface(root: Path, tmp_path: Path)
     assert columns.mean() == pytest.approx(60, abs=1)
 
 
-def test_the_light_is_drawn_alone(root: Path, tmp_path: Path):
+def test_the_light_picture_is_written_separately(root: Path, tmp_path: Path):
     path = tmp_path / "light.png"
     assert write_light_picture(make_run(root), path)
     assert cv2.imread(str(path)).std() > 5
     path.unlink()
-    assert not write_light_picture(make_run(root, step=4), path)  # no stage has moved the light
+    assert not write_light_picture(make_run(root, step=4), path)  # no stage has trained the light
     assert not path.exists()
 
 
 # ---------------------------------------------------------------------------------------------------- renders
 
 
-def test_renders_hold_the_values_and_go_on_where_they_stopped(root: Path, tmp_path: Path):
+def test_rendered_files_hold_the_values_and_rendering_continues(root: Path, tmp_path: Path):
     run = make_run(root)
     shares: list[float] = []
     written = render_run(run, tmp_path, "test", on_progress=shares.append)
@@ -221,7 +221,7 @@ def test_renders_hold_the_values_and_go_on_where_they_stopped(root: Path, tmp_pa
     assert (tmp_path / "002.exr").stat().st_mtime_ns > kept
 
 
-def test_views_are_chosen_by_group_or_by_name(root: Path):
+def test_views_are_selected_by_group_or_by_name(root: Path):
     capture = load_capture(root)
     assert view_names(capture, "train") == {"001", "003"}
     assert view_names(capture, "all") == {"000", "001", "002", "003"}

@@ -1,4 +1,4 @@
-"""The size at which views are rendered, and what is said about the time that takes."""
+"""The size at which views are rendered, and the announced time."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def sizes(run: Run) -> set[tuple[int, int]]:
     return {(view.camera.width, view.camera.height) for view in run.capture.views}
 
 
-def test_views_are_no_larger_than_it_takes_unless_asked_for(tmp_path: Path) -> None:
+def test_views_have_a_limited_size_unless_another_is_given(tmp_path: Path) -> None:
     run = make_run(load_capture(make_large_capture(tmp_path, views=3, size=(800, 600)), test_every=2))
     ((width, height),) = sizes(at_size(run))
     assert width * height == pytest.approx(PIXELS_OF_A_VIEW, rel=0.01)
@@ -41,7 +41,7 @@ def test_views_are_no_larger_than_it_takes_unless_asked_for(tmp_path: Path) -> N
         at_size(run, scale=1.0, width=100)
 
 
-def test_a_run_that_was_trained_small_is_shown_as_it_was_trained(tmp_path: Path) -> None:
+def test_a_run_trained_at_a_small_size_keeps_that_size(tmp_path: Path) -> None:
     capture = at_scale(
         load_capture(make_large_capture(tmp_path, views=2, size=(800, 600)), test_every=2), 0.25
     )
@@ -50,8 +50,8 @@ def test_a_run_that_was_trained_small_is_shown_as_it_was_trained(tmp_path: Path)
     assert sizes(at_size(run, scale=0.5)) == {(400, 300)}
 
 
-def test_a_true_estimate_is_true_at_half_the_size(tmp_path: Path) -> None:
-    """Maps of the sphere that made the images, against images and masks that are averaged."""
+def test_a_perfect_estimate_is_perfect_at_half_the_size(tmp_path: Path) -> None:
+    """Maps of the sphere from which the images were made, compared with averaged images and masks."""
     root = make_capture(tmp_path, size=(160, 120), views=4, test=(0, 2), masks=True)
     run = at_size(make_run(load_capture(root)), scale=0.5)
     shares: list[float] = []
@@ -87,5 +87,5 @@ def test_work_that_fails_leaves_no_bar_behind(monkeypatch, capsys) -> None:
     assert capsys.readouterr().out == ""
 
 
-def test_durations_are_for_people() -> None:
+def test_durations_are_rounded() -> None:
     assert [duration(s) for s in (42.4, 200.0, 9000.0)] == ["42 s", "3 min", "2.5 h"]

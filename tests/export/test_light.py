@@ -1,4 +1,4 @@
-"""Light out: in which frame, in which units, at which pixel; and the points that probes are for."""
+"""Exported light: its frame, its units and its pixels, and the points of the probes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ AXIS = torch.tensor([[0.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 class Ball(torch.nn.Module):
-    """A host that is a black sphere about the origin; it may be made to hide."""
+    """A host that is a black sphere around the origin, which can be hidden."""
 
     def __init__(self, radius: float = RADIUS) -> None:
         super().__init__()
@@ -69,7 +69,7 @@ def pixels(path: Path) -> np.ndarray:
     return read_image(path).pixels
 
 
-def test_the_map_is_written_as_it_is(tmp_path):
+def test_the_map_is_written_unchanged(tmp_path):
     run = make_run(tmp_path, "distant")
     written = export_light(run, tmp_path / "light")
     assert written == light_module.ExportedLight(tmp_path / "light" / "environment.exr", 0, 0)
@@ -83,7 +83,7 @@ def test_the_map_is_written_as_it_is(tmp_path):
     assert not (tmp_path / "light" / "probes.json").exists()
 
 
-def test_lamps_light_the_world_as_they_light_the_scene(tmp_path):
+def test_lamps_give_the_same_irradiance_in_world_and_scene(tmp_path):
     run = make_run(tmp_path, "distant_near")
     assert export_light(run, tmp_path / "light").lamps == 2
     described = json.loads((tmp_path / "light" / "lamps.json").read_text())
@@ -104,7 +104,7 @@ def test_lamps_light_the_world_as_they_light_the_scene(tmp_path):
         )
 
 
-def test_probes_show_what_arrives_above_the_surface(tmp_path, monkeypatch):
+def test_probes_have_the_incident_light_above_the_surface(tmp_path, monkeypatch):
     monkeypatch.setattr(light_module, "PROBE_HEIGHT", 9)
     run = make_run(tmp_path, "distant_near")
     run.model.lamps.place(POSITION[:0], INTENSITY[:0])
@@ -124,7 +124,7 @@ def test_probes_show_what_arrives_above_the_surface(tmp_path, monkeypatch):
         assert (shown[cosine < -1e-3] == 0).all()
 
 
-def test_a_free_light_is_probes_alone(tmp_path, monkeypatch):
+def test_a_free_light_is_exported_as_probes_only(tmp_path, monkeypatch):
     monkeypatch.setattr(light_module, "PROBE_HEIGHT", 8)
     written = export_light(make_run(tmp_path, "free"), tmp_path / "light")
     assert written == light_module.ExportedLight(None, 0, 16)
@@ -134,7 +134,7 @@ def test_a_free_light_is_probes_alone(tmp_path, monkeypatch):
     assert all(picture.shape == (8, 16, 3) and picture.max() > 0 for picture in shown)
 
 
-def test_points_are_unlike_one_another():
+def test_chosen_points_differ_in_position_and_normal():
     corners = torch.tensor([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [1.0, -1.0, 0.0]])
     floor = torch.cat((corners, 0.9 * corners, 0.5 * corners))
     up, aside = torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[1.0, 0.0, 0.0]])
@@ -146,7 +146,7 @@ def test_points_are_unlike_one_another():
     assert sorted(spread(points, 13).tolist()) == list(range(13))
 
 
-def test_surface_points_are_the_same_every_time(tmp_path):
+def test_surface_points_are_deterministic(tmp_path):
     run = make_run(tmp_path, "distant")
     one, other = spread_over_surface(run, 20), spread_over_surface(run, 20)
     assert torch.equal(one.position, other.position)

@@ -1,4 +1,4 @@
-"""The mesh against the closed forms of a sphere."""
+"""The exported mesh compared with the closed forms of a sphere."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_sphere_has_its_radius_volume_and_outward_faces():
     distance = np.linalg.norm(mesh.vertices, axis=-1)
     # A vertex lies on a chord of the distance along one edge: off by at most step² / (8 r) = 2.1e-4.
     np.testing.assert_allclose(distance, RADIUS, atol=step**2 / (8 * RADIUS) + 1e-6)
-    # Chords cut off a shell of that order: 3 · 2.1e-4 / 0.6 = 0.1 %, and faces as much again.
+    # Chords remove a shell of that thickness, 3 · 2.1e-4 / 0.6 = 0.1 % of the volume; faces remove as much.
     assert mesh.volume == pytest.approx(4.0 / 3.0 * np.pi * RADIUS**3, rel=3e-3)
     assert mesh.is_watertight
     cosines = (mesh.vertex_normals * mesh.vertices).sum(-1) / distance
@@ -41,7 +41,7 @@ def test_sphere_has_its_radius_volume_and_outward_faces():
     assert ((mesh.face_normals * mesh.triangles_center).sum(-1) > 0).all()
 
 
-def test_few_points_are_asked_and_nothing_is_lost():
+def test_few_points_are_evaluated_and_no_surface_is_lost():
     asked = []
 
     def counted(x: torch.Tensor) -> torch.Tensor:
@@ -53,7 +53,7 @@ def test_few_points_are_asked_and_nothing_is_lost():
     mesh = extract_mesh(counted, radius=1.0, resolution=128, chunk=50_000)
     assert max(asked) <= 50_000
     assert sum(asked) < 128**3 / 3
-    # The oracle asks every point. It keeps the faces within the sphere, as the mesh does.
+    # The reference evaluates every point. It keeps the faces within the sphere, as the mesh does.
     axis = torch.linspace(-1.0, 1.0, 128)
     dense = counted(torch.cartesian_prod(axis, axis, axis)).reshape(128, 128, 128).numpy()
     vertices, faces, _, _ = marching_cubes(dense, 0.0, allow_degenerate=False)
@@ -78,7 +78,7 @@ def test_field_without_a_surface_is_an_error(value: float):
 
 def test_surface_outside_the_scene_is_an_error():
     with pytest.raises(UserError, match="no surface"):
-        # Only the corners of the cube around the scene see it.
+        # It lies only in the corners of the cube around the scene.
         extract_mesh(lambda x: 1.3 - x.norm(dim=-1), radius=1.0, resolution=32)
 
 

@@ -1,4 +1,4 @@
-"""The inverted sphere: its chart and its compositing."""
+"""The inverted sphere: its coordinates and its compositing."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CONFIG = BackgroundConfig(layers=2, width=16, samples=8)
 
 
 def rays(radius: float, count: int = 20) -> tuple[torch.Tensor, torch.Tensor]:
-    """Origins everywhere within the sphere."""
+    """Rays with origins everywhere within the sphere."""
     generator = torch.Generator().manual_seed(1)
     outwards, directions = torch.nn.functional.normalize(
         torch.randn(2, count, 3, generator=generator).double(), dim=-1
@@ -24,7 +24,7 @@ def rays(radius: float, count: int = 20) -> tuple[torch.Tensor, torch.Tensor]:
 
 @pytest.mark.parametrize("encoding", [WAVES, GRID])
 @pytest.mark.parametrize("density", [-50.0, 0.0, 3.0, 50.0])
-def test_a_constant_colour_is_seen_whatever_the_density(density, encoding):
+def test_a_constant_colour_does_not_depend_on_the_density(density, encoding):
     torch.manual_seed(0)
     field = InvertedSphere(CONFIG, encoding, radius=3.0, scale=2.0)
     with torch.no_grad():
@@ -69,7 +69,7 @@ def test_a_hash_grid_encodes_the_contraction_of_the_same_points():
 
 
 @pytest.mark.parametrize("start", [(0.25, 0.2, 0.15), (1.0, 0.5, 0.04)])
-def test_it_starts_as_the_colour_that_it_is_told(start):
+def test_the_field_starts_with_the_given_colour(start):
     torch.manual_seed(0)
     field = InvertedSphere(CONFIG, WAVES, radius=3.0, scale=2.0, start=torch.tensor(start))
     color = field(*(t.float() for t in rays(3.0)))
@@ -77,7 +77,7 @@ def test_it_starts_as_the_colour_that_it_is_told(start):
 
 
 @pytest.mark.parametrize("start", [0.0, 2.0, 5.0])
-def test_a_colour_that_it_cannot_reach_leaves_it_able_to_learn(start):
+def test_a_colour_out_of_range_does_not_stop_training(start):
     field = InvertedSphere(CONFIG, WAVES, radius=3.0, scale=2.0, start=torch.full((3,), start))
     color = field(*(t.float() for t in rays(3.0)))
     color.sum().backward()
@@ -86,8 +86,8 @@ def test_a_colour_that_it_cannot_reach_leaves_it_able_to_learn(start):
 
 
 def test_two_samples_by_hand():
-    """An optical depth of ln 2 over the whole chart: half of the light would pass all of it, √½ each half of
-    it.
+    """With an optical depth of ln 2 over the whole range, half of the light passes all of it, and √½ passes
+    each half.
     """
     torch.manual_seed(0)
     field = InvertedSphere(BackgroundConfig(layers=2, width=16, samples=2), WAVES, radius=4.0, scale=1.0)

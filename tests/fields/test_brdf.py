@@ -1,4 +1,4 @@
-"""B: its start, its range and its gradients."""
+"""B: its initial value, its range and its gradients."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def positions(count: int = 8) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("name", ["paper-mlp", "paper-ngp", "fast"])
-def test_starts_at_the_middle_and_at_the_base_colour_that_is_set(name):
+def test_starts_at_the_configured_material(name):
     torch.manual_seed(0)
     config = preset(name)
     material = BrdfField(config.brdf, config.encoding, config.volume.radius)(positions(200).float())

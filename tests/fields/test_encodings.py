@@ -1,4 +1,4 @@
-"""Encodings, against SciPy, closed forms and autograd."""
+"""Encodings compared with SciPy, closed forms and autograd."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_spherical_harmonics_agree_with_scipy():
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3, 4, 5])
-def test_fewer_bands_are_the_first_of_all(degree):
+def test_fewer_bands_are_the_first_ones(degree):
     x = directions(*sphere_quadrature()[:2])
     encoding = SphericalHarmonics(degree)
     assert encoding.width == degree**2
@@ -62,7 +62,7 @@ def test_fewer_bands_are_the_first_of_all(degree):
 
 
 @pytest.mark.parametrize("degree", [0, 6])
-def test_bands_that_are_not_there_are_refused(degree):
+def test_an_unsupported_number_of_bands_is_refused(degree):
     with pytest.raises(UserError, match="bands"):
         SphericalHarmonics(degree)
 
@@ -94,8 +94,8 @@ def test_pull_back_is_the_chain_rule():
     torch.testing.assert_close(pull_back(rows, encoded), expected)
 
 
-def test_the_cube_of_the_grid_holds_the_scene_sphere():
-    """−radius and +radius are the two faces: only there and beyond does the derivative across them vanish."""
+def test_the_cube_of_the_grid_contains_the_scene_sphere():
+    """Its faces are at −radius and +radius: the derivative across them vanishes only there and beyond."""
     grid = HashGrid(GRID, radius=2.0).double()
     x = torch.tensor([[-1.999, 0.3, 0.1], [1.999, 0.3, 0.1], [2.001, 0.3, 0.1]], dtype=torch.float64)
     along_x = grid.with_jacobian(x).jacobian[:, 3:, 0].abs().sum(1)

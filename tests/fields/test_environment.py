@@ -1,4 +1,4 @@
-"""The environment map: look-ups, densities and sampling against closed forms."""
+"""The environment map: look-ups, densities and sampling compared with closed forms."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_it_starts_at_one_radiance_everywhere():
     )
 
 
-def test_texel_centres_show_their_texel():
+def test_radiance_at_a_texel_centre_is_that_of_the_texel():
     light = EnvironmentLight(9, 1.0)
     with torch.no_grad():
         light.log_radiance.normal_()
@@ -36,7 +36,7 @@ def test_texel_centres_show_their_texel():
         torch.testing.assert_close(light.radiance(torch.zeros(1, 3), wi)[0, 0], expected, rtol=1e-4, atol=0.0)
 
 
-def test_the_map_closes_around_the_azimuth():
+def test_the_map_is_periodic_in_azimuth():
     light = EnvironmentLight(9, 1.0)
     with torch.no_grad():
         light.log_radiance.normal_()
@@ -88,7 +88,7 @@ def test_there_is_one_direction_in_every_texel_and_the_texels_cover_the_sphere()
 # ---------------------------------------------------------------------------------------- maps that are known
 
 
-def test_a_bright_texel_shows_where_the_layout_puts_it():
+def test_a_bright_texel_is_in_the_direction_of_the_layout():
     """Row j ↔ θ = πj/(h − 1) from +z, column i ↔ φ = 2π(i + ½)/w, direction (sin φ sin θ, cos φ sin θ, cos
     θ).
     """
@@ -109,8 +109,8 @@ def test_a_bright_texel_shows_where_the_layout_puts_it():
     torch.testing.assert_close(map_directions(9, 12)[4, 2], torch.tensor(along[0]))
 
 
-def test_a_known_map_brings_what_its_texels_hold():
-    """Bilinear between its texels: a lamp of one texel brings its radiance times its solid angle, π/12 ·
+def test_a_known_map_has_the_irradiance_of_its_texels():
+    """Bilinear between texels: a lamp of one texel contributes its radiance times its solid angle, π/12 ·
     2π/24.
     """
     known = torch.zeros(3, 13, 24)
@@ -127,7 +127,7 @@ def test_a_known_map_brings_what_its_texels_hold():
     assert brought.item() == pytest.approx(1000 * math.pi / 12 * math.pi / 12, rel=0.02)
 
 
-def test_a_map_comes_back_from_a_checkpoint_in_its_own_size():
+def test_a_map_is_restored_from_a_checkpoint_in_its_own_size():
     light, other = EnvironmentLight(8, 1.0), EnvironmentLight(8, 1.0)
     light.show(torch.rand(3, 11, 30) + 0.1)
     other.load_state_dict(light.state_dict())
@@ -142,7 +142,7 @@ def test_a_map_comes_back_from_a_checkpoint_in_its_own_size():
 
 
 @pytest.mark.parametrize("size", [(40, 96), (33, 50), (48, 35), (17, 33)])
-def test_a_coarser_map_is_the_mean_of_what_lies_in_each_texel(size):
+def test_a_coarser_map_has_the_means_of_the_finer_one(size):
     light = EnvironmentLight(4, 1.0)
     theta = math.pi * torch.arange(size[0]) / (size[0] - 1)
     phi = 2 * math.pi * (torch.arange(size[1]) + 0.5) / size[1]
@@ -151,8 +151,8 @@ def test_a_coarser_map_is_the_mean_of_what_lies_in_each_texel(size):
     coarse = light.at_most(16)
     assert coarse.log_radiance.shape == (3, 16, 32)
     assert coarse.log_radiance.isfinite().all()
-    # 2 + y + z changes by at most √2 a radian, and what lies in a texel is up to half of one off each way:
-    # 0.1 · √2.
+    # 2 + y + z changes by at most √2 per radian, and the mean of a texel is shifted by up to half a texel per
+    # axis: 0.1 · √2.
     wi = directions(200)
     shown = coarse.radiance(torch.zeros(1, 3), wi)[0, :, 0]
     torch.testing.assert_close(shown, 2 + wi[0, :, 1] + wi[0, :, 2], rtol=0, atol=0.2)

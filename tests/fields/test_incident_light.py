@@ -1,4 +1,4 @@
-"""L: its start, where position and direction enter, and the exponential."""
+"""L: its initial value, the layers that position and direction enter, and the exponential."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def test_starts_near_the_initial_radiance(name, base):
     assert light.std() < 0.35
 
 
-def test_position_and_direction_enter_where_the_paper_says():
-    """The network, written again as one chain of layers over concatenated inputs."""
+def test_position_and_direction_enter_the_layers_of_the_paper():
+    """Compared with the network written as one chain of layers over concatenated inputs."""
     torch.manual_seed(0)
     field = IncidentLightField(
         FreeLightConfig(layers=6, width=16), WAVES, base=10.0, initial_radiance=2.0
@@ -55,8 +55,10 @@ def test_position_and_direction_enter_where_the_paper_says():
     torch.testing.assert_close(field.radiance(x, wi), expected)
 
 
-def test_directions_can_be_shared_between_points():
-    """The half of the network that sees the direction alone then runs once a direction, not once a pair."""
+def test_shared_directions_give_the_same_radiance():
+    """The part of the network that depends only on the direction is then evaluated once per direction, not
+    once per pair.
+    """
     field = IncidentLightField(CONFIGS["fast"].light, CONFIGS["fast"].encoding, 10.0, 1.0)
     x, wi = rays()
     every = wi[:1].expand_as(wi)

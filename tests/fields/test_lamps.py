@@ -1,4 +1,4 @@
-"""Lamps close by, against the closed forms of small spheres."""
+"""Near lamps compared with the closed forms of small spheres."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def lamps() -> Lamps:
     return both
 
 
-def test_only_as_many_are_lit_as_there_is_room_for():
+def test_at_most_the_maximum_number_of_lamps_is_lit():
     few = Lamps(1, radius=0.05)
     few.place(
         torch.tensor([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]]), torch.tensor([[0.2, 0.2, 0.2], [0.3, 0.6, 0.9]])
@@ -42,8 +42,8 @@ def test_a_lambertian_surface_shows_cosine_and_inverse_square():
     torch.testing.assert_close(color, expected)
 
 
-def test_the_light_that_is_seen_brings_the_same_irradiance_as_the_rays():
-    """Counted over the hemisphere, the discs of the lamps bring Σ I cos θ / d²."""
+def test_lamps_hit_by_directions_give_the_same_irradiance_as_lamp_rays():
+    """Integrated over the hemisphere, the discs of the lamps contribute Σ I cos θ / d²."""
     light = lamps()
     torch.manual_seed(0)
     wi = normalize(torch.randn(1, 2_000_000, 3), dim=-1)
@@ -53,8 +53,8 @@ def test_the_light_that_is_seen_brings_the_same_irradiance_as_the_rays():
     torch.testing.assert_close(irradiance, 0.8 * torch.tensor([0.3, 0.6, 0.9]) + 0.2, rtol=0.05, atol=0.0)
 
 
-def test_a_lamp_with_an_axis_sends_by_the_cosine_and_nothing_backwards():
-    """Both ways of asking, at 0°, 60° and 120° from the axis of a lamp at the origin."""
+def test_a_lamp_with_an_axis_emits_by_the_cosine_and_not_backwards():
+    """By both methods, at 0°, 60° and 120° from the axis of a lamp at the origin."""
     light = Lamps(1, radius=0.05)
     light.place(torch.zeros(1, 3), torch.full((1, 3), 0.6), torch.tensor([[0.0, 0.0, 1.0]]))
     angle = torch.tensor([0.0, math.pi / 3, 2 * math.pi / 3])
@@ -66,7 +66,7 @@ def test_a_lamp_with_an_axis_sends_by_the_cosine_and_nothing_backwards():
     torch.testing.assert_close(light.met(x, -x[:, None] / 2, infinite)[:, 0], expected, atol=1e-4, rtol=1e-5)
 
 
-def test_what_stands_before_a_lamp_hides_it():
+def test_a_closer_surface_occludes_a_lamp():
     light = lamps()
     up = torch.tensor([[[0.0, 0.0, 1.0]]])
     x = torch.zeros(1, 3)
@@ -82,7 +82,7 @@ def test_a_point_inside_a_lamp_gets_finite_light():
     assert rays.solid_angle.max().item() == pytest.approx(math.pi / 4)
 
 
-def test_a_checkpoint_knows_how_many_are_lit():
+def test_a_checkpoint_has_the_number_of_lit_lamps():
     before = lamps()
     before.axis[0] = torch.tensor([0.0, 0.0, -1.0])
     again = Lamps(3, radius=0.05)

@@ -1,4 +1,4 @@
-"""Networks: the written-out adjoint against autograd, and the starts of the weights."""
+"""Networks: the explicit reverse pass compared with autograd, and the initial weights."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ def test_forward_of_two_units_by_hand():
     assert mlp(torch.tensor([[0.5]])).item() == 3 * 1.5 + 5 * 0 + 7 * 0.5 + 0.125
 
 
-def test_sines_keep_their_distribution():
-    """SIREN's theorem: at any depth the units are spread like a sine of a uniform phase, whose variance is
+def test_sine_layers_keep_their_distribution():
+    """SIREN's theorem: at any depth the units are distributed like the sine of a uniform phase, with variance
     ½.
     """
     torch.manual_seed(0)
@@ -89,6 +89,6 @@ def test_weight_normalisation_keeps_the_function():
 
 
 @pytest.mark.parametrize(("layers", "skip"), [(0, None), (2, 3), (2, 0)])
-def test_a_network_that_cannot_be_is_refused(layers, skip):
+def test_an_invalid_network_is_refused(layers, skip):
     with pytest.raises(UserError, match="skip"):
         Mlp(3, 1, layers=layers, width=4, activation="relu", skip=skip)

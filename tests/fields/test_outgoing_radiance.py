@@ -1,4 +1,4 @@
-"""R: its start, its range, and what it depends on."""
+"""R: its initial value, its range, and the inputs that it depends on."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def inputs(feature_width: int) -> list[torch.Tensor]:
     ("scale", "asked", "start"),
     [(1.0, 0.2, 0.2), (3.0, 0.2, 0.2), (0.1, 0.2, 0.05), (3e4, 2e3, 2e3), (3e-4, 2e-5, 2e-5)],
 )
-def test_starts_near_what_is_asked_and_below_its_scale(name, scale, asked, start):
+def test_starts_near_the_given_radiance_and_below_its_scale(name, scale, asked, start):
     torch.manual_seed(0)
     config = preset(name)
     width = config.host.sdf.feature_width
@@ -34,7 +34,7 @@ def test_starts_near_what_is_asked_and_below_its_scale(name, scale, asked, start
 
 
 @pytest.mark.parametrize("name", ["paper-ngp", "fast"])
-def test_depends_on_all_that_it_is_given(name):
+def test_depends_on_all_inputs(name):
     torch.manual_seed(0)
     config = preset(name)
     field = OutgoingRadianceField(config.radiance, config.encoding, 15, 3.0, 1.0)
@@ -46,7 +46,7 @@ def test_depends_on_all_that_it_is_given(name):
         assert (gradient.abs().amax(1) > 0).all()
 
 
-def test_what_a_mirror_sends_moves_as_the_directions_that_it_mirrors():
+def test_the_mirrored_direction_is_that_of_a_mirror():
     torch.manual_seed(0)
     field = OutgoingRadianceField(preset("fast").radiance, preset("fast").encoding, 15, 3.0, 1.0).double()
     x, wo, normal, feature = (t.double() for t in inputs(15))

@@ -1,4 +1,4 @@
-"""G: its start, its gradient and its Hessian."""
+"""G: its initial value, its gradient and its Hessian."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ METHODS = ["analytic", "finite_difference"]
 
 
 def worn_in(encoding: str, noise: float = 0.1) -> SdfField:
-    """A field some way from its start, in float64: every parameter counts."""
+    """A field away from its initial value, in float64, so that every parameter has an influence."""
     torch.manual_seed(0)
     field = SdfField(*SMALL[encoding], radius=1.75).double()
     with torch.no_grad():

@@ -31,7 +31,7 @@ TABLE = 2 * (17**3 + 24**3 + 35**3 + 50**3 + 71**3 + 11 * 2**19)
 
 def test_sdf_of_the_mlp_setting():
     plain = linear(WAVES_6, 256) + 6 * linear(256, 256) + linear(256 + WAVES_6, 256) + linear(256, 1 + 256)
-    row_lengths = 8 * 256 + 1 + 256  # of the weight normalisation
+    row_lengths = 8 * 256 + 1 + 256  # lengths of the weight normalisation
     assert count(SdfField(MLP.host.sdf, MLP.encoding, 3.0)) == plain + row_lengths
 
 
@@ -59,7 +59,7 @@ def test_incident_light_of_both_settings(name, direction):
 def test_grids_of_the_ngp_setting():
     config = preset("paper-ngp")
     sdf = linear(GRID, 64) + linear(64, 64) + linear(64, 1 + 64)
-    radiance = linear(3 + 16 + 3 + 64, 64) + 3 * linear(64, 64) + linear(64, 3)  # no grid of its own
+    radiance = linear(3 + 16 + 3 + 64, 64) + 3 * linear(64, 64) + linear(64, 3)  # without its own grid
     brdf = linear(GRID, 120) + linear(120, 120) + linear(120, 5)
     three_heads = 3 * (linear(GRID, 64) + linear(64, 64)) + linear(64, 5)
     assert abs(brdf / three_heads - 1) < 0.02  # as many weights as in the published code

@@ -1,4 +1,4 @@
-"""What trainings of hard cases share, and the counts that `make test-hard` ends with."""
+"""Fixtures for trainings of hard cases, and the counts that `make test-hard` prints at its end."""
 
 from __future__ import annotations
 
@@ -13,14 +13,16 @@ COUNTED = ("inputs", "kills", "files", "mutants")
 
 @pytest.fixture(scope="module")
 def without_shape_checks():
-    """They cost two thirds of the time of a small step, and a hundred steps have the shapes of the first."""
+    """Shape checks take two thirds of the time of a small step, and all steps have the shapes of the
+    first.
+    """
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """One line with the counts, where hard cases were run."""
+    """Print one line with the counts if hard cases were run."""
     counts: Counter[str] = Counter()
     for reports in terminalreporter.stats.values():
         for report in reports:

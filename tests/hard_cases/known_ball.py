@@ -1,7 +1,7 @@
 """A ball of known material under a known environment map, rendered by quadrature in float64 NumPy.
 
-Nothing of the package takes part in the rendering, so its images are an oracle for shading and for what
-training recovers from them. The ball is convex, so no light goes from one of its points to another.
+The rendering does not use the package, so its images are an independent reference for shading and for the
+results of training. The ball is convex, so there is no light between its points.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def texel_directions(environment: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class KnownBall:
-    """A ball, its material by unit normal, and the light about it.
+    """A ball, its material as a function of the unit normal, and the surrounding light.
 
     Attributes:
         environment: the map (H, W, 3), linear radiance.
@@ -126,7 +126,7 @@ class KnownBall:
 
 @dataclass(frozen=True)
 class Photographed:
-    """Pixels of the ball: rays (N, 3), what they meet, and the radiance that they see."""
+    """Pixels of the ball: rays (N, 3), their hits, and the observed radiance."""
 
     origins: Array
     directions: Array
@@ -135,7 +135,7 @@ class Photographed:
 
 
 def photograph(ball: KnownBall, count: int, seed: int = 0, by_lobe: bool = True) -> Photographed:
-    """Pixels from cameras all around that see the ball, none within 11° of its outline."""
+    """Pixels of cameras all around whose rays hit the ball, none within 11° of its outline."""
     rng = np.random.default_rng(seed)
     origins = rng.normal(size=(count, 3))
     origins *= DISTANCE / np.linalg.norm(origins, axis=-1, keepdims=True)

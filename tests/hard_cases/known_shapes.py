@@ -1,4 +1,4 @@
-"""Shapes that are hard to find, as exact distances in float64 NumPy, and pixels that see them."""
+"""Shapes that are hard to recover, as exact distances in float64 NumPy, and pixels that show them."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ SHAPES: Mapping[str, Distance] = {
 
 @dataclass(frozen=True)
 class Seen:
-    """Rays (N, 3) and what they meet: `hit`, `position`, `normal`, and the linear radiance that they see."""
+    """Rays (N, 3) with `hit`, `position`, `normal`, and the observed linear radiance."""
 
     origins: Array
     directions: Array
@@ -80,9 +80,9 @@ class Seen:
 
 
 def photograph(shape: Distance, count: int, views: int = 24, seed: int = 0) -> Seen:
-    """Random pixels of so many cameras around a shape, each with a frame 2 wide at the origin.
+    """Random pixels of so many cameras around a shape, each with an image 2 scene units wide at the origin.
 
-    What the surface sends to every viewer changes with position and normal; beside it there is nothing.
+    The radiance of the surface depends on position and normal only; pixels beside it are black.
     """
     rng = np.random.default_rng(seed)
     turn = np.arange(views) * np.pi * (3 - np.sqrt(5))

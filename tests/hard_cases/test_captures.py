@@ -1,4 +1,4 @@
-"""Captures that cannot be used: each is refused in one line that names the file and says what to do."""
+"""Unusable captures are refused in one line that names the file and the remedy."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def load_pixels(root: Path, **options) -> PixelDataset:
 
 
 def refused(root: Path, *words: str, **options) -> None:
-    """Loading the capture and its pixels raises a one-line `UserError` with a remedy that has all these
-    words.
+    """Check that loading the capture and its pixels raises a one-line `UserError` with a remedy that has all
+    these words.
     """
     with pytest.raises(UserError) as caught:
         load_pixels(root, **options)
@@ -167,7 +167,7 @@ def test_links_do_not_lead_out_of_the_capture(tmp_path: Path, what: str) -> None
     refused(root, Path(what).name, "not a path within the capture folder")
 
 
-def test_the_file_that_is_meant_is_not_clear(tmp_path: Path) -> None:
+def test_ambiguous_file_names(tmp_path: Path) -> None:
     root = make_capture(tmp_path)
     images = root / "inputs" / "images"
     (images / "003.exr").rename(images / "003.tif")
@@ -175,7 +175,7 @@ def test_the_file_that_is_meant_is_not_clear(tmp_path: Path) -> None:
     refused(root, "003.exr: does not exist, and 003.tif and 003.png are both possible")
 
 
-def test_two_images_of_one_name(tmp_path: Path) -> None:
+def test_two_images_with_the_same_name(tmp_path: Path) -> None:
     root = make_capture(tmp_path)
     path = root / "inputs" / "sfm_scene.json"
     path.write_text(path.read_text().replace("images/003.exr", "more/002.exr"))
@@ -184,7 +184,7 @@ def test_two_images_of_one_name(tmp_path: Path) -> None:
     refused(root, "images/002.exr", "more/002.exr", "the same name")
 
 
-def test_an_image_that_the_scene_file_does_not_know(tmp_path: Path) -> None:
+def test_an_image_that_is_not_in_the_scene_file(tmp_path: Path) -> None:
     root = make_capture(tmp_path)
     write_exr(root / "inputs" / "images" / "007.exr", {"RGB": FLAT})
     refused(root, "007.exr: an image without a camera")
@@ -202,7 +202,7 @@ def test_split_file_is_broken(tmp_path: Path, text: str) -> None:
     refused(root, "split.json")
 
 
-def test_nothing_is_left_to_train_on(tmp_path: Path) -> None:
+def test_no_training_view_is_left(tmp_path: Path) -> None:
     root = make_capture(tmp_path)
     refused(root, "all 6 views are held out", test_every=1)
     refused(root, "cannot be held out", test_every=-2)
@@ -213,7 +213,7 @@ def test_nothing_is_left_to_train_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, -0.25])
-def test_pixels_that_no_light_can_have(tmp_path: Path, bad: float) -> None:
+def test_impossible_pixel_values(tmp_path: Path, bad: float) -> None:
     root = make_capture(tmp_path)
     broken = FLAT.copy()
     broken[3, 4:7, 1] = bad
@@ -244,7 +244,7 @@ def test_mask_shows_no_object(tmp_path: Path) -> None:
     refused(root, "masks/001.png: the mask shows no object")
 
 
-def test_mask_of_another_size(tmp_path: Path) -> None:
+def test_mask_with_another_size(tmp_path: Path) -> None:
     root = make_capture(tmp_path, masks=True)
     write_png(root / "inputs" / "masks" / "001.png", np.ones((9, 12), np.uint8))
     refused(root, "masks/001.png: 12×9 pixels where the camera has 24×18")

@@ -1,8 +1,8 @@
-"""Forward and backward of whole renders and whole steps against finite differences, in float64.
+"""Gradients of whole renders and whole steps compared with finite differences, in float64.
 
-Where rays are sampled, and from where light arrives, follows the parameters without gradient; samples are
-therefore drawn once and kept while the parameters move. Directions of the space of all parameters of a field
-are drawn at random: the slope along each by autograd agrees with the difference of two renders.
+The positions of samples and the directions of incident light depend on the parameters without gradient, so
+samples are drawn once and kept while the parameters change. Random directions in the space of all parameters
+of a field are used: the slope along each by autograd agrees with the difference of two renders.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from tests.scenes import sphere_batch, sphere_model, tiny_config
 from tests.train.small_runs import solved_light
 
 STEP = 1e-6
-"""Length of the step in the parameters: rounding of float64 then changes a slope of 1 by 1e-9."""
+"""Length of the step in the parameters; rounding of float64 then changes a slope of 1 by 1e-9."""
 
 
 def keep_first(monkeypatch: pytest.MonkeyPatch, module: ModuleType, name: str) -> None:
-    """A function returns at every call what it returned first."""
+    """Replace a function so that every call returns the result of the first."""
     function, kept = getattr(module, name), []
 
     def once(*args, **kwargs):
@@ -46,7 +46,7 @@ def samples_stay(monkeypatch):
 
 
 def small_model(light: str) -> NeilfModel:
-    """Gradients are not scaled, and a ray counts as a hit if it meets anything."""
+    """Gradients are not scaled, and every ray with any weight counts as a hit."""
     config = tiny_config() if light == "free" else solved_light(tiny_config())
     config = dataclasses.replace(
         config,
@@ -59,7 +59,7 @@ def small_model(light: str) -> NeilfModel:
         shading=dataclasses.replace(config.shading, hit_share=0.3),
     )
     model = sphere_model(config).double().train()
-    with torch.no_grad():  # away from the start, where weights are exactly 0
+    with torch.no_grad():  # away from the initial values, at which weights are exactly 0
         for parameters in model.parameter_groups().values():
             for p in parameters:
                 p.add_(0.01 * torch.randn_like(p))
@@ -73,7 +73,9 @@ def pixels() -> PixelBatch:
 
 
 def assert_slopes(model: NeilfModel, value: Callable[[], Tensor], moves: frozenset[str]) -> None:
-    """The slope of `value` along random directions of each field's parameters, both ways."""
+    """Compare the slope of `value` along random directions of each field's parameters, by autograd and by
+    differences.
+    """
     groups = {name: p for name, p in model.parameter_groups().items() if name in moves}
     slopes = {}
     for name, parameters in groups.items():
@@ -111,7 +113,7 @@ def test_renders_of_the_host(samples_stay, output):
 @pytest.mark.parametrize("light", ["free", "map"])
 @pytest.mark.parametrize("stage", list(Stage))
 def test_losses_of_a_step(samples_stay, light, stage):
-    """All losses of a stage together, with their weights, and all fields that the stage moves."""
+    """All losses of a stage together, with their weights, and all fields that the stage trains."""
     model, batch = small_model(light), pixels()
     model.freeze_for(stage)
     weights = active_losses(stage, model.config, model.stages)

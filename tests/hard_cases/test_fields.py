@@ -1,4 +1,4 @@
-"""Inputs on which fields tend to break: value and every gradient finite and bounded."""
+"""Inputs at which fields tend to fail: values and all gradients are finite and bounded."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_outgoing_radiance(name, dtype):
     config = preset(name)
     field = OutgoingRadianceField(config.radiance, config.encoding, 15, 1.75, 3.0).to(dtype)
     x = POSITIONS.to(dtype).requires_grad_()
-    zero = torch.zeros_like(x)  # a normal that vanished, a direction that was never set
+    zero = torch.zeros_like(x)  # a zero normal and a zero direction
     color = field(x, zero, zero, torch.zeros(len(x), 15, dtype=dtype))
     assert_bounded(color, *gradients(color.sum(), field, x), bound=3e7)
 
@@ -119,7 +119,7 @@ def test_background_from_the_centre_and_from_the_rim(name, dtype):
     assert_bounded(color, *gradients(color.sum(), field, origins))
 
 
-def test_no_points_are_no_trouble():
+def test_empty_batches():
     none = torch.zeros(0, 3)
     for encoding in ("fast", "paper-mlp"):
         sample = SdfField(preset(encoding).host.sdf, preset(encoding).encoding, 1.75).with_gradient(none)

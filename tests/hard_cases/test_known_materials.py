@@ -38,13 +38,13 @@ PIXELS, HELD_BACK, RAYS = 1500, 300, 128
 
 
 def closed_form_host(origins: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """The ball without a colour: while only material is learned, a host's colour does not count."""
+    """The ball without a colour: the host's colour has no influence if only the material is trained."""
     position, hit = meet_ball(RayBatch(origins, directions), RADIUS)
     return torch.full_like(position, 0.5), position, normalize(position, dim=-1) * hit[:, None]
 
 
 def settings(steps: int, known_map: Path | None, samples: int) -> NeilfConfig:
-    """A small material field for `steps` steps, under a known map or under one that is solved for."""
+    """A small material field trained for `steps` steps, under a known map or a map that is fitted."""
     config = solved_light(tiny_config())
     fit = dataclasses.replace(config.light.fit, points=512, every=50, steps=60)
     light = dataclasses.replace(
@@ -239,19 +239,19 @@ LONG = {
 
 def check(case: Case, folder: Path) -> None:
     found = learn(case.ball, folder, **case.options)
-    print(found)  # pytest -rA shows it
+    print(found)  # shown by pytest -rA
     for name, bound in case.bounds.items():
         assert getattr(found, name) <= bound, f"{name}: {found}"
 
 
 @pytest.mark.parametrize("name", QUICK)
-def test_what_is_recovered_is_right(tmp_path, name):
+def test_recovered_materials_are_accurate(tmp_path, name):
     check(QUICK[name], tmp_path)
 
 
 @pytest.mark.hard
 @pytest.mark.parametrize("name", LONG)
-def test_what_is_recovered_in_a_longer_list_of_cases_is_right(tmp_path, name):
+def test_recovered_materials_are_accurate_in_more_cases(tmp_path, name):
     check(LONG[name], tmp_path)
 
 
@@ -261,14 +261,14 @@ def test_what_is_recovered_in_a_longer_list_of_cases_is_right(tmp_path, name):
     reason="the absolute loss of few noisy samples prefers the lobe of a mirror, and below the smallest "
     "roughness of a lobe nothing leads back (docs/stability.md)",
 )
-def test_polished_metal_is_not_taken_for_a_mirror(tmp_path):
+def test_polished_metal_is_not_estimated_as_a_mirror(tmp_path):
     polished = KnownBall(roughness=0.2, metallic=1.0, base_color=gold)
     check(Case(polished, {"roughness": 0.1, "image": 0.04}), tmp_path)
 
 
 @pytest.mark.parametrize(("roughness", "metallic"), [(0.08, 1.0), (0.35, 0.0)])
-def test_shading_agrees_with_the_oracle(roughness, metallic):
-    """The estimator with the true material and 1024 samples: within 2 % per point, 0.3 % in the mean."""
+def test_shading_agrees_with_the_quadrature(roughness, metallic):
+    """The estimator with the true material and 1024 samples: within 2 % per point and 0.3 % in the mean."""
     torch.manual_seed(0)
     ball = KnownBall(roughness=roughness, metallic=metallic)
     truth = photograph(ball, 100, seed=1)

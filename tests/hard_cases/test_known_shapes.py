@@ -1,7 +1,7 @@
-"""Hard shapes with a known truth: the surface that training finds is right, not only finite.
+"""Hard shapes with a known truth: the recovered surface is accurate, not only finite.
 
-Each shape is learned from pixels alone, by the stage SDF init with small networks. Bounds are about 1.5 times
-the errors measured, at pixels of other views.
+Each shape is learned from pixels only, by the stage SDF init with small networks. Bounds are about 1.5 times
+the measured errors, at pixels of other views.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ PIXELS, HELD_BACK, RAYS = 20_000, 2_000, 192
 
 
 def settings() -> NeilfConfig:
-    """The preset `fast`, cut down to some ten milliseconds a step."""
+    """The preset `fast`, reduced to about ten milliseconds per step."""
     config = tiny_config()
     return dataclasses.replace(
         config,
@@ -96,7 +96,7 @@ def learn(
         seed_step(0, step)
         at = StagePosition(Stage.SDF_INIT, step, steps)
         set_rates(optimizer, config.optimizer, at)
-        # As the package draws pixels: most of them on the object.
+        # Like the package, draw most pixels on the object.
         rows = np.concatenate((rng.choice(on, 2 * RAYS // 3), rng.choice(off, RAYS // 3)))
         terms = model.step(batch_of(seen, rows), Stage.SDF_INIT).terms
         total = weigh(terms, active_losses(Stage.SDF_INIT, config, model.stages, at.share))
@@ -108,7 +108,7 @@ def learn(
 
 
 def cloud(seen: Seen, flipped: float) -> OrientedPoints:
-    """500 points of a surface, a share of their normals turned around."""
+    """500 points of a surface; a share of their normals is flipped."""
     rows = np.nonzero(seen.hit)[0][:500]
     sign = np.where(np.arange(500) < 500 * flipped, -1.0, 1.0)[:, None]
     return OrientedPoints(
@@ -159,9 +159,9 @@ CASES = {
 
 @pytest.mark.hard
 @pytest.mark.parametrize("name", CASES)
-def test_the_surface_that_is_found_is_right(name):
+def test_the_recovered_surface_is_accurate(name):
     case = CASES[name]
     found = learn(SHAPES[case.shape], 400, **case.options)
-    print(found)  # pytest -rA shows it
+    print(found)  # shown by pytest -rA
     for measure in dataclasses.fields(Errors):
         assert getattr(found, measure.name) <= getattr(case.largest, measure.name), found

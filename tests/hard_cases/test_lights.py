@@ -1,4 +1,4 @@
-"""Lights, and points beside them, on which light models tend to break: value and every gradient finite and
+"""Lights and nearby points at which light models tend to fail: values and all gradients are finite and
 bounded.
 """
 
@@ -46,7 +46,7 @@ def beside_lamps(dtype: torch.dtype, roughness: float) -> tuple[Observed, torch.
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("lobe", [GGX, SPHERICAL_GAUSSIAN, None], ids=["ggx", "gaussian", "lambertian"])
 @pytest.mark.parametrize("roughness", [1e-4, 0.3, 1.0])
-def test_lamps_in_touch_with_surfaces(dtype, lobe, roughness):
+def test_lamps_that_touch_surfaces(dtype, lobe, roughness):
     seen, rough = beside_lamps(dtype, roughness)
     places = LampPlaces(LAMPS.position.to(dtype).requires_grad_(), LAMPS.axis.to(dtype).requires_grad_())
     rough.requires_grad_()
@@ -61,7 +61,7 @@ def test_lamps_in_touch_with_surfaces(dtype, lobe, roughness):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("intensity", [0.0, 1e6])
-def test_what_lamps_show_of_themselves(dtype, intensity):
+def test_lamps_hit_by_directions(dtype, intensity):
     lamps = Lamps(4, RADIUS).to(dtype)
     lamps.place(LAMPS.position.to(dtype), torch.full((3, 3), intensity, dtype=dtype), LAMPS.axis.to(dtype))
     x = BESIDE.to(dtype)
@@ -94,9 +94,9 @@ def test_a_map_at_its_poles_and_at_its_seam(dtype, radiance):
 
 @pytest.mark.parametrize("pixel", [0.0, 1e6])
 @pytest.mark.parametrize(("base_color", "metallic"), [(0.0, 0.0), (1.0, 1.0)])
-def test_a_fit_to_what_cannot_be(pixel, base_color, metallic):
-    """Black surfaces that shine, mirrors that show nothing, beside and within lamps: the light is odd, but it
-    is a light.
+def test_a_fit_to_impossible_observations(pixel, base_color, metallic):
+    """Black surfaces that emit light, mirrors that reflect nothing, and points beside and within lamps: the
+    fitted light is finite and not negative.
     """
     torch.manual_seed(0)
     seen, rough = beside_lamps(torch.float32, 0.05)

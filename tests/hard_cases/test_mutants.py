@@ -1,4 +1,4 @@
-"""Faults that are planted one at a time: a quick test notices each."""
+"""Faults that are planted one at a time: a quick test detects each."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ REPOSITORY = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.what)
-def test_a_fault_can_be_planted_and_its_tests_are_there(mutant):
+def test_a_fault_can_be_planted_and_its_tests_exist(mutant):
     source = (REPOSITORY / "neilfpp_method" / mutant.module).read_text()
     compile(planted(mutant, source), mutant.module, "exec")
     assert (REPOSITORY / "tests" / mutant.tests).is_file()
 
 
-def test_a_fault_that_no_longer_stands_there_is_told():
+def test_a_fault_whose_code_has_changed_is_an_error():
     with pytest.raises(ValueError, match="0 places in shading/"):
         planted(MUTANTS[0], "nothing")
 
 
-def test_the_rows_of_the_table_are_faults_that_are_planted_still():
+def test_the_rows_of_the_table_are_current_faults():
     rows = re.findall(r"^\| (.+?) \| `(.+?)` \| `.+?` \|$", DOCUMENT.read_text("utf-8"), re.MULTILINE)
     assert rows
     assert set(rows) <= {(mutant.what, mutant.module) for mutant in MUTANTS}
@@ -35,7 +35,7 @@ def test_the_rows_of_the_table_are_faults_that_are_planted_still():
 
 @pytest.mark.hard
 @pytest.mark.timeout(3600)
-def test_all_faults_are_noticed(record_property):
+def test_all_faults_are_detected(record_property):
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "benchmarks.mutants"]
     done = subprocess.run(command, cwd=REPOSITORY, env=environment, capture_output=True, text=True)

@@ -1,7 +1,8 @@
-"""Properties that hold for every input: value and gradient finite, bounded, and continuous up to the limits.
+"""Properties that hold for every input: values and gradients are finite, bounded, and continuous up to the
+limits.
 
-Hypothesis draws the inputs, among them 0, 1, the smallest and the largest numbers of a type, and shrinks what
-fails. Each property is tried in float64, float32, bfloat16 and float16.
+Hypothesis draws the inputs, among them 0, 1, and the smallest and largest numbers of a type, and simplifies
+failing ones. Each property is tested in float64, float32, bfloat16 and float16.
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ from tests.lighting.surfaces import material, points
 
 DTYPES = (torch.float64, torch.float32, torch.bfloat16, torch.float16)
 BOUND = {torch.float64: 1e36, torch.float32: 1e19, torch.bfloat16: 1e19, torch.float16: 1e19}
-"""Of values and gradients of the BRDF: Adam squares gradients, which must not overflow."""
+"""Bound on values and gradients of the BRDF: Adam squares gradients, which must not overflow."""
 ROWS = 8
-"""Rows that one example has; hypothesis draws each number of each row."""
+"""Number of rows of an example; hypothesis draws each number of each row."""
 
 every_dtype = pytest.mark.parametrize("dtype", DTYPES, ids=str)
 some_examples = settings(max_examples=25, deadline=None, derandomize=True)
@@ -114,13 +115,13 @@ def test_the_brdf_is_continuous_in_the_material(lobe, parameters, to_viewer, to_
     )
     for part in ("diffuse", "specular"):
         one, other = getattr(before, part), getattr(after, part)
-        # Far from the mirror direction a Gaussian lobe falls below any number; only what counts is compared.
+        # Far from the mirror direction a Gaussian lobe underflows; only relevant values are compared.
         torch.testing.assert_close(one, other, rtol=0.1, atol=1e-5)
 
 
 @some_examples
 @given(unit(5), unit(2), unit(1))
-def test_what_grazing_light_brings_goes_to_zero(parameters, to_viewer, azimuth):
+def test_grazing_light_contributes_nothing(parameters, to_viewer, azimuth):
     """f · cos falls with the cosine of the light: no light comes from the horizon itself."""
     n = UP.double().expand(ROWS, 3)
     parameters[:, 3] = 0.1 + 0.9 * parameters[:, 3]
@@ -174,7 +175,7 @@ def test_samples_of_a_distribution_ascend_within_its_bounds(dtype, mass, span, c
 @every_dtype
 @some_examples
 @given(arrays(np.float64, (ROWS, 5), elements=st.floats(0, 6e4, width=32)), st.integers(-30, 0))
-def test_weights_and_what_passes_add_up_to_one(dtype, depths, exponent):
+def test_weights_and_transmittance_add_up_to_one(dtype, depths, exponent):
     depth = torch.from_numpy(depths * 2.0**exponent).to(dtype).requires_grad_()
     found = depth_weights(depth)
     assert found.weights.min() >= 0
@@ -191,7 +192,7 @@ def test_weights_and_what_passes_add_up_to_one(dtype, depths, exponent):
     st.floats(1e-4, 1.0),
     st.floats(0, 1e-2),
 )
-def test_density_is_bounded_falls_with_the_distance_and_does_not_jump(dtype, distances, beta, step):
+def test_density_is_bounded_decreasing_and_continuous(dtype, distances, beta, step):
     scale = torch.tensor(beta, dtype=dtype)
     sdf = torch.from_numpy(distances).to(dtype).requires_grad_()
     density = laplace_density(sdf, scale)
@@ -216,7 +217,7 @@ def test_density_is_bounded_falls_with_the_distance_and_does_not_jump(dtype, dis
     unit(3),
     st.floats(1e-4, 1.0),
 )
-def test_depth_is_finite_and_lies_between_those_of_the_ends(dtype, distances, widths, beta):
+def test_depth_is_finite_and_between_those_of_the_ends(dtype, distances, widths, beta):
     sdf = torch.from_numpy(distances).to(dtype).requires_grad_()
     scale = torch.tensor(beta, dtype=dtype).requires_grad_()
     along = torch.nn.functional.pad(torch.from_numpy(widths).cumsum(-1), (1, 0)).to(dtype)
@@ -240,7 +241,7 @@ REACH = 1.75
 @pytest.mark.parametrize("config", [GRID, FrequencyConfig()], ids=["hash", "frequency"])
 @some_examples
 @given(arrays(np.float64, (ROWS, 3), elements=st.floats(-60.0, 60.0, width=32)))
-def test_encodings_are_finite_and_do_not_jump(config, dtype, positions):
+def test_encodings_are_finite_and_continuous(config, dtype, positions):
     torch.manual_seed(0)
     encoding = position_encoding(config, REACH).to(dtype)
     for table in encoding.parameters():
@@ -274,7 +275,7 @@ def test_direction_encodings_are_bounded(kind, dtype, uv):
 @every_dtype
 @some_examples
 @given(arrays(np.float64, (ROWS, 3), elements=st.floats(-1.0, 6e4, width=32)))
-def test_the_srgb_curve_rises_and_comes_back(dtype, colors):
+def test_the_srgb_curve_is_increasing_and_inverted(dtype, colors):
     color = torch.from_numpy(np.sort(colors, 0)).to(dtype).requires_grad_()
     stored = linear_to_srgb(color)
     assert stored.dtype == dtype
@@ -290,7 +291,7 @@ def test_the_srgb_curve_rises_and_comes_back(dtype, colors):
 @pytest.mark.parametrize("response", ["linear", "srgb"])
 @some_examples
 @given(arrays(np.float64, (ROWS, 3), elements=st.floats(0.0, 6e4, width=32)), unit(3))
-def test_residuals_lead_back_to_the_pixel(response, dtype, radiance, stored):
+def test_gradients_of_residuals_point_to_the_pixel(response, dtype, radiance, stored):
     value, pixel = torch.from_numpy(radiance).to(dtype).requires_grad_(), torch.from_numpy(stored).to(dtype)
     off = residual(value, pixel, response)
     (slope,) = torch.autograd.grad(off.abs().sum(), value)
@@ -310,8 +311,8 @@ def test_residuals_lead_back_to_the_pixel(response, dtype, radiance, stored):
     st.floats(0.2, 20.0),
     arrays(np.float64, 2, elements=st.floats(-0.5, 1.5)),
 )
-def test_rays_come_back_to_their_pixels(dtype, uv, log_scale, away, focal, centre):
-    """A camera of any focal length, in scenes of any unit and place, seen from the scene frame."""
+def test_rays_project_back_to_their_pixels(dtype, uv, log_scale, away, focal, centre):
+    """A camera of any focal length, in scenes of any unit and position, in the scene frame."""
     forward, aside = direction(uv, torch.float64)[:2].numpy()
     right = np.cross(forward, aside)
     if np.linalg.norm(right) < 1e-3:
@@ -345,8 +346,8 @@ def test_rays_come_back_to_their_pixels(dtype, uv, log_scale, away, focal, centr
     st.integers(0, 12),
     st.integers(0, 1000),
 )
-def test_a_light_fit_is_a_light(pixel, firefly, count, seed):
-    """Any images, of any number of points, give a light that is finite and not negative."""
+def test_a_light_fit_is_finite_and_not_negative(pixel, firefly, count, seed):
+    """For any images of any number of points."""
     torch.manual_seed(seed)
     seen = points(count, seed)
     made_of = material(count, seed)

@@ -1,4 +1,4 @@
-"""The host and the method where geometry is at its worst: value and every gradient finite."""
+"""The host and the method with extreme geometry: values and all gradients are finite."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def grazing():
 
 
 def beside_the_scene():
-    """Rays that never enter the scene: their intervals have no length."""
+    """Rays that do not enter the scene: their intervals have length 0."""
     batch = sphere_batch()
     return dataclasses.replace(batch, directions=torch.tensor([[0.0, 1.0, 0.0]]).expand(len(batch), 3))
 
@@ -43,7 +43,7 @@ def test_every_stage_stays_finite(batch, beta, background, mode):
     config = dataclasses.replace(
         config,
         volume=dataclasses.replace(config.volume, beta_init=beta),
-        shading=dataclasses.replace(config.shading, hit_share=1e-3),  # whatever a ray met is shaded
+        shading=dataclasses.replace(config.shading, hit_share=1e-3),  # every ray with any weight is shaded
         inter_reflection=dataclasses.replace(config.inter_reflection, mode=mode),
     )
     model = sphere_model(config, background=background)
@@ -69,8 +69,10 @@ def test_black_and_blinding_pixels(radiance):
 
 @pytest.mark.parametrize("odd", [65504.0, 1e-42, 0.0], ids=["firefly", "denormal", "black"])
 @pytest.mark.parametrize("rays", [1, 48])
-def test_one_odd_pixel_and_one_ray(odd, rays):
-    """A single firefly, the largest half-precision number, moves no field further than its rate allows."""
+def test_one_extreme_pixel_and_one_ray(odd, rays):
+    """A single firefly with the largest half-precision number changes no field by more than its learning rate
+    permits.
+    """
     model = sphere_model()
     batch = sphere_batch()[:rays]
     color = batch.color.clone()
@@ -103,7 +105,7 @@ def test_ten_thousand_steps_with_beta_at_its_floor():
     optimizer = make_optimizer(model, config.optimizer)
     beta = [group for group in optimizer.param_groups if group["name"] == "beta"]
     assert beta
-    beta[0]["lr"] = 0.0  # it stays at the floor
+    beta[0]["lr"] = 0.0  # β stays at its floor
     batches = [sphere_batch(4, spread=0.05 + 0.1 * k) for k in range(8)]
     for step in range(10_000):
         seed_step(0, step)
@@ -115,5 +117,5 @@ def test_ten_thousand_steps_with_beta_at_its_floor():
         assert norms.isfinite().all(), step
         optimizer.step()
     assert 1e-4 <= model.host.density.beta().item() < 1.001e-4
-    # The images are of one colour, so R must have found it.
+    # The images have one colour, which R must have learned.
     assert (model.host.render(batches[0].rays).color - 0.3).abs().mean() < 0.05

@@ -1,4 +1,6 @@
-"""Every sampler against the density that it reports, with a million samples each (χ², Šidák-corrected)."""
+"""Every sampler compared with the density that it reports, with a million samples each (χ²,
+Šidák-corrected).
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,7 @@ from tests.shading.test_sampling import NORMALS, density, points
 SAMPLES = 1_000_000
 PER_POINT = {"mis": 2}
 """Directions per point, else one: those of a point share a turned lattice, and χ² wants independent ones."""
-# The even sampler has a density that jumps at the horizon, which must be an edge of the cells.
+# The density of the uniform sampler is discontinuous at the horizon, which must be an edge of the cells.
 CASES = [
     ("fibonacci", "ggx", "frontal"),
     *(("cosine", "ggx", view) for view in NORMALS),

@@ -1,5 +1,5 @@
-"""Where shading could break: mirrors, horizons, lamps, half precision. Values and gradients stay finite and
-bounded.
+"""Inputs at which shading may fail: mirrors, horizons, lamps, half precision. Values and gradients are finite
+and bounded.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def test_shade(lobe, dtype, light):
 
 @dtypes
 @lobes
-def test_a_vanishing_pdf_divides_nothing_by_zero(lobe, dtype):
+def test_a_pdf_of_zero_causes_no_division_by_zero(lobe, dtype):
     leaf, material, wo, wi = hard_scene(dtype)
     samples = IncidentSamples(wi, torch.zeros_like(wi[..., 0]))
     color = shade(material, leaf["n"], wo, Incident.of(samples, torch.ones_like(wi)), LOBES[lobe]).color
@@ -115,9 +115,9 @@ def test_samplers(kind, lobe, dtype):
 
 @lobes
 @pytest.mark.parametrize("kind", ["lobe", "mis"])
-def test_importance_samples_of_a_mirror_do_not_sparkle(kind, lobe):
-    """The density cancels D, so that even at the floor of the roughness no float32 sample outshines the
-    light.
+def test_importance_samples_of_a_mirror_cause_no_fireflies(kind, lobe):
+    """The density cancels D, so that even at the floor of the roughness no float32 sample is brighter than
+    the light.
     """
     torch.manual_seed(1)
     r = torch.tensor([[1e-4], [0.05], [0.1]])
@@ -135,12 +135,12 @@ def test_importance_samples_of_a_mirror_do_not_sparkle(kind, lobe):
         LOBES[lobe],
     ).color
     assert color.max() < 2.5
-    # The mirror under unit light sends out 1, whatever its roughness.
+    # Under unit light, the outgoing radiance of a mirror is 1 for any roughness.
     assert (color[:, 0].reshape(3, -1).mean(1) - 1).abs().max() < 0.02
 
 
 @dtypes
-def test_srgb_at_and_beyond_its_ends(dtype):
+def test_srgb_at_and_beyond_its_limits(dtype):
     color = torch.tensor([-1e6, -1.0, 0.0, 0.0031308, 0.04045, 1.0, 1.5, 1e6]).to(dtype).requires_grad_()
     for curve in (linear_to_srgb, srgb_to_linear, lambda c: apply_response(c, "srgb")):
         assert_tame(curve(color), {"color": color}, 1e16)

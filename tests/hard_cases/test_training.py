@@ -1,5 +1,5 @@
-"""Scenes that strain the method: a hundred steps of each stage (a dozen for captures that are merely odd) end
-finite, and none is skipped.
+"""Extreme scenes: a hundred steps of each stage (a dozen for merely unusual captures) end finite, without a
+skipped step.
 """
 
 from __future__ import annotations
@@ -23,12 +23,13 @@ from tests.train.small_runs import small_config, small_training, solved_light
 
 pytestmark = pytest.mark.usefixtures("without_shape_checks")
 
-# Linear radiance from a unit normal and the unit direction of the ray that sees it, both of the scene frame.
+# Linear radiance as a function of the unit normal and the unit direction of the camera ray, both in the scene
+# frame.
 Look = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def repaint(root: Path, look: Look) -> Path:
-    """Paint the sphere of a capture anew; what lies beside it stays."""
+    """Change the colours of the sphere of a capture; its surroundings are unchanged."""
     capture = load_capture(root)
     radius = RADIUS / SCALE
     for view in capture.views:
@@ -54,9 +55,9 @@ def repaint(root: Path, look: Look) -> Path:
 def trains(
     root: Path, out: Path, may_rest: frozenset[str] = frozenset(), steps: int = 100, solved: bool = False
 ) -> None:
-    """Train so many steps a stage, and shade nearly every ray that the object might stop.
+    """Train so many steps per stage, and shade nearly every ray that may hit the object.
 
-    Every field must move, but those that `may_rest`. The light is free, or `solved` for.
+    Every field must change, except those in `may_rest`. The light is free, or fitted if `solved`.
     """
     config = small_config(
         sdf_steps=steps, material_steps=steps, joint_steps=steps, checkpoint_every=1000, rays=16
@@ -77,7 +78,7 @@ def trains(
 
 
 def environment(direction: np.ndarray) -> np.ndarray:
-    """A bright lamp, as sharp as a pixel or so, in a dim coloured sky."""
+    """A bright lamp of about one pixel in a dim coloured sky."""
     lamp = np.exp(200.0 * (direction @ np.array([0.48, 0.6, 0.64]) - 1.0))
     return 50.0 * lamp[:, None] + 0.2 * (1.1 + direction)
 
@@ -92,14 +93,14 @@ def test_a_perfect_mirror(tmp_path):
 
 
 def test_a_body_that_is_nearly_black(tmp_path):
-    """At most a millionth of the light about it, and 10⁻¹¹ where it faces away."""
+    """It reflects at most a millionth of the surrounding light, and 10⁻¹¹ where it faces away."""
     root = repaint(make_capture(tmp_path / "dark", background=0.5), lambda n, d: 1e-6 * np.exp(6.0 * n - 6.0))
     trains(root, tmp_path / "run")
 
 
 @pytest.mark.parametrize("hdr", [True, False])
 def test_a_body_that_is_black_is_refused(tmp_path, hdr):
-    """Of an object that reflects nothing neither material nor light can be told."""
+    """For an object that reflects nothing, neither material nor light can be determined."""
     root = make_capture(tmp_path / "black", background=0.5, masks=True, hdr=hdr)
     repaint(root, lambda n, d: np.zeros_like(n))
     with pytest.raises(UserError, match="all pixels of the object are black"):
@@ -120,17 +121,17 @@ def test_an_overexposed_capture(tmp_path):
 def test_a_scene_without_an_object(tmp_path):
     root = make_capture(tmp_path / "empty", background=0.3)
     repaint(root, lambda n, d: np.full_like(n, 0.3))
-    # Once nothing is left to hit, there is nothing to shade.
+    # If no surface is left, nothing is shaded.
     trains(root, tmp_path / "run", may_rest=frozenset({"brdf", "light"}))
 
 
 # -------------------------------------------------------------------- captures that no setting was chosen for
 
-# A map that is solved for is no parameter, so nothing of the light trains by steps.
+# A fitted map is not a parameter, so no part of the light is trained by gradient steps.
 odd = {"steps": 12, "solved": True, "may_rest": frozenset({"light"})}
 
 
-def test_a_mirror_under_a_light_that_is_solved_for(tmp_path):
+def test_a_mirror_under_a_fitted_light(tmp_path):
     def mirror(normal: np.ndarray, seen_along: np.ndarray) -> np.ndarray:
         return environment(seen_along - 2.0 * (seen_along * normal).sum(-1, keepdims=True) * normal)
 
@@ -143,7 +144,7 @@ def test_one_view_to_train_on(tmp_path):
     trains(root, tmp_path / "run", **odd)
 
 
-def test_masks_that_call_everything_the_object(tmp_path):
+def test_masks_that_cover_everything(tmp_path):
     root = make_capture(tmp_path / "all", masks=True)
     for mask in (root / "inputs" / "masks").iterdir():
         write_png(mask, np.full((18, 24), 255, np.uint8))
@@ -165,7 +166,7 @@ def test_views_of_several_sizes(tmp_path):
 
 @pytest.mark.parametrize("solved", [False, True])
 def test_cameras_inside_the_object(tmp_path, solved):
-    """Whatever way they look there is a wall; of its outside, which is what is shaded, they see nothing."""
+    """In every direction there is a wall; its outside, which is the shaded side, is not visible."""
     root = make_capture(tmp_path / "inside", background=0.4)
     path = root / "inputs" / "sfm_scene.json"
     scene = json.loads(path.read_text())

@@ -1,7 +1,6 @@
-"""Units that nobody tuned for: what a capture calls a length or a radiance of 1 changes neither surface nor
-material.
+"""Unusual units: the unit of length or radiance of a capture changes neither surface nor material.
 
-Factors are powers of two, which no rounding touches, so two trainings can be compared bit for bit.
+Factors are powers of two, which cause no rounding, so two trainings can be compared bit for bit.
 """
 
 from __future__ import annotations
@@ -66,10 +65,8 @@ def usual(request, without_shape_checks, tmp_path_factory: pytest.TempPathFactor
 
 
 @pytest.mark.parametrize(("radiance", "length"), [(2.0**13, 2.0**-10), (2.0**-13, 2.0**10)])
-def test_other_units_show_the_same_scene(tmp_path, usual, radiance, length):
-    """Surface and material are the same; the light, and what the surface sends, have the unit of the
-    images.
-    """
+def test_other_units_give_the_same_scene(tmp_path, usual, radiance, length):
+    """Surface and material are the same; the light and R have the unit of the images."""
     light, reference = usual
     other = trained(tmp_path, light, radiance, length)
     # The logarithm of a map's texels is shifted by the unit, and rounded.

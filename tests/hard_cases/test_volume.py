@@ -1,4 +1,4 @@
-"""Volume rendering where numbers are extreme: values and gradients stay finite and bounded."""
+"""Volume rendering with extreme numbers: values and gradients are finite and bounded."""
 
 from __future__ import annotations
 
@@ -42,14 +42,18 @@ def test_weights(sigma, span):
     assert blended.isfinite().all()
     torch.testing.assert_close(blended[:, 0] + found.transmittance, torch.ones(2))
     assert density.grad.isfinite().all()
-    assert density.grad.abs().max() <= 5.0 * span  # no derivative exceeds the interval's width; five add up
+    assert (
+        density.grad.abs().max() <= 5.0 * span
+    )  # each derivative is at most the interval's width; five add up
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
 @pytest.mark.parametrize("stochastic", [False, True])
 @pytest.mark.parametrize("beta", [1e-4, 0.01, 10.0])
 def test_sampler(beta, stochastic, dtype):
-    """Rays through the centre, grazing, missing the scene, of no length, and starting on the surface."""
+    """Rays through the centre, grazing rays, rays that miss the scene, rays of length 0, and rays that start
+    on the surface.
+    """
     origins = torch.tensor([[-2.0, 0, 0], [-2, 0.6, 0], [-2, 5, 0], [4, 0, 0], [0.6, 0, 0]], dtype=dtype)
     directions = torch.tensor([[1.0, 0.0, 0.0]], dtype=dtype).expand(5, 3)
     interval = sphere_interval(origins, directions, 3.0)
@@ -68,7 +72,7 @@ def test_sampler(beta, stochastic, dtype):
 
 
 @pytest.mark.parametrize("constant", [-1e6, 0.0, 1e6])
-def test_sampler_where_the_sdf_is_the_same_everywhere(constant):
+def test_sampler_with_a_constant_sdf(constant):
     origins, directions = torch.zeros(2, 3), torch.tensor([[1.0, 0.0, 0.0]]).expand(2, 3)
     far = torch.tensor([0.0, 3.0])
     found = error_bounded_samples(
@@ -103,14 +107,14 @@ def test_sampler_takes_a_half_precision_sdf():
 
 @pytest.mark.parametrize("mass", [0.0, 1e-42, 1e-30, 1e30])
 @pytest.mark.parametrize("span", [0.0, 1e-30, 1.0])
-def test_inverse_cdf_of_an_even_mass_is_even(mass, span):
+def test_inverse_cdf_of_a_uniform_mass_is_uniform(mass, span):
     edges = torch.tensor([[0.0, 0.25, 0.5, 0.75, 1.0]]) * span
     samples = inverse_cdf_samples(edges, torch.full((1, 4), mass), 4, False)
     expected = torch.tensor([[0.125, 0.375, 0.625, 0.875]]) * span
     torch.testing.assert_close(samples, expected, atol=1e-6 * span, rtol=1e-5)
 
 
-def test_no_rays():
+def test_an_empty_batch_of_rays():
     empty = torch.zeros(0)
     found = error_bounded_samples(
         sphere, torch.zeros(0, 3), torch.zeros(0, 3), empty, empty, torch.tensor(0.1), CONFIG, True

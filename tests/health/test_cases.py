@@ -1,4 +1,4 @@
-"""What is a finding and what is not, and the verdict that findings come to."""
+"""Conditions of the findings, and the verdict that follows from them."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def cases(findings) -> list[str]:
         (0.3, 0.6, []),
     ],
 )
-def test_a_surface_is_there_and_sharp_or_it_is_said(opaque, sharp, found):
+def test_a_missing_or_blurred_surface_is_a_finding(opaque, sharp, found):
     assert cases(surface_findings(SurfaceMeasurement(100, opaque, sharp, None), 7)) == found
 
 
 @pytest.mark.parametrize(("share", "found"), [(None, []), (0.2, []), (0.8, ["material_at_bounds"])])
-def test_a_material_at_its_bounds_is_said(share, found):
+def test_a_material_at_its_bounds_is_a_finding(share, found):
     assert cases(material_findings(SurfaceMeasurement(100, 1.0, 1.0, share), 7)) == found
 
 
@@ -46,7 +46,7 @@ def test_a_material_at_its_bounds_is_said(share, found):
         (skipped_steps, 3, 20, "skipped_steps"),
     ],
 )
-def test_a_count_beyond_its_limit_is_said(function, good, bad, case):
+def test_a_count_beyond_its_limit_is_a_finding(function, good, bad, case):
     assert function(good, 100) == []
     (finding,) = function(bad, 100)
     assert finding.case == case

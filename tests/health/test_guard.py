@@ -1,4 +1,4 @@
-"""Steps that are not finite, in a loop of somebody else's."""
+"""Steps that are not finite, in a training loop outside of the package."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def guarded(optimizers) -> tuple[StepGuard, list[str]]:
     return guard, said
 
 
-def test_a_gradient_that_is_not_finite_moves_no_field_whichever_steps_first():
+def test_a_gradient_that_is_not_finite_changes_no_field_in_any_order():
     one, other, optimizers = two_fields()
     guard, said = guarded(optimizers)
     # The value is finite; the slope of a square root at 0 is not.
@@ -58,7 +58,7 @@ def test_a_loss_that_is_not_finite_is_named():
     assert "loss physical" in said[0]
 
 
-def test_a_skipped_step_leaves_no_trace_in_the_moments():
+def test_a_skipped_step_does_not_change_the_optimizer_state():
     one, _, optimizers = two_fields()
     guard, _ = guarded(optimizers)
     step(guard, optimizers, one.sum() * torch.nan)
@@ -80,7 +80,7 @@ def test_ten_in_a_row_end_the_training_and_nine_do_not():
         step(guard, optimizers, one.sum() * torch.nan)
 
 
-def test_watching_an_optimiser_twice_judges_it_once():
+def test_an_optimiser_watched_twice_is_checked_once():
     one, _, optimizers = two_fields()
     guard, said = guarded([*optimizers, *optimizers])
     step(guard, optimizers, one.sum() * torch.nan)

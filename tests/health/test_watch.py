@@ -1,4 +1,4 @@
-"""Models that are fog, and ones that are not: what a watch says of them, and when it takes it back."""
+"""Findings on models that are fog and on models with a surface, and findings that are dropped later."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def showing(opacity: float, concentration: float):
 @pytest.mark.parametrize(
     ("opacity", "concentration", "case"), [(1.0, 1.0, None), (1.0, 0.1, "fog"), (0.0, 0.0, "no_surface")]
 )
-def test_a_look_tells_surface_from_fog_and_from_nothing(opacity, concentration, case):
+def test_a_measurement_distinguishes_surface_fog_and_empty_space(opacity, concentration, case):
     said: list[str] = []
     watch = Watch(PIXELS, said.append)
     watch.after_stage(showing(opacity, concentration), STAGES[Stage.SDF_INIT], 0, 40)
@@ -47,7 +47,7 @@ def test_a_look_tells_surface_from_fog_and_from_nothing(opacity, concentration, 
     assert watch.record()["verdict"] == ("failed" if case else "sound")
 
 
-def test_what_a_later_look_finds_mended_is_dropped_and_nothing_is_said_twice():
+def test_a_finding_that_is_not_confirmed_is_dropped_and_warnings_are_not_repeated():
     said: list[str] = []
     watch = Watch(PIXELS, said.append)
     for _ in range(2):
@@ -71,13 +71,13 @@ def test_steps_that_shade_nothing_are_counted_in_material_stages():
     assert "no surface point was shaded" in said[0]
 
 
-def test_a_look_leaves_the_model_in_its_mode():
+def test_a_measurement_keeps_the_mode_of_the_model():
     model = sphere_model().train()
     assert measure_surface(model, PIXELS, with_material=True).at_bound == 0.0
     assert model.training
 
 
-def test_the_record_comes_back(tmp_path):
+def test_the_record_is_read_back(tmp_path):
     watch = Watch(PIXELS, lambda line: None)
     assert read_findings(tmp_path) is None
     watch.after_fit(3, 100)
@@ -89,7 +89,7 @@ def test_the_record_comes_back(tmp_path):
 
 
 def test_a_strict_command_ends_with_status_1_and_keeps_the_run(tmp_path, monkeypatch, capfd):
-    """Three steps make no surface that is sharp."""
+    """Three steps do not produce a sharp surface."""
     monkeypatch.setitem(PRESETS, "tiny", tiny_config)
     capture, out = make_capture(tmp_path / "sphere"), tmp_path / "run"
     steps = [f"--config.train.{stage}-steps=1" for stage in ("sdf", "material", "joint")]

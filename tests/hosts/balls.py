@@ -1,4 +1,4 @@
-"""A host of a dozen lines, whole and spoiled, for tests of whatever takes a host."""
+"""A short host, correct and with defects, for tests of code that takes a host."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from neilfpp_method.structures import RayBatch, SurfaceHits
 
 
 def ball_rays(count: int = 200, spread: float = 0.3, seed: int = 0) -> RayBatch:
-    """Rays from all sides to points close to the origin: with the default spread all hit the ball."""
+    """Rays from all sides to points close to the origin; with the default spread all of them hit the ball."""
     generator = torch.Generator().manual_seed(seed)
     origins = 3.0 * normalize(torch.randn(count, 3, generator=generator), dim=-1)
     targets = spread * (2.0 * torch.rand(count, 3, generator=generator) - 1.0)
@@ -21,7 +21,9 @@ def ball_rays(count: int = 200, spread: float = 0.3, seed: int = 0) -> RayBatch:
 
 
 class Ball(nn.Module):
-    """Rays to colour, hit position and normal of a ball with a learned radius and learned colours."""
+    """A function from rays to colour, hit position and normal of a ball with a learned radius and learned
+    colours.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -41,8 +43,8 @@ class Ball(nn.Module):
 
 
 class BallHost(Ball):
-    """The ball behind the host contract; `spoil` tells which outputs to replace before they are handed
-    out.
+    """The ball behind the host contract; `spoil` names the outputs that are replaced, with their
+    replacements.
     """
 
     def __init__(self, spoil: Callable[[RayBatch, dict], dict] = lambda rays, outputs: {}) -> None:

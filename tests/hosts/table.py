@@ -1,4 +1,4 @@
-"""A ball on a round table, in closed form: the truth that a proxy is held to."""
+"""A ball on a round table in closed form: the truth with which a proxy is compared."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ TABLE, REACH = -0.3, 0.9
 
 
 class TableTop:
-    """A function host; `lift` raises all of it, as a host that moves does."""
+    """A function host; `lift` raises the whole scene, like a host that changes."""
 
     def __init__(self, lift: float = 0.0) -> None:
         self.lift = lift
         self.asked = 0
 
     def meet(self, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-        """The distance to the first surface, infinite where there is none."""
+        """The distance to the first surface, infinite without a hit."""
         centre = torch.tensor(CENTRE) + torch.tensor([0.0, 0.0, self.lift])
         from_centre = origins - centre
         middle = -(from_centre * directions).sum(-1)
@@ -50,7 +50,7 @@ class TableTop:
 
 
 def camera_rays_above(count: int, seed: int = 0) -> RayBatch:
-    """Rays from cameras around and above the table, to places on and about it."""
+    """Rays from cameras around and above the table, to points on it and near it."""
     generator = torch.Generator().manual_seed(seed)
     azimuth = 2 * math.pi * torch.rand(count, generator=generator)
     height = torch.rand(count, generator=generator) * 1.2 + 0.5

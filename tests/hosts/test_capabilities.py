@@ -1,4 +1,4 @@
-"""The table of optional methods is that of the contract, and that of the docs."""
+"""The table of optional methods agrees with the contract and with docs/hosts.md."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ def test_every_optional_part_of_the_contract_is_in_the_table_once():
 
 
 @pytest.mark.parametrize("capability", CAPABILITIES, ids=lambda c: c.method)
-def test_a_row_names_what_the_protocol_has_and_who_asks_for_it(capability: Capability):
+def test_a_row_names_the_method_of_the_protocol_and_its_user(capability: Capability):
     own = {*vars(capability.protocol), *capability.protocol.__annotations__}
     assert capability.method in own
     asks = inspect.getsource(importlib.import_module(f"neilfpp_method.{capability.module}"))
     assert capability.protocol.__name__ in asks
 
 
-def test_the_table_of_the_docs_is_this_one():
+def test_the_table_of_the_docs_is_up_to_date():
     assert markdown() in DOCUMENT.read_text(), "python -m neilfpp_method.hosts.capabilities prints it"

@@ -1,4 +1,4 @@
-"""What goes wrong first is said at the first batch, once, with the remedy."""
+"""Mistakes of a host or a loop are reported at the first batches, once, with the remedy."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ ERRORS = [
 
 
 @pytest.mark.parametrize(("spoil", "message"), ERRORS, ids=[message[10:40] for _, message in ERRORS])
-def test_hits_that_cannot_be_used_are_an_error(spoil, message):
+def test_unusable_hits_are_an_error(spoil, message):
     neilf = attach_neilf(BallHost(spoil), tiny_config())
     with pytest.raises(UserError, match=message):
         neilf.losses(batch(ball_rays(64)), "material_init")
 
 
-def test_the_whole_host_is_let_pass_without_a_word(caplog):
+def test_a_correct_host_passes_without_messages(caplog):
     neilf = attach_neilf(BallHost(), tiny_config())
     with caplog.at_level(logging.WARNING, SAYS):
         for seed in range(BATCHES + 2):
@@ -67,7 +67,7 @@ def test_the_whole_host_is_let_pass_without_a_word(caplog):
     assert not [record for record in caplog.records if record.name == SAYS]
 
 
-def test_no_hit_in_a_batch_is_said_once(caplog):
+def test_no_hit_in_a_batch_is_warned_about_once(caplog):
     rays = ball_rays(64)
     away = RayBatch(rays.origins, -rays.directions)
     neilf = attach_neilf(Ball(), tiny_config())
@@ -81,7 +81,7 @@ def test_no_hit_in_a_batch_is_said_once(caplog):
     )
 
 
-def test_a_scene_far_outside_the_unit_sphere_is_said_once(caplog):
+def test_a_scene_far_outside_the_unit_sphere_is_warned_about_once(caplog):
     by, ball = torch.tensor([6.0, 0.0, 0.0]), Ball()
 
     def far(origins, directions):
@@ -97,8 +97,8 @@ def test_a_scene_far_outside_the_unit_sphere_is_said_once(caplog):
     assert "move and scale cameras and host so that the object lies in the unit sphere" in record.message
 
 
-def test_a_depth_that_is_no_distance_along_the_ray_is_said_once(caplog):
-    """A ball with z-depth of close cameras that look at its centre: positions lie on their rays."""
+def test_z_depth_is_warned_about_once(caplog):
+    """A ball with z-depth from close cameras that look at its centre; positions lie on their rays."""
 
     def z_depth(rays: RayBatch, outputs: dict) -> dict:
         axis = normalize(-rays.origins, dim=-1)
@@ -118,8 +118,8 @@ def test_a_depth_that_is_no_distance_along_the_ray_is_said_once(caplog):
     assert said in record.message
 
 
-def test_looking_from_another_viewpoint_changes_no_random_number():
-    """The host draws numbers; training draws the same ones after it as without the check."""
+def test_the_check_from_another_viewpoint_keeps_the_random_state():
+    """The host draws random numbers; training draws the same numbers with and without the check."""
 
     def drawn(rays: RayBatch, outputs: dict) -> dict:
         torch.rand(7)
@@ -136,7 +136,7 @@ def test_looking_from_another_viewpoint_changes_no_random_number():
     assert torch.equal(after_a_step(render=True), after_a_step(render=False))
 
 
-def test_a_host_of_camera_rays_is_rendered_from_no_other_viewpoint():
+def test_a_host_of_camera_rays_is_not_rendered_from_another_viewpoint():
     host = BallHost()
     host.answers_secondary_rays = False
     assert attach_neilf(host, tiny_config()).first_batches.render is None

@@ -1,6 +1,4 @@
-"""A mesh as the host: which triangle a ray meets, what it shows, and what light goes from one surface to
-another.
-"""
+"""A mesh as the host: first hits, rendered values, and the light between surfaces."""
 
 from __future__ import annotations
 
@@ -47,7 +45,7 @@ def mesh_host(shape: trimesh.Trimesh, **changes) -> MeshHost:
 
 
 def rays_at(count: int, spread: float, seed: int = 0, dtype: torch.dtype = torch.float32) -> RayBatch:
-    """Rays from all sides, 3 units away, to points around the origin."""
+    """Rays from all sides, from a distance of 3 units, to points around the origin."""
     generator = torch.Generator().manual_seed(seed)
     origins = 3.0 * normalize(torch.randn(count, 3, generator=generator, dtype=dtype), dim=-1)
     targets = spread * (2.0 * torch.rand(count, 3, generator=generator, dtype=dtype) - 1.0)
@@ -59,7 +57,7 @@ SPHERE = trimesh.creation.icosphere(subdivisions=5, radius=0.7)
 
 @pytest.fixture(params=["embree", "tree"])
 def tracer(request, monkeypatch) -> str:
-    """Both ways of finding the first triangle."""
+    """Both implementations of first hits."""
     if request.param == "tree":
         monkeypatch.setattr("neilfpp_method.hosts.mesh.embree_tracer", lambda triangles: None)
     return request.param
@@ -68,7 +66,7 @@ def tracer(request, monkeypatch) -> str:
 # --------------------------------------------------------------------------------------------------- geometry
 
 
-def test_hits_on_a_sphere_are_those_of_the_sphere(tracer):
+def test_hits_on_a_sphere_are_accurate(tracer):
     rays = rays_at(2000, 0.6)
     hits = mesh_host(SPHERE).render(rays)
     along = (rays.origins * rays.directions).sum(-1)
@@ -98,14 +96,14 @@ def test_hits_on_a_box_are_exact(tracer):
     torch.testing.assert_close(hits.normal[meets], axis[meets], atol=1e-6, rtol=0.0)
 
 
-def test_a_miss_shows_the_background_and_has_no_normal(tracer):
+def test_a_miss_has_the_background_color_and_no_normal(tracer):
     hits = mesh_host(SPHERE).render(RayBatch(3.0 * torch.eye(3), torch.eye(3)))
     torch.testing.assert_close(hits.color, torch.tensor([[0.25, 0.5, 0.75]]).expand(3, 3))
     assert not hits.normal.any()
     assert not hits.concentration.any()
 
 
-def test_an_open_scene_lies_behind_the_mesh():
+def test_an_open_background_is_rendered_behind_the_mesh():
     torch.manual_seed(0)
     host = MeshHost(mesh_of(SPHERE), mesh_config(), 3.0, background="inverted_sphere")
     rays = rays_at(100, 0.9)
@@ -129,8 +127,8 @@ def test_no_normal_points_away_from_the_viewer():
     assert len(distinct) > 80  # triangles
 
 
-def test_creases_are_edges_and_the_rest_is_smooth():
-    """A can: vertices of its rim are shared by side and lids."""
+def test_normals_are_smooth_except_at_creases():
+    """A cylinder with lids: the vertices of its rim are shared by side and lids."""
     can = trimesh.creation.cylinder(radius=0.5, height=0.8, sections=48)
     rays = rays_at(4000, 0.8)
     hits = mesh_host(can).render(rays)
@@ -141,11 +139,12 @@ def test_creases_are_edges_and_the_rest_is_smooth():
     torch.testing.assert_close(normal[lid], flat, atol=1e-5, rtol=0.0)
     round_ = torch.nn.functional.normalize(position[~lid] * position.new_tensor([1.0, 1.0, 0.0]), dim=-1)
     assert min(lid.sum(), (~lid).sum()) > 100
-    # Between the vertices of 48 sides a chord's normal is 3.75° off at most, an interpolated one by far less.
+    # Between the vertices of 48 sides the normal of a chord deviates by at most 3.75°, an interpolated one by
+    # far less.
     assert (normal[~lid] * round_).sum(-1).min() > math.cos(math.radians(0.1))
 
 
-def test_corners_of_a_face_without_size_have_no_normal_and_spoil_no_other():
+def test_a_face_without_area_has_no_normal_and_affects_no_other():
     box = trimesh.creation.box(extents=(0.8, 0.8, 0.8))
     line = [[0, 1, 1], [0, 0, 0]]
     shape = trimesh.Trimesh(box.vertices, np.concatenate([box.faces, line]), process=False)
@@ -153,14 +152,14 @@ def test_corners_of_a_face_without_size_have_no_normal_and_spoil_no_other():
     torch.testing.assert_close(mesh_host(shape).render(rays).normal, mesh_host(box).render(rays).normal)
 
 
-def test_the_inside_of_a_face_stops_a_ray_but_is_no_surface_point(tracer):
+def test_the_inside_of_a_face_stops_a_ray_and_is_not_a_hit(tracer):
     hits = mesh_host(SPHERE).render(RayBatch(torch.zeros(3, 3), torch.eye(3)))
     torch.testing.assert_close(hits.position, 0.7 * torch.eye(3), atol=1e-3, rtol=0.0)  # ahead, not behind
     assert (hits.opacity == 1.0).all()
     assert not hits.is_hit(0.8).any()
 
 
-def test_the_tree_finds_what_embree_finds(monkeypatch):
+def test_the_tree_agrees_with_embree(monkeypatch):
     knot = trimesh.creation.torus(0.5, 0.2, major_sections=90, minor_sections=40)
     floor = trimesh.creation.box(
         extents=(2.0, 2.0, 0.0)
@@ -172,7 +171,7 @@ def test_the_tree_finds_what_embree_finds(monkeypatch):
     rays = rays_at(2500, 0.9)
     found, expected = (t(rays.origins, rays.directions) for t in (tree, embree))
     assert 0.3 < (expected >= 0).float().mean() < 1.0
-    # Two triangles share an edge, and the floor is two sheets in one place: then the distance decides
+    # Two triangles share an edge, and the floor consists of two coincident sheets, so the distance decides
     # nothing.
     same = found == expected
     depths = [
@@ -184,7 +183,7 @@ def test_the_tree_finds_what_embree_finds(monkeypatch):
 
 
 @pytest.mark.parametrize("faces", [1, 7, 8, 9, 65])
-def test_a_tree_holds_every_triangle(faces):
+def test_a_tree_contains_every_triangle(faces):
     corners = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     shift = 2.0 * torch.arange(faces)[:, None] * torch.tensor([1.0, 0.0, 0.0])
     tracer = tree_tracer(build_tree(corners + shift[:, None]))
@@ -194,7 +193,7 @@ def test_a_tree_holds_every_triangle(faces):
     assert (tracer(origins, -down) == -1).all()  # away from them
 
 
-def test_a_ray_between_two_triangles_meets_the_one_ahead():
+def test_a_ray_between_two_triangles_hits_the_one_ahead():
     corners = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     tracer = tree_tracer(build_tree(torch.stack([corners, corners + torch.tensor([0.0, 0.0, 1.0])])))
     up = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
@@ -204,7 +203,7 @@ def test_a_ray_between_two_triangles_meets_the_one_ahead():
 # ---------------------------------------------------------------------------------------------- light between
 
 
-def test_noise_of_a_mesh_is_smoothed_on_demand():
+def test_normals_of_a_noisy_mesh_are_smoothed_if_configured():
     rough = SPHERE.copy()
     rough.vertices += np.random.default_rng(0).normal(0, 0.002, rough.vertices.shape)
     rays, errors = rays_at(500, 0.3), {}
@@ -223,9 +222,9 @@ def two_planes() -> trimesh.Trimesh:
     return trimesh.Trimesh(corners + ceiling, [[0, 1, 2], [0, 2, 3], [4, 6, 5], [4, 7, 6]], process=False)
 
 
-def test_light_between_two_planes_is_what_they_emit():
-    """The ceiling sends 1 + its x, the floor 3 + its y; light from the floor's middle meets the ceiling at
-    0.5 tan θ.
+def test_light_between_two_planes_is_their_emission():
+    """The ceiling emits 1 + x, the floor 3 + y; a ray from the floor's centre hits the ceiling at a distance
+    0.5 tan θ from the axis.
     """
     host = mesh_host(two_planes())
     host.radiance_field.forward = lambda x, wo, n, f: torch.where(
@@ -254,9 +253,9 @@ def test_light_between_two_planes_is_what_they_emit():
     assert term.mean().item() == pytest.approx(2.0, abs=0.01)  # y cancels
 
 
-def test_the_scene_sends_light_from_its_outsides_alone_and_says_from_how_far():
-    """From the middle between floor and ceiling; and from below the floor, whose back is dark and in the
-    way.
+def test_only_outsides_send_light_and_distances_are_returned():
+    """From the middle between floor and ceiling, and from below the floor, whose back is dark and stops
+    rays.
     """
     host = mesh_host(two_planes())
     host.radiance_field.forward = lambda x, wo, n, f: torch.where(n[:, 2:] < 0, 1.0, 3.0).expand(-1, 3)
@@ -266,7 +265,7 @@ def test_the_scene_sends_light_from_its_outsides_alone_and_says_from_how_far():
     assert met.hit.tolist() == [[True, True, False], [True, False, False]]
     sent = [[1.0, 3.0, 0.0], [0.0, 0.0, 0.0]]
     torch.testing.assert_close(met.radiance, torch.tensor(sent)[..., None].expand(2, 3, 3))
-    # Rays start a little way along: the distance is what is left of it.
+    # Rays start at a small offset, which the distance does not include.
     near = 0.25 - host.offset
     expected = torch.tensor([[near, near, math.inf], [near, math.inf, math.inf]])
     torch.testing.assert_close(met.distance, expected)
@@ -275,7 +274,7 @@ def test_the_scene_sends_light_from_its_outsides_alone_and_says_from_how_far():
 FACTS = SceneFacts("linear", 0.2, 3.0, "constant")
 
 
-def test_rays_leave_a_surface_at_every_angle_without_meeting_it():
+def test_rays_leave_a_surface_at_every_angle_without_hitting_it():
     torch.manual_seed(0)
     hits = mesh_host(SPHERE).render(rays_at(500, 0.4))
     settings = dataclasses.replace(mesh_config().inter_reflection, rays_per_point=4.0)
@@ -285,7 +284,7 @@ def test_rays_leave_a_surface_at_every_angle_without_meeting_it():
 # --------------------------------------------------------------------------------------------------- training
 
 
-def test_r_material_and_light_move_together_and_the_mesh_does_not():
+def test_r_material_and_light_are_trained_and_the_mesh_is_not():
     assert mesh_config().inter_reflection.radiance_gradient == 0.7  # METHOD §2, for fixed geometry
     host = mesh_host(SPHERE)
     model = NeilfModel(
@@ -337,7 +336,7 @@ def test_a_mesh_run_from_the_command_line(tmp_path: Path, monkeypatch, capsys):
     assert mesh.visual.vertex_colors.shape == (len(mesh.vertices), 4)
 
 
-def test_another_mesh_is_taken_by_its_path_and_found_again(tmp_path: Path, monkeypatch, capsys):
+def test_a_mesh_is_given_by_its_path_and_loaded_again(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.setitem(PRESETS, "tiny", small_config)
     capture = make_capture(tmp_path / "sphere")
     (capture / "inputs/model/mesh.ply").rename(tmp_path / "scan.ply")

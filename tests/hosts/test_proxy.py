@@ -1,4 +1,4 @@
-"""The proxy of a host that does not trace, against the closed form of a ball on a table."""
+"""The proxy of a host that does not trace, compared with the closed form of a ball on a table."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def still() -> SurfaceProxy:
 
 @dataclasses.dataclass
 class Compared:
-    """What the proxy says of directions from surface points, beside the truth."""
+    """Results of the proxy for directions from surface points, with the truth."""
 
     told: SceneLight
     true: torch.Tensor
@@ -60,8 +60,10 @@ def compare(host: TableTop, proxy: SurfaceProxy) -> Compared:
     return Compared(proxy.scene_light(hits.position, wi), true, wi, hits.position)
 
 
-def test_visibility_is_that_of_the_truth(still):
-    """97 % of all, and of those that are hidden nine in ten: a proxy that hides nothing would reach 84 %."""
+def test_visibility_agrees_with_the_truth(still):
+    """97 % of all directions agree, and nine in ten of the occluded ones; a proxy without occlusion would
+    reach 84 %.
+    """
     found = compare(TableTop(), still)
     hidden = found.true.isfinite()
     assert 0.1 < hidden.float().mean() < 0.25
@@ -79,7 +81,7 @@ def test_distances_are_off_by_less_than_a_cell(still):
     assert found.told.distance[~found.told.hit].isinf().all()
 
 
-def test_what_arrives_is_what_was_seen_there(still):
+def test_incident_light_is_the_observed_radiance(still):
     found = compare(TableTop(), still)
     both = found.told.hit & found.true.isfinite()
     place = (found.position[:, None] + found.true[..., None] * found.wi)[both]
@@ -102,7 +104,7 @@ def test_camera_rays_show_the_surface_through_the_proxy(still):
     assert (truth.normal * shown.normal).sum(-1)[both].median() > 0.995
 
 
-def test_its_error_is_measured_on_rays_that_it_has_not_seen(still):
+def test_the_error_is_measured_on_new_rays(still):
     report = still.report()
     assert report.agreement > 0.95
     assert 0 < report.error < 0.2 * report.cell
@@ -110,7 +112,7 @@ def test_its_error_is_measured_on_rays_that_it_has_not_seen(still):
     assert f"{report.agreement:.1%} of rays agree with the host" in str(report)
 
 
-def test_it_follows_a_host_that_moves():
+def test_the_proxy_follows_a_host_that_changes():
     proxy = gathered(TableTop(), steps=4)
     moved = TableTop(lift=0.25)
     before = compare(moved, proxy)
@@ -121,7 +123,7 @@ def test_it_follows_a_host_that_moves():
     assert proxy.report().age < 2 * EVERY
 
 
-def test_before_anything_was_seen_nothing_stands_in_the_way():
+def test_an_empty_proxy_occludes_nothing():
     empty = SurfaceProxy(SCENE, 16, 0.8)
     light = empty.scene_light(torch.zeros(2, 3), torch.eye(3).expand(2, 3, 3))
     assert not light.hit.any()
@@ -157,7 +159,7 @@ def test_a_checkpoint_between_two_refreshes_loses_no_ray():
         assert torch.equal(getattr(second.render(rays), field), getattr(whole.render(rays), field))
 
 
-def test_a_host_that_knows_its_radiance_is_asked_for_it():
+def test_the_radiance_method_of_a_host_is_used():
     proxy = SurfaceProxy(SCENE, CELLS, 0.8, radiance=lambda x, wo: wo.abs())
     adapted, rays = CallableHost(TableTop()), camera_rays_above(512)
     proxy.look_around(adapted.render, rays, adapted.render(rays))
@@ -165,6 +167,6 @@ def test_a_host_that_knows_its_radiance_is_asked_for_it():
     torch.testing.assert_close(light.radiance[0, 0], torch.tensor([0.0, 0.0, 1.0]))
 
 
-def test_rays_that_miss_the_cube_meet_nothing(still):
+def test_rays_that_miss_the_cube_hit_nothing(still):
     beside = RayBatch(torch.tensor([[5.0, 5.0, 5.0]]), torch.tensor([[1.0, 0.0, 0.0]]))
     assert not still.render(beside).opacity.any()

@@ -1,4 +1,4 @@
-"""The VolSDF host with rays that skip empty space: where they do, and that a checkpoint holds all of it."""
+"""The VolSDF host with rays that skip empty space, and its checkpoints."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _coarse(monkeypatch):
     monkeypatch.setattr(empty_space, "RESOLUTION", 24)
 
 
-def test_pictures_skip_what_is_empty_and_show_what_whole_rays_do():
+def test_images_skip_empty_space_and_agree_with_whole_rays():
     skipping, plain = host().eval(), host(skip=False).eval()
     plain.load_state_dict(skipping.state_dict(), strict=False)
     fine = dataclasses.replace(plain.config.volume, initial_samples=256, rounds=4, samples=128)
@@ -46,7 +46,7 @@ def test_pictures_skip_what_is_empty_and_show_what_whole_rays_do():
     assert (found.position - true.position)[solid].norm(dim=-1).max() < 0.02
 
 
-def test_rays_that_pass_by_ask_nothing_of_the_field(monkeypatch):
+def test_rays_that_miss_do_not_query_the_field(monkeypatch):
     skipping = host().eval()
     rays = sphere_batch(200, spread=1.2).rays
     with torch.no_grad():
@@ -60,7 +60,7 @@ def test_rays_that_pass_by_ask_nothing_of_the_field(monkeypatch):
     assert met * 16 <= sum(asked) < 200 * 24
 
 
-def test_pictures_follow_the_field_when_it_moves():
+def test_images_follow_a_field_that_changes():
     skipping = host().eval()
     rays = sphere_batch(200, spread=1.2).rays
     with torch.no_grad():
@@ -71,7 +71,7 @@ def test_pictures_follow_the_field_when_it_moves():
     assert ((after > 0.5) == (whole > 0.5)).float().mean() > 0.98
 
 
-def test_evaluation_with_gradients_takes_whole_rays():
+def test_evaluation_with_gradients_samples_whole_rays():
     skipping, plain = host().eval(), host(skip=False).eval()
     plain.load_state_dict(skipping.state_dict(), strict=False)
     rays = sphere_batch().rays
@@ -82,17 +82,17 @@ def test_evaluation_with_gradients_takes_whole_rays():
     assert skipping.empty_space.age is None
 
 
-def test_training_skips_and_ages_as_the_geometry_moves():
+def test_training_skips_empty_space_and_ages_the_grid():
     skipping = host().train()
     for _ in range(3):
         skipping.render_regularised(sphere_batch(), ())
     assert skipping.empty_space.age == 3
     with torch.no_grad():
         skipping.render_regularised(sphere_batch(), ())
-    assert skipping.empty_space.age == 3  # nothing moved
+    assert skipping.empty_space.age == 3  # the geometry was not trained
 
 
-def test_hits_stay_where_they_are():
+def test_hits_do_not_change():
     skipping, plain = host().train(), host(skip=False).train()
     rays = sphere_batch().rays
     one, other = skipping.render(rays), plain.render(rays)
@@ -101,9 +101,9 @@ def test_hits_stay_where_they_are():
     assert (one.position - other.position)[solid].norm(dim=-1).median() < 0.03
 
 
-def test_traced_rays_that_meet_nothing_are_not_rendered(monkeypatch):
-    """On a sphere no ray meets anything: none is rendered. Where the start lies before it, all are, and hit
-    as they did.
+def test_traced_rays_that_hit_nothing_are_not_rendered(monkeypatch):
+    """On a sphere no ray hits anything, so none is rendered. If the rays start in front of the sphere, all
+    are rendered, with the same hits.
     """
     skipping, plain = host().train(), host(skip=False).train()
     plain.load_state_dict(skipping.state_dict(), strict=False)
@@ -130,7 +130,7 @@ def test_no_ray_to_render_is_no_error():
     assert none.hit.shape == (0,)
 
 
-def test_a_checkpoint_goes_on_with_the_same_grid():
+def test_a_checkpoint_continues_with_the_same_grid():
     first = host().train()
     first.render_regularised(sphere_batch(), ())
     second = host().train()

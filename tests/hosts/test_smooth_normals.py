@@ -1,4 +1,4 @@
-"""Normals of a neighbourhood, against surfaces whose normals are known."""
+"""Smoothed normals compared with surfaces whose normals are known."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def test_a_sphere_keeps_its_normals():
     torch.testing.assert_close(found, normal, atol=1e-7, rtol=0)
 
 
-def test_ripples_go():
-    """A floor that waves by the cells of a grid: 5° at most, a cell of 0.03."""
+def test_ripples_are_removed():
+    """A floor with waves of the size of a grid cell, 0.03, and slopes of up to 5°."""
     waves, slope = 2 * math.pi / 0.03, math.tan(math.radians(5.0))
 
     def gradient(x: torch.Tensor) -> torch.Tensor:
@@ -42,7 +42,7 @@ def test_ripples_go():
     assert degrees_between(found, up).median() < degrees_between(rough, up).median() / 3
 
 
-def test_edges_stay():
+def test_edges_are_kept():
     def gradient(x: torch.Tensor) -> torch.Tensor:
         """Of the distance from the cube |x| < 0.5."""
         return torch.nn.functional.one_hot(x.abs().argmax(-1), 3) * x.sign()
@@ -55,19 +55,19 @@ def test_edges_stay():
     assert degrees_between(found, up).max() < 0.1
 
 
-def test_what_has_no_normal_stays_finite():
+def test_points_without_a_normal_stay_finite():
     zero = torch.zeros(3, 3)
     assert smooth_normals(torch.zeros_like, zero, zero, RADIUS).isfinite().all()
     up = torch.tensor([[0.0, 0.0, 1.0]])
     torch.testing.assert_close(smooth_normals(torch.zeros_like, zero[:1], up, RADIUS), up)
 
 
-def test_no_points_have_no_normals():
+def test_an_empty_batch_of_points():
     none = torch.zeros(0, 3)
     assert smooth_normals(lambda x: x, none, none, RADIUS).shape == (0, 3)
 
 
-def test_a_radius_of_zero_asks_nothing_and_others_ask_for_the_neighbours():
+def test_a_radius_of_zero_evaluates_no_neighbours():
     config = tiny_config()
     for radius, expected in ((0.0, 0), (RADIUS, NEIGHBOURS)):
         model = sphere_model(
@@ -83,7 +83,7 @@ def test_a_radius_of_zero_asks_nothing_and_others_ask_for_the_neighbours():
         assert sum(asked) == expected * len(hits)
 
 
-def test_the_gradient_is_that_of_the_hits_normals():
+def test_the_gradient_is_that_of_the_hit_normals():
     config = tiny_config()
     model = sphere_model(
         dataclasses.replace(config, volume=dataclasses.replace(config.volume, normal_radius=RADIUS))

@@ -1,4 +1,4 @@
-"""The contract suite: hosts that keep the contract pass, and each way to break it has a line of its own."""
+"""The contract suite: correct hosts pass, and each defect has its own message."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_the_reference_host_keeps_the_contract():
     assert len(report.checks) == len(CHECKS) + 1
 
 
-def test_a_mesh_keeps_the_contract_and_need_not_move():
+def test_a_mesh_keeps_the_contract_without_trained_geometry():
     report = check_host(mesh_host(SPHERE), ball_rays(spread=0.8))
     assert 0 < report.hits < report.rays
     assert not report.trains_geometry
@@ -46,7 +46,7 @@ def missed(outputs: dict) -> torch.Tensor:
 
 
 def recomputed(rays: RayBatch, outputs: dict) -> dict:
-    """What a host does that takes its normal by autograd and forgets to detach it."""
+    """A host that computes its normal by autograd and does not detach it."""
     with torch.enable_grad():
         return {"normal": outputs["normal"] * torch.ones((), requires_grad=True)}
 
@@ -104,12 +104,12 @@ BROKEN = [
 
 
 @pytest.mark.parametrize(("spoil", "message"), BROKEN, ids=[message[:40] for _, message in BROKEN])
-def test_a_broken_host_is_told_how_it_is_broken(spoil, message):
+def test_a_defect_is_named(spoil, message):
     with pytest.raises(AssertionError, match=f"^BallHost: {message}"):
         check_host(BallHost(spoil), ball_rays())
 
 
-def test_a_host_that_keeps_gradients_of_its_own_is_told():
+def test_a_host_that_changes_gradients_is_reported():
     host = BallHost()
 
     def render_and_step(rays: RayBatch, outputs: dict) -> dict:
@@ -121,5 +121,5 @@ def test_a_host_that_keeps_gradients_of_its_own_is_told():
         check_host(host, ball_rays())
 
 
-def test_the_unspoiled_host_keeps_the_contract():
+def test_the_host_without_defects_keeps_the_contract():
     assert check_host(BallHost(), ball_rays()).hits == 200

@@ -1,4 +1,4 @@
-"""The reference host on a sphere whose picture is known."""
+"""The reference host on a sphere whose image is known."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def sharp() -> VolSdfHost:
     return thin_surface()
 
 
-def test_it_keeps_the_contracts(sharp):
+def test_the_host_keeps_the_contracts(sharp):
     assert isinstance(sharp, Host)
     assert isinstance(sharp, Regularised)
     assert isinstance(sharp, HasSurfaceWidth)
@@ -54,7 +54,7 @@ def test_hits_lie_on_the_zero_set_with_its_normals(sharp):
     torch.testing.assert_close(hits.normal.norm(dim=-1), torch.ones(48))
 
 
-def test_a_miss_is_no_hit_and_shows_the_background(sharp):
+def test_a_miss_has_the_background_color(sharp):
     sharp.background_color.fill_(0.25)
     misses = RayBatch(torch.tensor([[0.0, 0.0, -3.0], [0.0, 9.0, -3.0]]), torch.tensor([[0.0, 1.0, 0.0]] * 2))
     hits = sharp.render(misses)
@@ -64,7 +64,7 @@ def test_a_miss_is_no_hit_and_shows_the_background(sharp):
 
 
 @pytest.mark.parametrize("skip_empty", [False, True])
-def test_without_a_background_the_sphere_of_the_scene_closes_it(skip_empty):
+def test_without_a_background_the_scene_sphere_has_the_radiance_of_r(skip_empty):
     config = tiny_config()
     config = dataclasses.replace(config, volume=dataclasses.replace(config.volume, skip_empty=skip_empty))
     host = sphere_model(config, background="none").train().host
@@ -82,7 +82,7 @@ def test_without_a_background_the_sphere_of_the_scene_closes_it(skip_empty):
 
 
 def true_opacity(gap: Tensor, beta: float) -> Tensor:
-    """Opacity of rays that pass the middle of the sphere at a distance `gap`: the density summed over 40,000
+    """Opacity of rays that pass the centre of the sphere at a distance `gap`: the density summed over 40,000
     steps, float64.
     """
     along = torch.linspace(-1.7, 1.7, 40_001, dtype=torch.float64)
@@ -96,9 +96,9 @@ def true_opacity(gap: Tensor, beta: float) -> Tensor:
     [("fast", 0.003, 0.02), ("fast", 0.03, 0.004), ("paper-mlp", 0.003, 0.002), ("paper-mlp", 0.03, 0.002)],
 )
 @pytest.mark.parametrize("training", [True, False])
-def test_the_opacity_of_rays_that_graze_a_sphere_is_true(name, beta, error, training):
-    """What is rendered, not what the sampler knows: rays that a thin layer covers in part, of a sphere that
-    is exact.
+def test_the_opacity_of_rays_that_graze_a_sphere_is_accurate(name, beta, error, training):
+    """The rendered opacity, not the sampler's bound: for rays that a thin layer covers in part, with an exact
+    sphere.
     """
     volume = dataclasses.replace(preset(name).volume, beta_init=beta)
     host = sphere_model(tiny_config(volume=volume)).train(training).host
@@ -125,9 +125,9 @@ def test_only_the_named_losses_are_computed(sharp):
     assert sharp.render_regularised(batch, []).terms == {}
 
 
-def test_regularisers_look_all_over_the_scene():
-    """On G = c · x the losses are known at any place, so what is averaged, and how often, shows where they
-    look.
+def test_regularisers_cover_the_whole_scene():
+    """For G = c · x the losses are known at every point, so their means and counts show which points are
+    used.
     """
     config = tiny_config()
     config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, points="scene"))
@@ -149,10 +149,8 @@ def test_regularisers_look_all_over_the_scene():
 
 
 @pytest.mark.parametrize("background", ["constant", "none"])
-def test_a_mask_removes_a_solid_that_stands_in_empty_space(background):
-    """No ray comes through, so opacity has no slope; the surface must give way all the same, and not by
-    getting foggy.
-    """
+def test_a_mask_removes_a_solid_in_empty_space(background):
+    """Behind the solid the opacity has no gradient; the surface must still move, and β must not grow."""
     host = thin_surface(background)
     batch = sphere_batch(32, spread=0.2)
     inside = 0.5 * batch.origins  # of the sphere that closes a scene without background
@@ -172,7 +170,7 @@ def test_a_mask_removes_a_solid_that_stands_in_empty_space(background):
     assert host.density.above_floor.grad == 0.0
 
 
-def test_a_cloud_on_the_surface_costs_little_and_one_off_it_its_distance():
+def test_the_loss_of_a_point_cloud_is_its_distance():
     direction = normalize(torch.randn(64, 3), dim=-1)
     for radius, expected in ((RADIUS, 0.0), (RADIUS + 0.3, 0.3)):
         host = VolSdfHost(
@@ -182,6 +180,6 @@ def test_a_cloud_on_the_surface_costs_little_and_one_off_it_its_distance():
         assert term.mean().item() == pytest.approx(expected, abs=0.15)  # the field starts as a rough sphere
 
 
-def test_the_background_field_moves_only_where_it_is_the_background():
+def test_the_background_field_gets_gradients_only_from_rays_that_show_it():
     assert "background" in sphere_model(background="inverted_sphere").host.parameter_groups()
     assert "background" not in sphere_model(background="constant").host.parameter_groups()

@@ -1,4 +1,4 @@
-"""What arrives at a surface point: the scene first, the light behind it, lamps by rays of their own."""
+"""Incident light at a surface point: the scene occludes the light, and lamps have their own rays."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ POINT = torch.zeros(1, 3)
 
 
 class Sky:
-    """Brighter towards +z; keeps the directions that it is asked for."""
+    """A light that is brighter towards +z and records the directions that it is evaluated for."""
 
     def __init__(self) -> None:
         self.asked: list[torch.Tensor] = []
@@ -30,7 +30,7 @@ class Sky:
 
 
 def wall(x: torch.Tensor, wi: torch.Tensor) -> SceneLight:
-    """All directions with x > 0 meet a wall at distance 1 that sends `WALL`."""
+    """All directions with x > 0 hit a wall at distance 1 that sends `WALL`."""
     hit = wi[..., 0] > 0
     radiance = torch.where(hit[..., None], WALL, 0.0).expand(wi.shape)
     return SceneLight(hit, radiance, torch.where(hit, 1.0, math.inf))
@@ -50,7 +50,7 @@ def lamps(*positions: tuple[float, float, float]) -> Lamps:
     return lit
 
 
-def test_the_light_is_asked_only_where_the_scene_is_not_in_the_way():
+def test_the_light_is_evaluated_only_in_unoccluded_directions():
     wi, sky = directions(3, 50), Sky()
     incident = arriving(Sources(sky, lamps(), wall), torch.zeros(3, 3), even(wi))
     expected = torch.where(wi[..., :1] > 0, torch.full_like(wi, WALL), Sky().radiance(None, wi))
@@ -59,14 +59,14 @@ def test_the_light_is_asked_only_where_the_scene_is_not_in_the_way():
     assert (torch.cat(sky.asked)[:, 0] <= 0).all()
 
 
-def test_without_a_scene_the_light_comes_from_everywhere():
+def test_without_a_scene_no_direction_is_occluded():
     wi = directions(3, 50)
     incident = arriving(Sources(Sky(), lamps(), None), torch.zeros(3, 3), even(wi))
     torch.testing.assert_close(incident.radiance, Sky().radiance(None, wi))
     assert (incident.source == Source.LIGHT).all()
 
 
-def test_directions_stand_for_the_whole_sphere_and_lamps_for_their_discs():
+def test_weights_are_the_solid_angles_of_directions_and_lamps():
     wi = directions(1, 50)
     incident = arriving(Sources(Sky(), lamps((0.0, 0.0, 2.0)), None), POINT, even(wi))
     assert math.isclose(incident.weight[0, :50].sum().item(), 4 * math.pi, rel_tol=1e-6)
@@ -75,14 +75,14 @@ def test_directions_stand_for_the_whole_sphere_and_lamps_for_their_discs():
     torch.testing.assert_close(incident.radiance[0, 50] * incident.weight[0, 50], torch.full((3,), 1 / 4))
 
 
-def test_a_lamp_behind_the_wall_does_not_shine_and_one_before_it_does():
+def test_a_wall_occludes_only_the_lamp_behind_it():
     before, behind, aside = (0.5, 0.0, 0.0), (1.5, 0.0, 0.0), (-1.5, 0.0, 0.0)
     incident = arriving(Sources(Sky(), lamps(before, behind, aside), wall), POINT, even(directions(1, 8)))
     assert incident.source[0, 8:].tolist() == [Source.LAMPS, Source.LAMPS + 1, Source.LAMPS + 2]
     assert (incident.radiance[0, 8:].sum(-1) > 0).tolist() == [True, False, True]
 
 
-def test_radiance_along_any_direction_includes_the_lamps_that_it_meets():
+def test_radiance_along_a_direction_includes_lamps_that_it_hits():
     sources = Sources(Sky(), lamps((0.5, 0.0, 0.0), (-1.5, 0.0, 0.0), (1.5, 0.0, 0.0)), wall)
     towards, away = torch.tensor([[[1.0, 0.0, 0.0]]]), torch.tensor([[[-1.0, 0.0, 0.0]]])
     lamp = sources.lamps.radiance()[0]

@@ -1,6 +1,4 @@
-"""Inspection: a good capture has no findings, and each thing that is broken on purpose is found, and nothing
-else.
-"""
+"""Inspection: a good capture has no findings, and each planted defect gives exactly its own finding."""
 
 from __future__ import annotations
 
@@ -38,7 +36,7 @@ def change(path: Path, how: Callable[[np.ndarray], np.ndarray]) -> None:
 
 @pytest.fixture
 def capture(tmp_path: Path) -> Capture:
-    """A copy of the scene of the demo, to break."""
+    """A copy of the demo scene, which a test may change."""
     shutil.copytree(
         SCENE, tmp_path / "scene", ignore=shutil.ignore_patterns("light", "ground_truths", "*_maps")
     )
@@ -51,7 +49,7 @@ def found(of: Capture | Inspection) -> dict[str, tuple[str, ...]]:
     return {finding.kind: finding.views for finding in inspection.findings}
 
 
-def test_nothing_is_wrong_with_the_scene_of_the_demo() -> None:
+def test_the_demo_scene_has_no_findings() -> None:
     inspection = inspect_capture(load_capture(SCENE))
     assert inspection.findings == ()
     assert inspection.verdict.quality == "good"
@@ -136,7 +134,7 @@ def test_display_values_in_linear_files(capture: Capture) -> None:
     assert inspection.verdict.quality == "poor"
 
 
-def test_broken_pixels_need_a_mark(capture: Capture) -> None:
+def test_broken_pixels_must_be_marked(capture: Capture) -> None:
     view = capture.views[VICTIM]
     change(
         view.image,
@@ -194,7 +192,7 @@ def test_display_values(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------------ the command
 
 
-def test_the_command_says_it_and_writes_it(capture: Capture, tmp_path: Path, capfd) -> None:
+def test_the_command_prints_and_writes_the_findings(capture: Capture, tmp_path: Path, capfd) -> None:
     view = capture.views[VICTIM]
     change(view.image, lambda pixels: 4 * pixels)
     assert main(["inspect", str(capture.root), "--out", str(tmp_path / "out")]) == 0

@@ -1,4 +1,4 @@
-"""Figures of single views, against pictures in which they are known."""
+"""Figures of single views, on images in which they are known."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ def test_luminance_and_range_are_linear_and_of_the_object(view: View) -> None:
     assert figures(view, grey, hdr=False).luminance == pytest.approx(0.491, abs=0.002)  # of the sRGB curve
 
 
-def test_luminance_moves_with_the_exposure_and_hardly_with_what_is_in_view(view: View) -> None:
+def test_luminance_follows_the_exposure_and_hardly_the_content(view: View) -> None:
     def seen(bright_rows: int, exposure: float = 1.0) -> float:
         pixels = exposure * (0.2 + 0.02 * NOISE)
         pixels[:bright_rows] *= 4.0
         return figures(view, pixels).luminance
 
-    # A little more than half of it sky, or a little less: what a step to the side does to a view without a
+    # Slightly more or less than half of the image is sky, like after a step to the side in a view without a
     # mask.
     assert seen(32) / seen(28) == pytest.approx(1.0, abs=0.15)
     assert seen(32, exposure=2.0) / seen(32) == pytest.approx(2.0, rel=1e-3)
@@ -105,7 +105,7 @@ def test_masks_and_broken_pixels(view: View, tmp_path: Path) -> None:
     assert figures(view, cut).pixels == 100
 
 
-def test_what_cannot_be_read_is_said(view: View, tmp_path: Path) -> None:
+def test_unreadable_views_are_reported(view: View, tmp_path: Path) -> None:
     assert "no such image" in measure(view, True).unreadable
     write_png(tmp_path / "valid.png", np.full((3, 3), 255, np.uint8))
     assert "another size" in figures(view, NOISE, valid=tmp_path / "valid.png").unreadable

@@ -1,4 +1,4 @@
-"""Figures of views together, against closed forms and pictures made alike on purpose."""
+"""Figures that compare views, with closed forms and with images that are alike on purpose."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from tests.data.make_capture import DISTANCE, SCALE, make_capture
 
 
 def ring(count: int) -> CameraPlacement:
-    """Cameras on a circle, looking inwards."""
+    """Cameras on a circle that look inwards."""
     azimuth = 2 * np.pi * np.arange(count) / count
     outward = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(count)], axis=1)
     none = np.zeros(count, bool)
     return CameraPlacement(3 * outward, -outward, none, none, 1.0, 360 / count)
 
 
-def test_a_jump_is_told_from_a_slow_change() -> None:
+def test_a_jump_is_distinguished_from_a_slow_change() -> None:
     slow = 1 + 0.5 * np.sin(2 * np.pi * np.arange(24) / 24)
     assert np.allclose(exposure_factors(slow.tolist(), ring(24)), 1, atol=0.15)
     for i in (0, 7):
@@ -56,7 +56,7 @@ def test_duplicates_survive_compression_size_and_brightness() -> None:
     assert duplicates([*pictures, 0.5 * small, rough, shifted, black, black]) == ((1, 5), (2, 4))
 
 
-def test_where_cameras_stand(tmp_path: Path) -> None:
+def test_coverage_by_cameras(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path, views=12))
     placement = camera_placement(capture)
     assert not placement.away.any()

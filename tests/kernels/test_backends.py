@@ -1,6 +1,4 @@
-"""Backends against the reference where the transcription does not reach: gradients, odd inputs, threads, and
-the choice.
-"""
+"""Backends compared with the reference: gradients, unusual inputs, threads, and the choice of the backend."""
 
 from __future__ import annotations
 
@@ -35,7 +33,7 @@ def table(seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:
 
 
 def scattered(count: int, seed: int = 1) -> torch.Tensor:
-    """Points in the cube and a little around it."""
+    """Points in the cube and slightly outside of it."""
     return (
         1.2 * torch.rand(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) - 0.1
     )
@@ -44,7 +42,7 @@ def scattered(count: int, seed: int = 1) -> torch.Tensor:
 def everything(
     x: torch.Tensor, table: torch.Tensor, backend: str, jacobian: bool = True
 ) -> list[torch.Tensor]:
-    """Features, Jacobian, and the gradients of a loss that weighs both at random."""
+    """Features, Jacobian, and the gradients of a loss that weights both at random."""
     x, table = x.clone().requires_grad_(), table.clone().requires_grad_()
     encoded = encode(x, table, dataclasses.replace(SPEC, backend=backend), jacobian)
     outputs = [encoded.features, encoded.jacobian] if jacobian else [encoded.features]
@@ -83,7 +81,7 @@ def test_points_far_outside():
     torch.testing.assert_close(got, expected, equal_nan=True)
 
 
-def test_many_points_at_one_place_add_up():
+def test_gradients_of_many_points_at_one_position_add_up():
     assert_agree(scattered(1).expand(200, 3))
 
 
@@ -117,7 +115,7 @@ def test_float32_gradients():
         torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-3 * expected.abs().max().item())
 
 
-def test_what_is_no_number_stays_so_and_spoils_nothing_else():
+def test_nan_stays_nan_and_affects_no_other_point():
     x = scattered(20)
     x[7, 1] = torch.nan
     encoded = encode(x, table(), SPEC, True)
@@ -135,9 +133,9 @@ def test_inputs_in_any_memory_order():
     torch.testing.assert_close(got, expected, rtol=1e-10, atol=1e-10)
 
 
-def test_only_what_is_asked_for_gets_a_gradient():
+def test_only_inputs_that_require_it_get_a_gradient():
     x, rows = scattered(5), table().requires_grad_()
-    encode(x, rows, SPEC, True).jacobian.square().sum().backward()  # the features take no part in the loss
+    encode(x, rows, SPEC, True).jacobian.square().sum().backward()  # the loss does not depend on the features
     expected = table().requires_grad_()
     encode(
         x, expected, dataclasses.replace(SPEC, backend="reference"), True
@@ -150,7 +148,7 @@ def test_only_what_is_asked_for_gets_a_gradient():
 
 
 def test_the_second_derivative_of_a_second_derivative():
-    """The analytic Hessian of a field, and a loss on it, as `SdfField` makes them."""
+    """The analytic Hessian of a field and a loss on it, as in `SdfField`."""
 
     def loss_gradient(backend):
         x, rows = scattered(4).requires_grad_(), table().requires_grad_()
@@ -174,7 +172,7 @@ def threads():
 
 
 @pytest.mark.skipif(INTERPRETED, reason="the interpreter knows no threads")
-def test_the_number_of_threads_changes_no_bit(threads):
+def test_the_result_does_not_depend_on_the_number_of_threads(threads):
     x, rows = scattered(20_000), table()
     threads(1)
     one = everything(x, rows, BACKEND)
@@ -184,7 +182,7 @@ def test_the_number_of_threads_changes_no_bit(threads):
 
 
 @pytest.mark.skipif(INTERPRETED, reason="the interpreter knows no threads")
-def test_threads_that_call_at_once(threads):
+def test_concurrent_calls(threads):
     threads(2)
     x, rows, found = scattered(5000), table(), {}
     expected = everything(x, rows, BACKEND)
@@ -207,7 +205,7 @@ def test_shares_cover_everything_once(threads):
         assert len(runs) == max(1, min(3, count // least))
 
 
-def test_an_error_in_a_thread_is_told(threads):
+def test_an_error_in_a_thread_is_raised(threads):
     def work(start, stop):
         if start == 2:
             raise ValueError("in the second run")
@@ -224,7 +222,7 @@ def mark(queue) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="no fork")
 def test_threads_after_a_fork():
-    for_each(lambda start, stop: None, [(0, 1), (1, 2), (2, 3)])  # the parent has its threads
+    for_each(lambda start, stop: None, [(0, 1), (1, 2), (2, 3)])  # the parent process has started its threads
     context = multiprocessing.get_context("fork")
     queue = context.Queue()
     child = context.Process(target=mark, args=(queue,))
@@ -248,7 +246,7 @@ def _fresh_choice():
 
 
 def used(monkeypatch, spec, dtype=torch.float32) -> str:
-    """Who computes: the reference, or kernels."""
+    """Which backend computes: the reference, or kernels."""
     seen = []
     original = function.encode_with
     monkeypatch.setattr(kernels, "encode_with", lambda *args: (seen.append(args[0]), original(*args))[1])
@@ -257,17 +255,17 @@ def used(monkeypatch, spec, dtype=torch.float32) -> str:
 
 
 @pytest.mark.skipif(INTERPRETED, reason="about the CPU backend")
-def test_a_cpu_takes_the_compiled_loops_unless_told_otherwise(monkeypatch):
+def test_a_cpu_uses_the_compiled_loops_by_default(monkeypatch):
     assert used(monkeypatch, dataclasses.replace(SPEC, backend="auto")) == "kernels"
     assert used(monkeypatch, dataclasses.replace(SPEC, backend="cpu")) == "kernels"
     assert used(monkeypatch, dataclasses.replace(SPEC, backend="reference")) == "reference"
 
 
-def test_half_precision_takes_the_reference(monkeypatch):
+def test_half_precision_uses_the_reference(monkeypatch):
     assert used(monkeypatch, SPEC, torch.bfloat16) == "reference"
 
 
-def test_without_numba_the_reference_stands_in_and_says_so(monkeypatch):
+def test_without_numba_the_reference_is_used_with_a_warning(monkeypatch):
     monkeypatch.setitem(sys.modules, "neilfpp_method.kernels.cpu", None)
     with pytest.warns(RuntimeWarning, match="slow reference"):
         assert used(monkeypatch, dataclasses.replace(SPEC, backend="auto")) == "reference"
@@ -289,8 +287,8 @@ def test_a_table_of_another_size_is_refused():
 
 
 @pytest.mark.skipif(INTERPRETED or os.name != "posix", reason="about the CPU backend")
-def test_where_nothing_can_be_kept_on_disk_it_still_compiles(tmp_path):
-    """The locators of Numba's cache are taken away, as a read-only installation without a home does."""
+def test_loops_compile_without_a_cache_on_disk(tmp_path):
+    """The locators of Numba's cache are removed, as in a read-only installation without a home folder."""
     script = """
 from numba.core import caching
 caching.CacheImpl._locator_classes = []

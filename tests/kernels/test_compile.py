@@ -1,7 +1,6 @@
-"""A compiler of whole steps goes around the loops that are compiled already.
+"""torch.compile of whole steps does not trace into loops that are compiled already.
 
-In a process of its own: the checkers of types that tests run with are themselves more than torch.compile
-looks into.
+This test runs in a separate process, because torch.compile cannot trace the type checkers of the tests.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ print(counters["stats"]["unique_graphs"], *counters["graph_break"])
 """
 
 
-def test_a_compiled_step_does_not_look_into_numba():
+def test_a_compiled_step_does_not_trace_into_numba():
     done = subprocess.run([sys.executable, "-c", STEP], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
     assert int(done.stdout.split()[0]) > 0

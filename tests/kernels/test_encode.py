@@ -1,7 +1,7 @@
-"""Every backend of the hash grid, against a transcription that visits one vertex at a time.
+"""Every backend of the hash grid, compared with a transcription that visits one vertex at a time.
 
-Triton's interpreter has to be chosen before Triton is imported: `test_triton.py` runs this file once more,
-with it.
+Triton's interpreter must be selected before Triton is imported, so `test_triton.py` runs this file again with
+it.
 """
 
 from __future__ import annotations
@@ -96,8 +96,8 @@ def test_jacobian_agrees_with_differences_of_the_transcription(small):
 
 
 def test_hash_of_a_fine_level_does_not_overflow(backend):
-    """Vertex numbers of 4096 times the primes leave int32; only their low bits count, and those must be
-    right.
+    """Products of vertex indices up to 4096 and the primes exceed int32. Only their low bits are used, and
+    these must be correct.
     """
     spec = grid_spec(
         levels=1, features=1, log2_entries=10, base_resolution=4096, max_resolution=4096, backend=backend
@@ -122,7 +122,7 @@ def test_derivatives_of_features_and_jacobian(small):
         assert gradgradcheck(lambda x, t: both(x, t)[0], (x[:1].detach().requires_grad_(), table))
 
 
-def test_a_point_outside_counts_as_the_nearest_point_of_the_cube(small):
+def test_a_point_outside_is_clamped_to_the_cube(small):
     outside = torch.tensor([[1.4, 0.3, -0.2]], dtype=torch.float64)
     nearest = outside.clamp(0, 1)
     got, at_face = (encode(x, small_table(), small, jacobian=True) for x in (outside, nearest))
@@ -132,7 +132,7 @@ def test_a_point_outside_counts_as_the_nearest_point_of_the_cube(small):
     assert at_face.jacobian.abs().amin() > 0
 
 
-def test_reruns_agree_to_the_last_bit(backend):
+def test_repeated_runs_agree_bit_for_bit(backend):
     spec = grid_spec(levels=8, log2_entries=12, max_resolution=128, backend=backend)
     x = points(100 if backend == "triton" else 5000).float()
 
@@ -158,6 +158,6 @@ def test_float32_and_bfloat16_follow_float64(small):
 @pytest.mark.parametrize(
     "wrong", [{"levels": 0}, {"base_resolution": 64, "max_resolution": 32}, {"log2_entries": 31}]
 )
-def test_a_grid_that_cannot_be_is_refused(wrong):
+def test_an_invalid_grid_is_refused(wrong):
     with pytest.raises(UserError, match="no hash grid has"):
         grid_spec(**({"levels": 4, "log2_entries": 10, "max_resolution": 64} | wrong))

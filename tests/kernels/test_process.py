@@ -1,4 +1,4 @@
-"""The settings of a process that computes, each in a process of its own: what is set stays set."""
+"""Process-wide settings, each tested in a separate process, because they cannot be undone."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def resident():
 
 
 def say(program: str) -> list[str]:
-    """What a program prints, by words."""
+    """The words that a program prints."""
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     return done.stdout.split()
 
 
-def test_denormal_numbers_count_as_zero():
+def test_denormal_numbers_are_flushed_to_zero():
     if not torch.set_flush_denormal(False):
         pytest.skip("this processor has no such setting")
     program = "from neilfpp_method.kernels.process import computing_fast\n" + SMALL
@@ -34,7 +34,7 @@ def test_denormal_numbers_count_as_zero():
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="glibc alone is asked")
-def test_memory_that_is_freed_is_kept():
+def test_freed_memory_is_kept():
     program = "from neilfpp_method.kernels.process import computing_fast\n" + RESIDENT
     program += "print(resident())\nwith computing_fast():\n    print(resident())\nprint(resident())"
     before, kept, after = map(int, say(program))
@@ -50,7 +50,7 @@ def test_memory_that_is_freed_is_kept():
         (["eval", "x"], "evaluate.protocols.evaluate"),
     ],
 )
-def test_a_command_that_computes_makes_them(words, does):
+def test_commands_that_compute_change_the_settings(words, does):
     if not torch.set_flush_denormal(False):
         pytest.skip("this processor has no such setting")
     module, name = f"neilfpp_method.{does}".rsplit(".", 1)

@@ -1,4 +1,4 @@
-"""Softplus by compiled loops, against float64 and against what autograd makes of torch's own."""
+"""Softplus by compiled loops, compared with float64 and with autograd of torch's softplus."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_gradients_of_first_and_second_order_agree_with_float64(sharpness):
         )
 
 
-def test_the_gradient_of_the_value_alone():
+def test_the_gradient_of_only_the_value():
     z = numbers().requires_grad_()
     softplus(z, 100.0).sum().backward()
     torch.testing.assert_close(
@@ -59,7 +59,7 @@ def test_the_gradient_of_the_value_alone():
     )
 
 
-def test_what_is_no_number_stays_none():
+def test_nan_stays_nan():
     units = softplus_and_slope(torch.tensor([math.nan, math.inf, -math.inf, 0.0]), 100.0)
     assert units.value[0].isnan()
     assert units.slope[0].isnan()

@@ -1,4 +1,4 @@
-"""Triton's kernels without a GPU: run by the interpreter, and compiled to machine code for one."""
+"""Triton's kernels without a GPU: run by the interpreter, and compiled for a GPU."""
 
 from __future__ import annotations
 

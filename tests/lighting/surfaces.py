@@ -9,16 +9,14 @@ from neilfpp_method.structures import Material, Observed, SceneLight
 
 
 def half_room(x: torch.Tensor, wi: torch.Tensor) -> SceneLight:
-    """A scene: wherever one looks down there is a wall 2 away that sends out radiance 0.7; above there is
-    nothing.
-    """
+    """A scene with a wall at distance 2 and radiance 0.7 in all downward directions, and nothing above."""
     below = wi[..., 2] < 0
     distance = torch.where(below, 2.0, torch.inf)
     return SceneLight(below, below[..., None] * torch.full_like(wi, 0.7), distance)
 
 
 def points(count: int, seed: int = 0) -> Observed:
-    """Points near the origin with all normals, each seen from within 60° of its normal."""
+    """Points near the origin with normals in all directions, each viewed from within 60° of its normal."""
     generator = torch.Generator().manual_seed(seed)
     normal = normalize(torch.randn(count, 3, generator=generator), dim=-1)
     wo = normalize(normal + 0.8 * normalize(torch.randn(count, 3, generator=generator), dim=-1), dim=-1)
@@ -26,7 +24,7 @@ def points(count: int, seed: int = 0) -> Observed:
 
 
 def material(count: int, seed: int = 1) -> Material:
-    """Every point is made of something else."""
+    """A different material at every point."""
     generator = torch.Generator().manual_seed(seed)
     base_color = 0.2 + 0.6 * torch.rand(count, 3, generator=generator)
     roughness = 0.3 + 0.5 * torch.rand(count, 1, generator=generator)
@@ -35,7 +33,7 @@ def material(count: int, seed: int = 1) -> Material:
 
 
 def patches(position: torch.Tensor) -> Material:
-    """Roughness and metallic as of `material`, and a base colour for each octant about the middle of the
+    """Roughness and metallic of `material`, and a base colour for each octant around the centre of the
     points.
     """
     speckled = material(len(position))

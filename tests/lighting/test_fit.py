@@ -1,6 +1,4 @@
-"""Solving for the environment map, against closed forms, the Monte-Carlo estimator and maps that are
-known.
-"""
+"""The fit of an environment map, compared with closed forms, the Monte-Carlo estimator, and known maps."""
 
 from __future__ import annotations
 
@@ -39,7 +37,7 @@ def fit(
     environment.log_radiance.copy_(found.log_radiance)
 
 
-def test_a_lambertian_surface_in_a_white_furnace_shows_its_base_colour():
+def test_a_lambertian_surface_in_a_white_furnace_has_its_base_colour():
     torch.manual_seed(0)
     seen, of = points(16), material(16)
     carried = from_texels(EnvironmentLight(48, 1.0), seen, of.roughness, None, None)
@@ -54,7 +52,7 @@ def test_transport_agrees_with_the_estimator_under_a_map_and_a_wall():
     rows = torch.linspace(0, math.pi, 48)[:, None].expand(48, 96)
     environment.log_radiance.copy_(torch.stack((rows.cos(), 0.5 * rows.sin(), -rows.cos())))
     several = [from_texels(environment, seen, of.roughness, GGX, half_room) for _ in range(4)]
-    # The texels are read where the map holds them; between texels it varies little here.
+    # The texels are read at their centres; this map varies little between texels.
     radiance = environment.log_radiance.exp().flatten(1).t()
     carried = sum(one.outgoing(of, radiance) for one in several) / len(several)
 
@@ -65,7 +63,7 @@ def test_transport_agrees_with_the_estimator_under_a_map_and_a_wall():
     torch.testing.assert_close(carried, expected, rtol=0.06, atol=0.02)
 
 
-def test_transport_knows_its_slopes_in_sources_and_strength():
+def test_gradients_of_transport_in_sources_and_strength():
     torch.manual_seed(0)
     of = Material(*(value.double() for value in (torch.rand(4, 3), torch.rand(4, 1), torch.rand(4, 1))))
     sources, scene, strength = (
@@ -89,9 +87,9 @@ def lamp(height: int) -> EnvironmentLight:
     [("speckles", 0.0, [200]), ("patches", 0.3, 4 * [100]), ("speckles", 0.3, 4 * [100])],
     ids=["known", "even", "uneven"],
 )
-def test_a_lamp_is_found_where_it_is_and_as_bright_beside_the_sky_as_it_is(tint, made_of, evenness, steps):
-    """All the same where the base colour is wrong by one factor, which light and base colour share; and, as
-    fits follow each other, where every point has a colour of its own.
+def test_a_lamp_is_found_with_its_position_and_brightness(tint, made_of, evenness, steps):
+    """Also if the base colour is wrong by one factor, which light and base colour share, and if fits follow
+    each other and every point has its own colour.
     """
     torch.manual_seed(0)
     seen = points(600)
@@ -118,7 +116,7 @@ def test_a_lamp_is_found_where_it_is_and_as_bright_beside_the_sky_as_it_is(tint,
     assert (green[:, 30:] - sky).abs().mean() < 0.3
 
 
-def test_where_no_point_looks_the_map_takes_after_its_surroundings():
+def test_texels_without_observations_follow_their_neighbours():
     torch.manual_seed(0)
     seen = points(300)
     up = normalize(seen.normal * torch.tensor([0.2, 0.2, 0.0]) + torch.tensor([0.0, 0.0, 1.0]), dim=-1)
@@ -132,9 +130,9 @@ def test_where_no_point_looks_the_map_takes_after_its_surroundings():
     assert found.log_radiance[:, -2:].exp().mean().item() == pytest.approx(2.0, rel=0.35)
 
 
-def test_what_a_few_points_see_alone_is_no_sun():
-    """All is under an even sky, but twelve mirrors in three hundred points look down, one way, and are
-    brighter than it.
+def test_texels_that_few_points_see_do_not_become_a_sun():
+    """All points are under an even sky, but twelve of three hundred are mirrors that face down in one
+    direction, and are brighter than the sky.
     """
     torch.manual_seed(0)
     seen = points(300)
@@ -156,21 +154,21 @@ def test_what_a_few_points_see_alone_is_no_sun():
     ("gain", "deviation", "points", "new", "chosen"),
     [
         (0.05, 0.01, 200, True, True),
-        (0.015, 0.01, 200, False, True),  # may be chance: it stays, but is not taken
-        (0.005, 0.001, 200, False, False),  # certain, and worth nothing
+        (0.015, 0.01, 200, False, True),  # not significant: an existing choice is kept, a new one is not made
+        (0.005, 0.001, 200, False, False),  # significant, but below the threshold
         (-0.02, 0.02, 200, False, True),
         (-0.02, 0.01, 200, False, False),
         (0.05, 0.01, 5, False, False),  # hardly any points
     ],
 )
-def test_what_is_chosen_stays_in_doubt_and_nothing_is_chosen_in_doubt(gain, deviation, points, new, chosen):
+def test_without_significance_the_choice_is_kept(gain, deviation, points, new, chosen):
     spoken = Evidence(gain, deviation, points)
     assert (spoken.favours(chosen=False), spoken.favours(chosen=True)) == (new, chosen)
 
 
-def test_a_base_colour_is_as_uneven_as_its_steps_are_high():
-    """Points along a line, whose neighbours are the two on either side: one step of ln 2 is crossed by 6 of
-    40 pairs.
+def test_unevenness_is_the_mean_step_of_log_base_colour():
+    """Points along a line, each with two neighbours on either side: a step of ln 2 lies between 6 of 40
+    pairs.
     """
     position = torch.arange(10.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
     nearest = nearest_points(position)
@@ -181,8 +179,8 @@ def test_a_base_colour_is_as_uneven_as_its_steps_are_high():
     assert unevenness(step[:1], nearest_points(position[:1])) == 0
 
 
-def test_total_variation_counts_every_step_once_and_closes_the_map():
-    """One column of 1 in a map of 0: it steps up and down in each of its four rows, of 32 texels."""
+def test_total_variation_counts_every_step_once_and_wraps_in_azimuth():
+    """One column of 1 in a map of 0: each of its four rows of 8 texels has two steps."""
     values = torch.zeros(1, 4, 8)
     values[0, :, 7] = 1.0
     assert total_variation(values).item() == pytest.approx(
@@ -190,7 +188,7 @@ def test_total_variation_counts_every_step_once_and_closes_the_map():
     )  # the rounding near 0 adds 0.01 a step
 
 
-def test_a_map_without_a_finite_answer_stays_as_it_was():
+def test_a_map_without_a_finite_solution_is_unchanged():
     seen, of = points(8), material(8)
     environment = EnvironmentLight(8, 0.5)
     before = environment.log_radiance.clone()

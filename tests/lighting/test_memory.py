@@ -1,4 +1,4 @@
-"""The points that light is fitted to."""
+"""The memory of surface points to which the light is fitted."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_the_first_fit_waits_for_a_full_memory_or_a_few_steps():
     assert len(few.recall()) == 4
 
 
-def test_memory_is_due_once_full_then_every_so_often_and_keeps_the_newest():
+def test_a_fit_is_due_when_the_memory_is_full_and_then_regularly():
     memory = SurfaceMemory(20, every=4)
     assert not memory.due
     memory.remember(points(50))
@@ -38,7 +38,7 @@ def test_memory_is_due_once_full_then_every_so_often_and_keeps_the_newest():
         assert all((kept.normal == normal).all(-1).any() for normal in newest)
 
 
-def test_memory_survives_a_checkpoint():
+def test_memory_is_restored_from_a_checkpoint():
     memory, again = SurfaceMemory(20, every=4), SurfaceMemory(20, every=4)
     memory.remember(points(12))
     memory.recall()

@@ -1,4 +1,4 @@
-"""Rays that are not rendered twice while the surface stands still."""
+"""Surface points are not rendered twice while the geometry is fixed."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from tests.scenes import sphere_batch, sphere_model, tiny_config
 from tests.test_model import count_queries
 
 RAYS = 4800
-"""So many that a quarter of them meets the surface as often as all do."""
+"""Number of rays, large enough that a quarter of them has about the same share of hits."""
 QUARTER = dataclasses.replace(tiny_config().train, fresh=0.25, rays=RAYS)
 
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
-    """A memory that is full after a few steps."""
+    """A replay buffer that is full after a few steps."""
     monkeypatch.setattr(replay, "KEPT_STEPS", 1)
 
 
 def model(**changes) -> NeilfModel:
     off = dataclasses.replace(tiny_config().inter_reflection, mode="off")
-    # A layer as soft as the sphere's at the start has little of its weight in one place.
+    # The weights along a ray of the initial sphere are spread out, because its layer is soft.
     soft = dataclasses.replace(tiny_config().shading, hit_share=0.5)
     return sphere_model(
         tiny_config(train=dataclasses.replace(QUARTER, **changes), inter_reflection=off, shading=soft)
@@ -42,7 +42,7 @@ def filled(**changes) -> NeilfModel:
     return stepping
 
 
-def test_once_enough_is_known_a_quarter_is_rendered_and_as_much_is_shaded():
+def test_with_a_full_buffer_a_quarter_is_rendered_and_as_many_points_are_shaded():
     before, after = model(), filled()
     all_new = count_queries(before, lambda: before.losses(sphere_batch(RAYS), Stage.MATERIAL_INIT))
     some_new = count_queries(after, lambda: after.losses(sphere_batch(RAYS), Stage.MATERIAL_INIT))
@@ -51,20 +51,20 @@ def test_once_enough_is_known_a_quarter_is_rendered_and_as_much_is_shaded():
 
 
 @pytest.mark.parametrize("where", ["the surface moves", "nothing is trained", "it is switched off"])
-def test_every_ray_is_rendered_where(where):
+def test_every_ray_is_rendered_without_replay(where):
     other = filled(fresh=1.0) if where == "it is switched off" else filled()
     other.train(where != "nothing is trained")
     stage = Stage.JOINT if where == "the surface moves" else Stage.MATERIAL_INIT
     assert count_queries(other, lambda: other.losses(sphere_batch(RAYS), stage))["rays"] == RAYS
 
 
-def test_a_borrowed_host_moves_as_its_trainer_likes():
+def test_points_of_a_borrowed_host_are_not_replayed():
     own = filled()
     assert NeilfModel(own.host, own.config, own.facts, borrowed=True).replay.fresh == 1
 
 
-def test_points_come_back_with_their_pixels():
-    """Each point is told by one number, which all that is known of it repeats."""
+def test_replayed_points_keep_their_pixels():
+    """All values of a point are derived from one number, which identifies it."""
     torch.manual_seed(0)
     memory = Replay(0.25, 40)
 
@@ -85,7 +85,7 @@ def test_points_come_back_with_their_pixels():
         torch.testing.assert_close(getattr(together, name), getattr(expected, name))
 
 
-def test_a_run_that_continues_draws_the_same_points():
+def test_a_resumed_run_draws_the_same_points():
     one, other = filled(), model()
     other.load_state_dict(one.state_dict())
     losses = []

@@ -1,4 +1,4 @@
-"""Rows that are remembered."""
+"""The ring buffer of rows."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def held(ring: Ring) -> list[float]:
     return sorted(ring.kept()[:, 0].tolist())
 
 
-def test_the_newest_rows_take_the_place_of_the_oldest():
+def test_new_rows_replace_the_oldest():
     ring = Ring(4, 2)
     ring.keep(rows(1, 2, 3))
     assert held(ring) == [1, 2, 3]
@@ -27,7 +27,7 @@ def test_the_newest_rows_take_the_place_of_the_oldest():
     assert held(ring) == [6, 7, 8, 9], "more than fit: the first"
 
 
-def test_draws_are_of_what_is_there_and_no_more_than_that():
+def test_draws_return_stored_rows():
     torch.manual_seed(0)
     ring = Ring(100, 2)
     assert len(ring.draw(5)) == 0
@@ -40,7 +40,7 @@ def test_draws_are_of_what_is_there_and_no_more_than_that():
     assert (counts[:40] - 50).square().sum() / 50 < 72
 
 
-def test_a_ring_survives_a_checkpoint():
+def test_a_ring_is_restored_from_a_checkpoint():
     ring, again = Ring(4, 2), Ring(4, 2)
     ring.keep(rows(1, 2, 3, 4))
     ring.keep(rows(5))

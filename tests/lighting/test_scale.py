@@ -1,4 +1,4 @@
-"""The scale that light and base colour share: an initial light fixes it, and later fits keep it."""
+"""The common scale of light and base colour: an initial light fixes it, and later fits keep it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.scenes import sphere_model
 
 MEAN = 0.4
 DRIFT = 0.3
-"""Factor by which surfaces became darker since the initial light."""
+"""Factor by which the surfaces became darker after the initial light."""
 
 
 def never(*_: object) -> Evidence:
@@ -60,5 +60,5 @@ def test_the_scale_of_an_initial_light_is_kept():
     assert brightness_after_drift(begins=True) == pytest.approx(1.0, rel=0.15)
 
 
-def test_without_an_initial_light_the_current_base_colour_gives_the_scale():
+def test_without_an_initial_light_the_current_base_colour_defines_the_scale():
     assert brightness_after_drift(begins=False) == pytest.approx(1 / DRIFT, rel=0.3)

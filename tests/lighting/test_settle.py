@@ -1,4 +1,6 @@
-"""Lamps that move: derivatives of what they bring, pieces that become one, and neighbours that stay two."""
+"""Refinement of lamps: derivatives of their contributions, candidates that merge into one lamp, and
+neighbouring lamps that stay separate.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,7 @@ WHITE = Material(torch.ones(600, 3), torch.ones(600, 1), torch.zeros(600, 1))
 
 
 def photographed(lamps: FoundLamps, speckled: bool) -> tuple[Observed, Material, Transport]:
-    """Points under lamps and even light from everywhere."""
+    """Points under lamps and an even light from all directions."""
     seen = points(600)
     seen = dataclasses.replace(seen, position=4 * seen.position)
     of = material(600) if speckled else patches(seen.position)
@@ -62,21 +64,21 @@ def test_derivatives_by_place_and_axis():
         return lamp_kernel(LampPlaces(position, axis), RADIUS, sight, seen, roughness, GGX)
 
     assert torch.autograd.gradcheck(lambda position: kernel(position, places[1].detach()), places[0])
-    # By an axis of zero, a bulb's, there is no derivative: which kind a lamp is does not change.
+    # The zero axis of a bulb has no derivative, because the kind of a lamp does not change.
     turned = places[1].detach()[1:].repeat(2, 1).requires_grad_()
     assert torch.autograd.gradcheck(lambda axis: kernel(places[0].detach(), axis), turned)
 
 
-def test_a_wall_hides_a_lamp():
+def test_a_wall_occludes_a_lamp():
     x = torch.zeros(1, 3)
     lamps = LampPlaces(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -3.0], [0.0, 0.0, -1.0]]), torch.zeros(3, 3))
     assert in_sight(lamps, RADIUS, x, half_room).tolist() == [[True, False, True]]
 
 
 @pytest.mark.parametrize(("evenness", "as_tinted"), [(0.0, 0.03), (EVENNESS, 0.06)])
-def test_a_lamp_in_pieces_becomes_one_where_it_is(evenness, as_tinted):
-    """Where base colour is not known, light near white is likelier: a little of the lamp's tint goes to the
-    surfaces.
+def test_candidates_around_a_lamp_become_one_lamp_at_its_position(evenness, as_tinted):
+    """If the base colour is unknown, a light close to white is preferred: a part of the lamp's tint is
+    assigned to the surfaces.
     """
     true = FoundLamps(TRUE.places[:1], TRUE.intensity[:1])
     offsets = torch.tensor([[0.12, 0.0, 0.05], [-0.1, 0.15, 0.0], [0.0, -0.2, -0.15], [0.3, 0.3, 0.3]])
@@ -91,7 +93,7 @@ def test_a_lamp_in_pieces_becomes_one_where_it_is(evenness, as_tinted):
 
 
 @pytest.mark.parametrize("evenness", [0.0, EVENNESS])
-def test_two_lamps_stay_two_and_come_to_where_they_are(evenness):
+def test_two_lamps_stay_separate_and_move_to_their_positions(evenness):
     torch.manual_seed(0)
     start = FoundLamps(
         LampPlaces(
@@ -121,10 +123,8 @@ def test_a_lamp_is_of_the_kind_that_explains_the_points(number, start):
 
 
 @pytest.mark.parametrize(("evenness", "within"), [(EVENNESS, 0.07), (0.0, math.inf)])
-def test_a_lamp_is_not_held_by_base_colours_that_were_learned_under_it_elsewhere(evenness, within):
-    """Nothing speaks against the lamp in the wrong place but that the surfaces then have its glow painted on
-    them.
-    """
+def test_base_colours_learned_under_a_misplaced_lamp_do_not_keep_it_there(evenness, within):
+    """The only evidence against the misplaced lamp is that the base colours then contain its light."""
     true = FoundLamps(TRUE.places[:1], TRUE.intensity[:1])
     astray = FoundLamps(
         LampPlaces(true.places.position + torch.tensor([[0.15, 0.1, -0.1]]), torch.zeros(1, 3)),
@@ -155,7 +155,7 @@ def test_a_lamp_is_not_held_by_base_colours_that_were_learned_under_it_elsewhere
 
 
 @pytest.mark.parametrize("broken", ["no points", "no lamps", "a pixel that is no number"])
-def test_where_there_is_nothing_to_go_by_lamps_stay(broken):
+def test_without_information_lamps_are_unchanged(broken):
     seen, of, beside = photographed(TRUE, speckled=True)
     start = TRUE
     if broken == "no points":

@@ -1,4 +1,4 @@
-"""What cameras saw of the light: what is remembered, what it is worth, and what a fit makes of it."""
+"""Direct observations of the light: their mean, their weight, and their influence on a fit."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ HEIGHT = 12
 
 
 def gradient(wi: torch.Tensor) -> torch.Tensor:
-    """Radiance of a sky that is bright above, bluish below, and changes slowly."""
+    """A sky that is bright above and bluish below, and varies smoothly."""
     height = wi[..., 2:]
     return (0.3 + 0.2 * height) * torch.tensor([1.0, 1.1, 1.3]) - 0.1 * height * torch.tensor([0.0, 0.0, 1.0])
 
 
 def looks(count: int, below: float = 1.0) -> torch.Tensor:
-    """Directions in which cameras look; none of them above a height."""
+    """Viewing directions of cameras; none of them above a given height."""
     wi = normalize(torch.randn(8 * count, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     return wi[wi[:, 2] <= below][:count]
 
 
 @pytest.mark.parametrize("response", ["linear", "srgb"])
-def test_texels_are_what_their_pixels_show(response):
+def test_texels_have_the_mean_of_their_pixels(response):
     sky, wi = SkySightings(HEIGHT, response), looks(20_000, below=0.2)
     shown = gradient(wi)
     beyond = torch.rand(len(wi), generator=torch.Generator().manual_seed(1)) < 0.5
@@ -48,8 +48,10 @@ def test_texels_are_what_their_pixels_show(response):
     torch.testing.assert_close(known.log_radiance.permute(1, 2, 0)[inside], expected, atol=0.05, rtol=0.0)
 
 
-def test_what_lies_near_counts_for_less():
-    """Half of the pixels of every direction show something else: a wall that each camera sees elsewhere."""
+def test_near_objects_lower_the_weight():
+    """Half of the pixels of every direction show a wall, which is in different directions from different
+    cameras.
+    """
     sky, wi = SkySightings(HEIGHT, "linear"), looks(20_000)
     color = torch.where(torch.arange(len(wi))[:, None] % 2 == 0, 0.1, 1.0).expand(-1, 3)
     sky.remember(wi, color)
@@ -68,7 +70,7 @@ def test_a_clipped_pixel_makes_its_texel_unseen():
     assert (weight[up.abs() < 0.2] > 0.5).all()
 
 
-def test_nothing_seen_is_nothing_known():
+def test_without_observations_all_weights_are_zero():
     sky = SkySightings(HEIGHT, "linear")
     sky.remember(looks(100)[:0], torch.zeros(0, 3))
     known = sky.known()
@@ -77,8 +79,8 @@ def test_nothing_seen_is_nothing_known():
     assert known.misfit(torch.zeros(3, HEIGHT, 2 * HEIGHT)) == 0
 
 
-def test_a_fit_keeps_to_what_was_seen_and_finds_the_rest():
-    """Cameras saw the lower half of the sky and the horizon, surfaces say what is above."""
+def test_a_fit_keeps_observed_texels_and_estimates_the_others():
+    """Cameras observe the lower half of the sky and the horizon; surfaces determine the upper part."""
     torch.manual_seed(0)
     seen, of = points(256), material(256)
     directions = map_directions(HEIGHT, 2 * HEIGHT)

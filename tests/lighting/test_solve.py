@@ -1,4 +1,4 @@
-"""Maps and lamps together: that lamps are found where there are any, and only there."""
+"""Maps and lamps together: lamps are found if there are any, and only then."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ PANEL = LampPlaces(LAMP, normalize(torch.tensor([[-0.7, 0.3, -0.6]]), dim=-1))
 
 
 def table(count: int) -> Observed:
-    """Points on a table, and on a ball of radius 0.25 on it, seen from above."""
+    """Points on a table, and on a ball of radius 0.25 on it, viewed from above."""
     generator = torch.Generator().manual_seed(3)
     half = count // 2
     flat = torch.cat((1.6 * torch.rand(half, 2, generator=generator) - 0.8, torch.zeros(half, 1)), -1)
@@ -46,7 +46,7 @@ def table(count: int) -> Observed:
 
 
 def photographed(lamp: LampPlaces | None, speckled: bool = False) -> tuple[Observed, Material]:
-    """The table under an even sky, with or without a lamp above it that brings about as much light."""
+    """The table under an even sky, with or without a lamp above it that contributes about as much light."""
     seen = table(800)
     of = material(800) if speckled else patches(seen.position)
     sky = EnvironmentLight(12, 0.5)
@@ -85,10 +85,8 @@ def solved(
 
 @pytest.mark.parametrize("true", [BULB, PANEL], ids=["bulb", "panel"])
 @pytest.mark.parametrize("known", [True, False])
-def test_a_lamp_is_found_where_it_is_as_strong_and_which_way_it_shines(true, known):
-    """Base colours that are known may be as uneven as they like; those that are not are even but for
-    edges.
-    """
+def test_a_lamp_is_found_with_its_position_intensity_and_kind(true, known):
+    """Known base colours may vary arbitrarily; unknown ones are constant except for edges."""
     lamps, _ = solved(*photographed(true, speckled=known), rounds=3, config=KNOWN if known else CONFIG)
     assert lamps.lit
     strongest = int(lamps.intensity.sum(-1).argmax())
@@ -98,12 +96,12 @@ def test_a_lamp_is_found_where_it_is_as_strong_and_which_way_it_shines(true, kno
     torch.testing.assert_close(lamps.axis[strongest], true.axis[0], rtol=0, atol=math.radians(10))
 
 
-def test_under_a_sky_alone_no_lamp_is_lit():
+def test_under_only_a_sky_no_lamp_is_lit():
     lamps, _ = solved(*photographed(None), rounds=2)
     assert lamps.lit == 0
 
 
-def test_proposals_keep_what_is_lit_and_stay_clear_of_surfaces():
+def test_proposals_include_lit_lamps_and_keep_clear_of_surfaces():
     torch.manual_seed(0)
     lamps = Lamps(4, 0.06)
     lamps.place(LAMP, torch.ones(1, 3))
@@ -126,7 +124,7 @@ def test_proposals_are_bulbs_and_panels_turned_to_the_scene():
     assert (towards > 0).float().mean() > 0.75
 
 
-def test_neighbours_become_one_lamp_of_their_joint_power():
+def test_neighbouring_lamps_merge_with_their_joint_power():
     position = torch.tensor([[0.0, 0.0, 0.5], [0.06, 0.0, 0.5], [0.8, 0.0, 0.5], [-0.8, 0.0, 0.5]])
     intensity = torch.tensor([[3.0, 3.0, 3.0], [1.0, 1.0, 1.0], [2.0, 0.0, 0.0], [0.01, 0.01, 0.01]])
     axis = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
@@ -139,13 +137,13 @@ def test_neighbours_become_one_lamp_of_their_joint_power():
     assert len(merge(places, torch.zeros(4, 3), torch.ones(4), most=4).intensity) == 0
 
 
-def test_lamps_back_to_back_are_a_bulb():
+def test_panels_back_to_back_become_a_bulb():
     axis = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
     found = merge(LampPlaces(LAMP.expand(2, 3), axis), torch.ones(2, 3), torch.ones(2), most=4)
     torch.testing.assert_close(found.places.axis, torch.zeros(1, 3))
 
 
-def test_before_a_known_map_lamps_are_found_and_the_map_stays():
+def test_lamps_are_found_under_a_known_map_which_is_unchanged():
     seen, of = photographed(BULB)
     known = dataclasses.replace(CONFIG, map="sky.exr")
     environment, lamps = EnvironmentLight(4, 1.0), Lamps(4, 0.06)
@@ -160,25 +158,23 @@ def test_before_a_known_map_lamps_are_found_and_the_map_stays():
     assert 100 < evidence.points < 220  # a part of 800 points is some blocks
     assert (lamps.position[0] - LAMP[0]).norm() < 0.12
     beside = (lamps.position - LAMP).norm(dim=-1) < 0.3
-    # The sky is no unknown that could take a share of it.
+    # The sky is known, so it cannot compensate for a part of the lamp.
     assert lamps.intensity[beside].sum().item() == pytest.approx(0.9 + 0.7 + 0.4, rel=0.15)
 
 
-def test_under_a_known_sky_alone_no_lamp_is_lit():
+def test_under_only_a_known_sky_no_lamp_is_lit():
     seen, of = photographed(None)
     environment, lamps = EnvironmentLight(12, 0.5), Lamps(4, 0.06)
     torch.manual_seed(0)
     known = dataclasses.replace(CONFIG, map="sky.exr")
     evidence = solve(environment, lamps, seen, of, seen.pixel.median().item(), known, first=True)
-    assert evidence.points == 800  # the first time each has its turn
+    assert evidence.points == 800  # in the first decision each point is held back once
     assert lamps.lit == 0
 
 
 @pytest.mark.parametrize("count", [1, 3, 5])
-def test_hardly_any_points_speak_for_no_lamp(count):
-    """Of a few points none or one is kept back: evidence that JSON can hold, and nothing that is not
-    finite.
-    """
+def test_too_few_points_give_no_lamp(count):
+    """Of a few points none or one is held back: the evidence is finite, so that JSON can store it."""
     seen, of = photographed(None)
     few = torch.arange(count)
     lamps, evidence = solved(seen[few], of[few], rounds=1)

@@ -1,4 +1,4 @@
-"""Native calls beside the main thread: results, failures, and a stop that waits for them."""
+"""Native calls in a second thread: results, exceptions, and a stop that waits for the end of the call."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from neilfpp_method import prepare
 from neilfpp_method.prepare.background import in_background, sigterm_as_ctrl_c
 
 
-def test_the_result_comes_back_and_somebody_looks():
+def test_the_result_is_returned_and_progress_is_updated():
     looks = []
     assert in_background(lambda token: time.sleep(0.5) or "done", lambda: looks.append(1)) == "done"
     assert len(looks) >= 2
 
 
-def test_a_failure_is_raised_where_it_was_called():
+def test_an_exception_is_raised_in_the_main_thread():
     def fail(token: object) -> None:
         raise ValueError("broken")
 
@@ -32,7 +32,7 @@ def test_a_failure_is_raised_where_it_was_called():
 
 @contextmanager
 def heard(number: signal.Signals) -> Iterator[None]:
-    """A shell starts its background jobs deaf to Ctrl-C, and these tests may be one."""
+    """Enable Ctrl-C: shells start background jobs with SIGINT ignored, and these tests may be such a job."""
     before = signal.signal(number, signal.default_int_handler)
     try:
         yield
@@ -41,7 +41,7 @@ def heard(number: signal.Signals) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_stop_reaches_the_call_and_waits_for_its_end(number):
+def test_a_stop_cancels_the_call_and_waits_for_its_end(number):
     ended = []
 
     def work(token) -> None:
@@ -58,8 +58,8 @@ def test_a_stop_reaches_the_call_and_waits_for_its_end(number):
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-def test_no_second_sqlite_touches_the_database():
-    """Two SQLite libraries in one process do not see each other's locks; COLMAP then dies of a bus error."""
+def test_no_second_sqlite_library_opens_the_database():
+    """Two SQLite libraries in one process ignore each other's locks; COLMAP then crashes with a bus error."""
     for path in Path(prepare.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             names = (

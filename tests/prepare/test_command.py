@@ -26,7 +26,7 @@ DATA = Path(os.environ.get("NEILFPP_DATA", Path(__file__).parents[2].parent / "s
 
 
 def prepare(images: Path, out: Path, *options: str) -> int:
-    """Run the command; without a dense cloud, which takes most of the time, unless a test asks for it."""
+    """Run the command, without a dense cloud, which takes most of the time, unless a test requests it."""
     cloud = () if "--cloud" in options else ("--cloud", "sparse")
     return main(["prepare", str(images), "--out", str(out), *cloud, *options])
 
@@ -47,7 +47,7 @@ def prepared(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def own(photos: Path, tmp_path: Path) -> Path:
-    """A copy of the photographs, to be spoilt."""
+    """A copy of the photographs, which a test may change."""
     return Path(shutil.copytree(photos, tmp_path / "photos"))
 
 
@@ -65,13 +65,13 @@ def to_truth(capture, poses: dict[str, np.ndarray]):
     return scale, rotation, shift, centres.max(), max(rotations)
 
 
-def test_the_cameras_are_where_they_were(prepared):
+def test_the_camera_poses_are_accurate(prepared):
     capture = load_capture(prepared)
     assert len(capture.views) == VIEWS
     _, rotation, _, centres, rotations = to_truth(capture, {f"{i:03}": pose(i, VIEWS) for i in range(VIEWS)})
     assert centres < 0.005
     assert rotations < 0.2
-    # The cameras are held level, so that the world's up is known as well.
+    # The cameras are level, so the up direction of the world is known as well.
     assert rotation[2, 2] == pytest.approx(1.0, abs=1e-4)
     for view in capture.views:
         assert view.camera.lens.model == "SIMPLE_RADIAL"
@@ -79,7 +79,7 @@ def test_the_cameras_are_where_they_were(prepared):
         assert view.camera.fx == pytest.approx(FOCAL * WIDTH, rel=0.01)
 
 
-def test_the_pixels_stay_linear_and_as_they_are(photos, prepared):
+def test_the_pixels_are_linear_and_unchanged(photos, prepared):
     capture = load_capture(prepared)
     assert capture.hdr
     for view in capture.views:
@@ -119,14 +119,14 @@ def test_the_folder_has_a_split_a_summary_and_other_formats(prepared):
         assert len(other.views) == VIEWS
 
 
-def test_what_is_finished_is_left_as_it_is(photos, prepared, capsys):
+def test_a_finished_capture_is_unchanged(photos, prepared, capsys):
     before = {path: path.stat().st_mtime_ns for path in prepared.rglob("*")}
     assert prepare(photos, prepared, "--cloud", "dense", "--also", "nerfstudio", "neilf") == 0
     assert "already finished" in capsys.readouterr().out
     assert {path: path.stat().st_mtime_ns for path in prepared.rglob("*")} == before
 
 
-def test_a_stopped_command_says_how_it_continues_and_does(photos, tmp_path, monkeypatch, capfd):
+def test_a_stopped_command_prints_how_to_continue_and_continues(photos, tmp_path, monkeypatch, capfd):
     out = tmp_path / "capture"
 
     def stop(*_: object) -> None:
@@ -151,7 +151,7 @@ def test_a_stopped_command_says_how_it_continues_and_does(photos, tmp_path, monk
     expected = 4.0 * photograph(pose(4, VIEWS), (camera.width, camera.height), camera.fx / camera.width)
     difference = np.abs(read_image(capture.views[4].image).pixels - expected)[4:-4, 4:-4]
     assert np.median(difference) < 0.03 * np.median(expected)
-    # Other photographs: nothing of it holds any more.
+    # With other photographs, all steps are repeated.
     monkeypatch.undo()
     more = Path(shutil.copytree(photos, tmp_path / "more"))
     (more / "000.exr").unlink()
@@ -160,7 +160,7 @@ def test_a_stopped_command_says_how_it_continues_and_does(photos, tmp_path, monk
     assert not (out / "images" / "000.exr").exists()
 
 
-def test_blurred_and_doubled_photographs_are_left_out_when_asked(own, tmp_path, capsys):
+def test_blurred_and_duplicate_photographs_are_left_out_with_auto(own, tmp_path, capsys):
     blurred, doubled = "004", "009"
     pixels = read_image(own / f"{blurred}.exr").pixels
     write_exr(own / f"{blurred}.exr", {"RGB": cv2.GaussianBlur(pixels, (0, 0), 1.5)})
@@ -179,7 +179,7 @@ def test_blurred_and_doubled_photographs_are_left_out_when_asked(own, tmp_path, 
     assert f"left out: {doubled}, the same picture as another" in said
 
 
-def test_problems_of_the_photographs_are_said(own, tmp_path, capsys):
+def test_problems_of_the_photographs_are_reported(own, tmp_path, capsys):
     path = own / "002.exr"
     write_exr(path, {"RGB": 4.0 * read_image(path).pixels})
     assert prepare(own, tmp_path / "out") == 0
@@ -191,7 +191,7 @@ def test_problems_of_the_photographs_are_said(own, tmp_path, capsys):
 def test_sub_folders_two_sizes_and_display_values(tmp_path):
     left, right = tmp_path / "photos" / "left", tmp_path / "photos" / "right"
     make_photos(left, 6, (WIDTH, 180), hdr=False)
-    for i in range(6):  # a second, smaller camera that sees the same
+    for i in range(6):  # a second camera with smaller images of the same scene
         pixels = photograph(pose(i, 6), (200, 150))
         write_png(right / f"{i:03}.png", np.rint(255 * pixels ** (1 / 2.2)).astype(np.uint8))
     assert prepare(tmp_path / "photos", tmp_path / "out", "--matching", "sequential") == 0
@@ -207,14 +207,14 @@ def test_sub_folders_two_sizes_and_display_values(tmp_path):
     assert focal[200] == pytest.approx(FOCAL * 200, rel=0.01)
 
 
-def test_look_alikes_are_found_by_words_of_their_own(own, tmp_path):
+def test_similar_images_are_found_with_a_vocabulary_of_the_capture(own, tmp_path):
     for i in (0, 1, 2, 3):
         (own / f"{i:03}.exr").unlink()
     assert prepare(own, tmp_path / "out", "--matching", "vocabulary") == 0
     assert len(load_capture(tmp_path / "out").views) == VIEWS - 4
 
 
-def test_raw_files_are_developed_and_what_is_saturated_stays_marked(tmp_path, monkeypatch):
+def test_raw_files_are_developed_and_saturated_pixels_are_marked(tmp_path, monkeypatch):
     folder = tmp_path / "photos"
     folder.mkdir()
     for i in range(5):
@@ -271,7 +271,7 @@ def test_a_colmap_project_keeps_its_poses_and_points(prepared, tmp_path):
 
 
 def refused(capfd, images: Path, out: Path, *options: str, says: str) -> str:
-    """The command ends with one line, and no capture is left behind."""
+    """Check that the command ends with one line and leaves no capture behind."""
     assert prepare(images, out, *options) == 2
     (line,) = capfd.readouterr().err.strip().splitlines()
     assert line.startswith("error: ")
@@ -303,7 +303,7 @@ def test_no_features(tmp_path, capfd):
     refused(capfd, tmp_path / "photos", tmp_path / "out", says="have features")
 
 
-def test_images_of_unlike_things(tmp_path, capfd):
+def test_images_without_common_features(tmp_path, capfd):
     for i in range(4):
         rng = np.random.default_rng(i)
         pixels = np.kron(rng.random((30, 40, 1)), np.ones((4, 4, 3)))
@@ -328,7 +328,7 @@ def test_less_than_sixty_per_cent_placed(own, tmp_path, capfd):
     assert "left out because they could not be placed: other0" in capfd.readouterr().out
 
 
-def test_two_sizes_that_are_to_share_a_camera(own, tmp_path, capfd):
+def test_images_of_two_sizes_cannot_share_a_camera(own, tmp_path, capfd):
     write_exr(own / "009.exr", {"RGB": photograph(pose(1, VIEWS), (200, 150))})
     refused(capfd, own, tmp_path / "out", "--cameras", "shared", says="009.exr: 200×150 pixels")
 
@@ -338,7 +338,7 @@ def test_two_kinds_of_images(own, tmp_path, capfd):
     refused(capfd, own, tmp_path / "out", says="is linear and")
 
 
-def test_two_images_of_one_name(own, tmp_path, capfd):
+def test_two_images_with_the_same_name(own, tmp_path, capfd):
     write_png(own / "003.png", np.zeros((180, WIDTH, 3), np.uint8))
     line = refused(capfd, own, tmp_path / "out", "--response", "linear", says="named '003'")
     assert "003.exr" in line
@@ -346,7 +346,7 @@ def test_two_images_of_one_name(own, tmp_path, capfd):
 
 
 @pytest.mark.parametrize("every", ["1", "-3"])
-def test_a_split_that_leaves_nothing(photos, tmp_path, capfd, every):
+def test_an_impossible_split(photos, tmp_path, capfd, every):
     refused(capfd, photos, tmp_path / "out", f"--test-every={every}", says="cannot be held out")
 
 
@@ -362,14 +362,14 @@ def test_an_output_folder_that_cannot_be_written(photos, tmp_path, capfd):
     refused(capfd, photos, tmp_path / "file", says="not a folder")
 
 
-def test_an_output_folder_that_is_somebody_elses(photos, tmp_path, capfd):
+def test_an_output_folder_with_other_files(photos, tmp_path, capfd):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "letter.txt").write_text("dear")
     refused(capfd, photos, tmp_path / "out", says="not empty")
     assert (tmp_path / "out" / "letter.txt").read_text() == "dear"
 
 
-def test_images_and_capture_within_one_another(own, tmp_path, capfd):
+def test_images_and_capture_inside_one_another(own, tmp_path, capfd):
     refused(capfd, own, own / "out", says="inside the other")
     refused(capfd, own, tmp_path, says="inside the other")
 

@@ -1,4 +1,4 @@
-"""Stereo against depths, planes and normals that are known in closed form."""
+"""Stereo compared with depths, planes and normals in closed form."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def camera(w2c: np.ndarray, size: tuple[int, int] = SIZE) -> Camera:
 
 
 def rays(view: Camera) -> np.ndarray:
-    """Directions of unit depth, in the world."""
+    """Directions of unit depth in the world frame."""
     rows, columns = np.mgrid[: view.height, : view.width] + 0.5
     local = np.stack([(columns - view.cx) / view.fx, (rows - view.cy) / view.fy, np.ones_like(rows)], axis=-1)
     return local @ view.w2c[:3, :3]
 
 
 def plane_depth(view: Camera, normal: np.ndarray, offset: float) -> np.ndarray:
-    """The depth at which each pixel meets the plane normal · x = offset."""
+    """The depth at which each pixel's ray hits the plane normal · x = offset."""
     eye = view.c2w[:, 3]
     return ((offset - eye @ normal) / (rays(view) @ normal)).astype(np.float32)
 
@@ -40,7 +40,9 @@ def corner_depth(view: Camera) -> np.ndarray:
 
 
 def picture(i: int) -> np.ndarray:
-    """Grey, at three times the size and then averaged: the noise is finer than a pixel."""
+    """A grey image, computed at three times the size and averaged, because the noise is finer than a
+    pixel.
+    """
     fine = photograph(pose(i, 9), (3 * SIZE[0], 3 * SIZE[1])).mean(axis=2)
     return cv2.resize(fine, SIZE, interpolation=cv2.INTER_AREA)
 
@@ -57,7 +59,7 @@ def test_the_sweep_finds_the_depth_of_the_corner():
     assert np.quantile(inverse, 0.9) < 0.5 * pixel
 
 
-def test_without_neighbours_or_texture_nothing_is_known():
+def test_without_neighbours_or_texture_depth_is_unknown():
     views = [GreyView(camera(pose(i, 9)), np.full(SIZE[::-1], 0.5, np.float32)) for i in range(3)]
     assert not sweep(views[0], [], BOX).any()
     assert not sweep(views[0], views[1:], BOX).any()
@@ -72,7 +74,7 @@ def test_sources_are_neither_too_close_nor_too_far():
 
 
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.3, 0.2, 0.93), (-0.5, 0.3, 0.81)])
-def test_a_plane_is_its_own_fit(normal):
+def test_the_fit_of_a_plane_is_exact(normal):
     view = camera(pose(2, 9))
     normal = np.array(normal) / np.linalg.norm(normal)
     depth = plane_depth(view, normal, 0.1)
@@ -85,13 +87,13 @@ def test_a_plane_is_its_own_fit(normal):
     np.testing.assert_allclose(fitted.normal[inner], np.broadcast_to(normal, (inner.sum(), 3)), atol=1e-3)
 
 
-def test_noise_has_no_plane():
+def test_noise_gives_no_plane():
     view = camera(pose(2, 9))
     depth = 1.5 + np.random.default_rng(0).random(SIZE[::-1]).astype(np.float32)
     assert not fit_planes(view, depth, step=0.005).depth.any()
 
 
-def test_what_the_views_agree_on_is_fused_once_and_what_one_says_is_not():
+def test_depths_that_views_agree_on_are_fused_once():
     cameras = [camera(pose(i, 7)) for i in range(7)]
     depths = [corner_depth(view).astype(np.float32) for view in cameras]
     rng = np.random.default_rng(1)

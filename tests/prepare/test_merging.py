@@ -1,6 +1,4 @@
-"""Exposure brackets among photographs: which folders are brackets, and a capture made from them end to
-end.
-"""
+"""Exposure brackets among photographs: which folders contain brackets, and a capture from them end to end."""
 
 from __future__ import annotations
 
@@ -39,13 +37,13 @@ def write(path: Path, radiance: np.ndarray, time: float, focal: float | None = N
 
 
 def radiance(i: int) -> np.ndarray:
-    """The corner, with glints on its texture that are clipped even at the shortest exposure."""
+    """The corner with highlights on its texture that are clipped even at the shortest exposure."""
     seen = photograph(pose(i, POSES), SIZE)
     return np.where(seen.min(axis=-1, keepdims=True) > 0.75, 40.0 * seen, 4.0 * seen)
 
 
 def plain(root: Path, times: Sequence[Sequence[float]], name: str = "{p}_{i}.png") -> Path:
-    """Small pictures of nothing much, a pose each for every entry of `times`."""
+    """Small images without content; each entry of `times` is a pose with its exposures."""
     ramp = np.linspace(0.02, 1.5, 24 * 16).reshape(16, 24, 1).repeat(3, axis=2)
     for p, exposures in enumerate(times):
         for i, time in enumerate(exposures):
@@ -94,7 +92,7 @@ def test_brackets_become_a_linear_capture(tmp_path: Path, capsys) -> None:
     assert "already finished" in capsys.readouterr().out
 
 
-def test_brackets_taken_by_hand_say_so_also_after_a_stop(tmp_path: Path, monkeypatch) -> None:
+def test_handheld_brackets_are_reported_also_after_a_stop(tmp_path: Path, monkeypatch) -> None:
     for p in range(3):
         for i, time in enumerate((1 / 32, 1 / 10, 1 / 3)):
             write(tmp_path / "photos" / f"{p}_{i}.png", np.roll(radiance(p), 3 * i if p else 0, axis=1), time)
@@ -122,7 +120,7 @@ def merged(photos: Photos, folder: Path):
         return merge_photos(photos, brackets_among(photos, "auto"), "srgb", folder, open_bar)
 
 
-def test_a_stopped_merge_goes_on_and_is_done_once(tmp_path: Path, monkeypatch) -> None:
+def test_a_stopped_merge_continues_and_repeats_nothing(tmp_path: Path, monkeypatch) -> None:
     photos = survey(plain(tmp_path / "photos", [TIMES] * 4), "auto")
     merge, seen = bracket_folder.merge, []
 
@@ -168,7 +166,7 @@ def test_brackets_are_found(tmp_path: Path, name: str) -> None:
     assert among(root, "off") is None
 
 
-def test_brackets_about_a_metered_exposure_are_found(tmp_path: Path) -> None:
+def test_brackets_around_a_metered_exposure_are_found(tmp_path: Path) -> None:
     assert len(among(plain(tmp_path, [[t * f for t in TIMES] for f in (1, 1.6, 0.5)]))) == 3
 
 
@@ -197,14 +195,14 @@ def test_photographs_beside_brackets_in_folders_are_not_lost(tmp_path: Path) -> 
     "name", ["{p}_{i}.png", "{p}/{i}.png", "IMG_{n:04}.png", "IMG{n:04}.png", "listed_{n:04}.png"]
 )
 @pytest.mark.parametrize("damaged", [0, 4, 11])
-def test_a_damaged_photograph_costs_its_own_bracket_alone(tmp_path: Path, name: str, damaged: int) -> None:
+def test_a_damaged_photograph_removes_only_its_own_bracket(tmp_path: Path, name: str, damaged: int) -> None:
     root = plain(tmp_path / "photos", [TIMES] * 4, name)
     paths = sorted(path for path in root.rglob("*.png"))
     if name.startswith("listed"):
         poses = {f"pose{p}": [path.name for path in paths[3 * p : 3 * p + 3]] for p in range(4)}
         (root / "brackets.json").write_text(json.dumps(poses))
     paths[damaged].write_bytes(b"no picture")
-    if not name.startswith("IMG"):  # one more would break the order of a sequence
+    if not name.startswith("IMG"):  # another file would change the order of the sequence
         (root / "scrap.jpg").write_bytes(b"nor this")
     spoilt = {path for path in paths if paths.index(path) // 3 == damaged // 3}
     photos = survey(root, "auto")
@@ -213,7 +211,7 @@ def test_a_damaged_photograph_costs_its_own_bracket_alone(tmp_path: Path, name: 
     assert "2 photographs in no bracket were left out" in merged(photos, tmp_path / "merged").remark
 
 
-def test_a_list_says_what_is_used(tmp_path: Path) -> None:
+def test_a_list_selects_the_photographs(tmp_path: Path) -> None:
     root = plain(tmp_path / "photos", [TIMES] * 4, "IMG_{n:04}.png")
     listed = {f"pose{p}": [f"IMG_{3 * p + i:04}.png" for i in range(3)] for p in range(3)}
     (root / "brackets.json").write_text(json.dumps(listed))
@@ -235,7 +233,7 @@ def test_a_list_says_what_is_used(tmp_path: Path) -> None:
         ({"exposures.txt": "0_0.png 1/60"}, r"0_1\.png: no exposure time; .*--brackets off"),
     ],
 )
-def test_a_list_that_is_wrong_is_refused(tmp_path: Path, lists, complaint: str) -> None:
+def test_a_wrong_list_is_refused(tmp_path: Path, lists, complaint: str) -> None:
     plain(tmp_path, [TIMES] * 3)
     (tmp_path / "notes.txt").write_text("sunny")
     for name, content in lists.items():

@@ -1,4 +1,4 @@
-"""What the headers tell: names, cameras, exposures; and what is refused."""
+"""Names, cameras and exposures from the headers of photographs, and refused folders."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_names_cameras_and_focal_lengths(tmp_path):
     assert survey(tmp_path, "linear").linear
 
 
-def test_exif_tells_how_a_camera_was_held(tmp_path):
+def test_exif_gives_the_orientation_of_a_camera(tmp_path):
     for i, orientation in enumerate((None, 6, 8, 99)):
         exif = Image.Exif()
         if orientation:
@@ -67,7 +67,7 @@ def test_unreadable_files_are_listed(tmp_path):
         survey(tmp_path, "auto")
 
 
-def test_pixels_that_are_no_radiance_are_invalid(tmp_path):
+def test_pixels_without_valid_radiance_are_marked(tmp_path):
     pixels = np.full((30, 40, 3), 0.5, np.float32)
     pixels[0, 0], pixels[1, 1, 2], pixels[2, 2, 0] = np.nan, np.inf, -1.0
     write_exr(tmp_path / "a.exr", {"RGB": pixels})
@@ -96,7 +96,7 @@ def test_linear_copies_share_one_exposure(tmp_path):
     assert copies["bright"] == 1.0
 
 
-def test_display_values_are_copied_as_they_are(tmp_path):
+def test_display_values_are_copied_unchanged(tmp_path):
     for i in range(3):
         write_png(tmp_path / f"{i}.png", np.full((30, 40, 3), 50 * i, np.uint8))
     write_copies(survey(tmp_path, "auto"), tmp_path / "work", lambda: None)
@@ -105,7 +105,7 @@ def test_display_values_are_copied_as_they_are(tmp_path):
     ] == pytest.approx([0, 50, 100])
 
 
-def test_exposures_count_where_all_are_known_and_the_pixels_linear(tmp_path):
+def test_exposures_are_used_if_all_are_known_and_pixels_are_linear(tmp_path):
     for name, time in (("a", 1 / 100), ("b", 1 / 50), ("c", 1 / 25)):
         jpeg(tmp_path / f"{name}.jpg", time=time)
     assert relative_exposures(survey(tmp_path, "linear")) == pytest.approx(

@@ -1,4 +1,4 @@
-"""Normals and outliers on a sphere, where both are known."""
+"""Normals and outliers on a sphere, for which both are known."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def seen(position: np.ndarray) -> SparsePoints:
     return SparsePoints(position, np.full(len(position), 0.5), np.full(len(position), 5), outward)
 
 
-def test_normals_point_to_those_who_see_them():
+def test_normals_point_towards_the_cameras():
     position = sphere(noise=0.002)
     for side in (1.0, -1.0):
         normal, flat = estimate_normals(position, side * position)
@@ -39,13 +39,13 @@ def test_normals_point_to_those_who_see_them():
         assert np.quantile(angle[flat], 0.95) < 12
 
 
-def test_a_heap_of_points_has_no_normal():
+def test_points_that_are_not_flat_have_no_normal():
     position = np.random.default_rng(1).normal(size=(500, 3))
     _, flat = estimate_normals(position, position)
     assert flat.mean() < 0.1
 
 
-def test_what_is_alone_uncertain_or_hardly_seen_is_left_out():
+def test_isolated_and_inaccurate_points_are_left_out():
     good = sphere(1000)
     rng = np.random.default_rng(2)
     alone = 3.0 + rng.random((20, 3)) * 4
@@ -62,7 +62,7 @@ def test_what_is_alone_uncertain_or_hardly_seen_is_left_out():
     np.testing.assert_allclose(np.linalg.norm(cloud.normal, axis=1), 1.0)
 
 
-def test_a_handful_of_points_is_no_cloud():
+def test_too_few_points_give_no_cloud():
     assert len(oriented(seen(sphere(8))).position) == 0
 
 
@@ -73,7 +73,7 @@ def test_outliers_of_a_given_cloud():
     np.testing.assert_array_equal(cloud.position, cloud.normal)
 
 
-def test_points_that_no_image_sees_look_nowhere_and_are_left_out():
+def test_points_without_observations_are_left_out():
     model = pycolmap.Reconstruction()
     for point in sphere(50):
         model.add_point3D(point, pycolmap.Track(), np.zeros(3, np.uint8))

@@ -1,22 +1,22 @@
-"""What is done stays done, what changes is done again, what was interrupted goes on."""
+"""Complete steps are kept, changed steps are repeated, and interrupted steps continue."""
 
 from __future__ import annotations
 
 from neilfpp_method.prepare.steps import begin, stamp
 
 
-def test_a_step_is_to_do_until_it_is_complete(tmp_path):
+def test_a_step_is_incomplete_until_it_is_marked(tmp_path):
     step = begin(tmp_path / "a", size=3)
     assert step.result is None
     (step.folder / "half").write_text("done")
     again = begin(tmp_path / "a", size=3)
     assert again.result is None
-    assert (again.folder / "half").is_file()  # an interrupted step finds what it has left
+    assert (again.folder / "half").is_file()  # an interrupted step keeps its files
     again.complete({"count": 7})
     assert begin(tmp_path / "a", size=3).result == {"count": 7}
 
 
-def test_other_inputs_start_from_nothing(tmp_path):
+def test_other_inputs_start_with_an_empty_folder(tmp_path):
     step = begin(tmp_path / "a", size=3)
     (step.folder / "old").write_text("old")
     step.complete({})
@@ -25,7 +25,7 @@ def test_other_inputs_start_from_nothing(tmp_path):
     assert not (fresh.folder / "old").exists()
 
 
-def test_what_changes_changes_all_that_follows(tmp_path):
+def test_a_change_repeats_all_later_steps(tmp_path):
     for size, known in ((3, None), (3, {}), (4, None)):
         first = begin(tmp_path / "a", size=size)
         first.complete({})
@@ -34,7 +34,7 @@ def test_what_changes_changes_all_that_follows(tmp_path):
         second.complete({})
 
 
-def test_a_damaged_marker_means_to_do(tmp_path):
+def test_a_step_with_a_damaged_marker_is_repeated(tmp_path):
     step = begin(tmp_path / "a")
     step.complete({})
     for text in ("", "[]", "{"):

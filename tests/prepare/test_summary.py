@@ -1,4 +1,4 @@
-"""What a person is told: lines, remarks and pictures."""
+"""The summary for the user: lines, remarks and images."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_lines_have_the_figures():
     assert "with the poses" in Summary((), (), (), 5, 0, "none", 1.0, "box", ()).lines[0]
 
 
-def test_a_small_part_is_refused_with_what_to_do():
+def test_a_small_model_is_refused_with_a_remedy():
     refuse_partial(["x"] * 4, [6, 2])  # six of ten are enough
     with pytest.raises(
         UserError, match=r"only 5 of 10 images.*models of 4; not placed: x, x, x, …; .*--allow-partial"
@@ -59,7 +59,7 @@ def has(picture: np.ndarray, color: tuple[int, int, int]) -> bool:
     return bool((np.abs(picture.astype(int) - color).max(axis=-1) <= 12).any())
 
 
-def test_the_pictures_show_cameras_points_and_failures(tmp_path):
+def test_the_images_show_cameras_points_and_failures(tmp_path):
     views = [
         View(f"{i}", i, Camera(200.0, 200.0, 80.0, 60.0, 160, 120, pose(i, 5)), tmp_path / f"{i}.png")
         for i in range(5)

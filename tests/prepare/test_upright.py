@@ -1,4 +1,6 @@
-"""Up is found again after the world has been turned, for rings of cameras, half rings and a single one."""
+"""The up direction is recovered after the world has been rotated, for full rings of cameras, half rings and
+single cameras.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ def ring(views: int, arc: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("arc", [360.0, 180.0, 60.0])
-def test_level_cameras_tell_up(arc):
+def test_level_cameras_define_up(arc):
     turn = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
     found = upright_rotation(ring(12, arc) @ turn.T)
     np.testing.assert_allclose(found @ turn @ [0, 0, 1], [0, 0, 1], atol=1e-9)
@@ -26,8 +28,8 @@ def test_level_cameras_tell_up(arc):
 
 
 def pixel_after(orientation: int) -> np.ndarray:
-    """Where the axes of a stored picture, x right and y down, point in the picture that Pillow shows for an
-    orientation.
+    """Directions of the axes of a stored image, x right and y down, in the image that Pillow shows for an
+    EXIF orientation.
     """
     axes = []
     for at in ((1, 0), (2, 0), (1, 1)):
@@ -40,7 +42,7 @@ def pixel_after(orientation: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
-def test_cameras_on_their_side_tell_up_by_their_orientation(orientation):
+def test_cameras_on_their_side_define_up_by_their_orientation(orientation):
     shown = np.eye(3)
     shown[:2, :2] = pixel_after(orientation)
     turn = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
@@ -53,17 +55,17 @@ def test_cameras_on_their_side_tell_up_by_their_orientation(orientation):
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(rotation, np.array([0.0, 0.0, 3.0])))
     turn_upright(model, {f"{i}.png": orientation for i in range(12)})
     for i, image in model.images.items():
-        # As before the world was turned, but for a turn about the upright axis.
+        # The same as before the rotation, except for a rotation about the up axis.
         back = (shown @ image.cam_from_world().rotation.matrix()).T @ ring(12, 360)[i - 1]
         np.testing.assert_allclose(back @ [0, 0, 1], [0, 0, 1], atol=1e-9)
 
 
-def test_cameras_that_all_look_alike_have_their_own_up():
+def test_cameras_with_one_orientation_define_up_by_their_own():
     rotations = np.repeat(pose(3, 9)[None, :3, :3], 4, axis=0)
     up = upright_rotation(rotations) @ -rotations[0, 1]
     np.testing.assert_allclose(up, [0, 0, 1], atol=1e-9)
 
 
-def test_cameras_that_contradict_one_another_leave_the_world_as_it_is():
+def test_contradictory_cameras_leave_the_world_unchanged():
     down = np.diag([1.0, -1.0, -1.0])
     np.testing.assert_array_equal(upright_rotation(np.stack([np.eye(3), down])), np.eye(3))

@@ -1,8 +1,8 @@
-"""A corner of a room with noise on its floor and two walls, photographed along an arc: everything known, easy
-to match.
+"""A corner of a room with noise textures on its floor and two walls, photographed along an arc; everything is
+known and easy to match.
 
-Rays are met with the planes in NumPy, apart from the package's cameras. World +z is up; all coordinates of
-what is seen lie between 0 and 1.
+Rays are intersected with the planes in NumPy, without the package's cameras. World +z is up; all visible
+coordinates lie between 0 and 1.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ TEXTURES = [noise(seed) for seed in range(3)]
 
 
 def pose(i: int, views: int, arc: float = 70.0) -> np.ndarray:
-    """World to camera: on an arc about the corner, at two heights by turns."""
+    """World to camera: on an arc around the corner, alternately at two heights."""
     azimuth, elevation = np.radians(45 + arc * (i / max(views - 1, 1) - 0.5)), np.radians(30 + 12 * (i % 2))
     outward = np.array(
         [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
@@ -49,7 +49,7 @@ def pose(i: int, views: int, arc: float = 70.0) -> np.ndarray:
 
 
 def photograph(w2c: np.ndarray, size: tuple[int, int], focal: float = FOCAL) -> np.ndarray:
-    """Linear radiance (H, W, 3); black beside the corner."""
+    """Linear radiance (H, W, 3); black outside of the corner."""
     width, height = size
     rows, columns = np.mgrid[:height, :width] + 0.5
     rays = np.stack(
@@ -80,15 +80,15 @@ def make_photos(
         if hdr:
             write_exr(
                 folder / f"{name.format(i)}.exr", {"RGB": 4.0 * pixels}
-            )  # an exposure that no display shows
+            )  # an exposure outside of the display range
         else:
             write_png(folder / f"{name.format(i)}.png", np.rint(255 * pixels ** (1 / 2.2)).astype(np.uint8))
     return poses
 
 
 def alignment(found: np.ndarray, true: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """The similarity (scale, rotation, shift) that takes points `found` to `true` best, by Umeyama's closed
-    form.
+    """The similarity (scale, rotation, shift) that maps points `found` to `true` with the least squared
+    error, by Umeyama's closed form.
     """
     a, b = found - found.mean(0), true - true.mean(0)
     u, s, vt = np.linalg.svd(b.T @ a)
@@ -99,5 +99,5 @@ def alignment(found: np.ndarray, true: np.ndarray) -> tuple[float, np.ndarray, n
 
 
 def angle(a: np.ndarray, b: np.ndarray) -> float:
-    """Degrees between two rotations."""
+    """Angle between two rotations, degrees."""
     return float(np.degrees(np.arccos(np.clip((np.trace(a @ b.T) - 1) / 2, -1, 1))))

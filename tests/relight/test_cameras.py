@@ -1,4 +1,4 @@
-"""Where pictures are taken from."""
+"""Cameras of relit images."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def middles(width: int, height: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("lens", [None, Lens("OPENCV", (0.05, -0.01, 0.002, 0.001))])
-def test_rays_through_pixels_are_those_of_the_capture(capture, lens):
+def test_rays_through_pixels_agree_with_the_capture(capture, lens):
     camera = dataclasses.replace(capture.views[0].camera, lens=lens)
     rays, shown = rays_through(camera, middles(camera.width, camera.height))
     expected = camera_rays(camera)
@@ -44,7 +44,7 @@ def test_points_between_pixels_project_back(capture):
     assert seen.pixel.numpy() == pytest.approx(points.numpy(), abs=1e-3)
 
 
-def test_another_size_shows_the_same(capture):
+def test_another_size_shows_the_same_scene(capture):
     camera = capture.views[0].camera
     double = resized(camera, 2.0)
     assert (double.width, double.height) == (48, 36)
@@ -72,7 +72,7 @@ def test_views_keep_their_size_up_to_a_width(capture):
         view_shots(capture, (), None, None)
 
 
-def test_a_turntable_goes_once_around_and_looks_at_the_middle(capture):
+def test_a_turntable_is_a_circle_around_the_centre(capture):
     shots = turntable(capture, 8, None, None)
     assert [shot.name for shot in shots][:2] == ["turn_0000", "turn_0001"]
     eyes = np.stack([shot.camera.c2w[:, 3] for shot in shots])

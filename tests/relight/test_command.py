@@ -1,5 +1,4 @@
-"""`neilfpp relight` from end to end on tiny runs: with a surface that was found, and with a mesh that was
-given."""
+"""`neilfpp relight` from end to end on tiny runs, with a recovered surface and with a given mesh."""
 
 from __future__ import annotations
 
@@ -48,19 +47,19 @@ def trained(folder: Path, capture: Path, *options: str) -> Path:
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory, capture) -> Path:
-    """A run that has found its surface and an environment map."""
+    """A run with a recovered surface and an environment map."""
     return trained(tmp_path_factory.mktemp("runs") / "found", capture, "--preset", "tiny_map")
 
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory, capture) -> Path:
-    """A run with the capture's mesh, and a light that is free at every point."""
+    """A run with the capture's mesh and a light that is free at every point."""
     return trained(tmp_path_factory.mktemp("runs") / "given", capture, "--preset", "tiny", "--host", "mesh")
 
 
 @pytest.fixture(scope="module")
 def sky(tmp_path_factory) -> Path:
-    """Light from +x, and a little from everywhere."""
+    """Light from +x, and a little from all directions."""
     radiance = np.full((8, 16, 3), 0.2, np.float32)
     radiance[3:5, 3:5] = (8.0, 4.0, 2.0)
     path = tmp_path_factory.mktemp("light") / "studio.exr"
@@ -105,8 +104,8 @@ def test_a_run_under_another_light(request, sky, which, capfd):
     assert not made["lamps"]
 
 
-def test_the_light_comes_from_where_the_map_has_it(given, sky, tmp_path):
-    """The mesh is a ball: half of it faces the sun at +x, and after half a turn the other half."""
+def test_the_light_comes_from_the_direction_in_the_map(given, sky, tmp_path):
+    """The mesh is a ball: one half of it faces the sun at +x, and after a rotation by 180° the other half."""
     means = {}
     for turn in (0, 180):
         out = tmp_path / str(turn)
@@ -123,14 +122,14 @@ def test_the_light_comes_from_where_the_map_has_it(given, sky, tmp_path):
     assert (film.get(cv2.CAP_PROP_FRAME_WIDTH), film.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (24, 18)
 
 
-def test_its_own_light_keeps_its_lamps(found):
+def test_the_own_light_includes_the_lamps(found):
     assert relit(found, "--scale", 0.5) == 0
     made = json.loads((found / "relit" / "own" / "000.json").read_text())
     assert made["lamps"]
     assert made["width"] == 12
 
 
-def test_what_is_there_is_not_made_again(given, sky, tmp_path, capfd):
+def test_existing_images_are_not_rendered_again(given, sky, tmp_path, capfd):
     options = ("--env", sky, "--out", tmp_path)
     assert relit(given, *options) == 0
     picture = tmp_path / "studio" / "000.exr"
@@ -143,7 +142,7 @@ def test_what_is_there_is_not_made_again(given, sky, tmp_path, capfd):
     assert picture.stat().st_mtime_ns == before
     assert relit(given, *options, "--rotate", 90, "--force") == 0
     assert picture.stat().st_mtime_ns > before
-    # A picture whose record is missing was not finished.
+    # An image without a record is unfinished.
     picture.with_suffix(".json").unlink()
     before = picture.stat().st_mtime_ns
     assert relit(given, *options, "--rotate", 90) == 0
@@ -164,12 +163,12 @@ def test_the_default_number_of_samples_is_the_same_setting_as_that_number(given,
     assert json.loads(record.read_text())["spp"] is None
 
 
-def test_views_are_chosen_by_name(given, sky, tmp_path):
+def test_views_are_selected_by_name(given, sky, tmp_path):
     assert relit(given, "--env", sky, "--out", tmp_path, "--views", "002", "000") == 0
     assert {path.stem for path in (tmp_path / "studio").iterdir()} == {"000", "002"}
 
 
-def test_another_map_of_the_same_name_is_told_apart(given, sky, tmp_path, capfd):
+def test_another_map_with_the_same_name_is_detected(given, sky, tmp_path, capfd):
     options = ("--width", 6, "--out", tmp_path / "out", "--env")
     assert relit(given, *options, sky) == 0
     write_exr(tmp_path / sky.name, {"RGB": np.ones((8, 16, 3), np.float32)})
@@ -180,7 +179,7 @@ def test_another_map_of_the_same_name_is_told_apart(given, sky, tmp_path, capfd)
     assert "sha256" not in said
 
 
-def test_an_edit_changes_what_is_seen(given, sky, tmp_path):
+def test_an_edit_changes_the_image(given, sky, tmp_path):
     def mean(name: str, *options: object) -> np.ndarray:
         assert relit(given, "--env", sky, "--out", tmp_path / name, *options) == 0
         return read_image(tmp_path / name / "studio" / "000.exr").pixels.mean((0, 1))
@@ -194,7 +193,9 @@ def test_an_edit_changes_what_is_seen(given, sky, tmp_path):
 
 
 def test_an_edit_within_a_painted_mask(given, sky, tmp_path):
-    """The left half of a view turns black, the right half stays; what is drawn depends on the view alone."""
+    """The left half of a view becomes black and the right half is unchanged; the random numbers depend only
+    on the view.
+    """
     options = ("--env", sky, "--spp", "8", "--set", "base_color=0", "--set", "metallic=1", "--bounces", 1)
     assert relit(given, "--env", sky, "--spp", "8", "--bounces", 1, "--out", tmp_path / "plain") == 0
     white = np.zeros((18, 24, 1), np.uint8)
@@ -207,8 +208,10 @@ def test_an_edit_within_a_painted_mask(given, sky, tmp_path):
     np.testing.assert_allclose(masked.pixels[:, 13:], plain.pixels[:, 13:], rtol=1e-5)
 
 
-def test_lamps_are_moved_and_left_out(given, sky, tmp_path, monkeypatch):
-    """A lamp behind the ball does not light what the first view sees; moved to the camera it does."""
+def test_lamps_are_moved_and_removed(given, sky, tmp_path, monkeypatch):
+    """A lamp behind the ball does not light the part that the first view shows; moved to the camera, it
+    does.
+    """
     behind = Lamplight(
         torch.tensor([[-1.5, 0.0, 0.0]]), torch.zeros(1, 3), torch.full((1, 3), 900.0), radius=0.05
     )
@@ -297,19 +300,19 @@ def test_a_time_per_view_is_kept(given, sky, tmp_path):
         (["--rotate", "nan"], ("--rotate",)),
     ],
 )
-def test_what_cannot_be_is_refused_before_anything_is_written(found, capfd, options, words):
+def test_invalid_options_are_refused_before_anything_is_written(found, capfd, options, words):
     refused(capfd, found, *options, words=words)
 
 
 @pytest.mark.parametrize(("value", "word"), [(np.nan, "NaN"), (-3.0, "negative")])
-def test_a_map_that_is_no_light_is_refused(found, tmp_path, capfd, value, word):
+def test_an_invalid_map_is_refused(found, tmp_path, capfd, value, word):
     radiance = np.ones((8, 16, 3), np.float32)
     radiance[2, 3] = value
     write_exr(tmp_path / "bad.exr", {"RGB": radiance})
     refused(capfd, found, "--env", tmp_path / "bad.exr", words=("bad.exr", word))
 
 
-def test_a_light_that_is_no_map_needs_one(given, capfd):
+def test_a_free_light_needs_a_map(given, capfd):
     refused(capfd, given, words=("no environment map", "--env"))
 
 
@@ -319,8 +322,10 @@ def test_a_folder_that_cannot_be_written(found, sky, tmp_path, capfd):
     refused(capfd, found, "--env", sky, "--out", tmp_path / "file", words=("is a file",))
 
 
-def test_a_full_disk_leaves_no_half_picture(given, sky, tmp_path, capfd):
-    """Files may grow to a size that no picture fits into: one line, and nothing that looks finished."""
+def test_a_full_disk_leaves_no_incomplete_image(given, sky, tmp_path, capfd):
+    """The size of files is limited below that of an image: there is one line, and no file that seems
+    finished.
+    """
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1500, before[1]))
     try:
@@ -330,14 +335,14 @@ def test_a_full_disk_leaves_no_half_picture(given, sky, tmp_path, capfd):
     assert not [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
 
 
-def test_without_a_denoiser_it_says_so(found, sky, capfd, monkeypatch):
+def test_without_a_denoiser_there_is_an_error(found, sky, capfd, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyoidn", None)
     refused(
         capfd, found, "--env", sky, "--denoise", words=("pyoidn", "pip install 'neilfpp-method[denoise]'")
     )
 
 
-def test_truths_for_each_map(found, sky, capfd):
+def test_true_images_for_each_map(found, sky, capfd):
     refused(capfd, found, "--env", sky, "--truth", "a", "b", words=("2 folders",))
 
 

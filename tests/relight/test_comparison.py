@@ -1,4 +1,4 @@
-"""Figures against true images."""
+"""Figures of relit images compared with true images."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_one_scale_for_all_views_and_none():
     assert found.figures["baseline_psnr"] < 25
 
 
-def test_without_a_mask_what_was_rendered_counts():
+def test_without_a_mask_the_rendered_pixels_count():
     (image,) = images(1)
     opacity = np.zeros((16, 20))
     opacity[:8] = 1
@@ -52,7 +52,7 @@ def test_without_a_mask_what_was_rendered_counts():
         compare([image], [0 * opacity], [true(image, None)])
 
 
-def test_what_is_read_of_the_truth(tmp_path):
+def test_true_images_are_read_with_their_masks(tmp_path):
     capture = load_capture(make_capture(tmp_path / "capture"))
     view = capture.test_views[0]
     linear = np.full((18, 24, 3), 0.25, np.float32)
@@ -72,7 +72,7 @@ def test_what_is_read_of_the_truth(tmp_path):
     assert not read.mask[9:].any()
 
 
-def test_a_truth_that_is_not_there_or_of_another_size_is_refused(tmp_path):
+def test_missing_true_images_and_other_sizes_are_refused(tmp_path):
     capture = load_capture(make_capture(tmp_path / "capture"))
     with pytest.raises(UserError, match="no true image of the view 000"):
         find_truth(tmp_path, capture.test_views)

@@ -1,4 +1,4 @@
-"""The denoiser, where there is one."""
+"""The denoiser, if it is installed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.relight.test_film import camera
 from tests.relight.test_path_tracer import EVEN, ball, made_of
 
 
-def test_noise_goes_and_light_stays():
+def test_noise_is_reduced_and_the_mean_is_kept():
     pytest.importorskip("pyoidn")
     close = dataclasses.replace(camera(64, 48), fx=200.0, fy=200.0)
     picture = render_picture(Scene(ball(), made_of(0.6), None, EVEN), close, Budget(2), bounces=1)
@@ -27,7 +27,7 @@ def test_noise_goes_and_light_stays():
     assert (clean.alpha == picture.alpha).all()
 
 
-def test_without_one_it_says_what_to_install(monkeypatch):
+def test_without_a_denoiser_the_error_names_the_package(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyoidn", None)
     with pytest.raises(UserError, match=r"neilfpp-method\[denoise\]"):
         check_denoiser()

@@ -1,4 +1,4 @@
-"""Edits of a material: what they say, and where they count."""
+"""Edits of the material: parsing, and the region in which they apply."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_edits_replace_what_they_name():
 
 
 def test_a_box_of_the_world_bounds_an_edit():
-    # The world is twice as large as the scene, and its middle at (1, 0, 0).
+    # The world is twice as large as the scene, with its centre at (1, 0, 0).
     box = scene_box((3.0, 2.0, 2.0, 1.0, -2.0, -2.0), Normalisation(2.0, (1.0, 0.0, 0.0)))
     x = torch.tensor([[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0], [0.5, 0.0, 1.1], [1.0, 1.0, -1.0]])
     changed = with_edits(grey, parse_edits(["metallic=1"]), [box.contains])(x).metallic[:, 0]
@@ -48,7 +48,7 @@ def test_a_box_of_the_world_bounds_an_edit():
         "roughness=much",
     ],
 )
-def test_what_cannot_be_set_is_refused(text):
+def test_invalid_edits_are_refused(text):
     with pytest.raises(UserError, match=f"--set {text}"):
         parse_edits([text])
 

@@ -1,4 +1,4 @@
-"""Pictures: when they are done, and that what they show does not depend on how the work is cut up."""
+"""Rendered images: when they are finished, and independence from the division of the work."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def scene() -> Scene:
     return Scene(ball(), made_of(0.6), None, EVEN)
 
 
-def test_a_picture_is_the_same_however_it_is_cut_up(scene, monkeypatch):
+def test_an_image_does_not_depend_on_the_batches(scene, monkeypatch):
     whole = render_picture(scene, camera(), Budget(8), bounces=2, seed=3)
     assert whole.samples == 8
     monkeypatch.setattr(film, "PATHS_AT_ONCE", 50)
@@ -43,13 +43,13 @@ def test_alpha_is_the_share_of_a_pixel_that_is_covered(scene):
     assert picture.alpha.sum().item() == pytest.approx(np.pi * (20 * 0.6 / np.sqrt(9 - 0.36)) ** 2, rel=0.02)
     assert picture.alpha[size // 2, size // 2] == 1
     assert picture.alpha[0, 0] == 0
-    # Light of 1 from everywhere: what is covered sends the base colour, and the rest nothing.
+    # Under light of 1 from all directions, covered pixels have the base colour, and the others are black.
     assert torch.allclose(picture.radiance.mean(-1, keepdim=True), 0.6 * picture.alpha, atol=0.05)
     assert torch.allclose(picture.albedo, 0.6 * picture.alpha.expand(-1, -1, 3), atol=1e-5)
     assert picture.normal[size // 2, size // 2, 2] > 0.95
 
 
-def test_the_time_ends_a_picture(scene):
+def test_the_time_limit_ends_an_image(scene):
     ticks = iter(range(10_000))
     shares: list[float] = []
     budget = Budget(None, seconds=10.0)
@@ -63,8 +63,8 @@ def test_the_time_ends_a_picture(scene):
     assert rushed.samples >= 1
 
 
-def test_more_samples_are_closer(scene):
-    """The error of an even spread falls faster than that of chance, 1/√n."""
+def test_more_samples_are_more_accurate(scene):
+    """The error of a quasi-random sequence decreases faster than that of random numbers, 1/√n."""
     exact = 0.6
 
     def error(samples: int) -> float:
@@ -75,7 +75,7 @@ def test_more_samples_are_closer(scene):
     assert error(1024) < error(16) / 6
 
 
-def test_numbers_are_even_for_each_pixel_and_differ_between_them():
+def test_numbers_are_evenly_spread_and_differ_between_pixels():
     numbers = Sequence(4, seed=1).next(256, 5)
     u = numbers.at(torch.arange(5 * 256), 1, 2)
     assert u.min() >= 0
@@ -86,7 +86,7 @@ def test_numbers_are_even_for_each_pixel_and_differ_between_them():
             assert (strata - 16).abs().max() <= 1
     first = u[numbers.sample == 0, 0]
     assert len(first.unique()) == 5
-    # In blocks it is the same sequence.
+    # Generated in blocks, the sequence is the same.
     halves = Sequence(4, seed=1)
     pair = [halves.next(128, 5) for _ in range(2)]
     again = torch.cat([part.at(torch.arange(5 * 128), 1, 2) for part in pair])

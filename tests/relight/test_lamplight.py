@@ -1,4 +1,4 @@
-"""Lamps that are sampled by their solid angle, against closed forms of spheres."""
+"""Lamps that are sampled by solid angle, compared with the closed forms of spheres."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def light(*positions, axes=None, radiance=None, radius=0.1) -> Lamplight:
 
 
 def irradiance(lamps: Lamplight, count: int = 200_000) -> torch.Tensor:
-    """At the origin, on a surface that faces +z."""
+    """Irradiance at the origin on a surface that faces +z."""
     u = torch.quasirandom.SobolEngine(3, scramble=True, seed=3).draw(count)
     drawn = lamps.sample(torch.zeros(count, 3), u)
     kept = drawn.pdf > 0
@@ -28,31 +28,32 @@ def irradiance(lamps: Lamplight, count: int = 200_000) -> torch.Tensor:
     return (radiance * wi[:, 2:].clamp_min(0) / pdf[:, None]).double().sum(0) / count
 
 
-def test_a_sphere_lights_a_surface_as_the_closed_form_says():
-    # π L (r/d)² cos of the angle to its middle, for a sphere that is wholly above the horizon.
+def test_the_irradiance_of_a_sphere_agrees_with_the_closed_form():
+    # π L (r/d)² times the cosine of the angle to its centre, for a sphere that is completely above the
+    # horizon.
     expected = math.pi * (0.1 / 0.5) ** 2 * 0.8
     assert irradiance(light((0.3, 0.0, 0.4))).numpy() == pytest.approx(expected, rel=1e-3)
 
 
-def test_a_lamp_far_away_keeps_its_digits():
+def test_a_distant_lamp_keeps_its_precision():
     assert irradiance(light((0.0, 0.0, 1000.0))).numpy() == pytest.approx(math.pi * 1e-8, rel=2e-3)
 
 
-def test_lamps_are_summed_whatever_the_choice_between_them():
+def test_lamps_are_summed_for_any_selection_probability():
     pair = light((0.3, 0.0, 0.4), (0.0, 0.0, 2.0), radiance=((1.0, 2.0, 3.0), (50.0, 10.0, 0.0)))
     one, other = math.pi * 0.04 * 0.8, math.pi * 0.0025
     expected = [one + 50 * other, 2 * one + 10 * other, 3 * one]
     assert irradiance(pair).numpy() == pytest.approx(expected, rel=3e-3)
 
 
-def test_a_panel_sends_by_the_cosine_of_its_axis():
+def test_a_panel_emits_by_the_cosine_to_its_axis():
     radius, turned = 1e-3, (0.0, 0.6, -0.8)
     found = irradiance(light((0.0, 0.0, 1.0), axes=(turned,), radius=radius))
     assert found.numpy() == pytest.approx(0.8 * math.pi * radius**2, rel=2e-3)
     assert not irradiance(light((0.0, 0.0, 1.0), axes=((0.0, 0.0, 1.0),))).any()
 
 
-def test_density_of_directions_that_meet_a_lamp():
+def test_density_of_directions_that_hit_a_lamp():
     pair = light((0.3, 0.0, 0.4), (0.0, 0.0, 2.0))
     u = torch.rand(5000, 3, generator=torch.Generator().manual_seed(0))
     x = torch.zeros(5000, 3)
@@ -70,7 +71,7 @@ def test_density_of_directions_that_meet_a_lamp():
     assert total == pytest.approx(1, rel=1e-3)
 
 
-def test_from_within_a_lamp_there_is_none():
+def test_a_point_inside_a_lamp_gets_no_sample():
     drawn = light((0.0, 0.0, 0.05)).sample(torch.zeros(10, 3), torch.rand(10, 3))
     assert not drawn.pdf.any()
     assert drawn.wi.isfinite().all()

@@ -1,4 +1,4 @@
-"""Environment maps from files: what is read, which way it faces, and what is refused."""
+"""Environment maps from files: valid files, their orientation, and refused files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def with_spot(row: int, column: int, height: int = 16) -> np.ndarray:
 
 
 def brightest(path: Path, layout: str, rotate: float = 0.0) -> str:
-    """The axis from which most light comes."""
+    """The axis from which most of the light comes."""
     sky = read_map(path, layout, rotate).sky
     light = sky.lookup(torch.tensor(list(AXES.values()), dtype=torch.float32)).sum(-1)
     assert light.max() > 1
@@ -49,20 +49,21 @@ def brightest(path: Path, layout: str, rotate: float = 0.0) -> str:
         ("common", 24, "-y"),
     ],
 )
-def test_where_columns_are(tmp_path, layout, column, axis):
-    """docs/light.md: ours has +x at a quarter of the width; Blender has +x in the middle and +y a quarter to
-    its left."""
+def test_the_azimuth_of_columns(tmp_path, layout, column, axis):
+    """docs/light.md: this package has +x at a quarter of the width; Blender has +x at the centre and +y a
+    quarter of the width to its left.
+    """
     write_exr(tmp_path / "sun.exr", {"RGB": with_spot(8, column)})
     assert brightest(tmp_path / "sun.exr", layout) == axis
 
 
 @pytest.mark.parametrize(("degrees", "axis"), [(90.0, "+y"), (180.0, "-x"), (-90.0, "-y"), (450.0, "+y")])
-def test_light_is_turned_counter_clockwise_about_z(tmp_path, degrees, axis):
+def test_light_is_rotated_counter_clockwise_about_z(tmp_path, degrees, axis):
     write_exr(tmp_path / "sun.exr", {"RGB": with_spot(8, 8)})
     assert brightest(tmp_path / "sun.exr", "ours", degrees) == axis
 
 
-def test_the_first_row_is_above(tmp_path):
+def test_the_first_row_is_at_the_zenith(tmp_path):
     pixels = np.full((16, 32, 3), 0.01, np.float32)
     pixels[:2] = 5.0
     write_exr(tmp_path / "zenith.exr", {"RGB": pixels})
@@ -77,7 +78,7 @@ def test_stops_make_it_brighter(tmp_path):
     assert torch.equal(brighter, 4 * plain)
 
 
-def test_files_of_other_kinds(tmp_path):
+def test_other_types_of_files(tmp_path):
     radiance = with_spot(8, 8)
     cv2.imwrite(str(tmp_path / "sun.hdr"), radiance[..., ::-1])
     np.testing.assert_allclose(read_map(tmp_path / "sun.hdr", "ours").sky.radiance, radiance, rtol=0.02)
@@ -107,13 +108,13 @@ def spoiled(value: float) -> np.ndarray:
         (np.ones((2, 4, 3), np.float32), "2 rows"),
     ],
 )
-def test_what_is_no_light_is_refused(tmp_path, pixels, words):
+def test_invalid_radiance_is_refused(tmp_path, pixels, words):
     write_exr(tmp_path / "map.exr", {"RGB": pixels})
     with pytest.raises(UserError, match=words):
         read_map(tmp_path / "map.exr", "ours")
 
 
-def test_ringing_of_a_filter_counts_as_black(tmp_path):
+def test_slightly_negative_texels_are_set_to_black(tmp_path):
     write_exr(tmp_path / "map.exr", {"RGB": spoiled(-1e-5)})
     read = read_map(tmp_path / "map.exr", "ours")
     assert read.negative == 1
@@ -121,13 +122,13 @@ def test_ringing_of_a_filter_counts_as_black(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["missing.exr", "notes.txt"])
-def test_what_is_no_image_is_refused(tmp_path, name):
+def test_invalid_images_are_refused(tmp_path, name):
     (tmp_path / "notes.txt").write_text("light")
     with pytest.raises(UserError, match=name):
         check_map(tmp_path / name)
 
 
-def test_maps_are_told_apart():
+def test_maps_get_unique_names():
     assert map_names([Path("a/sky.exr"), Path("b/dawn.hdr")]) == ["sky", "dawn"]
     assert map_names([Path("a/sky.exr"), Path("b/sky.exr"), Path("c/dawn.exr")]) == ["a-sky", "b-sky", "dawn"]
     with pytest.raises(UserError, match="two maps have this name"):

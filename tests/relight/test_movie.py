@@ -1,4 +1,4 @@
-"""Films of pictures."""
+"""Videos of images."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from neilfpp_method.relight import movie
 
 
 def pictures(folder, count: int = 3, height: int = 33, width: int = 48):
-    """Grey that grows from frame to frame, half of it covered."""
+    """Grey images that become brighter from frame to frame; half of each is covered."""
     paths = []
     for k in range(count):
         rgba = np.full((height, width, 4), 60 * (k + 1), np.uint8)
@@ -24,7 +24,7 @@ def pictures(folder, count: int = 3, height: int = 33, width: int = 48):
 
 
 @pytest.mark.parametrize("encoder", ["opencv", "ffmpeg"])
-def test_a_film_shows_the_pictures_over_black(tmp_path, monkeypatch, encoder):
+def test_a_video_shows_the_images_over_black(tmp_path, monkeypatch, encoder):
     if encoder == "ffmpeg":
         pytest.importorskip("imageio_ffmpeg")
     monkeypatch.setattr(movie, "_has_ffmpeg", lambda: encoder == "ffmpeg")
@@ -43,7 +43,7 @@ def test_a_film_shows_the_pictures_over_black(tmp_path, monkeypatch, encoder):
     assert {path.name for path in tmp_path.iterdir()} == {"film.mp4", "0.png", "1.png", "2.png"}
 
 
-def test_without_an_encoder_it_says_so_and_leaves_nothing(tmp_path, monkeypatch):
+def test_without_an_encoder_there_is_an_error_and_no_file(tmp_path, monkeypatch):
     monkeypatch.setattr(movie, "_has_ffmpeg", lambda: False)
     monkeypatch.setattr(movie, "CODEC", "????")
     with pytest.raises(UserError, match="no MP4 encoder"):

@@ -1,4 +1,4 @@
-"""Paths against closed forms and quadrature."""
+"""The path tracer compared with closed forms and quadrature."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def ball(subdivisions: int = 3, inside_out: bool = False) -> Surface:
 
 
 def squares(*corners) -> Surface:
-    """A square for each corner and its two edges; it faces the way of edge × edge."""
+    """A square for each corner with its two edges; it faces the direction edge × edge."""
     found = []
     for corner, first, second in corners:
         a, b, c = (torch.tensor(v, dtype=torch.float32) for v in (corner, first, second))
@@ -68,15 +68,15 @@ def scattered_targets(count: int, radius: float = 0.5) -> torch.Tensor:
     )
 
 
-def test_a_white_ball_in_white_light_cannot_be_seen():
+def test_a_white_ball_in_white_light_is_invisible():
     found = trace(
         Scene(ball(), made_of(1.0), None, EVEN), looking_at(scattered_targets(500, 0.35)), 256, bounces=1
     )
     assert found.mean().item() == pytest.approx(1, abs=1e-3)
 
 
-def test_a_white_bowl_in_white_light_cannot_be_seen():
-    """Light that bounces some dozen times, with paths that end by chance."""
+def test_a_white_bowl_in_white_light_is_invisible():
+    """With a dozen bounces and paths that are terminated by Russian roulette."""
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.6)
     kept = mesh.triangles[mesh.triangles_center[:, 2] < 0.2]
     bowl = Surface(torch.tensor(np.array(kept), dtype=torch.float32).flip(1))
@@ -88,7 +88,7 @@ def test_a_white_bowl_in_white_light_cannot_be_seen():
 
 @pytest.mark.parametrize("lobe", [GGX, SPHERICAL_GAUSSIAN])
 @pytest.mark.parametrize(("roughness", "metallic"), [(0.15, 1.0), (0.5, 1.0), (0.5, 0.0)])
-def test_a_surface_in_white_light_sends_its_directional_albedo(lobe, roughness, metallic):
+def test_a_surface_in_white_light_has_its_directional_albedo(lobe, roughness, metallic):
     plane = squares(((-0.5, -0.5, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     eye = (1.8, 0.0, 2.4)  # cosine 0.8
     scene = Scene(plane, made_of(1.0, roughness, metallic), lobe, EVEN)
@@ -119,7 +119,7 @@ def directional_albedo(name: str, roughness: float, metallic: float, cosine: flo
 
 @pytest.fixture(scope="module")
 def gradient() -> Sky:
-    """A bright spot in a sky that darkens downwards."""
+    """A sky with a bright spot that becomes darker downwards."""
     radiance = torch.linspace(1.0, 0.1, 12)[:, None, None].expand(12, 24, 3).clone()
     radiance[3, 4] = torch.tensor([30.0, 20.0, 10.0])
     return Sky(radiance, rows_at_poles=True, start=0.3)
@@ -128,8 +128,9 @@ def gradient() -> Sky:
 def quadrature(
     sky: Sky, normal: np.ndarray, wo: np.ndarray, base: float, roughness: float, metallic: float
 ) -> np.ndarray:
-    """What a convex surface sends: the rendering equation by an even spread of a quarter of a million
-    directions."""
+    """Outgoing radiance of a convex surface: the rendering equation with a quarter of a million evenly spread
+    directions.
+    """
     count = 500_000
     k = np.arange(count) + 0.5
     wi = oracles.spherical(1 - 2 * k / count, np.pi * (3 - 5**0.5) * k)
@@ -141,7 +142,7 @@ def quadrature(
 
 
 @pytest.mark.parametrize(("roughness", "metallic"), [(0.4, 1.0), (0.6, 0.2)])
-def test_a_ball_under_a_map_is_that_of_quadrature(gradient, roughness, metallic):
+def test_a_ball_under_a_map_agrees_with_quadrature(gradient, roughness, metallic):
     surface, targets = ball(), scattered_targets(4, 0.35)
     rays = looking_at(targets)
     met = surface.intersect(rays.origins, rays.directions)
@@ -153,8 +154,8 @@ def test_a_ball_under_a_map_is_that_of_quadrature(gradient, roughness, metallic)
 
 
 @pytest.mark.parametrize("lobe", [None, GGX])
-def test_both_techniques_and_each_alone_agree(gradient, lobe, monkeypatch):
-    """A light drawn by the map and one met by chance: their weighted sum is what either gives by itself."""
+def test_both_techniques_together_and_each_alone_agree(gradient, lobe, monkeypatch):
+    """Light sampling and BRDF sampling: their weighted sum equals the result of either."""
     scene = Scene(
         squares(
             ((-0.5, -0.5, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
@@ -225,11 +226,11 @@ FACING = (
 
 
 def series(albedo: float, lit: float, point: np.ndarray, terms: int) -> list[float]:
-    """What the upper square sends from a point, by the number of times that light has bounced off either
-    square.
+    """Outgoing radiance of a point on the upper square, by the number of reflections at either square.
 
-    The lower one is lit evenly and sends `lit` · albedo / π; each further term is the integral of the one
-    before over the other square with the kernel cos cos / (π d²) of form factors, by Gauss-Legendre nodes.
+    The lower square is lit uniformly and sends `lit` · albedo / π. Each further term is the integral of the
+    previous one over the other square with the kernel cos cos / (π d²) of form factors, by Gauss-Legendre
+    nodes.
     """
     nodes, weights = np.polynomial.legendre.leggauss(24)
     x, w = (nodes + 1) / 2, weights / 2
@@ -247,8 +248,9 @@ def series(albedo: float, lit: float, point: np.ndarray, terms: int) -> list[flo
     return found
 
 
-def test_light_between_two_planes_is_the_series_of_form_factors():
-    # From far to the side, at 45°: the lower square is lit all over, the upper one from behind.
+def test_light_between_two_planes_agrees_with_form_factors():
+    # Light from far to the side, at 45°: it reaches the whole lower square and only the back of the upper
+    # one.
     radius, far = 10.0, 2000.0
     lamps = Lamplight(torch.tensor([[far, 0.5, far]]), torch.zeros(1, 3), torch.full((1, 3), 1e5), radius)
     lit = math.pi * 1e5 * radius**2 / (2 * far**2) / math.sqrt(2)
@@ -257,7 +259,7 @@ def test_light_between_two_planes_is_the_series_of_form_factors():
     point = np.array([0.4, 0.6])
     rays = looking_at([(*point, 1.0)] * 256, eye=(0.5, 0.5, 0.5))
     expected = series(0.8, lit, point, terms=4)
-    # The upper square sends light that has come over 2, 4, 6, … surfaces; beyond 8 it is a share of 1e-4.
+    # The upper square sends light after 2, 4, 6, … surfaces; beyond 8 its share is 1e-4.
     for bounces, terms in ((1, 0), (2, 1), (4, 2), (8, 4)):
         found = trace(scene, rays, 256, bounces).mean().item()
         assert found == pytest.approx(sum(expected[:terms]), rel=0.01, abs=1e-6), bounces
@@ -267,7 +269,9 @@ def test_light_between_two_planes_is_the_series_of_form_factors():
 
 
 def point_form_factor(x: float, y: float) -> float:
-    """From a small area to a parallel unit square at the distance 1, below the point (x, y) of the square."""
+    """Form factor from a small area to a parallel unit square at distance 1, below the point (x, y) of the
+    square.
+    """
 
     def corner(a: float, b: float) -> float:
         p, q = math.sqrt(1 + a * a), math.sqrt(1 + b * b)

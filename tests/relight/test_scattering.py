@@ -1,4 +1,4 @@
-"""Directions at a surface: their density, and that their weights add up to what the BRDF reflects."""
+"""Sampled directions at a surface: their density, and the sum of their weights."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def at(
 
 
 @pytest.mark.parametrize(("name", "roughness", "metallic"), CASES)
-def test_directions_have_the_density_that_is_said(name, roughness, metallic):
+def test_directions_have_the_reported_density(name, roughness, metallic):
     lobe = LOBES[name]
     u = torch.rand(100_000, 3, generator=torch.Generator().manual_seed(5))
     # χ² cells meet at the poles, so the viewer, against whom the density of the lobe is infinite, is one:
@@ -53,12 +53,12 @@ def spread(one: Vertices, count: int) -> Vertices:
 
 @pytest.mark.parametrize("cosine", [1.0, 0.6, 0.15])
 @pytest.mark.parametrize(("name", "roughness", "metallic"), CASES)
-def test_weights_add_up_to_what_the_brdf_reflects(name, roughness, metallic, cosine):
+def test_the_mean_weight_is_the_directional_albedo(name, roughness, metallic, cosine):
     lobe = LOBES[name]
     u = torch.quasirandom.SobolEngine(3, scramble=True, seed=1).draw(2**16)
     points = at(len(u), lobe, roughness, metallic, cosine)
     wi = scatter(points, u, lobe)
-    # Far below the horizon a narrow lobe has no density in float32, and there is nothing to weigh.
+    # Far below the horizon the density of a narrow lobe underflows in float32, and the weight is undefined.
     weight = brdf_cosine(points, wi, lobe) / scattering_pdf(points, wi, lobe).clamp_min(1e-30)[:, None]
     # By Gauss-Legendre nodes in the cosine and an even spread in azimuth, from the formula as it is printed.
     nodes, weights = np.polynomial.legendre.leggauss(200)
@@ -73,11 +73,11 @@ def test_weights_add_up_to_what_the_brdf_reflects(name, roughness, metallic, cos
     assert weight.max() < 12  # ten for the least share of a technique
 
 
-def test_a_lambertian_surface_has_the_weight_of_its_colour():
+def test_the_weight_of_a_lambertian_surface_is_its_colour():
     points = at(1000, None, 0.5, 0.9)
     wi = scatter(points, torch.rand(1000, 3), None)
     weight = brdf_cosine(points, wi, None) / scattering_pdf(points, wi, None)[:, None]
-    assert weight.numpy() == pytest.approx(0.7, rel=1e-4)  # metallic counts for nothing
+    assert weight.numpy() == pytest.approx(0.7, rel=1e-4)  # metallic has no influence
 
 
 @pytest.mark.parametrize("lobe", [GGX, SPHERICAL_GAUSSIAN, None])

@@ -1,4 +1,6 @@
-"""The map that paths are traced to: where its texels are, and directions in proportion to them."""
+"""The environment map of the path tracer: positions of its texels, and directions in proportion to their
+radiance.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ LAYOUTS = {"ours": (True, 0.0), "common": (False, -math.pi / 2), "turned": (True
 
 
 def uneven(height: int = 9, width: int = 18) -> torch.Tensor:
-    """A map with a lamp of one texel in a haze."""
+    """A dim map with a lamp of one texel."""
     generator = torch.Generator().manual_seed(2)
     radiance = 0.2 + torch.rand(height, width, 3, generator=generator)
     radiance[2, 5] = 60.0
@@ -29,7 +31,7 @@ def directions(count: int = 4000) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_directions_have_the_density_that_is_said(layout):
+def test_directions_have_the_reported_density(layout):
     rows_at_poles, start = LAYOUTS[layout]
     sky = Sky(uneven(), rows_at_poles, start)
     u = torch.rand(200_000, 2, generator=torch.Generator().manual_seed(0))
@@ -44,14 +46,14 @@ def test_directions_have_the_density_that_is_said(layout):
     assert sky.pdf(wi).double().mean().item() * 4 * math.pi == pytest.approx(1, abs=0.02)
     drawn = sky.sample(u)
     assert torch.equal(drawn.pdf, sky.pdf(drawn.wi))
-    # Importance sampling of a function that is not the radiance: ∫ (1 + z) L dw by light directions and by
+    # Importance sampling of another function than the radiance: ∫ (1 + z) L dw by light directions and by
     # even ones.
     by_light = ((1 + drawn.wi[:, 2:]) * sky.lookup(drawn.wi) / drawn.pdf[:, None]).double().mean(0)
     evenly = 4 * math.pi * ((1 + wi[:, 2:]) * sky.lookup(wi)).double().mean(0)
     assert by_light.numpy() == pytest.approx(evenly.numpy(), rel=0.03)
 
 
-def test_every_direction_with_light_can_be_drawn():
+def test_every_direction_with_light_can_be_sampled():
     radiance = torch.zeros(8, 16, 3)
     radiance[3, 0] = 1.0
     sky = Sky(radiance, False, 0.0)
@@ -60,7 +62,7 @@ def test_every_direction_with_light_can_be_drawn():
     assert torch.isfinite(sky.sample(torch.rand(1000, 2)).wi).all()
 
 
-def test_our_layout_is_that_of_the_light_that_is_fitted():
+def test_the_own_layout_is_that_of_the_fitted_light():
     light = EnvironmentLight(8, 1.0)
     light.show(uneven(8, 16).permute(2, 0, 1))
     wi = directions()
@@ -89,8 +91,8 @@ def test_the_common_layout_is_that_of_blender():
     np.testing.assert_allclose(seen.numpy(), radiance.reshape(-1, 3).numpy(), rtol=2e-3, atol=1e-3)
 
 
-def test_the_mean_of_a_cell_is_that_of_its_bilinear_radiance():
-    """The lamp of one texel spreads over nine; their probability is what each of them brings."""
+def test_the_mass_of_a_texel_is_that_of_its_bilinear_radiance():
+    """The lamp of one texel extends over nine; the probability of each is in proportion to its radiance."""
     radiance = torch.zeros(32, 64, 3)
     radiance[16, 20] = 1.0
     sky = Sky(radiance, False, 0.0)

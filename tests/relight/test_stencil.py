@@ -1,4 +1,4 @@
-"""Masks painted over a view, against a scene whose every point is known."""
+"""Masks painted over a view, on a scene whose every point is known."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def mask(folder: Path, name: str, pixels: np.ndarray) -> Path:
 
 
 def seen_points(capture: Capture, name: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where the pixels of a view meet the ball (N, 3), and the numbers of those pixels (N,)."""
+    """Hits of the rays of a view on the ball, (N, 3), and the indices of their pixels, (N,)."""
     camera = capture.normalisation.camera(next(view.camera for view in capture.views if view.name == name))
     rays = camera_rays(camera)
     position, hit = meet_ball(rays, IN_SCENE)
@@ -48,8 +48,8 @@ def seen_points(capture: Capture, name: str) -> tuple[torch.Tensor, torch.Tensor
 
 
 @pytest.mark.parametrize("enlarged", [1, 2])
-def test_what_a_view_sees_through_white_is_covered(capture, surface, tmp_path, enlarged):
-    """At the middle of each pixel that shows the ball, away from its outline."""
+def test_points_behind_white_pixels_are_covered(capture, surface, tmp_path, enlarged):
+    """At the centre of each pixel that shows the ball, except near its outline."""
     white = np.zeros((36, 48, 1))
     white[:, 24:] = 1.0
     big = white.repeat(enlarged, 0).repeat(enlarged, 1)
@@ -70,7 +70,7 @@ def test_the_far_side_is_not_covered(capture, surface, tmp_path):
     assert not limit(-x).any()
 
 
-def test_masks_of_two_views_add_up(capture, surface, tmp_path):
+def test_masks_of_two_views_are_combined(capture, surface, tmp_path):
     every = np.ones((36, 48, 1))
     names = ("001", "004")
     paths = [mask(tmp_path, name, every) for name in names]
@@ -81,7 +81,7 @@ def test_masks_of_two_views_add_up(capture, surface, tmp_path):
     assert (one(x) != other(x)).any()
 
 
-def test_what_is_transparent_does_not_count(capture, surface, tmp_path):
+def test_transparent_pixels_do_not_count(capture, surface, tmp_path):
     layer = np.ones((36, 48, 4))
     layer[:, :24, 3] = 0.0
     limit = masked_limit(read_stencils([mask(tmp_path, "001", layer)], capture), surface)
@@ -98,6 +98,6 @@ def test_what_is_transparent_does_not_count(capture, surface, tmp_path):
         ("001", np.zeros((36, 48, 1)), "no pixel of the mask is white"),
     ],
 )
-def test_what_is_no_mask_is_refused(capture, tmp_path, name, pixels, words):
+def test_invalid_masks_are_refused(capture, tmp_path, name, pixels, words):
     with pytest.raises(UserError, match=words):
         read_stencils([mask(tmp_path, name, pixels)], capture)

@@ -1,7 +1,6 @@
 """A page in a real browser: Chromium without a window.
 
-Nothing is needed but the browser: it prints the page as it stands after a script of the test has clicked
-through it.
+Only the browser is needed: it prints the page after a script of the test has operated it.
 """
 
 from __future__ import annotations
@@ -35,14 +34,15 @@ FLAGS = (
 
 
 def after(page: Path, script: str, width: int = 1100) -> Any:
-    """What a script, which may await and ends in `return`, says of the page once it has loaded.
+    """Return the value of a script that runs after the page has loaded; it may use `await` and must `return`.
 
-    The page's policy lets no script run but its own two, so the copy that is tested has none.
+    The security policy of the page permits only its own two scripts, so the policy is removed from the tested
+    copy.
     """
     html = page.read_text("utf-8")
     policy = re.search(r'<meta http-equiv="Content-Security-Policy"[^>]*>', html)
     assert policy
-    # Timers in place of frames: a machine that is busy may show no frame before the browser's time is up.
+    # Timers instead of frames: a busy machine may draw no frame before the browser's time limit.
     said = f"""<pre id=said></pre><script>
       requestAnimationFrame = (draw) => setTimeout(draw, 16);
       const {{ getContext }} = HTMLCanvasElement.prototype;

@@ -1,4 +1,4 @@
-"""The page in a real browser: layers change what is seen, nothing fails, and a phone has room for it."""
+"""The page in a real browser: layers change the images, no script fails, and the page fits a phone."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def page(tmp_path_factory) -> Path:
     return write_report(folder / "run", folder / "report.html", ReportOptions(views=2, size=24))
 
 
-def test_clicking_through_the_layers_changes_the_pictures(page: Path):
+def test_selecting_layers_changes_the_images(page: Path):
     said = after(
         page,
         CLICK
@@ -79,11 +79,11 @@ def test_the_surface_is_drawn_layer_by_layer(page: Path):
     assert "triangles" in said["said"]
     pixels = said["found"]
     assert set(pixels) == {"0", "1", "2", "3", "4"}
-    assert all(pixel[3] == 255 for pixel in pixels.values())  # something is there
+    assert all(pixel[3] == 255 for pixel in pixels.values())  # the surface is drawn
     assert pixels["2"][0] == pixels["2"][1] == pixels["2"][2]  # roughness is grey
     assert len({tuple(pixel) for pixel in pixels.values()}) == 5
 
 
-def test_a_phone_has_room(page: Path):
+def test_the_page_fits_a_phone(page: Path):
     said = after(page, "return [document.documentElement.scrollWidth, innerWidth];", width=500)
     assert said[0] <= said[1]

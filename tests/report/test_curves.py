@@ -1,4 +1,4 @@
-"""The drawings of time and quality: every number stands where it belongs."""
+"""The charts of time and quality: every value is drawn at its position."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def points(svg: str) -> list[list[tuple[float, float]]]:
     return [[tuple(map(float, point.split(","))) for point in line.split()] for line in lines]
 
 
-def test_checks_lie_on_the_axes_that_are_drawn():
+def test_checks_are_drawn_at_their_positions():
     checks = [
         QualityCheck(10, "sdf_init", 0.0, 20.0, None, 0.1),
         QualityCheck(20, "joint", 50.0, 25.0, 22.0, 0.1),
@@ -43,7 +43,7 @@ def test_checks_lie_on_the_axes_that_are_drawn():
     assert len(points(quality_curve(checks[:1]))) == 1  # no material yet
 
 
-def test_bars_are_as_long_as_the_work_took():
+def test_bars_are_proportional_to_the_time():
     svg = work_bars(
         {"preparation": {"data": 1.0}, "joint": {"shading": 3.0, "gradients": 1.0}}, {"joint": "Joint"}
     )
@@ -55,7 +55,7 @@ def test_bars_are_as_long_as_the_work_took():
     assert work_bars({}, {}) is None
 
 
-def test_labels_of_curves_that_end_at_one_place_do_not_overlap():
+def test_labels_of_curves_with_the_same_end_do_not_overlap():
     svg = quality_curve([QualityCheck(10, "material_init", 5.0, 22.3, 22.4, 0.1)])
     heights = [float(y) for y in re.findall(r'y="([^"]*)"[^>]*>(?:R|PBR) [0-9.]+ dB<', svg)]
     assert len(heights) == 2

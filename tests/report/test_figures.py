@@ -1,4 +1,4 @@
-"""The table of figures: which columns it has, and how commands are set in it."""
+"""The table of figures: its columns, and the formatting of commands."""
 
 from __future__ import annotations
 

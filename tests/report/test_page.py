@@ -1,4 +1,4 @@
-"""The page of small runs: it loads nothing, escapes what files say, and tells what is missing."""
+"""The page of small runs: it loads nothing, escapes text from files, and reports missing parts."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SMALL = ReportOptions(views=1, size=24)
 
 
 class Page(HTMLParser):
-    """The text of a page, its data blocks, and whatever it would load from elsewhere."""
+    """The text of a page, its data blocks, and everything that it would load from elsewhere."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ def train(capture: Path, out: Path, *options: str) -> None:
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> Path:
-    """A run of a capture with a hostile name, whose page `train` has written."""
+    """A run of a capture with a hostile name; `train` has written its page."""
     root = make_capture(tmp_path_factory.mktemp("captures") / HOSTILE, masks=True)
     out = tmp_path_factory.mktemp("runs") / "run"
     train(root, out)
@@ -74,7 +74,7 @@ def trained(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def run(trained: Path, tmp_path: Path) -> Path:
-    """A copy to spoil."""
+    """A copy that a test may change."""
     return Path(shutil.copytree(trained, tmp_path / "run"))
 
 
@@ -89,7 +89,7 @@ def test_training_ends_with_a_page_that_loads_nothing(trained: Path):
     page = Page((trained / "report.html").read_text("utf-8"))
     assert page.loaded == []
     assert page.unnamed == 0  # every picture has an alternative text
-    assert page.scripts == 2  # ours
+    assert page.scripts == 2  # the page's own scripts
     assert HOSTILE in page.text
     assert "<script>alert" not in page.html
     assert "default-src 'none'" in unescape(page.html)
@@ -104,7 +104,7 @@ def test_the_scripts_that_may_run_are_those_of_the_page(trained: Path):
     assert [name.strip("'").removeprefix("sha256-") for name in named] == made
 
 
-def test_maps_stand_beside_their_truth(trained: Path):
+def test_maps_are_shown_beside_their_truth(trained: Path):
     page = page_of(trained)
     layers = page.data["views-data"]["layers"]
     assert [layer["title"] for layer in layers] == [
@@ -139,11 +139,11 @@ def test_the_surface_is_that_of_the_run(trained: Path):
     place = low + position / 65535 * (high - low)
     normal = np.frombuffer(raw["normal"], "i1").reshape(-1, 3) / 127
     np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), 1, atol=0.02)
-    # A ball about the origin, so far: normals lead away from it.
+    # The surface is still a ball around the origin: normals point away from it.
     assert ((place * normal).sum(-1) > 0).mean() > 0.95
 
 
-def test_figures_are_of_the_protocol_once_they_are_measured(run: Path):
+def test_measured_figures_replace_those_of_the_shown_views(run: Path):
     before = page_of(run).text
     assert "not the figures of the protocol neilfpp" in before
     figures = {"pbr_psnr": 12.34, "base_color_psnr": 9.87, "base_color_psnr_frame": 11.5}
@@ -202,7 +202,7 @@ def test_a_finding_comes_with_its_cause_and_remedy(run: Path):
     assert "few <views>" not in page.html
 
 
-def test_effects_and_times_are_shown_where_they_are_recorded(run: Path):
+def test_effects_and_times_are_shown_if_they_are_recorded(run: Path):
     row = {
         "effect": "lamps",
         "title": "Lamps nearby",
@@ -231,7 +231,7 @@ def test_a_damaged_side_file_is_named_and_left_out(run: Path):
 # ----------------------------------------------------------------------------------------------- unusual runs
 
 
-def test_a_run_that_was_stopped_says_how_it_goes_on(run: Path):
+def test_the_page_of_a_stopped_run_says_how_to_continue(run: Path):
     (run / "checkpoints" / "last.pt").write_bytes((run / "checkpoints" / "sdf_init.pt").read_bytes())
     page = page_of(run)
     assert "stopped after step 4 of 12" in page.text
@@ -271,13 +271,13 @@ def test_a_given_mesh_has_its_page(tmp_path: Path):
 
 
 @pytest.mark.parametrize("options", [["--views", "0"], ["--size", "5"], ["--views", "99"]])
-def test_what_cannot_be_shown_is_refused(trained: Path, options: list[str], tmp_path: Path, capsys):
+def test_invalid_options_are_refused(trained: Path, options: list[str], tmp_path: Path, capsys):
     assert main(["report", str(trained), "--out", str(tmp_path / "page.html"), *options]) == 2
     assert options[0] in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
-def test_no_run_no_page(tmp_path: Path):
+def test_without_a_run_there_is_an_error(tmp_path: Path):
     with pytest.raises(UserError, match="no run here"):
         write_report(tmp_path, tmp_path / "report.html")
     assert not list(tmp_path.iterdir())
@@ -286,7 +286,7 @@ def test_no_run_no_page(tmp_path: Path):
 # ------------------------------------------------------------------------------------------------------ parts
 
 
-def test_text_is_escaped_and_elements_are_not():
+def test_only_text_is_escaped():
     made = element("p", "a < b", element("b", "c"), None, title='"', hidden=False, data_x=1)
     assert made == '<p title="&quot;" data-x="1">a &lt; b<b>c</b></p>'
     assert isinstance(made, Html)

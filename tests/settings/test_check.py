@@ -1,6 +1,4 @@
-"""Settings that nothing can be built from are refused by whoever builds: the command, the plugin and
-`attach_neilf` alike.
-"""
+"""Impossible settings are refused in the same way by the command, the plugin and `attach_neilf`."""
 
 from __future__ import annotations
 
@@ -29,20 +27,20 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_what_excludes_itself_is_refused(case):
+def test_settings_that_exclude_each_other_are_refused(case):
     config, room, settings, message = WRONG[case]
     with pytest.raises(UserError, match=message):
         check_config(with_setting(config, room, **settings))
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_presets_and_what_is_made_of_them_pass(name):
+def test_presets_and_their_variants_are_accepted(name):
     for config in (preset(name), fixed_geometry(preset(name))):
         check_config(config)
     check_config(free_light(preset("fast")))
 
 
-def test_attaching_asks_as_well():
+def test_attaching_checks_the_settings():
     config = with_setting(tiny_config(), "train", fresh=2.0)
     with pytest.raises(UserError, match="fresh is 2"):
         attach_neilf(lambda origins, directions: (origins, origins, origins), config=config)

@@ -1,4 +1,4 @@
-"""The units that errors are measured in."""
+"""The units of the losses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from neilfpp_method.shading.color import apply_response
 
 
 @pytest.mark.parametrize("median", [1e-3, 0.05, 0.47])
-def test_an_error_of_radiance_counts_the_same_whatever_the_camera_stores(median):
+def test_an_error_of_radiance_counts_the_same_in_every_response(median):
     truth = torch.full((1, 3), median)
     found = []
     for response in ("linear", "srgb"):

@@ -1,6 +1,4 @@
-"""Settings from files: words stay words, numbers are numbers, and what is no file of settings is told in one
-line.
-"""
+"""Settings from files: words and numbers keep their types, and invalid files are refused in one line."""
 
 from __future__ import annotations
 
@@ -18,7 +16,7 @@ from neilfpp_method.settings.types import NeilfConfig
 
 
 def settings_of(*arguments: str) -> NeilfConfig:
-    """What `neilfpp train` starts from, before options for single settings."""
+    """The settings of `neilfpp train` before options for single settings are applied."""
     return COMMAND.default(arguments).config
 
 
@@ -29,7 +27,7 @@ def written(folder: Path, text: str, name: str = "settings.yaml") -> Path:
 
 
 def test_words_and_numbers_of_yaml(tmp_path):
-    """YAML 1.1 reads `off` as false, `5e-4` as a word and `1:30` as ninety."""
+    """YAML 1.1 reads `off` as false, `5e-4` as a string and `1:30` as ninety."""
     text = "a: off\nb: no\nc: 5e-4\nd: 12\ne: true\nf: none\ng: -.5\nh: 1:30\ni: [1, 2.5]\nj: 'off'\n"
     text += "k: 1_000\nl: 2001-01-01\nm:\n"
     expected = {"a": "off", "b": "no", "c": 5e-4, "d": 12, "e": True, "f": None, "g": -0.5}
@@ -41,7 +39,7 @@ def test_words_and_numbers_of_yaml(tmp_path):
     }
 
 
-def test_a_file_changes_a_preset_and_options_win(tmp_path):
+def test_a_file_changes_a_preset_and_options_override_it(tmp_path):
     path = written(
         tmp_path, "preset: paper-ngp\ntrain:\n  rays: 64\ninter-reflection.mode: off\nloss.eikonal: 1e-2\n"
     )
@@ -88,26 +86,26 @@ def test_the_file_of_a_run_folder_gives_its_settings(tmp_path, config):
         ("a.yaml", "x" * (1 << 21), "a.yaml: too large"),
     ],
 )
-def test_what_is_no_file_of_settings_is_told(tmp_path, name, text, complaint):
+def test_invalid_settings_files_are_refused(tmp_path, name, text, complaint):
     with pytest.raises(UserError) as error:
         settings_of("--config", str(written(tmp_path, text, name)))
     assert complaint in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_a_file_that_is_missing_is_told(tmp_path):
+def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(UserError, match=r"none\.yaml: no such file"):
         settings_of("--config", str(tmp_path / "none.yaml"))
 
 
-def test_a_binary_file_is_told(tmp_path):
+def test_a_binary_file_is_refused(tmp_path):
     path = tmp_path / "a.yaml"
     path.write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(UserError, match="not a text file"):
         settings_of("--config", str(path))
 
 
-def test_a_host_that_contradicts_the_file_is_told(tmp_path):
+def test_a_host_that_contradicts_the_file_is_refused(tmp_path):
     path = written(tmp_path, "host.kind: volsdf\n")
     with pytest.raises(UserError, match="its host is volsdf, but --host is mesh"):
         settings_of("--config", str(path), "--host", "mesh")

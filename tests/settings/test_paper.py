@@ -1,4 +1,4 @@
-"""docs/paper.md against the presets: the tables are read, so neither can change without the other."""
+"""docs/paper.md agrees with the presets: the tables are read, so neither can change without the other."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ ROOMS = ("radiance", "brdf", "volume", "shading", "inter_reflection", "loss", "o
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """A line of a table: what the code has (none: nothing to compare with), what we have, and why."""
+    """A row of a table: the value of the published code (None if there is nothing to compare), the value of
+    the preset, and the reason.
+    """
 
     published: object
     ours: object
@@ -34,7 +36,7 @@ def value(cell: str) -> object:
 
 
 def table(name: str) -> Mapping[str, Row]:
-    """The rows under the heading of a preset, by setting, on top of those of the preset that it is based
+    """The rows under the heading of a preset by setting, in addition to those of the preset that it is based
     on.
     """
     section = PAGE.read_text(encoding="utf-8").split(f"## `{name}`\n")[1].split("\n## ")[0]
@@ -54,7 +56,7 @@ def settings(name: str) -> NeilfConfig:
 
 
 def rows_of(name: str) -> Mapping[str, Row]:
-    """Those of settings that the preset has: G has none on a mesh."""
+    """The rows of settings that the preset has: with a mesh there is no G."""
     given = name.endswith("-mesh")
     return {path: row for path, row in table(name).items() if not (given and path.startswith("host.sdf."))}
 
@@ -71,7 +73,7 @@ def equal(one: object, other: object) -> bool:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_the_preset_is_what_the_table_says(name):
+def test_the_preset_agrees_with_the_table(name):
     config = settings(name)
     wrong = {
         path: setting(config, path)
@@ -89,13 +91,13 @@ def test_every_difference_from_the_published_code_has_its_reason(name):
     assert not unexplained
 
 
-def test_no_setting_of_what_is_computed_is_left_out():
+def test_the_table_has_every_relevant_setting():
     config = preset("paper-mlp")
     expected = {f"{room}.{leaf.name}" for room in ROOMS for leaf in dataclasses.fields(getattr(config, room))}
     assert expected <= set(table("paper-mlp"))
 
 
-def test_a_table_that_says_something_else_is_noticed(monkeypatch, tmp_path):
+def test_a_wrong_table_is_detected(monkeypatch, tmp_path):
     page = tmp_path / "paper.md"
     row = "| `loss.eikonal` | 0.1 | `0.1` | `0.1` |"
     text = PAGE.read_text(encoding="utf-8")
@@ -103,4 +105,4 @@ def test_a_table_that_says_something_else_is_noticed(monkeypatch, tmp_path):
     page.write_text(text.replace(row, "| `loss.eikonal` | 0.1 | `0.1` | `0.2` |"), encoding="utf-8")
     monkeypatch.setattr("tests.settings.test_paper.PAGE", page)
     with pytest.raises(AssertionError):
-        test_the_preset_is_what_the_table_says("paper-mlp")
+        test_the_preset_agrees_with_the_table("paper-mlp")

@@ -1,5 +1,5 @@
-"""Settings to and from plain values, and changed by them: what is wrong is told in one line that names the
-setting.
+"""Conversion of settings to and from plain values, and changes of settings: errors name the setting in one
+line.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def test_settings_survive_json(config):
     assert changed(NeilfConfig(), json.loads(json.dumps(to_dict(config)))) == config
 
 
-def test_a_change_leaves_all_else():
+def test_a_change_keeps_all_other_settings():
     config = changed(
         preset("fast"), {"train.rays": 7, "light": {"fit": {"points": 3}}, "host": {"sdf.width": 9}}
     )
@@ -59,7 +59,7 @@ def test_a_change_leaves_all_else():
     assert changed(config, back) == preset("fast")
 
 
-def test_a_kind_brings_its_own_settings():
+def test_a_new_kind_has_its_own_settings():
     fast = preset("fast")
     assert changed(fast, {"light.kind": "distant"}).light == MapLightConfig("distant", 48, fit=fast.light.fit)
     assert changed(fast, {"light": {"kind": "free", "width": 8}}).light == FreeLightConfig(width=8)
@@ -87,7 +87,7 @@ def test_a_kind_brings_its_own_settings():
         ({"inter_reflection.mode": False}, "config.inter_reflection.mode: 'False' is not a choice"),
     ],
 )
-def test_what_is_wrong_is_named(values, complaint):
+def test_the_wrong_setting_is_named(values, complaint):
     with pytest.raises(UserError) as error:
         changed(preset("fast"), values)
     assert complaint in str(error.value)

@@ -1,4 +1,4 @@
-"""Each preset, at its real sizes, takes a step of every stage."""
+"""Each preset, at its real sizes, runs a step of every stage."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.scenes import sphere_batch
 def test_a_step_of_every_stage(name):
     torch.manual_seed(0)
     config = preset(name)
-    # An untrained surface is fog; here whatever a ray meets is shaded.
+    # An untrained surface is fog, so every ray with any weight is shaded here.
     config = dataclasses.replace(config, shading=dataclasses.replace(config.shading, hit_share=1e-3))
     facts = SceneFacts("linear", 0.2, 3.0, "constant", log_gains=(0.1, 0.0, 0.0, -0.1, 0.0, 0.0))
     direction = torch.nn.functional.normalize(torch.randn(50, 3), dim=-1)
@@ -41,7 +41,7 @@ def test_a_step_of_every_stage(name):
 
 
 def plain_settings(name: str) -> dict[str, object]:
-    """The settings of a preset by their paths."""
+    """The settings of a preset by their dotted names."""
 
     def leaves(part: object, path: str) -> dict[str, object]:
         if not dataclasses.is_dataclass(part):
@@ -56,7 +56,7 @@ def plain_settings(name: str) -> dict[str, object]:
 
 
 @pytest.mark.parametrize(("smaller", "larger"), [("fast", "balanced"), ("balanced", "best")])
-def test_a_larger_preset_is_the_same_method_with_more_of_it(smaller, larger):
+def test_a_larger_preset_differs_only_in_sizes_and_steps(smaller, larger):
     before = {path.split(".", 1)[1]: value for path, value in plain_settings(smaller).items()}
     after = {path.split(".", 1)[1]: value for path, value in plain_settings(larger).items()}
     assert before.keys() == after.keys()

@@ -1,5 +1,5 @@
-"""Directional albedo against SciPy's quadrature of the printed BRDF, at the corners of its tables, and by its
-gradient.
+"""Directional albedo compared with SciPy's quadrature of the published BRDF, at the corners of its tables,
+and its gradient.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ def test_is_finite_and_positive_in_all_corners(lobe):
         assert (found >= 0).all()
 
 
-def test_white_paint_under_varnish_sends_more_than_it_gets_and_a_white_metal_does_not():
+def test_a_white_dielectric_reflects_more_than_all_light_and_a_white_metal_does_not():
     both = directional_albedo(surface(1.0, 0.3, 0.0), UP, UP, GGX)
     metal = directional_albedo(surface(1.0, 0.3, 1.0), UP, UP, GGX)
     assert (both > 1.02).all()
     assert (metal <= 1.0).all()
 
 
-def test_the_gradient_goes_to_the_material_and_not_to_the_view():
+def test_gradients_reach_the_material_and_not_the_view():
     material = surface(0.5, 0.4, 0.5)
     leaves = [
         value.requires_grad_() for value in (material.base_color, material.roughness, material.metallic)

@@ -1,4 +1,4 @@
-"""The BRDF against a NumPy transcription, closed forms, reciprocity, the white furnace, gradcheck."""
+"""The BRDF compared with a NumPy transcription and closed forms; reciprocity, white furnace, gradcheck."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def unit(*shape: int) -> torch.Tensor:
 
 
 def upper(v: torch.Tensor, n: torch.Tensor) -> torch.Tensor:
-    """v mirrored to the side of n."""
+    """v, mirrored to the side of n if necessary."""
     return v * (v * n).sum(-1, keepdim=True).sign()
 
 
@@ -38,7 +38,7 @@ def random_material() -> Material:
 
 
 @lobes
-def test_agrees_with_the_printed_formula(lobe, scene):
+def test_agrees_with_the_published_formula(lobe, scene):
     n, wo, wi = scene
     material = random_material()
     value = evaluate(material, n, wo, wi, LOBES[lobe])
@@ -59,8 +59,8 @@ def test_reciprocity(lobe, scene):
 
 
 def test_schlick_keeps_f0_near_the_normal():
-    """At wo·h = 0.8, F0 = 0.04: 0.04 + 0.96 · 0.2⁵ = 0.0403; the misprint in the supplement would give
-    0.69.
+    """At wo·h = 0.8, F0 = 0.04: 0.04 + 0.96 · 0.2⁵ = 0.0403; the misprint in the paper's supplement would
+    give 0.69.
     """
     wo = torch.tensor([[0.6, 0.0, 0.8]], dtype=torch.float64)
     wi, n = wo.new_tensor([[[-0.6, 0.0, 0.8]]]), wo.new_tensor([[0.0, 0.0, 1.0]])
@@ -96,8 +96,10 @@ def test_projected_area_of_the_microfacets(lobe, closed_form, r):
 
 @pytest.mark.parametrize("r", [0.2, 0.5, 1.0])
 @lobes
-def test_half_vectors_are_drawn_from_their_density(lobe, r):
-    """n·h against the cumulative distribution that SciPy integrates from `pdf_h` (Kolmogorov-Smirnov)."""
+def test_half_vectors_are_sampled_from_their_density(lobe, r):
+    """n·h compared with the cumulative distribution that SciPy integrates from `pdf_h`
+    (Kolmogorov-Smirnov).
+    """
     knots = 1 - np.linspace(0, 1, 20001)[::-1] ** 3
     roughness = torch.full((1, 1), r, dtype=torch.float64)
     density = 2 * np.pi * LOBES[lobe].pdf_h(torch.from_numpy(knots.copy())[None], roughness)[0].numpy()
@@ -143,7 +145,7 @@ def test_cosines_of_the_half_vector(scene):
 
 
 @lobes
-def test_below_the_floor_the_lobe_stays_that_of_the_floor(lobe):
+def test_below_the_roughness_floor_the_lobe_is_constant(lobe):
     floor = roughness_floor(torch.float32)
     assert floor == pytest.approx(0.0442, abs=1e-4)
     one = torch.ones(1, 1)

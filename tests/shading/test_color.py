@@ -1,4 +1,4 @@
-"""The sRGB curve against its standard, and what an image response does."""
+"""The sRGB curve compared with its standard, and the responses of images."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_known_values():
     assert srgb_to_linear(srgb).allclose(linear, atol=1e-6)
 
 
-def test_round_trip_outside_the_unit_interval_too():
+def test_round_trip_inside_and_outside_the_unit_interval():
     color = torch.linspace(-0.5, 4, 1001, dtype=torch.float64)
     assert srgb_to_linear(linear_to_srgb(color)).allclose(color, atol=2e-7)
 
@@ -44,7 +44,7 @@ def test_responses():
     assert torch.equal(tone_map(color), apply_response(color, "srgb"))
 
 
-def test_an_unsettled_response_is_refused():
+def test_an_undetermined_response_is_refused():
     with pytest.raises(UserError, match="choose linear or srgb"):
         apply_response(torch.zeros(3), "auto")
 
@@ -70,7 +70,8 @@ def test_a_clipped_pixel_is_a_lower_bound():
     off = residual(radiance, pixel, "srgb")
     off.abs().sum().backward()
     off = off.detach()
-    # Brighter than white is free, darker costs. Too bright where the camera saw less costs, and leads back.
+    # At a clipped pixel, a brighter render has no loss and a darker one has. Elsewhere a too bright render
+    # has a loss.
     assert off[0] == 0
     assert radiance.grad[0] == 0
     assert off[1] < -0.4
@@ -93,8 +94,8 @@ def test_common_exposure_is_the_inverse_of_a_gain(response):
     torch.testing.assert_close(found, apply_response(radiance, response))
 
 
-def test_what_is_clipped_stays_a_lower_bound_at_any_exposure():
+def test_clipped_pixels_stay_lower_bounds_at_any_exposure():
     found = at_common_exposure(torch.tensor([1.0, 1.0]), torch.tensor([2.0, 0.5]), "srgb")
-    assert found[0] == 1.0  # its bound is 0.5; as a bound of 1 it is still none from above
+    assert found[0] == 1.0  # its lower bound is 0.5; as 1 it is still a lower bound
     assert found[1] == pytest.approx(1.055 * 2.0 ** (1 / 2.4) - 0.055)
     assert residual(torch.tensor(9.0), found[0], "srgb") == 0

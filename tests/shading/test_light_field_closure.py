@@ -1,7 +1,8 @@
-"""On the rendered ground truth, true material and true incident light give the true outgoing radiance.
+"""On the rendered ground truth, the true material and the true incident light give the true outgoing
+radiance.
 
-The light field is that of a path tracer: 64 surface points, 4096 directions of equal weight 2π/4096, 16 views
-each.
+The light field was rendered by a path tracer: 64 surface points, 4096 directions of equal weight 2π/4096, 16
+views each.
 """
 
 from __future__ import annotations
@@ -45,5 +46,5 @@ def test_the_estimator_closes_the_rendering_equation(light_field):
     outgoing = torch.stack(shaded, 1)
 
     assert outgoing.sum((0, 1)).allclose(truth.sum((0, 1)), rtol=0.02)
-    # Point by point what remains is the noise of the path tracer and of 4096 directions under small lamps.
+    # The remaining difference per point is noise of the path tracer and of 4096 directions under small lamps.
     assert ((outgoing - truth).abs().sum() / truth.sum()).item() < 0.05

@@ -1,4 +1,6 @@
-"""One integral, whatever the sampler: furnaces, SciPy quadrature, gradcheck, the sum written out."""
+"""All samplers estimate the same integral: white furnace, SciPy quadrature, gradcheck, and the explicit
+sum.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ from tests import oracles
 KINDS = ("fibonacci", "cosine", "lobe", "mis")
 B, M = (0.7, 0.4, 0.1), 0.3
 WO = (0.6, 0.0, 0.8)
-# A smooth surface is a metal: lobe samples alone see next to nothing of what a narrow lobe leaves to the
+# The smooth surface is a metal, because samples of only a narrow lobe hardly cover the
 # diffuse part.
 SURFACES = [(0.4, 1.0), (0.9, 0.3)]
 
@@ -25,7 +27,7 @@ def rows(values, count: int, dtype=torch.float64) -> torch.Tensor:
 
 
 def sky(wi):
-    """A smooth light, bright towards one side, of either array kind."""
+    """A smooth light, brighter towards one side, for NumPy and torch arrays."""
     return 1 + 0.5 * wi[..., 0] + 2 * wi[..., 1] ** 2
 
 
@@ -61,8 +63,8 @@ def test_is_the_mean_of_integrand_over_pdf(lobe):
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 32, 128, 256])
 def test_white_furnace_is_exact_at_every_count(count):
-    """The midpoint rule integrates the cosine exactly: under unit light a Lambertian surface sends out its
-    colour.
+    """The midpoint rule integrates the cosine exactly: under unit light the outgoing radiance of a Lambertian
+    surface is its colour.
     """
     n = torch.nn.functional.normalize(torch.randn(10, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
     material = Material(rows(B, 10, torch.float32), torch.ones(10, 1), torch.full((10, 1), M))
@@ -107,7 +109,7 @@ def test_every_sampler_estimates_the_same_integral(kind, lobe, r, m, truth):
 
 
 @pytest.mark.parametrize("lobe", list(LOBES))
-def test_midpoint_lattices_converge_too(lobe, truth):
+def test_midpoint_lattices_converge(lobe, truth):
     r, m = SURFACES[0]
     material = Material(rows(B, 1), rows([r], 1), rows([m], 1))
     n, wo = rows((0.0, 0.0, 1.0), 1), rows(WO, 1)
@@ -119,8 +121,8 @@ def test_midpoint_lattices_converge_too(lobe, truth):
 
 
 def test_specular_furnace_of_a_smooth_metal():
-    """D and V both lose little at r = 0.2: a white metal under unit light sends out nearly 1, by lobe samples
-    alone.
+    """D and V lose little energy at r = 0.2: under unit light the outgoing radiance of a white metal is
+    nearly 1, by only lobe samples.
     """
     count = 2000
     torch.manual_seed(3)
@@ -144,7 +146,7 @@ def test_gradcheck(lobe):
 
 
 def test_gradient_of_the_estimate_is_the_gradient_of_the_integral(truth):
-    """d/dr by lobe samples, whose density depends on r but carries no gradient, against differences of
+    """d/dr by lobe samples, whose density depends on r but has no gradient, compared with differences of
     quadratures.
     """
     torch.manual_seed(4)

@@ -1,4 +1,4 @@
-"""Every sampler draws from the density it reports (χ²), and its lattice is what it says."""
+"""Every sampler draws from the density that it reports (χ²), and its lattice has the documented positions."""
 
 from __future__ import annotations
 
@@ -87,8 +87,8 @@ def test_fibonacci_lies_at_cell_midpoints():
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 9])
-def test_mis_holds_for_odd_counts(count):
-    """The mean of (n·wi)/pdf estimates ∫ n·wi dwi = π; at one sample the mixture is the cosine alone."""
+def test_mis_is_unbiased_for_odd_counts(count):
+    """The mean of (n·wi)/pdf estimates ∫ n·wi dwi = π; with one sample the mixture has only the cosine."""
     torch.manual_seed(6)
     n, wo, r = points((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), 20_000)
     samples = sample_directions("mis", n, wo, r, count, SPHERICAL_GAUSSIAN, stochastic=True)
@@ -159,7 +159,9 @@ def test_the_density_of_mis_with_light_is_that_of_its_directions():
 
 
 def test_a_lattice_of_the_sphere_is_spread_evenly():
-    """∫ max(n·wi, 0) dwi = π about any n, from one set of directions; 4 % at 512 on the sphere."""
+    """∫ max(n·wi, 0) dwi = π for any n, with one set of directions; accurate to 4 % with 512 directions of
+    the sphere.
+    """
     torch.manual_seed(10)
     n = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
     wi = sphere_lattice(512, n)

@@ -1,4 +1,4 @@
-"""A ledger on a clock that is set by hand: every second goes to one kind of work, and none is lost."""
+"""A ledger with a simulated clock: every second is attributed to one kind of work, and none is lost."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from neilfpp_method.timing.ledger import EVERY, FIRST, Ledger, doing, listening
 
 
 class Clock:
-    """A clock that stands still until it is told; waiting for the device takes `lag` seconds if work is under
-    way there.
+    """A clock that stands still until it is advanced; waiting for the device takes `lag` seconds if work is
+    pending there.
     """
 
     def __init__(self) -> None:
@@ -24,7 +24,7 @@ class Clock:
         self.time, self.lag = self.time + self.lag, 0.0
 
 
-def test_work_within_work_is_told_apart():
+def test_nested_work_is_counted_separately():
     clock = Clock()
     with listening(Ledger(now=clock)) as ledger:
         clock.time = 1.0
@@ -42,7 +42,7 @@ def test_work_within_work_is_told_apart():
     assert ledger.total == 31.0
 
 
-def test_nothing_within_a_fit_is_told_apart_and_an_error_ends_it():
+def test_marks_within_a_fit_are_ignored_and_an_error_ends_it():
     clock = Clock()
 
     def fit():
@@ -70,11 +70,11 @@ def test_a_decorated_function_may_call_itself():
         render(2)
         clock.time += 5.0
     assert ledger.seconds() == {"preparation": {"rendering": 3.0, "rest": 5.0}}
-    render(1)  # nobody listens
+    render(1)  # no ledger is active
     assert ledger.seconds()["preparation"]["rendering"] == 3.0
 
 
-def test_what_was_counted_before_is_added():
+def test_earlier_seconds_are_added():
     clock = Clock()
     ledger = Ledger(now=clock)
     ledger.add({"preparation": {"rest": 2.0}, "joint": {"data": 1.5}})
@@ -82,9 +82,9 @@ def test_what_was_counted_before_is_added():
     assert ledger.seconds() == {"preparation": {"rest": 6.0}, "joint": {"data": 1.5}}
 
 
-def test_a_device_is_seldom_waited_for_and_its_time_is_shared_out():
-    """Work of a device shows up when it is waited for: 3 s of rendering and 1 s of shading in every step, 2 s
-    in a fit.
+def test_a_device_is_sampled_and_its_time_is_divided():
+    """The work of a device is visible only while waiting for it: 3 s of rendering and 1 s of shading in every
+    step, 2 s in a fit.
     """
     clock, steps = Clock(), EVERY + FIRST + 1
     with listening(Ledger(synchronise=clock.synchronise, now=clock)) as ledger:

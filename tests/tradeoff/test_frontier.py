@@ -1,5 +1,5 @@
-"""The frontier of accuracy over time: means, spread, gain per minute and what is dominated, by hand; and its
-files.
+"""The frontier of accuracy over time: means, deviations, gains per minute and dominated budgets, by hand; and
+its files.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def runs_of(*figures: tuple[float, float, float], seed: int = 0) -> list[Measure
     ]
 
 
-def test_what_a_minute_brings():
+def test_the_gain_per_minute():
     points = frontier(runs_of((180.0, 26.0, 8.0), (60.0, 20.0, 10.0)))
     assert [point.budget for point in points] == [60.0, 180.0]
     assert points[0].per_minute == {}
@@ -57,7 +57,7 @@ def test_only_figures_that_all_runs_have_are_compared():
     assert frontier([]) == []
 
 
-def test_the_files_say_the_same(tmp_path):
+def test_the_files_agree(tmp_path):
     runs = runs_of((60.0, 20.0, 10.0), (120.0, 19.0, 10.0))
     write_tradeoff(tmp_path, "a <scene>", runs)
     lines = list(csv.DictReader((tmp_path / "tradeoff.csv").open()))
@@ -76,7 +76,7 @@ def test_the_files_say_the_same(tmp_path):
     assert sum("dominated" in line for line in table(frontier(runs))) == 1
 
 
-def test_better_is_higher_in_the_picture_and_later_is_further_right():
+def test_better_is_higher_and_later_is_further_right():
     drawn = draw_frontier("t", frontier(runs_of((60.0, 20.0, 10.0), (120.0, 25.0, 8.0))))
     (x, y), (later, above) = re.findall(r'<circle cx="([\d.]+)" cy="([\d.]+)"', drawn)[:2]
     assert float(later) > float(x)

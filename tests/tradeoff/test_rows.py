@@ -1,4 +1,6 @@
-"""Rows are runs: those that are done stay, those that were stopped go on, those too small are left out."""
+"""Rows of a tradeoff are runs: finished ones are kept, stopped ones continue, and budgets that are too small
+are skipped.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,7 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return ["tradeoff", "--data", str(capture), "--out", str(tmp_path / "out"), "--device", "cpu"]
 
 
-def test_a_second_call_goes_on_and_does_nothing_twice(tmp_path, words, clock, monkeypatch, capsys):
+def test_a_second_call_continues_and_repeats_nothing(tmp_path, words, clock, monkeypatch, capsys):
     out = tmp_path / "out"
     words += ["--budgets", "2m,1s,3m"]
     with monkeypatch.context() as patch:
@@ -85,7 +87,7 @@ def test_a_row_that_differs_in_any_setting_is_refused_by_name(tmp_path, words, c
     assert main([*words, "--budgets", "2m"]) == 0
 
 
-def test_nothing_can_be_run(tmp_path, words, clock, capsys):
+def test_no_budget_is_large_enough(tmp_path, words, clock, capsys):
     assert main([*words, "--budgets", "1s"]) == 2
     assert "no run could be made" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
@@ -107,7 +109,7 @@ def test_bad_input_is_one_line(tmp_path, words, options, complaint, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_seeds_count_on(tmp_path):
+def test_seeds_start_at_that_of_the_settings(tmp_path):
     found = rows_of(tmp_path, tmp_path, small_config(seed=3), [180.0, 60.0], 2, "cpu")
     assert [row.name for row in found] == ["1m-seed3", "1m-seed4", "3m-seed3", "3m-seed4"]
     assert [row.config.train.seed for row in found] == [3, 4, 3, 4]

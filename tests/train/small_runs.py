@@ -1,4 +1,4 @@
-"""Trainings of milliseconds a step, for tests of the loop."""
+"""Small trainings with milliseconds per step, for tests of the loop."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from tests.scenes import tiny_config
 
 
 def small_config(**train) -> NeilfConfig:
-    """The tiny settings, in which most rays that meet something are shaded; four steps a stage but for
-    `train`.
+    """The tiny settings, in which most rays with any weight are shaded, with four steps per stage unless
+    `train` changes it.
     """
     config = tiny_config()
     return dataclasses.replace(
@@ -38,7 +38,7 @@ def small_config(**train) -> NeilfConfig:
 
 
 def solved_light(config: NeilfConfig) -> NeilfConfig:
-    """The settings with the light of `fast`: a small map and lamps, fitted every third step, and traced
+    """The settings with the light of `fast`: a small map and lamps, fitted at every third step, and traced
     visibility.
     """
     fast = preset("fast")
@@ -51,7 +51,7 @@ def solved_light(config: NeilfConfig) -> NeilfConfig:
 
 
 class Listener(Reporter):
-    """A reporter that shows nothing and remembers what it was told."""
+    """A reporter that prints nothing and records its calls."""
 
     def __init__(self) -> None:
         super().__init__(Console(quiet=True), None, None)
@@ -66,7 +66,7 @@ class Listener(Reporter):
 
 
 def small_training(root: Path, out: Path, config: NeilfConfig, patches: int = PATCHES) -> Training:
-    """A training of a capture that is ready to begin; so many patches are held back."""
+    """A training of a capture that is ready to start, with so many held-back patches."""
     capture = load_capture(root)
     pixels = PixelDataset(capture, capture.train_views)
     seed_step(config.train.seed, step=-1)
@@ -80,7 +80,7 @@ def small_training(root: Path, out: Path, config: NeilfConfig, patches: int = PA
 
 
 def differences(one: object, other: object, where: str = "") -> list[str]:
-    """The places where two nests of dictionaries, lists and tensors are not the same bit for bit."""
+    """The places at which two nested structures of dictionaries, lists and tensors differ in any bit."""
     if isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor):
         same = one.dtype == other.dtype and torch.equal(one, other)
     elif isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():

@@ -1,4 +1,6 @@
-"""A run for a time: tried out, planned, kept to by its own clock, continued, refused where it cannot be."""
+"""Training for a time budget: trial, plan, revisions by a clock, continuation, and refusal of budgets that
+are too small.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A ledger whose time passes by being looked at, and a trial that takes steps for twice as cheap."""
+    """A ledger whose clock advances at every reading, and a trial in which steps cost half as much."""
 
     def ticking(synchronise: object = None) -> Ledger:
         ticks = itertools.count()
@@ -67,7 +69,7 @@ def trained_steps(out: Path) -> int:
     return load_checkpoint(out / "checkpoints" / "last.pt")["step"]
 
 
-def test_a_run_keeps_to_its_budget_though_steps_take_longer_than_the_trial_said(tmp_path, capture, clock):
+def test_a_run_keeps_its_budget_although_steps_are_slower_than_in_the_trial(tmp_path, capture, clock):
     said = run(capture, tmp_path / "run", budget=120.0, effects=parse_effects("auto"))
     plan = read_budget(tmp_path / "run")
     assert plan.took == pytest.approx(120.0, rel=0.1)
@@ -76,7 +78,7 @@ def test_a_run_keeps_to_its_budget_though_steps_take_longer_than_the_trial_said(
     assert sum(last.steps.values()) < 0.8 * sum(first.steps.values())  # as many as the trial promised
     assert trained_steps(tmp_path / "run") == sum(last.steps.values())
 
-    # Whoever loads the run finds the steps that were taken, and the material that is there.
+    # The loaded run has the steps that were trained, and a material.
     loaded = load_run(tmp_path / "run")
     assert loaded.config.train.sdf_steps == last.steps["sdf_init"]
     assert loaded.config.train.joint_steps == last.steps["joint"]
@@ -90,7 +92,7 @@ def test_a_run_keeps_to_its_budget_though_steps_take_longer_than_the_trial_said(
     assert [(decision["on"], decision["by"]) for decision in metals] == [(True, "settings")]
 
 
-def test_a_run_that_was_stopped_goes_on_within_its_budget(tmp_path, capture, clock):
+def test_a_stopped_run_continues_within_its_budget(tmp_path, capture, clock):
     out = tmp_path / "run"
     with pytest.MonkeyPatch.context() as patch:
         interrupt_at(patch, 12)
@@ -107,7 +109,7 @@ def test_a_run_that_was_stopped_goes_on_within_its_budget(tmp_path, capture, clo
     assert trained_steps(out) == sum(after.steps.values())
 
 
-def test_a_budget_too_small_is_refused_with_one_that_is_not(tmp_path, capture, clock, monkeypatch, capsys):
+def test_a_budget_too_small_is_refused_with_the_smallest_one(tmp_path, capture, clock, monkeypatch, capsys):
     monkeypatch.setitem(PRESETS, "tiny", lambda: small_config(**STEPS))
     words = ["train", "--data", str(capture), "--preset", "tiny", "--device", "cpu", "--no-report"]
     assert main([*words, "--out", str(tmp_path / "run"), "--budget", "10s"]) == 2
@@ -120,12 +122,12 @@ def test_a_budget_too_small_is_refused_with_one_that_is_not(tmp_path, capture, c
     assert not (tmp_path / "other").exists()
 
 
-def test_several_processes_have_no_budget(tmp_path, capture, clock):
+def test_a_budget_with_several_processes_is_refused(tmp_path, capture, clock):
     with pytest.raises(UserError, match="--budget plans for one process"):
         run(capture, tmp_path / "run", budget=120.0, devices=2)
 
 
-def test_a_run_without_a_budget_has_none(tmp_path, capture, clock):
+def test_a_run_without_a_budget_has_no_plan(tmp_path, capture, clock):
     with pytest.MonkeyPatch.context() as patch:
         interrupt_at(patch, 2)
         with pytest.raises(Stopped):
@@ -154,11 +156,11 @@ def test_a_trial_measures_every_stage_that_has_steps(capture):
     assert costs.stages["sdf_init"].fit == costs.stages["sdf_init"].start == 0.0
     assert costs.stages["joint"].fit > 0
     assert costs.stages["joint"].first_fit > 0
-    assert costs.stages["joint"].start > trial.places > 0  # that of the surface, and that of places
+    assert costs.stages["joint"].start > trial.places > 0  # evidence at the surface and at places
     assert costs.reserve > 0
 
 
-def test_evidence_that_takes_too_long_is_not_looked_for(capture):
+def test_evidence_that_takes_too_long_is_not_measured(capture):
     config = solved_light(small_config(sdf_steps=0))
     trial = run_trial(
         load_capture(capture),
@@ -172,10 +174,10 @@ def test_evidence_that_takes_too_long_is_not_looked_for(capture):
     )
     assert trial.places == 0.0
     assert list(trial.costs.stages) == ["material_init", "joint"]
-    assert trial.costs.stages["joint"].first_fit == 0.0  # it was in the stage before
+    assert trial.costs.stages["joint"].first_fit == 0.0  # it is in the previous stage
 
 
-def test_the_first_light_is_part_of_the_plan_and_takes_as_many_pixels_as_there_is_time_for(tmp_path):
+def test_the_initial_light_is_planned_with_as_many_pixels_as_the_time_permits(tmp_path):
     config = solved_light(small_config(sdf_steps=10))
     many = load_capture(make_capture(tmp_path / "many", views=9))
 
@@ -187,14 +189,14 @@ def test_the_first_light_is_part_of_the_plan_and_takes_as_many_pixels_as_there_i
     whole = trial(1e9)
     assert whole.light_pixels == MOST_PIXELS
     first, later = whole.costs.stages["material_init"], whole.costs.stages["joint"]
-    assert first.first_fit == 0.0  # it ends the search
+    assert first.first_fit == 0.0  # it is part of the search
     assert first.start > 100 * later.start
     none = trial(1e-9)
     assert none.light_pixels == 0
     assert none.costs.stages["material_init"].first_fit > 0.0
 
 
-def test_without_time_for_the_first_light_training_starts_from_an_even_one(tmp_path):
+def test_without_time_for_the_initial_light_training_starts_from_an_even_one(tmp_path):
     capture = make_capture(tmp_path / "many", views=9)
     training = small_training(capture, tmp_path / "run", solved_light(small_config(sdf_steps=0)))
     plan = Plan.begin(parse_effects("auto"), training.config)
@@ -210,7 +212,7 @@ def test_without_time_for_the_first_light_training_starts_from_an_even_one(tmp_p
     assert "20% of the budget" in plan.newest("long-tails").reason
 
 
-def test_what_settings_decide_is_not_tried(capture):
+def test_effects_that_settings_decide_are_not_measured_in_a_trial(capture):
     config = small_config(joint_steps=0)
     trial = run_trial(
         load_capture(capture),
@@ -223,7 +225,7 @@ def test_what_settings_decide_is_not_tried(capture):
         report=False,
     )
     assert list(trial.costs.stages) == ["sdf_init", "material_init"]
-    assert trial.costs.stages["material_init"].fit == 0.0  # a light that is free is not solved for
+    assert trial.costs.stages["material_init"].fit == 0.0  # a free light is not fitted
     assert trial.costs.reserve == trial.places == 0.0
     assert trial.light_pixels is None
 

@@ -1,5 +1,5 @@
-"""The run folder: whole files or none, nothing executed that a file says, and one line for what does not
-fit.
+"""The run folder: complete files or none, no code from a file is run, and invalid files are refused in one
+line.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ FACTS = SceneFacts("linear", 0.25, 3.0, "constant", (0.5, 0.25, 0.125))
 
 
 def learner() -> tuple[torch.nn.Module, torch.nn.Module, torch.optim.Optimizer]:
-    """A model, a light solver that remembers nothing, and the optimiser after one step."""
+    """A model, a light solver without memory, and the optimizer after one step."""
     model = torch.nn.Linear(3, 2)
     optimizer = torch.optim.Adam(model.parameters())
     model(torch.ones(1, 3)).sum().backward()
@@ -53,7 +53,7 @@ def refused(path: Path, complaint: str) -> None:
 # ------------------------------------------------------------------------------------------------ checkpoints
 
 
-def test_a_checkpoint_holds_what_was_saved(tmp_path):
+def test_a_checkpoint_is_read_back(tmp_path):
     model, solver, optimizer = learner()
     save_checkpoint(tmp_path / "checkpoints" / "last.pt", model, solver, optimizer, 7)
     saved = load_checkpoint(tmp_path / "checkpoints" / "last.pt")
@@ -84,7 +84,7 @@ def test_a_crash_while_writing_leaves_the_old_checkpoint(tmp_path, monkeypatch):
 
 
 class Bomb:
-    """Unpickling it makes a file."""
+    """An object that creates a file when it is unpickled."""
 
     def __init__(self, crater: Path) -> None:
         self.crater = crater
@@ -93,13 +93,13 @@ class Bomb:
         return Path.touch, (self.crater,)
 
 
-def test_a_checkpoint_that_wants_to_run_code_is_refused_and_does_not(tmp_path):
+def test_a_checkpoint_with_code_is_refused_without_running_it(tmp_path):
     path, crater = tmp_path / "last.pt", tmp_path / "crater"
     torch.save({"format": FORMAT, "step": 1, "model": Bomb(crater), "optimizer": {}}, path)
     refused(path, "not a readable checkpoint")
     assert not crater.exists()
     torch.load(path, weights_only=False)
-    assert crater.exists()  # the bomb was live
+    assert crater.exists()  # pickle itself runs the code
 
 
 def test_a_truncated_checkpoint(tmp_path):
@@ -157,14 +157,14 @@ def described(path: Path) -> Path:
     return path
 
 
-def test_a_description_comes_back(tmp_path):
+def test_a_description_is_read_back(tmp_path):
     run = read_description(described(tmp_path / "run"))
     assert run.config == tiny_config()
     assert run.source == CaptureSource("/captures/sphere", 4, "linear", "sfm_scene")
     assert run.facts == FACTS
 
 
-def test_a_run_does_not_move_into_somebodys_folder(tmp_path):
+def test_a_run_is_not_created_in_a_folder_with_other_files(tmp_path):
     (tmp_path / "empty").mkdir()
     check_free(tmp_path / "empty")
     check_free(tmp_path / "missing")
@@ -177,8 +177,8 @@ def test_a_run_does_not_move_into_somebodys_folder(tmp_path):
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["thesis.tex"]
 
 
-def test_a_description_that_finds_no_room_leaves_nothing(tmp_path, monkeypatch):
-    """So that the same command may be given again."""
+def test_a_full_disk_leaves_no_part_of_a_description(tmp_path, monkeypatch):
+    """The same command can then be given again."""
 
     def full(source: Path, target: Path) -> None:
         if Path(target).name == "config.json":
@@ -245,7 +245,7 @@ def test_a_folder_that_is_no_run(tmp_path):
         load_run(tmp_path)
 
 
-def test_the_environment_is_written_down(tmp_path):
+def test_the_environment_is_recorded(tmp_path):
     written = json.loads((described(tmp_path / "run") / "environment.json").read_text())
     assert written["packages"]["torch"] == metadata.version("torch")
     assert written["packages"]["numpy"] == metadata.version("numpy")

@@ -1,6 +1,4 @@
-"""Image gradients take nine reads a pixel: they are computed in the steps whose losses need them, and in no
-others.
-"""
+"""Image gradients need nine reads per pixel: they are computed only in steps whose losses use them."""
 
 from __future__ import annotations
 

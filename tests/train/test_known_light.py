@@ -1,6 +1,4 @@
-"""Light in and out: what a run exports is what another trains under, and the record of why there are
-lamps.
-"""
+"""Known light: the exported map of one run is used in another, and the record of the decision on lamps."""
 
 from __future__ import annotations
 
@@ -24,7 +22,7 @@ from tests.train.small_runs import small_config
 
 
 def mapped_config() -> NeilfConfig:
-    """Milliseconds a step, with an environment map and lamps that are fitted at every other step."""
+    """Milliseconds per step, with an environment map and lamps that are fitted at every second step."""
     config = small_config()
     fit = LightFitConfig(points=60, every=2, steps=4)
     return dataclasses.replace(
@@ -56,7 +54,7 @@ def radiance_of(run: Path) -> torch.Tensor:
     return load_run(run).model.light.log_radiance.exp()
 
 
-def test_an_exported_map_is_trained_under_and_no_longer_needed(capture, tmp_path, capfd):
+def test_an_exported_map_is_used_and_then_not_needed(capture, tmp_path, capfd):
     first, second = tmp_path / "first", tmp_path / "second"
     assert train(capture, first) == 0
     said = capfd.readouterr().out
@@ -78,7 +76,7 @@ def test_an_exported_map_is_trained_under_and_no_longer_needed(capture, tmp_path
     assert load_run(second).config.light.map == str(sky)
 
 
-def test_a_map_alone_leaves_nothing_to_fit(capture, tmp_path, capfd):
+def test_a_known_map_without_lamps_is_not_fitted(capture, tmp_path, capfd):
     assert train(capture, tmp_path / "first") == 0
     assert command("export", tmp_path / "first", "--what", "light") == 0
     sky = tmp_path / "first" / "export" / "light" / "environment.exr"
@@ -90,8 +88,8 @@ def test_a_map_alone_leaves_nothing_to_fit(capture, tmp_path, capfd):
     assert not (out / "light.json").exists()
 
 
-def test_a_stopped_run_goes_on_without_the_file(capture, tmp_path):
-    """A checkpoint after every step; the first part of a run stands for one that was stopped there."""
+def test_a_stopped_run_continues_without_the_file(capture, tmp_path):
+    """With a checkpoint after every step; the first part of a run stands in for a stopped run."""
     assert train(capture, tmp_path / "first") == 0
     assert command("export", tmp_path / "first", "--what", "light") == 0
     sky = tmp_path / "first" / "export" / "light" / "environment.exr"
@@ -104,7 +102,7 @@ def test_a_stopped_run_goes_on_without_the_file(capture, tmp_path):
     sky.unlink()
     assert command("train", "--out", out, "--resume") == 0
     torch.testing.assert_close(radiance_of(out), expected, rtol=0, atol=0)
-    assert read_fits(out, before=10**9) == record  # nothing twice, and the same again
+    assert read_fits(out, before=10**9) == record  # no duplicates, and the same values
 
 
 @pytest.mark.parametrize(
@@ -118,7 +116,7 @@ def test_a_stopped_run_goes_on_without_the_file(capture, tmp_path):
         ),
     ],
 )
-def test_a_map_that_cannot_be_is_refused_and_leaves_nothing(
+def test_an_invalid_map_is_refused_and_leaves_no_run(
     capture, tmp_path, capfd, monkeypatch, options, complaint
 ):
     monkeypatch.chdir(tmp_path)
@@ -134,7 +132,7 @@ def test_a_map_that_cannot_be_is_refused_and_leaves_nothing(
 FITS = [LightFit(0, 0.021, 0.004, 204, 3), LightFit(100, -0.001, 0.003, 204, 0)]
 
 
-def test_the_record_says_why():
+def test_the_record_has_the_reason():
     auto = MapLightConfig(kind="auto")
     assert (
         light_summary(auto, FITS)

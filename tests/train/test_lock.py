@@ -1,4 +1,4 @@
-"""Two trainings do not share a run folder, and a killed one is in nobody's way."""
+"""Two trainings cannot use the same run folder, and a killed training does not block it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def holder(folder: Path) -> subprocess.Popen[str]:
     return process
 
 
-def test_the_second_is_refused_until_the_first_is_gone(tmp_path):
+def test_the_second_training_is_refused_until_the_first_has_ended(tmp_path):
     folder = tmp_path / "run"
     with holder(folder) as process:
         with (
@@ -33,20 +33,20 @@ def test_the_second_is_refused_until_the_first_is_gone(tmp_path):
             pytest.fail("two at once")
         assert (folder / LOCK).exists()
         process.send_signal(signal.SIGKILL)
-    assert (folder / LOCK).exists()  # nobody could take it away
+    assert (folder / LOCK).exists()  # it was not removed
     with run_lock(folder):
         pass
     assert not (folder / LOCK).exists()
 
 
-def test_it_is_let_go_of_after_an_error(tmp_path):
+def test_the_lock_is_released_after_an_error(tmp_path):
     for _ in range(2):
         with pytest.raises(ZeroDivisionError), run_lock(tmp_path):
             raise ZeroDivisionError
     assert not list(tmp_path.iterdir())
 
 
-def test_other_processes_of_one_training_are_let_in(tmp_path, monkeypatch):
+def test_other_processes_of_a_training_do_not_lock(tmp_path, monkeypatch):
     with run_lock(tmp_path):
         monkeypatch.setenv("LOCAL_RANK", "1")
         with run_lock(tmp_path):
@@ -56,7 +56,7 @@ def test_other_processes_of_one_training_are_let_in(tmp_path, monkeypatch):
             pytest.fail("two at once")
 
 
-def test_what_a_killed_training_left_before_it_was_a_run_is_in_nobodys_way(tmp_path):
+def test_files_of_a_training_killed_before_its_run_existed_are_ignored(tmp_path):
     for name in (LOCK, "capture.json", "scene.json", ".config.4711.json"):
         (tmp_path / name).write_text("{")
     check_free(tmp_path)

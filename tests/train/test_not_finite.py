@@ -1,4 +1,4 @@
-"""A step that is not finite moves nothing, is counted, and says what went wrong; ten in a row end the
+"""A step that is not finite changes nothing, is counted, and its cause is reported; ten in a row end the
 training.
 """
 
@@ -34,7 +34,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def spoil_loss(
     training: Training, name: str, steps: range | tuple[int, ...], value: float = math.nan
 ) -> None:
-    """Let a loss be `value` at these steps."""
+    """Replace a loss by `value` at these steps."""
     honest, calls = training.model.step, iter(range(1000))
 
     def spoiled(*arguments):
@@ -47,7 +47,7 @@ def spoil_loss(
 
 
 def spoil_gradient(training: Training, field: str, steps: tuple[int, ...]) -> None:
-    """Let the gradient of a field be NaN at these steps, and the loss stay finite."""
+    """Replace the gradient of a field by NaN at these steps; the loss stays finite."""
     honest, calls = training.model.step, iter(range(1000))
     parameter = training.model.parameter_groups()[field][0]
     current = [0]
@@ -61,7 +61,7 @@ def spoil_gradient(training: Training, field: str, steps: tuple[int, ...]) -> No
 
 
 def watch(training: Training, patch: pytest.MonkeyPatch) -> list[dict]:
-    """The whole state, parameters and optimiser, after each step."""
+    """The whole state, parameters and optimizer, after each step."""
     states, made = [], []
     make_optimizer, step = loop.make_optimizer, training.reporter.step
 
@@ -110,8 +110,8 @@ def test_a_gradient_that_is_not_finite(tmp_path, capture, monkeypatch, field, st
     assert f"step {step} skipped: the gradient of {field} is not finite" in line
 
 
-def test_what_is_not_finite_in_another_process(tmp_path, capture, monkeypatch):
-    """The mean over all processes is not finite where one of them is not: all leave the step out."""
+def test_a_step_that_is_not_finite_in_another_process(tmp_path, capture, monkeypatch):
+    """The mean over all processes is not finite if one value is not, so all processes skip the step."""
     training = small_training(capture, tmp_path, small_config())
     states, calls = watch(training, monkeypatch), iter(range(1000))
     monkeypatch.setattr(
@@ -133,14 +133,14 @@ def test_skipped_steps_are_counted(tmp_path, capture):
     assert all(p.isfinite().all() for p in training.model.parameters())
 
 
-def test_nine_in_a_row_are_an_accident(tmp_path, capture):
+def test_nine_in_a_row_do_not_end_the_training(tmp_path, capture):
     training = small_training(capture, tmp_path, small_config(sdf_steps=40))
     spoil_loss(training, "volume", (*range(2, 11), *range(12, 21)))
     train(training)
     assert training.skipped == 18
 
 
-def test_ten_in_a_row_are_none(tmp_path, capture, monkeypatch):
+def test_ten_in_a_row_end_the_training(tmp_path, capture, monkeypatch):
     training = small_training(capture, tmp_path, small_config(sdf_steps=40))
     spoil_loss(training, "volume", range(7, 40))
     states = watch(training, monkeypatch)
@@ -150,7 +150,7 @@ def test_ten_in_a_row_are_none(tmp_path, capture, monkeypatch):
         train(training)
     assert str(tmp_path / "checkpoints") in caught.value.remedy
     assert training.skipped == 10
-    # Steps 0 to 6 were good; the checkpoint of every third step holds what step 6 left.
+    # Steps 0 to 6 were finite; the checkpoint, made every third step, has the state after step 6.
     saved = torch.load(tmp_path / "checkpoints" / "last.pt", weights_only=True)
     assert differences(saved["model"], states[6]["model"]) == []
     assert differences(saved["optimizer"]["state"], states[6]["optimizer"]) == []

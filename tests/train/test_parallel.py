@@ -1,4 +1,4 @@
-"""Two processes train one model: each on rays of its own, both with the mean of the two gradients."""
+"""Two processes train one model: each on its own rays, both with the mean of the gradients."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def started(
     capture: Path, out: Path, *options: str, record: Path | None = None
 ) -> Iterator[subprocess.Popen]:
-    """A training in two processes; none is left when the block ends, however it ends."""
+    """Start a training in two processes; both are ended when the context ends."""
     command = [sys.executable, "-m", "tests.tiny_command", "train", "--data", str(capture), "--out", str(out)]
     command += ["--preset", "tiny", "--device", "cpu", "--devices", "2", *options]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"} | ({"TINY_RECORD": str(record)} if record else {})
@@ -57,7 +57,7 @@ def started(
 
 
 def recorded(folder: Path, name: str) -> dict[str, torch.Tensor]:
-    """What a process wrote down; the second may end a moment after the first."""
+    """The values that a process has written; the second process may end slightly after the first."""
     path, deadline = folder / f"{name}.pt", time.monotonic() + 20.0
     while time.monotonic() < deadline:
         try:
@@ -108,15 +108,15 @@ def local_gradients(training, rank: int) -> dict[str, torch.Tensor]:
     return {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
 
 
-def test_a_stop_stops_both_processes_after_the_same_step(tmp_path, capture):
-    """The signal reaches the first process alone."""
+def test_a_stop_ends_both_processes_after_the_same_step(tmp_path, capture):
+    """Only the first process receives the signal."""
     out = tmp_path / "run"
     with started(capture, out, "--config.train.sdf-steps", "100000") as process:
         while not (out / "checkpoints" / "last.pt").exists():
             assert process.poll() is None
             time.sleep(0.02)
         process.send_signal(signal.SIGINT)
-        _, complaint = process.communicate(timeout=30)  # until both have closed their end
+        _, complaint = process.communicate(timeout=30)  # until both processes have ended
     assert process.returncode == 130
     assert complaint.count("stopped after step") == 1
     assert complaint.endswith(f"continue with: neilfpp train --out {out} --resume --device cpu --devices 2\n")
@@ -165,7 +165,7 @@ def test_two_nodes_end_with_one_model(tmp_path, capture):
 
 
 def free_port() -> int:
-    """A port of this machine that nobody listens to."""
+    """A port of this machine that is not in use."""
     with socket.socket() as server:
         server.bind(("127.0.0.1", 0))
         return server.getsockname()[1]
@@ -180,7 +180,7 @@ def free_port() -> int:
         (["--nodes", "0"], None, "--nodes is 0"),
     ],
 )
-def test_processes_that_do_not_go_together_are_named(
+def test_inconsistent_numbers_of_processes_are_refused(
     tmp_path, capture, options, started, complaint, monkeypatch, capsys
 ):
     monkeypatch.setitem(PRESETS, "tiny", small_config)
@@ -193,7 +193,7 @@ def test_processes_that_do_not_go_together_are_named(
     assert not (tmp_path / "run").exists()
 
 
-def test_bad_input_is_told_once(tmp_path, capture):
+def test_an_input_error_is_printed_once(tmp_path, capture):
     with started(capture, capture) as process:
         _, complaint = process.communicate(timeout=30)
     assert process.returncode == 2
@@ -202,8 +202,8 @@ def test_bad_input_is_told_once(tmp_path, capture):
     )
 
 
-def test_the_second_process_leaves_words_and_status_to_the_first(monkeypatch, capfd):
-    """A child that ends with a status of its own has its parent killed."""
+def test_only_the_first_process_prints_errors_and_sets_the_status(monkeypatch, capfd):
+    """If a child ended with an error status, its parent would be killed."""
     assert main(["eval", "nowhere"]) == 2
     assert "no run here" in capfd.readouterr().err
     monkeypatch.setenv("LOCAL_RANK", "1")

@@ -1,4 +1,4 @@
-"""Geometry keeps to the capture's point cloud, where there is one."""
+"""The capture's point cloud supervises the geometry, if there is one."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def test_the_cloud_is_in_the_loss_of_fast(capture):
     assert config.loss.point_cloud > 0
     model, pixels = built(capture, changed(tiny_config(), {"loss.point_cloud": config.loss.point_cloud}))
     terms = model.losses(pixels.sample(8), Stage.SDF_INIT)
-    # The sphere of the start is no sphere of 0.8: points lie off it.
+    # The initial sphere does not have the radius 0.8, so the points are not on it.
     assert terms["point_cloud"].values.max() > 0.05
     assert "oriented_pcd.ply supervises the geometry" in cloud_summary(capture, config)
 
 
-def test_a_capture_without_a_cloud_goes_without_it(capture):
+def test_a_capture_without_a_cloud_has_no_loss_on_it(capture):
     without = dataclasses.replace(capture, point_cloud=None)
     config = changed(tiny_config(), {"loss.point_cloud": 0.1})
     model, pixels = built(without, config)
@@ -44,6 +44,6 @@ def test_a_capture_without_a_cloud_goes_without_it(capture):
     assert "from the images alone" in cloud_summary(without, config)
 
 
-def test_nothing_is_said_where_no_cloud_is_asked_for(capture):
+def test_no_message_if_the_settings_use_no_cloud(capture):
     assert cloud_summary(capture, changed(preset("fast"), {"loss.point_cloud": 0.0})) is None
     assert cloud_summary(capture, fixed_geometry(preset("fast"))) is None

@@ -1,4 +1,4 @@
-"""Held-back pixels are measured while a run trains, and the training is the same without."""
+"""Held-back pixels are measured while a run trains, without any influence on the training."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def train_here(data, out, resume=False, **settings):
     run_training(data=data, out=out, config=config, resume=resume, console=Console(quiet=True), **options)
 
 
-def test_checks_change_nothing_and_a_resumed_run_goes_on_with_them(tmp_path, capture, monkeypatch):
-    """Checks after every step, checks only at the ends of stages, and a run that was stopped."""
+def test_checks_do_not_change_the_training_and_continue_after_a_stop(tmp_path, capture, monkeypatch):
+    """Checks after every step, checks only at the ends of stages, and a stopped run."""
     train_here(capture, tmp_path / "seldom")
     monkeypatch.setattr(quality, "MIN_STEPS", 1)
     monkeypatch.setattr(quality, "MAX_SHARE", 1.0)
@@ -59,13 +59,13 @@ def test_checks_change_nothing_and_a_resumed_run_goes_on_with_them(tmp_path, cap
 
 
 def test_the_psnr_is_that_of_clipped_srgb_values():
-    """R and PBR of a model against pixels that lie a known distance off, in display values."""
+    """R and PBR of a model compared with pixels at a known difference in display values."""
     model = sphere_model()
     model.eval()
     batch = sphere_batch(32)
     maps = model.maps(batch.rays)
     for off in (0.1, 0.01):
-        # A photograph that is R brighter by `off` in display values, where that does not clip.
+        # A photograph that is brighter than R by `off` in display values, unless that clips.
         shown = quality.tone_map(maps.rgb_volume)
         batch.color.copy_(shown + torch.where(shown > 0.5, -off, off))
         watch = Quality(batch, hdr=False)
@@ -75,7 +75,7 @@ def test_the_psnr_is_that_of_clipped_srgb_values():
         assert model.training
 
 
-def test_checks_are_seldom_and_cheap(monkeypatch):
+def test_checks_are_rare_and_cheap(monkeypatch):
     monkeypatch.setattr(quality, "_decibels", lambda *_: (20.0, None))
     watch = Quality(sphere_batch(4), hdr=True)
     model = sphere_model()
@@ -85,7 +85,7 @@ def test_checks_are_seldom_and_cheap(monkeypatch):
     for number in range(1, 501):
         watch.check_when_due(model, StagePosition(Stage.JOINT, number, 500), 3000 + number, 1e9)
     assert [check.step for check in watch.checks[10:]] == [3200, 3400, 3500]
-    # Looks that have cost too much wait, but for the one at the end of a stage.
+    # Checks that took too much time are postponed, except that at the end of a stage.
     watch = Quality(sphere_batch(4), True, [QualityCheck(10, "sdf_init", 10.0, 1.0, None, took=1.0)])
     for seconds, checks in ((0.9 / MAX_SHARE, 1), (1.1 / MAX_SHARE, 2)):
         watch.check_when_due(model, StagePosition(Stage.JOINT, 400, 900), 1000, seconds)
@@ -94,7 +94,7 @@ def test_checks_are_seldom_and_cheap(monkeypatch):
     assert watch.checks[-1].step == 1500
 
 
-def test_a_capture_too_small_is_not_checked(tmp_path):
+def test_a_very_small_capture_is_not_checked(tmp_path):
     training = small_training(make_capture(tmp_path / "sphere", size=(8, 6)), tmp_path, small_config())
     assert not len(training.quality.pixels)
     train(training)

@@ -1,4 +1,4 @@
-"""A run that is stopped and continued is the run that was never stopped, bit for bit."""
+"""A run that is stopped and continued agrees bit for bit with an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ STEPS = 12
 def run(
     data: Path | None, out: Path, config: NeilfConfig | None = None, resume: bool = False, **options
 ) -> str:
-    """Train or continue, and return what the person is told."""
+    """Train or continue, and return the printed messages."""
     console = Console()
     options = {"test_every": None, "response": "auto", "device": "cpu", "devices": 1, **options}
     with console.capture() as said:
@@ -74,7 +74,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory, capture: Path) -> Path:
-    """A run that nobody stopped."""
+    """An uninterrupted run."""
     out = tmp_path_factory.mktemp("runs") / "whole"
     run(capture, out, small_config())
     return out
@@ -101,7 +101,7 @@ def test_a_stop_in_any_stage_changes_nothing(tmp_path, capture, whole, monkeypat
         assert (out / preview).read_bytes() == (whole / preview).read_bytes()
 
 
-def test_the_comparison_sees_a_changed_bit(whole):
+def test_the_comparison_detects_a_changed_bit(whole):
     changed = state(whole)
     moments = changed["optimizer"]["state"]
     assert {"exp_avg", "exp_avg_sq", "step"} <= moments[0].keys()
@@ -121,8 +121,8 @@ def test_many_stops_change_nothing(tmp_path, capture, whole, monkeypatch):
     assert differences(state(out), state(whole)) == []
 
 
-def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint(tmp_path, capture, whole, monkeypatch):
-    """Nothing is saved at the moment of death; the checkpoint of every third step is there."""
+def test_a_killed_run_continues_from_its_last_checkpoint(tmp_path, capture, whole, monkeypatch):
+    """Nothing is saved when the process is killed; the last checkpoint, made every third step, exists."""
 
     def die(seed: int, step: int, rank: int = 0) -> None:
         if step == 7:
@@ -139,7 +139,7 @@ def test_a_run_that_was_killed_goes_on_from_its_last_checkpoint(tmp_path, captur
     assert differences(state(out), state(whole)) == []
 
 
-def test_a_run_that_found_no_room_goes_on_once_there_is_some(tmp_path, capture, whole, monkeypatch):
+def test_a_run_on_a_full_disk_continues_when_there_is_space(tmp_path, capture, whole, monkeypatch):
     """The disk is full when the checkpoint after step 6 is due."""
 
     def save(contents: dict, file: BinaryIO) -> None:
@@ -160,13 +160,13 @@ def test_a_run_that_found_no_room_goes_on_once_there_is_some(tmp_path, capture, 
     assert differences(state(out), state(whole)) == []
 
 
-def test_a_stop_in_the_last_step_has_nothing_left_to_stop(tmp_path, capture, whole, monkeypatch):
+def test_a_stop_in_the_last_step_has_no_effect(tmp_path, capture, whole, monkeypatch):
     interrupt_at(monkeypatch, STEPS - 1)
     run(capture, tmp_path / "run", small_config())
     assert differences(state(tmp_path / "run"), state(whole)) == []
 
 
-def test_seed_step_and_process_each_have_random_numbers_of_their_own():
+def test_random_numbers_differ_by_seed_step_and_process():
     def drawn(*place: int) -> float:
         loop.seed_step(*place)
         return torch.rand(()).item()
@@ -177,7 +177,7 @@ def test_seed_step_and_process_each_have_random_numbers_of_their_own():
 
 
 def test_a_second_ctrl_c_does_not_wait(tmp_path, capture, whole, monkeypatch):
-    """Steps since the last checkpoint are lost, and computed again."""
+    """The steps since the last checkpoint are lost and computed again."""
 
     def seed_step(seed: int, step: int, rank: int = 0) -> None:
         if step == 5:
@@ -196,10 +196,10 @@ def test_a_second_ctrl_c_does_not_wait(tmp_path, capture, whole, monkeypatch):
 
 
 def test_time_adds_up_over_stops(tmp_path, capture, monkeypatch):
-    """On a clock that ticks when it is read, a stage takes one second a step, stopped or not."""
+    """With a clock that advances when it is read, a stage takes one second per step, stopped or not."""
     out = tmp_path / "run"
     with monkeypatch.context() as patch:
-        patch.setattr(loop, "time", SimpleNamespace(perf_counter=ticking()))  # of the loop alone
+        patch.setattr(loop, "time", SimpleNamespace(perf_counter=ticking()))  # only in the loop
         interrupt_at(patch, 1, 5)
         with pytest.raises(Stopped):
             run(capture, out, small_config())
@@ -223,7 +223,7 @@ def ticking() -> Callable[[], float]:
 # ------------------------------------------------------------------------------------------ what resume takes
 
 
-def test_a_finished_run_is_left_as_it_is(whole):
+def test_a_finished_run_is_unchanged(whole):
     before = files(whole)
     said = run(None, whole, resume=True)
     assert said == f"run folder {whole}: finished already, nothing to continue\n"
@@ -247,7 +247,7 @@ def test_a_run_keeps_its_settings(tmp_path, capture, whole, monkeypatch):
         with pytest.raises(UserError, match="a run keeps its capture and its settings"):
             run(out=out, resume=True, **given)
     assert files(out) == before
-    run(capture, out, small_config(), resume=True)  # the same command again, with --resume, is as good
+    run(capture, out, small_config(), resume=True)  # the same command with --resume is accepted
     assert read_description(out) == read_description(whole)
     assert differences(state(out), state(whole)) == []
 
@@ -262,7 +262,7 @@ def test_a_run_that_stopped_before_its_first_checkpoint_starts_again(tmp_path, c
     assert differences(state(out), state(whole)) == []
 
 
-def test_weights_that_do_not_fit_the_settings(tmp_path, capture, monkeypatch):
+def test_weights_that_do_not_fit_the_settings_are_refused(tmp_path, capture, monkeypatch):
     out = tmp_path / "run"
     interrupt_at(monkeypatch, 1)
     with pytest.raises(Stopped):
@@ -278,7 +278,9 @@ def test_weights_that_do_not_fit_the_settings(tmp_path, capture, monkeypatch):
 
 
 def test_ctrl_c_in_a_real_terminal_session(tmp_path, capture):
-    """The process says in one line how to go on, ends with 130, and that line, typed as it is, goes on."""
+    """The process prints in one line how to continue and ends with 130; that line, typed unchanged, continues
+    the run.
+    """
     out, rays = tmp_path / "a folder with spaces", 512
     command = [
         sys.executable,
@@ -304,8 +306,8 @@ def test_ctrl_c_in_a_real_terminal_session(tmp_path, capture):
     assert complaint == told
 
     assert main(shlex.split(complaint.split("continue with: neilfpp ")[1])) == 0
-    # As a process of its own, too: commands compute without denormal numbers, which the moments of a table
-    # come to hold.
+    # Also run in a separate process: commands flush denormal numbers, which the moments of a table
+    # may contain.
     unstopped = _start([*command, str(tmp_path / "unstopped")])
     unstopped.communicate(timeout=60)
     assert unstopped.returncode == 0
@@ -320,9 +322,9 @@ def _start(command: list[str]) -> subprocess.Popen[str]:
 # ---------------------------------------------------------------------------------------------------- effects
 
 
-def test_what_evidence_decided_is_read_from_the_run(tmp_path, capture, monkeypatch):
-    """A ball sees nothing of itself: nothing is traced after SDF init, in a run that was stopped as in one
-    that was not.
+def test_decisions_by_evidence_are_read_from_the_run(tmp_path, capture, monkeypatch):
+    """A ball does not occlude itself, so nothing is traced after SDF init, in a stopped run as in an
+    uninterrupted one.
     """
     config = solved_light(small_config())
     asked = parse_effects("auto")

@@ -1,4 +1,4 @@
-"""Rays that skip empty space by a grid of an earlier step: a continued run skips by the very same grid."""
+"""Rays skip empty space by a grid of an earlier step: a continued run uses the same grid."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.train.test_resume import interrupt_at, run, state
 
 
 @pytest.mark.parametrize("asked", [1, 9])
-def test_a_stop_changes_nothing(tmp_path, monkeypatch, asked):
+def test_a_stop_does_not_change_the_result(tmp_path, monkeypatch, asked):
     monkeypatch.setattr(empty_space, "RESOLUTION", 16)
     config = small_config()
     config = dataclasses.replace(config, volume=dataclasses.replace(config.volume, skip_empty=True))

@@ -1,5 +1,5 @@
-"""What lies behind a scene must not swallow it: a ground and a sky are found to be two, and surfaces come
-first.
+"""The background must not explain the scene: ground and sky are detected as two colours, and surfaces are
+trained first.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def facts_of(root: Path):
     return scene_facts(capture, PixelDataset(capture, capture.train_views), tiny_config())
 
 
-def test_what_lies_behind_is_told_from_the_images(tmp_path):
+def test_the_kind_of_background_comes_from_the_images(tmp_path):
     even, sky = (
         facts_of(make_capture(tmp_path / "even", background=GROUND)),
         facts_of(make_sky_capture(tmp_path / "sky")),
@@ -46,7 +46,7 @@ def test_what_lies_behind_is_told_from_the_images(tmp_path):
     (Stage.MATERIAL_INIT, 0.0, True),
     (Stage.JOINT, 0.0, True),
 ])  # fmt: skip
-def test_it_waits_until_there_are_surfaces(stage, share, moves):
+def test_the_background_is_trained_after_surfaces_exist(stage, share, moves):
     model = sphere_model(background="inverted_sphere")
     config = OptimizerConfig(background_from=0.4)
     optimizer = make_optimizer(model, config)
@@ -56,7 +56,7 @@ def test_it_waits_until_there_are_surfaces(stage, share, moves):
     assert all(rate > 0 for rate in rates.values())
 
 
-def test_it_does_not_wait_where_points_were_found_behind(tmp_path):
+def test_the_background_is_trained_at_once_if_points_are_behind_the_scene(tmp_path):
     capture = load_capture(make_sky_capture(tmp_path / "sky", views=6, size=(48, 36)))
     pixels = PixelDataset(capture, capture.train_views)
     far_points = [
@@ -78,7 +78,7 @@ def test_it_does_not_wait_where_points_were_found_behind(tmp_path):
 
 
 def test_a_sphere_under_a_sky_gets_a_surface(tmp_path):
-    """With the settings of `fast` for what lies behind, and small networks."""
+    """With the background settings of `fast`, and small networks."""
     config = tiny_config()
     fast = preset("fast").optimizer
     steps = dataclasses.replace(
@@ -106,7 +106,7 @@ def test_a_sphere_under_a_sky_gets_a_surface(tmp_path):
 
 @pytest.mark.parametrize("background", ["inverted_sphere", "constant"])
 def test_pixels_beyond_the_scene_are_remembered_as_its_light(tmp_path, background):
-    """A constant background is a backdrop, or black for want of one: no light."""
+    """A constant background is a backdrop, or black if nothing is known: it is not light."""
     model = sphere_model(solved_light(tiny_config()), background=background).train()
     capture = load_capture(make_sky_capture(tmp_path / "sky"))
     batch = PixelDataset(capture, capture.views).sample(400)

@@ -1,4 +1,4 @@
-"""A skipped step is kept, and running it again names the operation that is not finite."""
+"""A skipped step is stored, and running it again names the operation that is not finite."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def training(tmp_path: Path, capture: Path, monkeypatch: pytest.MonkeyPatch) -> Training:
-    """A run on disk, four steps a stage, whose material stage shades points of earlier steps again."""
+    """A run on disk with four steps per stage, whose material stage shades points of earlier steps again."""
     monkeypatch.setattr("neilfpp_method.lighting.replay.KEPT_STEPS", 1)
     config = small_config(fresh=0.5)
     made = small_training(capture, tmp_path / "run", config)
@@ -39,7 +39,7 @@ def training(tmp_path: Path, capture: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def spoil(monkeypatch: pytest.MonkeyPatch, training: Training, number: int, spoiled) -> None:
-    """Let `losses.photometric` return `spoiled(errors)` in this step, and whenever that step is run again."""
+    """Let `losses.photometric` return `spoiled(errors)` in this step, also when the step is run again."""
     honest, step = losses.photometric, training.model.step
     calls, now = iter(range(1000)), [number]
 
@@ -79,7 +79,7 @@ def test_a_loss_that_is_not_finite(training, monkeypatch, step):
 
 
 def test_a_gradient_that_is_not_finite_names_the_line_of_its_operation(training, monkeypatch):
-    """√0 has the value 0 and no slope."""
+    """√0 has the value 0, and its derivative is infinite."""
 
     def rooted(errors: torch.Tensor) -> torch.Tensor:
         return errors + (errors[:1] * 0.0).sqrt()
@@ -93,7 +93,7 @@ def test_a_gradient_that_is_not_finite_names_the_line_of_its_operation(training,
 
 
 def test_a_rerun_repeats_the_step_bit_for_bit(training, monkeypatch):
-    """Its losses are those of the skipped step, in a stage that shades remembered points again as well."""
+    """The losses are those of the skipped step, also in a stage that shades stored points again."""
     values, honest = [], training.model.step
 
     def remembering(*arguments):
@@ -128,7 +128,7 @@ def test_a_rerun_repeats_the_step_bit_for_bit(training, monkeypatch):
         assert torch.equal(value, again[0][name]), name
 
 
-def test_the_first_ones_are_kept(training):
+def test_the_first_skipped_steps_are_stored(training):
     honest = training.model.step
     training.model.step = lambda *a: (r := honest(*a))._replace(
         terms={name: LossTerm(t.values * math.nan) for name, t in r.terms.items()}
@@ -138,7 +138,7 @@ def test_the_first_ones_are_kept(training):
     assert sorted(int(file.stem) for file in (training.path / FOLDER).iterdir()) == list(range(MAX_KEPT))
 
 
-def test_an_infinity_that_a_mask_takes_out_is_not_told():
+def test_an_infinity_that_a_mask_removes_is_not_reported():
     with OriginsOfNotFinite() as origins:
         x = torch.tensor([0.0, 1.0])
         harmless = torch.where(x > 0, 1.0 / x, 0.0)
@@ -148,7 +148,7 @@ def test_an_infinity_that_a_mask_takes_out_is_not_told():
     assert origins.origin_of(wrong).rows == (0,)
 
 
-def test_a_step_that_was_not_kept(training, monkeypatch, capfd):
+def test_a_step_that_is_not_stored(training, monkeypatch, capfd):
     monkeypatch.setitem(PRESETS, "tiny", small_config)
     with pytest.raises(UserError, match="step 3 is not a stored skipped step; the run has skipped no step"):
         load_step(training.path, 3)

@@ -1,4 +1,4 @@
-"""What the distance field starts as: the hull of the masks, or the sphere and why."""
+"""The initial distance field: the visual hull of the masks, or a sphere with the reason."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SIZE = (64, 48)
 
 @pytest.fixture(autouse=True)
 def cheap(monkeypatch) -> None:
-    """A coarser hull and a shorter fit, enough for tiny fields."""
+    """A coarser hull and a shorter fit, sufficient for tiny fields."""
     monkeypatch.setattr(start, "find_hull", functools.partial(find_hull, resolution=40))
     monkeypatch.setattr(start, "STEPS", 100)
     monkeypatch.setattr(start, "POINTS", 512)
@@ -41,7 +41,7 @@ def cheap(monkeypatch) -> None:
 
 @pytest.fixture
 def masked(tmp_path: Path) -> Path:
-    """Twelve views of a ball of radius 0.8 scene units, the first of them held out."""
+    """Twelve views of a ball of radius 0.8 scene units; the first view is held out."""
     return make_capture(tmp_path / "capture", views=12, size=SIZE, masks=True)
 
 
@@ -53,7 +53,7 @@ def settings(begin: str = "silhouettes") -> NeilfConfig:
 
 
 def started(root: Path, config: NeilfConfig) -> tuple[NeilfModel, GeometryStart]:
-    """An untrained model of the capture after its start."""
+    """An untrained model of the capture after its initialisation."""
     capture = load_capture(root)
     seed_step(config.train.seed, -1)
     model = build_model(
@@ -63,7 +63,7 @@ def started(root: Path, config: NeilfConfig) -> tuple[NeilfModel, GeometryStart]
 
 
 def off_the_ball(model: NeilfModel) -> torch.Tensor:
-    """G at points of the ball's surface: 0 where it is right."""
+    """G at points of the ball's surface: 0 if it is correct."""
     direction = torch.nn.functional.normalize(
         torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)), dim=-1
     )
@@ -81,7 +81,7 @@ def test_the_field_starts_as_the_hull_of_the_masks(masked):
     assert plain.text == "geometry starts as a sphere: as the settings say"
     assert told.text.startswith("geometry starts as the visual hull of 11 masks, to 0.0")
     assert told.error < 0.02
-    # Eleven views from a ring leave a hull that is a little larger than the ball: G is negative on the ball.
+    # The hull of eleven views from a ring is slightly larger than the ball: G is negative on the ball.
     assert off_the_ball(sphere).abs().mean() > 0.1
     assert off_the_ball(hull).abs().mean() < 0.05
     with torch.no_grad():
@@ -92,7 +92,7 @@ def test_the_field_starts_as_the_hull_of_the_masks(masked):
     assert (outside > 0.2).all()
 
 
-def test_the_start_follows_from_the_seed_and_moves_no_other_draw(masked):
+def test_the_start_depends_on_the_seed_and_keeps_the_random_state(masked):
     config = settings()
     first, _ = started(masked, config)
     state = torch.get_rng_state()
@@ -103,14 +103,14 @@ def test_the_start_follows_from_the_seed_and_moves_no_other_draw(masked):
     assert torch.equal(torch.get_rng_state(), state), "training draws the same whatever it started as"
 
 
-def test_masks_that_are_held_out_are_not_asked(masked):
+def test_masks_of_test_views_are_not_used(masked):
     first, _ = started(masked, settings())
     write_png(masked / "inputs" / "masks" / "000.png", np.full(SIZE[::-1], 255, np.uint8))
     again, _ = started(masked, settings())
     assert all(torch.equal(a, b) for a, b in zip(weights(first), weights(again), strict=True))
 
 
-def test_without_masks_it_is_the_sphere_and_says_so(tmp_path):
+def test_without_masks_it_is_a_sphere_with_a_message(tmp_path):
     root = make_capture(tmp_path, views=4)
     plain, _ = started(root, settings("sphere"))
     model, told = started(root, settings())
@@ -118,7 +118,7 @@ def test_without_masks_it_is_the_sphere_and_says_so(tmp_path):
     assert all(torch.equal(a, b) for a, b in zip(weights(plain), weights(model), strict=True))
 
 
-def test_masks_that_make_no_body_are_a_warning(masked):
+def test_masks_without_a_hull_are_a_warning(masked):
     for path in sorted((masked / "inputs" / "masks").iterdir()):
         write_png(path, np.full(SIZE[::-1], 255, np.uint8))
     plain, _ = started(masked, settings("sphere"))
@@ -130,8 +130,8 @@ def test_masks_that_make_no_body_are_a_warning(masked):
     assert all(torch.equal(a, b) for a, b in zip(weights(plain), weights(model), strict=True))
 
 
-def test_training_says_how_it_starts_and_a_resumed_run_does_not_start_again(masked, tmp_path, monkeypatch):
-    """The loop is left out: what it finds is saved as it is after the first step."""
+def test_training_prints_its_start_and_a_resumed_run_does_not_start_again(masked, tmp_path, monkeypatch):
+    """The loop is replaced: its initial state is saved as that after the first step."""
 
     def first_step(run: command.Training) -> None:
         path = run.path / "checkpoints" / "last.pt"

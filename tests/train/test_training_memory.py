@@ -1,4 +1,4 @@
-"""Training on many pixels: what it takes is bounded, and asked for before it is taken."""
+"""Training with many pixels: the memory is bounded, and checked before it is allocated."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ sys.exit(status)
 
 
 def peak(data: Path, out: Path) -> int:
-    """Most memory, bytes, of a process that trains on images at their full size."""
+    """Peak memory, bytes, of a process that trains on images at their full size."""
     command = [
         sys.executable,
         "-c",
@@ -43,8 +43,10 @@ def peak(data: Path, out: Path) -> int:
     return int(done.stdout.split("PEAK ")[1])
 
 
-def test_many_pixels_take_the_memory_of_one_view(tmp_path: Path) -> None:
-    """48 views of 1 megapixel, which took 19 bytes a pixel (0.9 GB), take no more than some views do."""
+def test_memory_is_that_of_single_views(tmp_path: Path) -> None:
+    """48 views of 1 megapixel, which would need 0.9 GB at 19 bytes per pixel, need no more than a few views
+    do.
+    """
     small = peak(make_large_capture(tmp_path / "few", views=2, size=(1152, 864)), tmp_path / "a")
     large = peak(make_large_capture(tmp_path / "many", views=48, size=(1152, 864)), tmp_path / "b")
     pixels = 48 * 1152 * 864
@@ -53,7 +55,7 @@ def test_many_pixels_take_the_memory_of_one_view(tmp_path: Path) -> None:
     assert large - small < 19 * pixels / 3
 
 
-def test_what_does_not_fit_ends_at_once_in_one_line(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_too_little_memory_is_an_error_of_one_line(tmp_path: Path, monkeypatch, capsys) -> None:
     root = make_capture(tmp_path / "c")
     monkeypatch.setattr("neilfpp_method.data.memory.available_memory", lambda: 2 * 10**8)
     assert main(["train", "--data", str(root), "--out", str(tmp_path / "run"), "--device", "cpu"]) == 2

@@ -1,4 +1,4 @@
-"""A run says where its time went, and all of it."""
+"""The record of the time of a run by stage and kind of work is complete."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.train.small_runs import small_config, solved_light
 from tests.train.test_resume import interrupt_at
 
 
-def test_the_seconds_of_a_run_that_was_stopped_add_up_to_the_clock(tmp_path, monkeypatch):
+def test_the_seconds_of_a_stopped_run_add_up_to_the_clock(tmp_path, monkeypatch):
     capture, out = make_capture(tmp_path / "sphere"), tmp_path / "run"
     config, console = solved_light(small_config()), Console(quiet=True)
     options = {"test_every": None, "response": "auto", "device": "cpu", "devices": 1, "console": console}
@@ -36,7 +36,7 @@ def test_the_seconds_of_a_run_that_was_stopped_add_up_to_the_clock(tmp_path, mon
     work = read_work(out)
     assert list(work) == ["preparation", "sdf_init", "material_init", "joint"]
     assert sum(sum(parts.values()) for parts in work.values()) == pytest.approx(taken, rel=0.02)
-    assert work["sdf_init"] == before["sdf_init"]  # over before the stop
+    assert work["sdf_init"] == before["sdf_init"]  # finished before the stop
     assert work["material_init"]["shading"] > before["material_init"]["shading"]
     told = {kind for parts in work.values() for kind in parts}
     assert told == set(WORK)
@@ -61,7 +61,7 @@ def test_a_damaged_record_is_named(tmp_path, damage):
         read_work(tmp_path)
 
 
-def test_json_that_is_nested_without_end_is_refused(tmp_path):
+def test_deeply_nested_json_is_refused(tmp_path):
     (tmp_path / FILE).write_text("[" * 100_000)
     with pytest.raises(UserError, match="not readable as JSON"):
         read_work(tmp_path)

@@ -1,4 +1,4 @@
-"""Tiny runs to look at: with a surface that was found, and with a mesh that was given."""
+"""Tiny runs to view: with a recovered surface, and with a given mesh."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def capture(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="package")
 def found(tmp_path_factory, capture) -> Path:
-    """A run that has found its surface and an environment map."""
+    """A run with a recovered surface and an environment map."""
     return _trained(tmp_path_factory.mktemp("runs") / "found", capture, solved_light)
 
 
 @pytest.fixture(scope="package")
 def given(tmp_path_factory, capture) -> Path:
-    """A run with the capture's mesh, and a light that is free at every point."""
+    """A run with the capture's mesh and a light that is free at every point."""
     return _trained(
         tmp_path_factory.mktemp("runs") / "given", capture, lambda config: config, "--host", "mesh"
     )

@@ -1,4 +1,4 @@
-"""The viewer beside a training, as the process that it is."""
+"""The viewer during a training, as a separate process."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def served(port: int) -> bool:
     return False
 
 
-def test_the_page_is_there_while_the_body_runs(tmp_path, port):
+def test_the_page_is_served_while_the_context_runs(tmp_path, port):
     said = []
     with viewer_beside(tmp_path / "run", port, "cpu", said.append):
         ends = time.monotonic() + PATIENCE
@@ -44,7 +44,7 @@ def test_the_page_is_there_while_the_body_runs(tmp_path, port):
     check_free("127.0.0.1", port)
 
 
-def test_a_viewer_that_fails_is_told_and_harms_nothing(found, tmp_path, port):
+def test_a_failed_viewer_is_reported_and_does_not_affect_the_training(found, tmp_path, port):
     run, said = tmp_path / "run", []
     shutil.copytree(found, run)
     (run / "checkpoints" / "last.pt").write_bytes(b"not a checkpoint")
@@ -54,7 +54,7 @@ def test_a_viewer_that_fails_is_told_and_harms_nothing(found, tmp_path, port):
     assert "last.pt" in said[-1]
 
 
-def test_training_beside_a_busy_port_is_one_line(tmp_path, capture, capsys):
+def test_training_with_a_busy_port_is_an_error_of_one_line(tmp_path, capture, capsys):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

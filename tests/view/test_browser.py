@@ -1,6 +1,4 @@
-"""The page in a real browser, where there is one: through the layers, the light, and a click on the
-surface.
-"""
+"""The page in a real browser, if there is one: the layers, the light, and a click on the surface."""
 
 from __future__ import annotations
 
@@ -42,7 +40,7 @@ def page(found):
 
 
 def middle(driver) -> np.ndarray:
-    """The mean colour about the middle of the window."""
+    """Mean colour around the centre of the window."""
     pixels = np.asarray(Image.open(io.BytesIO(driver.get_screenshot_as_png())).convert("RGB"), float)
     height, width = pixels.shape[:2]
     return pixels[int(0.45 * height) : int(0.55 * height), int(0.45 * width) : int(0.5 * width)].mean((0, 1))
@@ -53,11 +51,11 @@ def test_every_layer_is_shown(page):
     for title in LAYERS.values():
         before = middle(page)
         choose(page, "Layer", title)
-        if title != "PBR":  # which is shown first
+        if title != "PBR":  # it is shown first
             wait_for(lambda before=before: np.abs(middle(page) - before).max() > 2, 30)
         seen[title] = middle(page)
     assert np.ptp(seen["roughness"]) < 3  # grey
-    assert np.ptp(seen["normal"]) > 20  # the middle of a ball faces the camera, whose direction is a colour
+    assert np.ptp(seen["normal"]) > 20  # the centre of a ball faces the camera, and its normal is a colour
 
 
 def test_another_environment_is_another_light(page):
@@ -68,13 +66,13 @@ def test_another_environment_is_another_light(page):
     wait_for(lambda: middle(page)[0] < 1.5 * middle(page)[1], 30)
 
 
-def test_a_click_on_the_surface_tells_its_material(page):
+def test_a_click_on_the_surface_shows_its_material(page):
     click_at(page, 0.48, 0.5)
     wait_for(lambda: "metallic 0." in text_of(page), 30)
     assert "Click the surface." not in text_of(page)
 
 
-def test_a_view_is_gone_to_with_its_photograph(page):
+def test_going_to_a_view_shows_its_photograph(page):
     choose(page, "Layer", "normal")
     before = middle(page)
     from selenium.webdriver.common.by import By

@@ -50,7 +50,7 @@ def test_the_page_is_served_until_it_is_ended(found, port):
     command.view(request(found, port), said.append, once)
     assert served == [200]
     assert said == [f"open http://127.0.0.1:{port} in a browser; press Ctrl-C to stop"]
-    check_free("127.0.0.1", port)  # nothing is left
+    check_free("127.0.0.1", port)  # the port is free again
 
 
 def test_following_waits_and_shows_each_new_checkpoint(found, port, tmp_path, monkeypatch):
@@ -74,7 +74,7 @@ def test_following_waits_and_shows_each_new_checkpoint(found, port, tmp_path, mo
     assert shown == [6, 6]
 
 
-def test_an_open_door_is_told(found, port):
+def test_an_address_open_to_other_machines_is_warned_about(found, port):
     pytest.importorskip("viser")
     said = []
     command.view(request(found, port, host="0.0.0.0"), said.append, lambda _: True)
@@ -121,7 +121,7 @@ def test_without_the_library_the_line_names_the_command(capsys, found, monkeypat
     assert "0.2.7 is installed" in ends(capsys, str(found))
 
 
-def test_a_folder_of_maps_is_all_maps_in_it(tmp_path):
+def test_a_folder_of_maps_stands_for_all_its_maps(tmp_path):
     for name, value in (("noon", 2.0), ("dusk", 0.5)):
         radiance = np.full((8, 16), value, np.float32)
         write_exr(tmp_path / f"{name}.exr", {channel: radiance for channel in "RGB"})

@@ -9,7 +9,7 @@ def test_sizes_double_up_to_the_whole_window():
     assert sizes(640, 480, 10**9) == [1.0]
 
 
-def test_the_first_picture_is_no_larger_than_can_be_there_at_once():
+def test_the_first_image_is_small_enough_to_appear_immediately():
     for at_once in (300, 5_000, 80_000):
         first = sizes(1280, 720, at_once)[0]
         assert at_once / 4.1 < first**2 * 1280 * 720 <= at_once * 1.01
@@ -19,9 +19,9 @@ def test_the_number_of_rays_follows_the_measured_speed():
     pace = Pace()
     pace.note("normal", 100_000, 1.0)
     assert pace.first_image("normal") == int(100_000 * FIRST_IMAGE)
-    pace.note("normal", 300_000, 1.0)  # half of either: 200,000 a second
+    pace.note("normal", 300_000, 1.0)  # the mean of both: 200,000 per second
     assert pace.first_image("normal") == int(200_000 * FIRST_IMAGE)
     assert pace.batch("normal") == pytest.approx(200_000 * BATCH)
-    pace.note("radiance", 1, 1.0)  # of each layer by itself, and never nothing
+    pace.note("radiance", 1, 1.0)  # separately for each layer, and never 0
     assert pace.first_image("radiance") == 256
     assert pace.first_image("normal") == int(200_000 * FIRST_IMAGE)

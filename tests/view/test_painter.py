@@ -8,7 +8,7 @@ WAIT = 10.0
 
 
 class Seen:
-    """What a painter has shown, and ways to wait for it."""
+    """The images that a painter has shown, and functions that wait for them."""
 
     def __init__(self):
         self.shown, self.failures, self.news = [], [], threading.Condition()
@@ -46,12 +46,12 @@ def painting(seen):
         painter.stop()
 
 
-def test_pictures_come_in_order(seen, painting):
+def test_images_are_shown_in_order(seen, painting):
     painting(lambda wish: iter([None, f"{wish} coarse", None, f"{wish} fine"])).request("a")
     seen.wait(lambda: seen.shown == ["a coarse", "a fine"])
 
 
-def test_a_newer_wish_ends_the_refinement_of_the_older(seen, painting):
+def test_a_new_request_ends_the_refinement_of_the_previous_one(seen, painting):
     reached, newer = threading.Event(), threading.Event()
 
     def frames(wish):
@@ -71,14 +71,14 @@ def test_a_newer_wish_ends_the_refinement_of_the_older(seen, painting):
     assert seen.shown == ["old coarse", "new coarse"]
 
 
-def test_the_first_picture_is_finished_and_wishes_in_between_are_skipped(seen, painting):
+def test_the_first_image_is_finished_and_intermediate_requests_are_skipped(seen, painting):
     begun, asked = threading.Event(), threading.Event()
 
     def frames(wish):
         if wish == 0:
             begun.set()
             assert asked.wait(WAIT)
-        yield None  # here it could be given up
+        yield None  # here it could be abandoned
         yield wish
 
     painter = painting(frames)
@@ -91,7 +91,7 @@ def test_the_first_picture_is_finished_and_wishes_in_between_are_skipped(seen, p
     assert seen.shown == [0, 3]
 
 
-def test_a_failure_is_told_and_the_next_wish_goes(seen, painting):
+def test_a_failure_is_reported_and_the_next_request_is_rendered(seen, painting):
     def frames(wish):
         if wish == "bad":
             raise ValueError("no such thing")

@@ -1,4 +1,4 @@
-"""Pictures of layers against rays that trimesh casts, and light against constant surroundings."""
+"""Images of layers compared with rays that trimesh casts, and light in constant surroundings."""
 
 from dataclasses import replace
 
@@ -39,7 +39,9 @@ def pictures(wish: Request, count: int = 99) -> list[Frame]:
 
 
 def cast(subject, camera):
-    """Which pixels meet the surface first from outside, where, and on which triangle, by trimesh."""
+    """For each pixel, whether its ray first hits the outside of the surface, where, and which triangle, by
+    trimesh.
+    """
     rays = camera_rays(camera)
     corners = subject.surface.triangles.reshape(-1, 3).numpy()
     mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
@@ -55,7 +57,7 @@ def srgb(linear):
     )
 
 
-def test_pictures_become_finer_up_to_the_window(subject, camera):
+def test_images_become_finer_up_to_the_size_of_the_window(subject, camera):
     made = pictures(Request(subject, camera, "normal", own_light(subject.run)))
     assert [frame.share for frame in made] == sorted(frame.share for frame in made)
     assert made[0].share < 1 == made[-1].share
@@ -63,7 +65,7 @@ def test_pictures_become_finer_up_to_the_window(subject, camera):
 
 
 @pytest.mark.parametrize("layer", ["base_color", "roughness", "metallic"])
-def test_a_layer_is_the_material_of_what_a_pixel_sees(subject, camera, layer):
+def test_a_layer_shows_the_material_at_the_hit_of_each_pixel(subject, camera, layer):
     frame = pictures(Request(subject, camera, layer, own_light(subject.run)))[-1]
     _, place, ray = cast(subject, camera)
     assert len(ray) > 100
@@ -84,8 +86,8 @@ def test_depth_is_along_the_axis(subject, camera):
     assert frame.depth.max() == FAR
 
 
-def test_pbr_comes_to_the_path_tracers_picture(subject, camera):
-    """Many samples of either, by other random numbers."""
+def test_pbr_converges_to_the_image_of_the_path_tracer(subject, camera):
+    """Many samples of both, with different random numbers."""
     light = own_light(subject.run)
     made = [frame for frame in pictures(Request(subject, camera, "pbr", light), 40) if frame.share == 1]
     assert [frame.samples for frame in made] == list(range(1, len(made) + 1))
@@ -97,7 +99,7 @@ def test_pbr_comes_to_the_path_tracers_picture(subject, camera):
     assert abs((made[-1].image.astype(float) - true)[inside].mean()) < 1.5
 
 
-def test_twice_the_light_is_a_stop_more(subject, camera):
+def test_twice_the_light_is_one_stop_brighter(subject, camera):
     light = own_light(subject.run)
     brighter = Lighting(replace(light.sky, radiance=2 * light.sky.radiance), None, own=False)
     last = [
@@ -115,7 +117,7 @@ def test_a_free_light_shows_pbr_too(given, camera):
     assert frame.image.std() > 5
 
 
-def test_a_run_without_a_surface_shows_r_and_says_so(found, camera):
+def test_a_run_without_a_surface_shows_r_with_a_note(found, camera):
     run = load_run(found)
     run.model.host.sdf = lambda x: x.norm(dim=-1) + 1.0
     empty = subject_of(run, 32)
@@ -152,14 +154,14 @@ def test_even_light_arrives_evenly_and_not_from_below(subject, camera):
         np.sin(theta)[:, None] * (np.sin(phi) * normal[0] + np.cos(phi) * normal[1])
         + np.cos(theta)[:, None] * normal[2]
     )
-    assert np.median(np.abs(radiance[cosine > 0.5] - 0.7)) < 1e-5  # nothing stands before it
+    assert np.median(np.abs(radiance[cosine > 0.5] - 0.7)) < 1e-5  # it is not occluded
     assert radiance[cosine < -0.05].max() == 0
     picture = light_picture(np.ones_like(radiance), normal)
     assert (picture[cosine < -0.05] == 44).all()
     assert picture[cosine > 0.05].min() > 88
 
 
-def test_own_light_is_what_the_model_says(subject, camera):
+def test_the_own_light_agrees_with_the_model(subject, camera):
     rays, _, ray = cast(subject, camera)
     middle = ray[len(ray) // 2]
     point = point_under(

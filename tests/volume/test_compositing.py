@@ -1,4 +1,4 @@
-"""Weights along a ray, against the product formula and closed forms."""
+"""Weights along a ray, compared with the product formula and closed forms."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from neilfpp_method.volume.compositing import (
 
 
 def product_formula(density, distances, far):
-    """Weights of one ray as they are in the textbook: alpha times what the samples in front let through."""
+    """Weights of one ray by the textbook formula: alpha times the transmittance of the samples in front."""
     alpha = 1.0 - np.exp(-density * np.diff([*distances, far]))
     return alpha * np.cumprod([1.0, *(1.0 - alpha[:-1])])
 
@@ -48,7 +48,7 @@ def test_two_samples_by_hand():
 
 
 @pytest.mark.parametrize("sigma", [1e-6, 0.3, 5.0])
-def test_a_homogeneous_slab_is_beer_lambert_however_it_is_cut(sigma):
+def test_a_homogeneous_slab_follows_beer_lambert_for_any_cuts(sigma):
     length = 1.7
     cuts = torch.tensor([[1.0, 1.01, 1.5, 1.5, 2.2]])
     found = render_weights(torch.full((1, 5), sigma), cuts, torch.tensor([1.0 + length]))
@@ -58,7 +58,7 @@ def test_a_homogeneous_slab_is_beer_lambert_however_it_is_cut(sigma):
     assert found.transmittance.item() == pytest.approx(math.exp(-sigma * length), rel=1e-6)
 
 
-def test_half_of_an_interval_counts_at_either_end():
+def test_half_of_the_weight_of_an_interval_goes_to_either_end():
     intervals = depth_weights(
         torch.tensor([[math.log(2.0), math.log(4.0)]])
     )  # let through one half, then one quarter
@@ -75,7 +75,7 @@ def test_the_share_near_a_depth_takes_parts_of_intervals():
     assert share_near(distances, weights, torch.tensor([9.0]), 1.5).item() == 0.0
 
 
-def test_an_opaque_sample_hides_what_is_behind_it():
+def test_an_opaque_sample_occludes_later_samples():
     found = render_weights(
         torch.tensor([[0.0, 1e8, 3.0]]), torch.tensor([[0.0, 1.0, 2.0]]), torch.tensor([3.0])
     )
@@ -83,13 +83,13 @@ def test_an_opaque_sample_hides_what_is_behind_it():
     assert found.transmittance.item() == 0.0
 
 
-def test_intervals_without_length_count_for_nothing():
+def test_intervals_of_length_zero_have_no_weight():
     found = render_weights(torch.full((1, 3), 1e8), torch.full((1, 3), 2.0), torch.tensor([2.0]))
     assert found.weights.tolist() == [[0.0, 0.0, 0.0]]
     assert found.transmittance.item() == 1.0
 
 
-def test_half_precision_is_added_up_in_float32():
+def test_half_precision_is_summed_in_float32():
     half = torch.bfloat16
     distances = (torch.arange(256.0) / 256.0).to(half)  # exact: eight bits each
     found = render_weights(torch.ones(1, 256, dtype=half), distances[None], torch.ones(1, dtype=half))
@@ -109,7 +109,9 @@ def test_gradients():
 
 
 def test_samples_that_rounding_has_swapped_emit_nothing():
-    """One unit in the last place behind its neighbour, in a medium in which that is a depth of −0.6."""
+    """Two samples are swapped by one unit in the last place, in a medium in which that is an optical depth of
+    −0.6.
+    """
     distances = torch.tensor([[0.5, 1.0, 1.0, 1.5]])
     distances[0, 2] = torch.nextafter(distances[0, 1], torch.tensor(0.0))
     found = render_weights(torch.tensor([[0.0, 1e7, 0.0, 0.1]]), distances, torch.tensor([2.0]))

@@ -1,4 +1,4 @@
-"""The Laplace density, against SciPy's distribution."""
+"""The Laplace density, compared with SciPy's distribution."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_is_the_laplace_cdf_over_beta(beta):
     np.testing.assert_allclose(density.numpy(), expected, rtol=1e-12)
 
 
-def test_thin_air_keeps_its_relative_precision_in_float32():
+def test_low_density_keeps_its_relative_precision_in_float32():
     density = laplace_density(torch.tensor([4.0]), torch.tensor(0.1))
     assert density.item() == pytest.approx(
         0.5 * np.exp(-40.0) / 0.1, rel=1e-5
@@ -81,7 +81,7 @@ def test_depth_has_gradients_also_along_a_surface():
     assert torch.autograd.gradcheck(lambda s, b: laplace_depth(s, cuts, b), (sdf, beta))
 
 
-def test_beta_starts_where_told_and_stays_above_its_floor():
+def test_beta_starts_at_the_given_value_and_stays_above_its_floor():
     density = LaplaceDensity(beta_init=0.1, beta_floor=1e-4)
     assert density.beta().item() == pytest.approx(0.1)
     assert density(torch.zeros(1, 2), torch.tensor([[1.0, 3.0]])).item() == pytest.approx(2.0 * 0.5 / 0.1)
@@ -95,7 +95,7 @@ def test_beta_at_its_floor_is_refused():
         LaplaceDensity(beta_init=1e-4, beta_floor=1e-4)
 
 
-def test_a_limit_lowers_the_scale_and_never_below_its_floor():
+def test_a_limit_lowers_the_scale_but_not_below_its_floor():
     density = LaplaceDensity(0.1, beta_floor=1e-3)
     density.limit_(0.2)
     assert density.beta().item() == pytest.approx(0.1)

@@ -1,4 +1,4 @@
-"""Tracing on a sampled distance field, against exact intersections."""
+"""Sphere tracing in a sampled distance field, compared with exact intersections."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_look_up_is_exact_for_a_linear_field():
     )
 
 
-def test_rays_meet_the_sphere_where_they_should():
+def test_rays_hit_the_sphere_at_the_exact_points():
     torch.manual_seed(0)
     grid = sample_grid(sphere, RADIUS, 96, torch.zeros(1))
     origins = 1.4 * normalize(torch.randn(2000, 3), dim=-1)
@@ -39,7 +39,7 @@ def test_rays_meet_the_sphere_where_they_should():
     missed_by = (origins.square().sum(-1) - along**2).clamp_min(0).sqrt() - 0.6
     clear = missed_by.abs() > 2 * cell_size(
         grid, RADIUS
-    )  # within a cell or two of grazing either answer is right
+    )  # within one or two cells of a grazing ray both results are accepted
     assert torch.equal(found.hit[clear], missed_by[clear] < 0)
     hit = found.hit & clear
     exact = -along[hit] - (0.36 - (origins[hit].square().sum(-1) - along[hit] ** 2)).sqrt()
@@ -64,7 +64,7 @@ def test_a_ray_that_leaves_the_cube_hits_nothing():
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("field", [sphere, plate])
-def test_compiled_loops_go_where_the_reference_goes(field, threads, monkeypatch):
+def test_compiled_loops_agree_with_the_reference(field, threads, monkeypatch):
     torch.manual_seed(0)
     grid = sample_grid(field, RADIUS, 33, torch.zeros(1, dtype=torch.float64))
     origins = 3 * torch.rand(5000, 3, dtype=torch.float64) - 1.5
@@ -83,7 +83,7 @@ def test_compiled_loops_go_where_the_reference_goes(field, threads, monkeypatch)
     torch.testing.assert_close(found.distance, expected.distance, atol=1e-9, rtol=0.0)
 
 
-def test_rays_that_are_no_rays_hit_nothing():
+def test_invalid_rays_hit_nothing():
     grid = sample_grid(sphere, RADIUS, 17, torch.zeros(1))
     broken = torch.tensor([[torch.nan, 0.0, 0.0], [torch.inf, 0.0, 0.0], [0.0, -torch.inf, torch.nan]])
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3)

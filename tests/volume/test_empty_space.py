@@ -1,4 +1,6 @@
-"""Skipped space, against quadrature of the true density: what is skipped neither absorbs nor can be seen."""
+"""Skipped space, compared with quadrature of the true density: skipped parts neither absorb nor are
+visible.
+"""
 
 from __future__ import annotations
 
@@ -29,18 +31,18 @@ def sphere(x):
 
 
 def hollow(x):
-    """The camera's side of a thin shell: a room seen from within."""
+    """The inner side of a thin shell, on the side of the camera: a room viewed from within."""
     return 0.01 - (x.norm(dim=-1) - 1.2).abs()
 
 
 def plate(thickness, tilt=0.3, offset=0.1):
-    """An infinite plate, thinner than a cell where the thickness is."""
+    """An infinite plate that is thinner than a cell if `thickness` is."""
     normal = torch.tensor([math.sin(tilt), 0.2, math.cos(tilt)]) / math.sqrt(1.04)
     return lambda x: (x @ normal - offset).abs() - thickness / 2
 
 
 def bundle(count=200, seed=0, inside=False):
-    """Rays towards the middle of the scene from without, or in all directions from within."""
+    """Rays towards the centre of the scene from outside, or in all directions from within."""
     generator = torch.Generator().manual_seed(seed)
     origins = normalize(torch.randn(count, 3, generator=generator), dim=-1) * (0.9 if inside else 2.5)
     targets = torch.randn(count, 3, generator=generator) * (3.0 if inside else 0.5)
@@ -54,7 +56,7 @@ def narrowed(sdf, rays, beta, grid=None):
 
 
 def true_weights(sdf, rays, beta, whole):
-    """Places along each ray and their blending weight, by quadrature of the true density."""
+    """Positions along each ray and their blending weights, by quadrature of the true density."""
     edges = torch.lerp(
         whole.near[:, None].double(), whole.far[:, None].double(), torch.linspace(0, 1, 8001).double()
     )
@@ -83,7 +85,7 @@ def assert_nothing_lost(sdf, rays, beta):
     "sdf", [sphere, hollow, plate(0.2), plate(1e-3)], ids=["sphere", "hollow", "plate", "foil"]
 )
 @pytest.mark.parametrize("inside", [False, True])
-def test_what_is_skipped_holds_no_weight(sdf, beta, inside):
+def test_skipped_parts_have_no_weight(sdf, beta, inside):
     assert_nothing_lost(sdf, bundle(inside=inside), beta)
 
 
@@ -96,23 +98,23 @@ def test_what_is_skipped_holds_no_weight(sdf, beta, inside):
     seed=st.integers(0, 99),
 )
 def test_no_thin_plate_is_lost(share, tilt, offset, log_beta, seed):
-    """From a thousandth of a cell to two cells thick, in any place."""
+    """From a thousandth of a cell to two cells thick, at any position."""
     assert_nothing_lost(plate(share * CELL, tilt, offset), bundle(20, seed), 10.0**log_beta)
 
 
-def test_grazing_rays_keep_what_they_graze():
+def test_grazing_rays_keep_the_surface_that_they_graze():
     height = torch.linspace(0.5, 0.75, 101)
     origins = torch.stack([torch.full_like(height, -2.5), height, torch.zeros_like(height)], -1)
     rays = RayBatch(origins, torch.tensor([1.0, 0.0, 0.0]).expand(101, 3))
     assert_nothing_lost(sphere, rays, 0.01)
 
 
-def test_much_is_skipped_where_much_is_empty():
+def test_most_of_a_mostly_empty_ray_is_skipped():
     whole, part = narrowed(sphere, bundle(), 0.01)
     assert (part.far - part.near).sum() < 0.4 * (whole.far - whole.near).sum()
 
 
-def test_a_ray_that_meets_nothing_keeps_its_interval():
+def test_an_empty_ray_keeps_its_interval():
     whole, part = narrowed(lambda x: x.norm(dim=-1) + 1.0, bundle(), 0.01)
     assert torch.equal(part.near, whole.near)
     assert torch.equal(part.far, whole.far)
@@ -120,7 +122,9 @@ def test_a_ray_that_meets_nothing_keeps_its_interval():
 
 @pytest.mark.parametrize("sdf", [sphere, plate(0.3 * CELL)], ids=["sphere", "foil"])
 def test_fewer_queries_find_the_same_surface(sdf):
-    """The rendered median depth against that of the true weights, from the part and from the whole ray."""
+    """The rendered median depth, compared with that of the true weights, from the part and from the whole
+    ray.
+    """
     rays, beta = bundle(), 0.01
     whole, part = narrowed(sdf, rays, beta)
     place, weight = true_weights(sdf, rays, beta, whole)
@@ -159,7 +163,7 @@ def may_meet(sdf, rays, beta=0.01):
 
 
 def leaving(steepest=0.2, height=0.06):
-    """Rays away from the sphere, at least so steep, from so far above it."""
+    """Rays away from the sphere, with a minimum angle to it, from a given height above it."""
     generator = torch.Generator().manual_seed(0)
     normal = normalize(torch.randn(300, 3, generator=generator), dim=-1)
     away = normalize(torch.randn(300, 3, generator=generator), dim=-1)
@@ -168,7 +172,7 @@ def leaving(steepest=0.2, height=0.06):
     return RayBatch((0.6 + height) * normal[steep], away[steep])
 
 
-def test_rays_that_leave_a_round_thing_meet_nothing():
+def test_rays_that_leave_a_sphere_hit_nothing():
     assert may_meet(sphere, leaving()).float().mean() < 0.03
 
 
@@ -179,9 +183,9 @@ def test_rays_that_leave_a_round_thing_meet_nothing():
     tilt=st.floats(-1.5, 1.5),
     log_beta=st.floats(-3.0, -1.5),
 )
-def test_no_thin_plate_before_a_ray_is_overlooked(share, seed, tilt, log_beta):
-    """Rays from two cells or more before the plate, by no less than 10° towards it, from above a surface of
-    their own.
+def test_no_thin_plate_in_front_of_a_ray_is_missed(share, seed, tilt, log_beta):
+    """Rays at least two cells in front of the plate, at least 10° towards it, that start above another
+    surface.
     """
     normal = torch.tensor([math.sin(tilt), 0.2, math.cos(tilt)]) / math.sqrt(1.04)
     foil, generator = plate(share * CELL, tilt, 0.3), torch.Generator().manual_seed(seed)
@@ -198,7 +202,7 @@ def test_no_thin_plate_before_a_ray_is_overlooked(share, seed, tilt, log_beta):
     def scene(x):
         return torch.minimum(
             foil(x), (x.norm(dim=-1) - 0.9).abs() + 0.03
-        )  # a shell that all rays leave, or pass
+        )  # a shell that all rays leave or pass
 
     assert may_meet(scene, RayBatch(origins, directions)[meets], 10.0**log_beta).all()
 
@@ -206,7 +210,7 @@ def test_no_thin_plate_before_a_ray_is_overlooked(share, seed, tilt, log_beta):
 # ----------------------------------------------------------------------------------------- a field that moves
 
 
-def test_a_surface_that_has_come_up_is_noticed_at_once():
+def test_a_new_surface_is_detected_immediately():
     grid, rays = EmptySpace(RADIUS), bundle()
     narrowed(sphere, rays, 0.01, grid)
 
@@ -214,16 +218,16 @@ def test_a_surface_that_has_come_up_is_noticed_at_once():
         return torch.minimum(sphere(x), (x - torch.tensor([0.0, 0.0, 1.2])).norm(dim=-1) - 0.5)
 
     whole, part = narrowed(moved, rays, 0.01, grid)
-    assert torch.equal(part.near, whole.near)  # nobody skips anything
+    assert torch.equal(part.near, whole.near)  # no ray skips anything
     for _ in range(empty_space.MIN_LIFE):
         grid.moved()
     narrowed(moved, rays, 0.01, grid)
     whole, part = narrowed(moved, rays, 0.01, grid)
-    assert grid.age == 0  # sampled anew
+    assert grid.age == 0  # sampled again
     assert (part.near > whole.near).any()
 
 
-def test_the_grid_is_sampled_when_it_must():
+def test_the_grid_is_sampled_after_its_maximum_age():
     grid, rays, asked = EmptySpace(RADIUS), bundle(5), []
 
     def counted(x):
@@ -241,7 +245,7 @@ def test_the_grid_is_sampled_when_it_must():
     assert grid.age == 0
 
 
-def test_a_grid_from_a_checkpoint_skips_the_same():
+def test_a_grid_from_a_checkpoint_skips_the_same_parts():
     one, other, rays = EmptySpace(RADIUS), EmptySpace(RADIUS), bundle()
     narrowed(sphere, rays, 0.01, one)
     one.moved()
@@ -253,7 +257,7 @@ def test_a_grid_from_a_checkpoint_skips_the_same():
     assert torch.equal(first.far, second.far)
 
 
-def test_the_slope_is_the_steepest_of_the_field():
+def test_the_bound_is_the_largest_slope_of_the_field():
     grid = EmptySpace(RADIUS)
     narrowed(lambda x: 3.0 * x[:, 1], bundle(2), 0.01, grid)
     assert grid.slope.item() == pytest.approx(empty_space.MARGIN * 3.0, rel=1e-4)

@@ -1,4 +1,4 @@
-"""Free space about cameras: how far it reaches, its depth against the definition, and what it does to the
+"""Free space around cameras: its size, its depth compared with the definition, and its effect on the
 reference host.
 """
 
@@ -21,7 +21,7 @@ def ring(count: int, distance: float) -> torch.Tensor:
 
 
 def shell(radius: float) -> torch.Tensor:
-    """Points all over a sphere around the origin."""
+    """Points distributed over a sphere around the origin."""
     return radius * torch.nn.functional.normalize(
         torch.randn(20_000, 3, generator=torch.Generator().manual_seed(0)), dim=-1
     )
@@ -38,7 +38,7 @@ def test_no_ball_reaches_the_unit_sphere_and_none_is_larger_than_a_quarter_of_th
     assert free_balls(ring(1, 2.0), None, 1.75).radius.tolist() == pytest.approx([0.5])
 
 
-def test_points_tell_how_much_space_is_free():
+def test_points_determine_the_free_space():
     cameras = ring(6, 1.8)
     assert free_balls(cameras, shell(0.9), 1.75).radius == pytest.approx(
         torch.full((6,), 0.8 * 0.9), rel=0.02
@@ -53,7 +53,7 @@ def test_points_tell_how_much_space_is_free():
     assert free_balls(cameras, beside, 1.75).radius.min() < 0.1
 
 
-def test_cameras_far_away_leave_the_scene_as_it_is():
+def test_distant_cameras_do_not_change_the_scene():
     near, far = ring(6, 1.8), ring(6, 2.4)  # 2.4 − 0.6 = 1.8 lies beyond the scene sphere
     assert torch.equal(free_balls(torch.cat([near, far]), None, 1.75).center, near)
     config = tiny_config()
@@ -78,19 +78,19 @@ def test_the_depth_is_that_of_the_deepest_ball():
     assert (ahead - found.depth).median().item() == pytest.approx(step, rel=0.01)
 
 
-def test_fog_before_a_lens_is_cut_out_and_the_object_is_not():
+def test_fog_in_front_of_a_camera_is_cut_out_and_the_object_is_not():
     config = tiny_config()
     cameras = ring(12, 1.5)
     torch.manual_seed(0)
     cut, whole = (VolSdfHost(config, 3.0, "constant", cameras=places).eval() for places in (cameras, None))
     cut.load_state_dict(whole.state_dict())
     with torch.no_grad():
-        # The object first: both see the ball, more or less, that fields start as.
+        # First the object: both show the initial ball of the field.
         rays = RayBatch(cameras, torch.nn.functional.normalize(-cameras, dim=-1))
         seen, also = whole.render(rays), cut.render(rays)
         assert (seen.position - also.position).abs().max() < 0.02
         assert also.position.norm(dim=-1).max() < 0.9
-        # Then a field that is solid everywhere, as fog before the lens is.
+        # Then a field that is solid everywhere, like fog in front of the camera.
         for host in (cut, whole):
             host.sdf_field.forward = lambda x: torch.full_like(x[:, 0], -0.2)
             exact = host.sdf_field.with_gradient
@@ -100,6 +100,6 @@ def test_fog_before_a_lens_is_cut_out_and_the_object_is_not():
         assert (whole.render(rays).position - cameras).norm(dim=-1).max() < 0.1
         first = (cut.render(rays).position - cameras).norm(dim=-1)
         assert first.min() > 0.9 * 0.375, "a quarter of the distance is free"
-        # Rays from the object to a camera come to its ball, too: free space is where it is, whoever looks.
+        # Rays from the object to a camera also cross its ball: free space does not depend on the ray.
         assert (cut.sdf(0.8 * cameras) > 0).all()
         assert (whole.sdf(0.8 * cameras) < 0).all()

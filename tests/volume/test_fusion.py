@@ -1,4 +1,4 @@
-"""Points fused into distances, against the distance of a sphere."""
+"""Points fused to distances, compared with the distance from a sphere."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def sphere(count: int = 20_000):
     return fuse(BALL * normal, normal, normal.abs(), R, CELLS), normal
 
 
-def test_distances_near_the_surface_are_true_and_far_from_it_too_small():
+def test_distances_are_accurate_near_the_surface_and_lower_bounds_elsewhere():
     surface, normal = sphere()
     edge = cell_size(surface.distance, R)
     for height in (0.0, 0.5, 1.0):
@@ -26,7 +26,7 @@ def test_distances_near_the_surface_are_true_and_far_from_it_too_small():
         found = look_up(surface.distance, R, (BALL + height * edge) * normal[:500])
         assert (found > 0.3 * height * edge).all()
         assert (found < height * edge).all()
-    assert (look_up(surface.distance, R, torch.zeros(1, 3)) > 0).all()  # nobody has seen the inside
+    assert (look_up(surface.distance, R, torch.zeros(1, 3)) > 0).all()  # no point shows the inside
 
 
 def test_normals_and_means_are_those_of_the_points():
@@ -37,7 +37,7 @@ def test_normals_and_means_are_those_of_the_points():
     assert not mean_at(surface, R, torch.zeros(1, 3)).any()
 
 
-def test_rays_meet_it_where_they_should():
+def test_rays_hit_the_fused_surface():
     surface, _ = sphere()
     towards = normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
     found = trace_grid(surface.distance, R, -0.95 * towards, towards)
@@ -45,7 +45,7 @@ def test_rays_meet_it_where_they_should():
     assert (found.distance - 0.35).abs().max() < 0.5 * cell_size(surface.distance, R)
 
 
-def test_no_points_make_an_empty_grid():
+def test_no_points_give_an_empty_grid():
     nothing = fuse(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 3), R, 8)
     assert (nothing.distance > 0).all()
     assert not trace_grid(nothing.distance, R, torch.zeros(1, 3), torch.eye(3)[:1]).hit.any()

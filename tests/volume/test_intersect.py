@@ -1,4 +1,4 @@
-"""Where rays enter and leave a sphere, against closed forms."""
+"""Intersections of rays with a sphere, compared with closed forms."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ X = [1.0, 0.0, 0.0]
     [
         ([-5.0, 0.0, 0.0], X, 3.0, 7.0),  # through the centre: 5 ∓ 2
         ([-5.0, 1.0, 0.0], X, 5.0 - math.sqrt(3.0), 5.0 + math.sqrt(3.0)),  # half chord √(2² − 1²)
-        ([0.5, 0.0, 0.0], X, 0.0, 1.5),  # from the inside: only the way out
+        ([0.5, 0.0, 0.0], X, 0.0, 1.5),  # from the inside: only the exit
         ([0.0, 0.0, 0.0], [0.6, 0.0, 0.8], 0.0, 2.0),  # from the centre
         ([-5.0, 2.0, 0.0], X, 5.0, 5.0),  # tangent
     ],
@@ -43,4 +43,4 @@ def test_the_ends_lie_on_the_sphere_for_far_cameras():
     interval = sphere_interval(inside - 1000.0 * directions, directions, 2.0)
     for distance in (interval.near, interval.far):
         ends = inside.double() + (distance.double() - 1000.0)[:, None] * directions.double()
-        assert (ends.norm(dim=-1) - 2.0).abs().max() < 2e-3  # a float32 at 1000 is good to 6e-5
+        assert (ends.norm(dim=-1) - 2.0).abs().max() < 2e-3  # float32 at 1000 is accurate to 6e-5

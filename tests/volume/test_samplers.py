@@ -1,6 +1,4 @@
-"""Ray samplers: the distributions they draw from, and the error bound against quadrature of the true
-density.
-"""
+"""Ray samplers: their distributions, and the error bound compared with quadrature of the true density."""
 
 from __future__ import annotations
 
@@ -46,7 +44,7 @@ SURFACES = [sphere, thin_plate, tilted_plane]
 
 
 def ray_bundle(count, dtype=F64):
-    """Rays from a shell of radius 2.5 towards the object; some pass it."""
+    """Rays from a shell of radius 2.5 towards the object; some miss it."""
     generator = torch.Generator().manual_seed(3)
     origins = (
         torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=F64), dim=-1) * 2.5
@@ -68,12 +66,12 @@ def sample(sdf, rays, beta, config=CONFIG, stochastic=False):
 # -------------------------------------------------------------------------------------------- simple samplers
 
 
-def test_uniform_samples_are_both_ends_and_the_middles_of_equal_parts():
+def test_uniform_samples_are_both_ends_and_the_centres_of_equal_parts():
     samples = uniform_samples(torch.tensor([0.0, 1.0]), torch.tensor([4.0, 1.0]), 6, False)
     assert samples.tolist() == [[0.0, 0.5, 1.5, 2.5, 3.5, 4.0], [1.0] * 6]
 
 
-def test_uniform_samples_at_random_fall_evenly_one_in_each_part():
+def test_random_uniform_samples_have_one_in_each_part():
     torch.manual_seed(0)
     samples = uniform_samples(torch.full((4000,), 2.0), torch.full((4000,), 6.0), 6, True)[:, 1:-1]
     assert (samples.floor() == torch.tensor([2.0, 3.0, 4.0, 5.0])).all()
@@ -91,7 +89,7 @@ def test_inverse_cdf_draws_from_a_piecewise_constant_density():
     edges = torch.tensor([0.0, 0.5, 0.6, 1.5, 1.5, 2.0, 4.0], dtype=F64)
     mass = torch.tensor([0.1, 0.4, 0.0, 0.0, 0.3, 0.2], dtype=F64)
     draws = 20_000
-    # One sample per row: independent, as the χ² test asks.
+    # One sample per row: independent, as the χ² test requires.
     samples = inverse_cdf_samples(edges.expand(draws, 7), mass.expand(draws, 6), 1, True)[:, 0].numpy()
     counts = np.histogram(samples, edges.numpy()[[0, 1, 2, 4, 5, 6]])[0]
     assert counts[2] == 0  # the flat part of the CDF
@@ -109,13 +107,13 @@ def test_inverse_cdf_gives_one_sample_to_each_share_and_none_to_flat_parts(stoch
     assert (samples.diff(dim=-1) >= 0.0).all()
 
 
-def test_inverse_cdf_without_mass_is_even_in_length_not_in_bins():
+def test_inverse_cdf_without_mass_is_uniform_in_length():
     samples = inverse_cdf_samples(torch.tensor([[0.0, 3.0, 4.0]]), torch.zeros(1, 2), 4, False)
     torch.testing.assert_close(samples, torch.tensor([[0.5, 1.5, 2.5, 3.5]]))
 
 
 @pytest.mark.parametrize(("u", "mass", "where"), [(0.0, [0.0, 1.0, 1.0], 1.0), (1.0, [1.0, 1.0, 0.0], 2.0)])
-def test_inverse_cdf_at_its_ends_stays_where_the_mass_is(monkeypatch, u, mass, where):
+def test_inverse_cdf_at_its_ends_stays_in_bins_with_mass(monkeypatch, u, mass, where):
     monkeypatch.setattr(samplers, "strata", lambda like, count, stochastic: torch.full((1, count), u))
     samples = inverse_cdf_samples(torch.arange(4.0)[None], torch.tensor([mass]), 1, True)
     assert samples.item() == pytest.approx(where, abs=1e-6)
@@ -125,8 +123,8 @@ def test_inverse_cdf_at_its_ends_stays_where_the_mass_is(monkeypatch, u, mass, w
 
 
 def distance_beyond_two_balls(width, a, b):
-    """Brute force: from the segment [0, width] on an axis to the nearest point outside the discs at its two
-    ends.
+    """Brute force: the distance from the segment [0, width] on an axis to the nearest point outside the discs
+    at its two ends.
     """
     angle = np.linspace(0.0, np.pi, 20_001)
     first = np.stack([a * np.cos(angle), a * np.sin(angle)], -1)
@@ -141,7 +139,7 @@ def test_least_distance_is_that_to_the_outline_of_the_two_balls():
     rng = np.random.default_rng(0)
     for _ in range(40):
         width, a = rng.uniform(0.1, 1.0, 2)
-        b = rng.uniform(max(a - width, 0.0), a + width)  # a distance changes by no more than the step
+        b = rng.uniform(max(a - width, 0.0), a + width)  # a distance changes by at most the step
         if a + b < width:
             continue
         found = cut(torch.tensor([[0.0, width]], dtype=F64), torch.tensor([[a, b]], dtype=F64)).least_distance
@@ -149,7 +147,7 @@ def test_least_distance_is_that_to_the_outline_of_the_two_balls():
 
 
 @pytest.mark.parametrize("ends", [(0.1, 0.2), (-0.8, 0.9), (0.9, -0.8), (0.0, 1.0)])
-def test_least_distance_is_zero_where_the_surface_may_cross(ends):
+def test_least_distance_is_zero_if_the_surface_may_cross(ends):
     found = cut(torch.tensor([[0.0, 1.0]]), torch.tensor([ends])).least_distance
     assert found.item() == 0.0
 
@@ -206,7 +204,7 @@ def test_the_opacity_is_within_the_bound_and_the_bound_within_epsilon(sdf, beta,
             assert found.error_bound.item() <= OPACITY_ERROR
 
 
-def test_the_bound_says_when_the_rounds_were_too_few():
+def test_the_bound_shows_when_the_rounds_were_too_few():
     found = sample(sphere, ray_bundle(16), 1e-4, dataclasses.replace(CONFIG, rounds=0))
     assert (found.error_bound > OPACITY_ERROR).any()
     assert found.distances.isfinite().all()
@@ -216,7 +214,7 @@ def test_the_bound_says_when_the_rounds_were_too_few():
 
 
 @pytest.mark.parametrize("stochastic", [False, True])
-def test_samples_gather_at_the_surface(stochastic):
+def test_samples_are_dense_at_the_surface(stochastic):
     torch.manual_seed(0)
     origins, directions, _, far = rays = ray_bundle(200, torch.float32)
     closest = -(origins * directions).sum(-1)
@@ -246,13 +244,13 @@ def test_a_thin_plate_is_not_missed():
         thin_plate(points.reshape(-1, 3)).reshape(points.shape[:2]), torch.tensor(0.002)
     )
     opacity = render_weights(density, found.distances, far).opacity
-    # Along the normal the plate's optical depth is 0.02 / 0.002, so exp(−10) passes at most.
+    # Along the normal the plate's optical depth is 0.02 / 0.002, so at most exp(−10) is transmitted.
     assert crosses.sum() > 10
     assert (opacity[crosses] > 0.99).all()
 
 
 def test_samples_follow_the_true_opacity():
-    """In a soft plane that stops all light, the share of samples before t is the opacity up to t, within
+    """In an opaque plane with soft density, the share of samples before t is the opacity up to t, within
     ε.
     """
     origins, directions = torch.zeros(1, 3, dtype=F64), torch.tensor([[0.0, 0.0, 1.0]], dtype=F64)
@@ -264,14 +262,14 @@ def test_samples_follow_the_true_opacity():
     depth = np.where(t < 1, 0.5 * np.exp((t - 1) / beta), 0.5 * np.exp(-(t - 1) / beta) + (t - 1) / beta)
     opacity = -np.expm1(-(depth - 0.5 * math.exp(-1 / beta)))
     share = (np.arange(510) + 0.5) / 510
-    # The spread third follows the cuts, which lie nearly evenly here; two ends beside.
+    # The third that is spread follows the cuts, which are nearly uniform here, in addition to both ends.
     spread = (t[1:-1] / 4.0 - opacity[1:-1]) * SPREAD
     assert np.abs(share - opacity[1:-1] - spread).max() <= found.error_bound.item()
     assert t[0] == 0.0
     assert t[-1] == 4.0
 
 
-def test_queries_are_counted_and_asked_only_once():
+def test_queries_are_counted_and_not_repeated():
     asked = []
 
     def recorded(x):
@@ -282,10 +280,10 @@ def test_queries_are_counted_and_asked_only_once():
     points = torch.cat(asked)
     assert found.sdf_queries == len(points) / 50
     assert len(points.unique(dim=0)) == len(points)
-    assert 128 <= found.sdf_queries < 128 * 6  # easy rays leave early
+    assert 128 <= found.sdf_queries < 128 * 6  # converged rays are removed
 
 
-def test_a_ray_does_not_depend_on_its_neighbours():
+def test_a_ray_does_not_depend_on_other_rays():
     bundle = ray_bundle(20)
     together = sample(sphere, bundle, 0.005)
     for i in range(20):
@@ -294,7 +292,7 @@ def test_a_ray_does_not_depend_on_its_neighbours():
         torch.testing.assert_close(together.error_bound[i : i + 1], alone.error_bound)
 
 
-def test_without_leaving_early_the_bound_is_met_as_well(monkeypatch):
+def test_without_removing_rays_the_bound_is_met_as_well(monkeypatch):
     monkeypatch.setattr(samplers, "can_leave_early", lambda device: False)
     found = sample(sphere, ray_bundle(50), 0.01)
     assert found.sdf_queries == 128 * (1 + 5)
@@ -302,7 +300,7 @@ def test_without_leaving_early_the_bound_is_met_as_well(monkeypatch):
     assert (found.distances.diff(dim=-1) >= 0.0).all()
 
 
-def test_new_cuts_pay_more_than_cuts_in_proportion_to_the_bound(monkeypatch):
+def test_cuts_by_contribution_are_better_than_cuts_by_the_bound(monkeypatch):
     """The rule of the paper, transcribed: it needs more queries for the same bound."""
 
     def bound_itself(partition, beta):
@@ -318,7 +316,7 @@ def test_new_cuts_pay_more_than_cuts_in_proportion_to_the_bound(monkeypatch):
     assert ours.sdf_queries < papers.sdf_queries
 
 
-def test_middles_repeat_and_jitter_follows_the_seed():
+def test_central_samples_are_deterministic_and_random_ones_depend_on_the_seed():
     rays = ray_bundle(4)
     assert torch.equal(sample(sphere, rays, 0.02).distances, sample(sphere, rays, 0.02).distances)
     draws = []
@@ -329,7 +327,7 @@ def test_middles_repeat_and_jitter_follows_the_seed():
     assert not torch.equal(draws[0], draws[2])
 
 
-def test_nothing_is_differentiated():
+def test_samples_have_no_gradient():
     beta = torch.tensor(0.02, dtype=F64, requires_grad=True)
     found = error_bounded_samples(sphere, *ray_bundle(2), beta, CONFIG, True)
     assert not found.distances.requires_grad

@@ -1,6 +1,4 @@
-"""The sphere of `make_capture` as bare material for other layouts: images, masks, cameras and known
-projections.
-"""
+"""The sphere of `make_capture` as files for other layouts: images, masks, cameras and known projections."""
 
 from __future__ import annotations
 
@@ -36,18 +34,18 @@ def material(root: Path, folder: str = "images", masks: str | None = "masks", hd
 
 
 def local(i: int, points: np.ndarray = POINTS) -> np.ndarray:
-    """Points as camera i has them: x right, y down, z forward."""
+    """Points in the frame of camera i: x right, y down, z forward."""
     return points @ POSES[i][:3, :3].T + POSES[i][:3, 3]
 
 
 def pinhole_pixels(i: int, points: np.ndarray = POINTS) -> np.ndarray:
-    """Where the pinhole of `make_capture` sees points, in NumPy and apart from the package."""
+    """Pixels of points in the pinhole camera of `make_capture`, computed in NumPy without the package."""
     x, y, z = local(i, points).T
     return np.stack([FOCAL[0] * x / z + PRINCIPAL[0], FOCAL[1] * y / z + PRINCIPAL[1]], axis=1)
 
 
 def opengl_pose(i: int, world: np.ndarray | None = None) -> np.ndarray:
-    """Camera to world with OpenGL's axes, in a world turned by the rotation `world`."""
+    """Camera to world with OpenGL's axes, in a world rotated by `world`."""
     c2w = np.linalg.inv(POSES[i])
     c2w[:3, 1:3] *= -1
     turn = np.eye(4)
@@ -61,7 +59,7 @@ def _load(root: Path, **options) -> PixelDataset:
 
 
 def refused(root: Path, *words: str, **options) -> None:
-    """Loading the capture, its pixels included, raises a one-line `UserError` with a remedy and all these
+    """Check that loading the capture and its pixels raises a one-line `UserError` with a remedy and all these
     words.
     """
     with pytest.raises(UserError) as caught:

@@ -21,7 +21,7 @@ SPLITS = {"train": (0, 1, 2, 3), "test": (4, 5)}
 
 
 def scene(root: Path, hdr: bool = True) -> Path:
-    """Stanford-ORB's layout; `hdr` off: NeRF's, with alpha in place of masks."""
+    """Stanford-ORB's layout; if `hdr` is False, NeRF's layout, with alpha instead of masks."""
     material(root, hdr=hdr)
     suffix = ".exr" if hdr else ".png"
     for split, numbers in SPLITS.items():

@@ -1,4 +1,4 @@
-"""COLMAP models that pycolmap writes, and one written by hand as COLMAP did before rigs."""
+"""COLMAP models that pycolmap writes, and a model without rigs, as older versions of COLMAP wrote it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def colmap_camera(model: str) -> pycolmap.Camera:
 
 
 def reconstruction(camera: pycolmap.Camera, names: list[str] | None = None) -> pycolmap.Reconstruction:
-    """The six views, and points on the sphere with some far away from it."""
+    """The six views, points on the sphere, and some points far away from it."""
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(camera)
     for i, pose in enumerate(POSES):
@@ -75,7 +75,7 @@ def test_every_camera_model_projects_as_in_colmap(tmp_path: Path, model: str, te
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", ".", "colmap/sparse/0", "dense/sparse"])
-def test_models_are_found_where_colmap_puts_them(tmp_path: Path, place: str) -> None:
+def test_models_are_found_in_the_folders_that_colmap_uses(tmp_path: Path, place: str) -> None:
     write(material(tmp_path), reconstruction(colmap_camera("PINHOLE")), place)
     capture = load_capture(tmp_path)
     assert capture.format == "colmap"
@@ -109,7 +109,7 @@ def test_a_model_from_before_rigs(tmp_path: Path) -> None:
         )
 
 
-def test_the_sparse_points_tell_where_the_scene_is(tmp_path: Path) -> None:
+def test_the_scene_box_comes_from_the_sparse_points(tmp_path: Path) -> None:
     write(material(tmp_path, masks=None), reconstruction(colmap_camera("PINHOLE")))
     capture = load_capture(tmp_path)
     assert capture.scene_from == "points"
@@ -118,12 +118,12 @@ def test_the_sparse_points_tell_where_the_scene_is(tmp_path: Path) -> None:
     assert capture.point_cloud is None  # sparse points have no normals
 
 
-def test_the_points_of_the_object_tell_where_it_is(tmp_path: Path) -> None:
+def test_the_scene_box_comes_from_the_points_of_the_object(tmp_path: Path) -> None:
     model = reconstruction(colmap_camera("PINHOLE"))
     for point in np.random.default_rng(4).uniform(-20, 20, (600, 3)):  # the room
         model.add_point3D(point, pycolmap.Track(), np.zeros(3, np.uint8))
     write(material(tmp_path, masks=None), model, "colmap/sparse/0")
-    assert load_capture(tmp_path).normalisation.scale < 3  # what the cameras look at, not the room
+    assert load_capture(tmp_path).normalisation.scale < 3  # the focus of the cameras, not the room
     (tmp_path / "cloud.ply").rename(tmp_path / "object_point_cloud.ply")
     capture = load_capture(tmp_path)
     assert np.allclose(capture.normalisation.centre, CENTRE, atol=0.05 * RADIUS)
@@ -149,7 +149,7 @@ def test_masks_of_other_names_are_an_error(tmp_path: Path) -> None:
         load_capture(tmp_path)
 
 
-def test_images_of_one_name_in_two_folders(tmp_path: Path) -> None:
+def test_images_with_the_same_name_in_two_folders(tmp_path: Path) -> None:
     images = material(tmp_path, masks=None) / "images"
     names = [f"{side}/{i:03d}.png" for i in range(3) for side in ("left", "right")]
     for i, name in enumerate(names):
@@ -231,7 +231,7 @@ def test_a_name_that_is_not_utf_8(tmp_path: Path) -> None:
     refused(tmp_path, "sparse", "utf-8")
 
 
-def test_a_pose_of_which_nothing_is_finite(tmp_path: Path) -> None:
+def test_a_pose_that_is_not_finite(tmp_path: Path) -> None:
     write(material(tmp_path, masks=None), reconstruction(colmap_camera("PINHOLE")))
     path = tmp_path / "sparse" / "0" / "frames.bin"
     data = path.read_bytes()
@@ -251,7 +251,7 @@ def test_a_model_without_images_and_a_panorama(tmp_path: Path) -> None:
     refused(tmp_path, "EQUIRECTANGULAR", "perspective")
 
 
-def test_a_camera_of_another_size_than_its_image(tmp_path: Path) -> None:
+def test_a_camera_with_another_size_than_its_image(tmp_path: Path) -> None:
     camera = colmap_camera("PINHOLE")
     camera.width = 48
     write(material(tmp_path, masks=None), reconstruction(camera))

@@ -1,4 +1,4 @@
-"""The layout of IDR and NeuS: projection matrices of any scale and sign, and the unit sphere of the scale
+"""The layout of IDR and NeuS: projection matrices of any scale and sign, and the unit sphere from the scale
 matrices.
 """
 
@@ -27,7 +27,7 @@ from tests.data.formats.scenes import (
 )
 from tests.data.make_capture import CENTRE, SCALE
 
-# A pixel's centre lies at whole numbers in these files.
+# Pixel centres have integer coordinates in these files.
 K = np.array([[FOCAL[0], 0, PRINCIPAL[0] - 0.5], [0, FOCAL[1], PRINCIPAL[1] - 0.5], [0, 0, 1]])
 
 
@@ -74,7 +74,7 @@ def test_the_scale_matrix_is_the_scene_frame(tmp_path: Path) -> None:
     assert normalisation.centre == tuple(CENTRE)
 
 
-def test_masks_go_by_order_where_names_differ(tmp_path: Path) -> None:
+def test_masks_are_assigned_by_order_if_names_differ(tmp_path: Path) -> None:
     scan(tmp_path)
     for i in range(VIEWS):
         (tmp_path / "image" / f"{i:03d}.exr").rename(tmp_path / "image" / f"rect_{i:03d}.exr")
@@ -130,7 +130,7 @@ def test_bad_archives_are_refused(tmp_path: Path) -> None:
     refused(tmp_path, "not an archive of matrices")
 
 
-def test_numbers_without_zeros_in_front_are_refused(tmp_path: Path) -> None:
+def test_numbers_without_leading_zeros_are_refused(tmp_path: Path) -> None:
     scan(tmp_path)
     for i, path in enumerate(sorted((tmp_path / "image").iterdir())):
         path.rename(path.with_stem(f"{i + 7:02d}"))
@@ -140,7 +140,7 @@ def test_numbers_without_zeros_in_front_are_refused(tmp_path: Path) -> None:
     refused(tmp_path, "10.exr comes first", "pad the numbers")
 
 
-def test_images_and_cameras_have_to_match(tmp_path: Path) -> None:
+def test_images_and_cameras_must_match(tmp_path: Path) -> None:
     scan(tmp_path)
     (tmp_path / "image" / "002.exr").unlink()
     refused(tmp_path, "6 cameras for 5 images and 6 masks")

@@ -1,4 +1,4 @@
-"""NeRO's scenes: pickles as NumPy writes them in every protocol, and pickles as nobody should."""
+"""NeRO's scenes: pickles that NumPy writes in every protocol, and malicious pickles."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_cameras(tmp_path: Path, protocol: int, kind: type) -> None:
     "array", [np.asfortranarray(K), K.astype(">f8"), K.astype(np.int64), K[::2, 1:], np.float32(K)]
 )
 @pytest.mark.parametrize("protocol", [0, 2, 4, 5])
-def test_arrays_come_back(tmp_path: Path, array: np.ndarray, protocol: int) -> None:
+def test_arrays_are_read_back(tmp_path: Path, array: np.ndarray, protocol: int) -> None:
     (tmp_path / "a.pkl").write_bytes(pickle.dumps([array, array], protocol))
     for read in read_pickled_arrays(tmp_path / "a.pkl"):
         assert np.array_equal(read, array)
@@ -98,7 +98,7 @@ class Evil:
         ),
     ],
 )
-def test_what_is_no_array_is_refused_and_nothing_is_run(tmp_path: Path, made, words: str) -> None:
+def test_anything_but_arrays_is_refused_without_running_code(tmp_path: Path, made, words: str) -> None:
     mark = tmp_path / "mark"
     (tmp_path / "a.pkl").write_bytes(made(str(mark)))
     with pytest.raises(UserError, match=rf"a\.pkl.*{words}"):

@@ -1,5 +1,5 @@
-"""Known points in known pixels: every layout, in worlds whose up is z, y, or somewhere else; every lens in
-the own folder.
+"""Known points project to known pixels: in every layout, with z, y or another direction up, and with every
+lens in the package's own layout.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ NAMES = [f"{i:03d}.exr" for i in range(VIEWS)]
 
 
 def moved(rotation: Rotation, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
-    """From the world of `scenes`, whose up is z, to another."""
+    """Transformation from the world of `scenes`, in which z is up, to another world."""
     world = np.eye(4)
     world[:3, :3], world[:3, 3] = rotation.as_matrix(), shift
     return world
@@ -99,7 +99,7 @@ def sfm_scene(root: Path, w2c: list[np.ndarray], centre: np.ndarray) -> None:
 
 def dtu(root: Path, w2c: list[np.ndarray], centre: np.ndarray) -> None:
     (root / "images").rename(root / "image")
-    to_whole_numbers = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # there a pixel's centre lies
+    to_whole_numbers = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # pixel centres
     sphere = np.diag([SCALE] * 3 + [1.0])
     sphere[:3, 3] = centre
     arrays = {f"scale_mat_{i}": sphere for i in range(VIEWS)}
@@ -159,13 +159,13 @@ WRITERS: dict[str, Callable[[Path, list[np.ndarray], np.ndarray], None]] = {
 }
 
 
-def test_every_layout_is_here() -> None:
+def test_every_layout_is_tested() -> None:
     assert list(WRITERS) == list(READERS)
 
 
 @pytest.mark.parametrize("world", WORLDS)
 @pytest.mark.parametrize("layout", WRITERS)
-def test_points_are_seen_where_they_are(tmp_path: Path, layout: str, world: str) -> None:
+def test_points_project_to_known_pixels(tmp_path: Path, layout: str, world: str) -> None:
     move = WORLDS[world]
     material(tmp_path, masks=None)
     WRITERS[layout](
@@ -176,13 +176,13 @@ def test_points_are_seen_where_they_are(tmp_path: Path, layout: str, world: str)
     points = torch.from_numpy(POINTS @ move[:3, :3].T + move[:3, 3])
     for i, view in enumerate(capture.views):
         assert np.abs(project(view.camera, points).pixel.numpy() - pinhole_pixels(i)).max() < TOLERANCE
-        # The scene frame is the world's, moved and scaled: a camera sees there what it sees here.
+        # The scene frame is the world frame, shifted and scaled, so the projections are the same.
         seen = project(capture.normalisation.camera(view.camera), capture.normalisation.to_scene(points))
         assert np.abs(seen.pixel.numpy() - pinhole_pixels(i)).max() < TOLERANCE
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_every_lens_in_the_own_folder(tmp_path: Path, model: str) -> None:
+def test_every_lens_in_the_own_layout(tmp_path: Path, model: str) -> None:
     neilfpp(
         material(tmp_path, masks=None), POSES, CENTRE, {"model": model, "coefficients": COEFFICIENTS[model]}
     )

@@ -1,4 +1,4 @@
-"""transforms.json as nerfstudio and others write it, against NumPy and OpenCV."""
+"""transforms.json as nerfstudio and other programs write it, compared with NumPy and OpenCV."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ INTRINSICS = {
 def scene(
     root: Path, world: np.ndarray | None = None, per_frame: bool = False, hdr: bool = True, **entries
 ) -> Path:
-    """Write a transforms.json; `world` turns its frame."""
+    """Write a transforms.json; `world` rotates its frame."""
     suffix = ".exr" if hdr else ".png"
     frames = []
     for i in range(VIEWS):
@@ -81,7 +81,7 @@ def test_opengl_cameras_become_opencv_cameras(tmp_path: Path, per_frame: bool) -
     assert max(np.abs(seen[i] - pinhole_pixels(i)).max() for i in range(VIEWS)) < 1e-6
 
 
-def test_a_world_with_y_up_is_left_as_it_is(tmp_path: Path) -> None:
+def test_a_world_with_y_up_is_unchanged(tmp_path: Path) -> None:
     y_up = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # z becomes y
     root = scene(tmp_path, world=y_up, applied_transform=np.pad(y_up, ((0, 0), (0, 1))).tolist())
     seen = seen_pixels(root, POINTS @ y_up.T)
@@ -117,7 +117,7 @@ def test_lenses(
 
 
 def test_a_file_from_windows(tmp_path: Path) -> None:
-    """Its separators, and the mark that its editors put first."""
+    """Its path separators, and the byte order mark that its editors write."""
     scene(tmp_path)
     edit(
         tmp_path,
@@ -133,7 +133,7 @@ def test_a_file_from_windows(tmp_path: Path) -> None:
     refused(tmp_path, "not a path within the capture")
 
 
-def test_a_field_of_view_stands_for_the_focal_length(tmp_path: Path) -> None:
+def test_a_field_of_view_defines_the_focal_length(tmp_path: Path) -> None:
     scene(tmp_path)
 
     def change(content: dict) -> None:
@@ -177,7 +177,7 @@ def test_the_focal_length_of_a_frame_takes_precedence(
 # ------------------------------------------------------------------------------------------- files and splits
 
 
-def test_masks_and_the_box_that_they_tell(tmp_path: Path) -> None:
+def test_masks_and_the_scene_box_from_them(tmp_path: Path) -> None:
     scene(tmp_path)
     assert load_capture(tmp_path).scene_from == "cameras"
     assert "guessed from the cameras only" in load_capture(tmp_path).summary
@@ -274,9 +274,9 @@ def test_bad_entries_are_refused(tmp_path: Path, change: Callable[[dict], object
     refused(edit(scene(tmp_path / "capture"), change), *words)
 
 
-def test_an_image_on_its_side(tmp_path: Path) -> None:
-    """Some programs turn a picture as its EXIF says before they look for its camera, and leave the file as it
-    is.
+def test_an_image_with_an_exif_orientation(tmp_path: Path) -> None:
+    """Some programs rotate the pixels by the EXIF orientation before they estimate the camera, without
+    changing the file.
     """
     refused(
         edit(scene(tmp_path), lambda c: c.update(w=HEIGHT, h=WIDTH)),
@@ -284,7 +284,7 @@ def test_an_image_on_its_side(tmp_path: Path) -> None:
     )
 
 
-def test_what_is_no_json(tmp_path: Path) -> None:
+def test_invalid_json_is_refused(tmp_path: Path) -> None:
     scene(tmp_path)
     for text in ("", "{", "[" * 100_000, "\x00"):
         (tmp_path / "transforms.json").write_text(text)

@@ -1,5 +1,5 @@
-"""What is written for others comes back: cameras, pixels, masks, the box, the split; lenses and exposures
-where known.
+"""Captures written in other formats are read back: cameras, pixels, masks, scene box and split; lenses and
+exposures if the format has them.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def bent(captured: Capture, model: str) -> Capture:
 
 @pytest.mark.parametrize("hdr", [True, False])
 @pytest.mark.parametrize("masks", [True, False])
-def test_a_capture_comes_back(tmp_path: Path, writer: str, hdr: bool, masks: bool) -> None:
+def test_a_written_capture_is_read_back(tmp_path: Path, writer: str, hdr: bool, masks: bool) -> None:
     first = capture(tmp_path / "in", hdr, masks)
     back = written(first, writer, tmp_path / "out")
     assert back.normalisation == first.normalisation
@@ -76,7 +76,7 @@ def test_a_capture_comes_back(tmp_path: Path, writer: str, hdr: bool, masks: boo
         )
 
 
-def test_validity_comes_back(tmp_path: Path, writer: str) -> None:
+def test_validity_masks_are_read_back(tmp_path: Path, writer: str) -> None:
     usable = np.full((18, 24), 255, np.uint8)
     usable[3:5, 7:9] = 0
     write_png(tmp_path / "usable.png", usable)
@@ -97,7 +97,7 @@ def test_exposures_are_divided_out(tmp_path: Path, writer: str) -> None:
 
 
 @pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"])
-def test_nerfstudio_keeps_the_lenses_that_it_knows(tmp_path: Path, model: str) -> None:
+def test_nerfstudio_keeps_supported_lenses(tmp_path: Path, model: str) -> None:
     first = bent(capture(tmp_path / "in"), model)
     back = written(first, "transforms", tmp_path / "out")
     points = torch.from_numpy(POINTS)
@@ -107,14 +107,14 @@ def test_nerfstudio_keeps_the_lenses_that_it_knows(tmp_path: Path, model: str) -
 
 
 @pytest.mark.parametrize("hdr", [True, False])
-def test_other_lenses_are_undone(tmp_path: Path, writer: str, hdr: bool) -> None:
+def test_other_lenses_are_resampled_to_pinholes(tmp_path: Path, writer: str, hdr: bool) -> None:
     first = bent(capture(tmp_path / "in", hdr), "THIN_PRISM_FISHEYE")
     back = written(first, writer, tmp_path / "out")
     assert back.hdr == hdr
     for new, old in zip(back.views, first.views, strict=True):
         assert new.camera.lens is None
         assert new.image.suffix == (".exr" if hdr else ".png")
-        # A pixel well inside the sphere shows what the bent image shows of the same point, to within a
+        # A pixel well inside the sphere has the value of the distorted image at the same point, to within a
         # pixel's step.
         point = torch.from_numpy(POINTS.mean(axis=0, keepdims=True))
         there, here = (project(view.camera, point).pixel[0].long() for view in (old, new))
@@ -126,7 +126,7 @@ def test_other_lenses_are_undone(tmp_path: Path, writer: str, hdr: bool) -> None
         assert 0.7 * outside < inside < 1.4 * outside
 
 
-def test_a_resampled_pixel_is_valid_where_all_that_it_is_made_of_is(tmp_path: Path, writer: str) -> None:
+def test_a_resampled_pixel_is_valid_if_all_its_sources_are(tmp_path: Path, writer: str) -> None:
     first = bent(capture(tmp_path / "in", masks=False), "THIN_PRISM_FISHEYE")
     usable = np.random.default_rng(0).random((18, 24)) > 0.1
     write_png(tmp_path / "usable.png", np.where(usable, 255, 0).astype(np.uint8))
@@ -141,7 +141,7 @@ def test_a_resampled_pixel_is_valid_where_all_that_it_is_made_of_is(tmp_path: Pa
         assert 0.3 < kept.mean() < 0.9
 
 
-def test_a_fisheye_beside_a_pinhole_is_undone(tmp_path: Path) -> None:
+def test_a_fisheye_among_pinholes_is_resampled(tmp_path: Path) -> None:
     first = capture(tmp_path / "in")
     lens = Lens("OPENCV_FISHEYE", tuple(COEFFICIENTS["OPENCV_FISHEYE"]))
     mixed = with_views(first, lambda v: v if v.index else replace(v, camera=replace(v.camera, lens=lens)))
@@ -164,7 +164,7 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path, writer: str) -> None:
     assert (tmp_path / "out").read_text() == "a file, and no folder"
 
 
-def test_nothing_is_described_before_it_is_there(tmp_path: Path, writer: str) -> None:
+def test_the_description_is_written_last(tmp_path: Path, writer: str) -> None:
     first = capture(tmp_path / "in")
     first.views[3].image.unlink()
     with pytest.raises(UserError):

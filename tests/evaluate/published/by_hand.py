@@ -43,7 +43,7 @@ def similarity(estimate: np.ndarray, truth: np.ndarray, window: int, beyond: str
             sum(w * (e - a) ** 2 for w, e, _ in pairs),
             sum(w * (t - b) ** 2 for w, _, t in pairs),
         )
-        # About the means: the sum of weights is 1, so this is what E[x²] − E[x]² gives.
+        # Relative to the means: the sum of weights is 1, so this equals E[x²] − E[x]².
         ab = sum(w * (e - a) * (t - b) for w, e, t in pairs)
         result[y, x, c] = (2 * a * b + 1e-4) * (2 * ab + 9e-4) / ((a * a + b * b + 1e-4) * (aa + bb + 9e-4))
     return result
@@ -73,7 +73,7 @@ def moved(view: View, image: Path | None) -> View:
 
 
 def random_view(name: str, height: int, width: int, seed: int) -> RenderedView:
-    """Maps of noise: opacity from 0 to 1, normals of unit length."""
+    """Maps of random values: opacity from 0 to 1, normals of unit length."""
     draw = np.random.default_rng(seed)
     normal = draw.normal(size=(height, width, 3))
     maps = {

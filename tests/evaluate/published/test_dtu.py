@@ -26,13 +26,13 @@ def triangle(height: float = 0.0, size: float = 8.0) -> np.ndarray:
 
 
 def scan(points: np.ndarray, plane: tuple[float, ...] = (0, 0, 1, 5)) -> Observed:
-    """All of a box of 20 mm observed, the ground 5 mm below."""
+    """A scan in which a box of 20 mm is observed completely, and the ground is 5 mm below."""
     low, high = np.array([-5.0, -5, -5]), np.array([15.0, 15, 15])
     return Observed(np.ones((21, 21, 21), np.uint8), low, high, 1.0, np.array(plane, float), points)
 
 
 def lattice(vertices: np.ndarray, spacing: float) -> list[tuple[float, ...]]:
-    """Points of one triangle, as the official code has them, without arrays."""
+    """Sample points of one triangle as in the official code, without arrays."""
     a, b, c = (tuple(map(float, v)) for v in vertices)
     u, v = [q - p for p, q in zip(a, b, strict=True)], [q - p for p, q in zip(a, c, strict=True)]
     l1, l2 = math.hypot(*u), math.hypot(*v)
@@ -61,7 +61,7 @@ def test_samples_of_a_triangle(corners):
     assert len(surface_samples(np.zeros((3, 3)), FACE, 0.2)) == 3  # no area, no lattice
 
 
-def test_thinned_points_are_spread_and_none_is_far_from_one_that_is_kept():
+def test_thinned_points_keep_the_spacing_and_cover_all_points():
     points = np.random.default_rng(0).uniform(0, 2, (2000, 3))
     kept = thinned(points, 0.2, 0)
     gaps = np.linalg.norm(kept[:, None] - kept[None], axis=-1)[np.triu_indices(len(kept), 1)]
@@ -69,16 +69,16 @@ def test_thinned_points_are_spread_and_none_is_far_from_one_that_is_kept():
     assert np.linalg.norm(points[:, None] - kept[None], axis=-1).min(1).max() <= 0.2
 
 
-def test_far_points_are_dropped_and_not_clipped():
+def test_far_points_are_left_out_and_not_clipped():
     points = np.array([[1.0, 0, 0], [3, 0, 0], [20, 0, 0], [500, 0, 0]])
     assert capped_mean(points, np.zeros((1, 3)), 20.0) == pytest.approx(2.0)  # (1 + 3) / 2
     assert capped_mean(points[2:], np.zeros((1, 3)), 20.0) is None
 
 
-def test_parallel_planes_are_their_distance_apart():
+def test_the_distance_of_parallel_planes():
     truth = surface_samples(triangle(0.5), FACE, 0.05)
     found = chamfer_of_scan(triangle(), FACE, scan(truth))
-    # The nearest lattice points are at most 0.03 mm beside one another.
+    # The nearest lattice points are shifted by at most 0.03 mm.
     assert found["chamfer_accuracy_mm"] == pytest.approx(0.5, abs=0.01)
     assert found["chamfer_completeness_mm"] == pytest.approx(0.5, abs=0.05)
     assert found["chamfer_mm"] == pytest.approx(
@@ -87,7 +87,7 @@ def test_parallel_planes_are_their_distance_apart():
 
 
 def by_hand(vertices: np.ndarray, faces: np.ndarray, seen: Observed) -> tuple[float, float]:
-    """Both means, with all distances in one table."""
+    """Both means, from a table of all distances."""
     points = [p for face in faces for p in lattice(vertices[face], 0.2)]
     points += [tuple(v) for v in vertices]
     kept: list[np.ndarray] = []
@@ -106,7 +106,7 @@ def by_hand(vertices: np.ndarray, faces: np.ndarray, seen: Observed) -> tuple[fl
     return tuple(float(np.mean([d for d in side if d < 20])) for side in (there, back))
 
 
-def test_the_mask_the_box_and_the_plane_choose_the_points():
+def test_the_mask_the_box_and_the_plane_select_the_points():
     draw = np.random.default_rng(4)
     # Pieces in the object, out of the observed cells, above the box by less and by more than 120 mm, below
     # it by 65 mm.
@@ -124,7 +124,7 @@ def test_the_mask_the_box_and_the_plane_choose_the_points():
     seen.mask[12:] = 0
     found = chamfer_of_scan(vertices, faces, seen)
     accuracy, completeness = by_hand(vertices, faces, seen)
-    # Which of two close points stays is random, and moves a mean of hundreds of distances by little.
+    # Which of two close points is kept is random; this changes a mean of hundreds of distances only slightly.
     assert found["chamfer_accuracy_mm"] == pytest.approx(accuracy, abs=0.05)
     assert found["chamfer_completeness_mm"] == pytest.approx(completeness, abs=0.05)
     everywhere = chamfer_of_scan(vertices, faces, scan(seen.points))
@@ -132,7 +132,7 @@ def test_the_mask_the_box_and_the_plane_choose_the_points():
     assert abs(everywhere["chamfer_completeness_mm"] - completeness) > 0.1, "the plane matters in this test"
 
 
-def test_nothing_where_the_scanner_looked_is_told():
+def test_a_surface_outside_the_observed_region_is_an_error():
     with pytest.raises(UserError, match="that the scanner observed"):
         chamfer_of_scan(triangle() + 1000, FACE, scan(triangle()))
     with pytest.raises(UserError, match="within 20 mm"):
@@ -144,7 +144,7 @@ def test_nothing_where_the_scanner_looked_is_told():
 
 @pytest.fixture
 def capture(tmp_path: Path):
-    """The ball of `make_capture` as scan 24, and its truth beside it."""
+    """The ball of `make_capture` as scan 24, with its truth in the parent folder."""
     root = make_capture(tmp_path / "scan24")
     mesh = trimesh.load(root / "inputs" / "model" / "mesh.ply")
     (tmp_path / "ObsMask").mkdir()

@@ -37,7 +37,7 @@ def run(root) -> Run:
 
 
 def made_up(run: Run) -> tuple[RenderedView, ...]:
-    """Estimates with errors, some beyond [0, 1], and with soft opacity."""
+    """Estimates with errors, some of them outside of [0, 1], and with soft opacity."""
     generator = np.random.default_rng(3)
     views = []
     for view in render_test_views(run):
@@ -118,7 +118,7 @@ def test_known_answers():
         median_gamma(np.full((4, 3), 0.5), np.zeros((4, 3)))
 
 
-def test_a_capture_without_material_is_told_where_it_belongs(root, tmp_path):
+def test_an_error_names_the_place_of_missing_materials(root, tmp_path):
     bare = shutil.copytree(root, tmp_path / "bare")
     shutil.rmtree(bare / "ground_truths")
     with pytest.raises(UserError, match="neilf-synthetic needs true base colour") as told:
@@ -130,7 +130,9 @@ def test_a_capture_without_material_is_told_where_it_belongs(root, tmp_path):
 
 
 def test_shiny_normals_weigh_by_opacity_and_alpha(run, root, tmp_path):
-    """The true normals of one copy are 8-bit pictures beside the images, those of the other float maps."""
+    """The true normals of one copy are 8-bit images beside the photographs, those of the other are float
+    maps.
+    """
     plain, pictured = load_capture(root), load_capture(shutil.copytree(root, tmp_path / "copied"))
     truths = {}
     for view in pictured.test_views:
@@ -145,7 +147,7 @@ def test_shiny_normals_weigh_by_opacity_and_alpha(run, root, tmp_path):
             truth, weights, total = truths[view.name][chosen], 0.0, 0.0
             depth = read_image(root / "inputs" / "depth_maps" / f"{view.name}.exr").pixels[..., 0]
             for (y, x), d in np.ndenumerate(depth):
-                # The pictures lie beside images without alpha: all of the frame counts there.
+                # These files are beside images without alpha, so the whole frame counts.
                 weight = float(view.maps["opacity"][y, x, 0]) * (chosen == 1 or d > 0)
                 a, b = view.maps["normal"][y, x].astype(float), truth[y, x].astype(float)
                 if weight:
@@ -162,12 +164,12 @@ def test_shiny_normals_weigh_by_opacity_and_alpha(run, root, tmp_path):
 def test_weights_shift_the_mean_angle():
     up, tilted = np.zeros((1, 2, 3)), np.zeros((1, 2, 3))
     up[..., 2] = 1
-    tilted[0, 0], tilted[0, 1] = (0, 0, 3), (1, 0, 1)  # of no unit length: 0° and 45°
+    tilted[0, 0], tilted[0, 1] = (0, 0, 3), (1, 0, 1)  # not of unit length: 0° and 45°
     assert weighted_angle(tilted, up, np.array([[1.0, 3.0]])) == pytest.approx(33.75, abs=0.01)
     assert weighted_angle(up, up, np.ones((1, 2))) == pytest.approx(math.degrees(math.acos(1 - 2**-23)))
 
 
-def test_a_capture_without_normals_is_told_where_they_belong(root, tmp_path):
+def test_an_error_names_the_place_of_missing_normals(root, tmp_path):
     bare = shutil.copytree(root, tmp_path / "bare")
     shutil.rmtree(bare / "inputs" / "normal_maps")
     with pytest.raises(UserError, match="shiny-normals needs true normals") as told:

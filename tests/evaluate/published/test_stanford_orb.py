@@ -86,7 +86,7 @@ def ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
     return 1 - 2 * float(loss)
 
 
-def test_it_is_the_official_formula(tmp_path, files):
+def test_agrees_with_the_official_formula(tmp_path, files):
     run = run_of(tmp_path)
     rendered = [random_view(name, SIDE, SIDE, i) for i, name in enumerate(NAMES)]
     PROTOCOL.check(run)
@@ -155,7 +155,7 @@ def test_masks_shrink_by_two_pixels():
     assert (eroded(mask) == expected).all()
 
 
-def test_what_is_not_there_is_not_measured_and_a_mask_must_be(tmp_path, files):
+def test_missing_truth_is_not_measured_and_masks_are_required(tmp_path, files):
     run = run_of(tmp_path)
     for folder in ("pseudo_gt_albedo", "surface_normal", "z_depth"):
         for name in NAMES:

@@ -34,7 +34,7 @@ def make_truth(root: Path, rough: str) -> dict[str, dict[str, np.ndarray]]:
 
 
 @pytest.mark.parametrize("rough", ["rough", "roughness"])
-def test_it_is_the_formula(tmp_path, rough):
+def test_agrees_with_the_official_formula(tmp_path, rough):
     root = tmp_path / "c"
     truth = make_truth(root, rough)
     run = run_with_images(root, {name: root / "test" / f"{name}_rgba.png" for name in truth})
@@ -94,7 +94,7 @@ def test_channels_are_averaged_in_decibels(tmp_path):
     assert PROTOCOL.measure(run, [estimate, estimate])["albedo_psnr"] == pytest.approx(expected, abs=1e-2)
 
 
-def test_what_is_missing_is_named(tmp_path):
+def test_missing_files_are_named(tmp_path):
     root = tmp_path / "c"
     truth = make_truth(root, "rough")
     run = run_with_images(root, {name: root / "test" / f"{name}_rgba.png" for name in truth})

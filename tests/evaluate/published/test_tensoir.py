@@ -59,7 +59,7 @@ def inner(similar: np.ndarray) -> float:
     return float(similar[5:-5, 5:-5].mean())
 
 
-def test_it_is_the_official_formula(tmp_path, truth, monkeypatch):
+def test_agrees_with_the_official_formula(tmp_path, truth, monkeypatch):
     monkeypatch.setattr(tensoir, "VIEWS_OF_THE_FACTOR", 2)  # 3 views: ⌊3/2⌋ = 1, so views 0 and 1
     run = run_of(tmp_path, truth)
     rendered = [random_view(name, HEIGHT, WIDTH, i) for i, name in enumerate(truth)]
@@ -120,7 +120,7 @@ def test_known_answers():
     assert albedo_factor(estimate, truth) == pytest.approx([4, 1, 1])
 
 
-def test_fewer_views_than_the_factor_takes_use_the_first_alone(tmp_path, truth):
+def test_with_too_few_views_the_factor_comes_from_the_first(tmp_path, truth):
     run = run_of(tmp_path, truth)
     rendered = [random_view(name, HEIGHT, WIDTH, i) for i, name in enumerate(truth)]
     before = PROTOCOL.measure(run, rendered)["albedo_psnr"]
@@ -131,7 +131,7 @@ def test_fewer_views_than_the_factor_takes_use_the_first_alone(tmp_path, truth):
     assert PROTOCOL.measure(run, changed)["render_psnr"] == PROTOCOL.measure(run, rendered)["render_psnr"]
 
 
-def test_what_is_missing_is_named(tmp_path, truth):
+def test_missing_files_are_named(tmp_path, truth):
     run = run_of(tmp_path, truth)
     (tmp_path / "c" / "test_002" / "normal.png").unlink()
     with pytest.raises(UserError, match="tensoir needs true normals") as told:

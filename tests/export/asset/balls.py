@@ -1,4 +1,4 @@
-"""A run whose surface is a sphere of painted and metal bands, all of it known, and its asset."""
+"""A run whose surface is a sphere with known bands of paint and metal, and its asset."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ AXIS = [0.0, -0.6, -0.8]
 
 
 class Ball(torch.nn.Module):
-    """A host that is a sphere about the origin, with ripples of a height along z where that is not 0."""
+    """A host that is a sphere around the origin, with ripples along z if their height is not 0."""
 
     def __init__(self, ripples: float = 0.0) -> None:
         super().__init__()
@@ -42,7 +42,7 @@ class Ball(torch.nn.Module):
 
 
 def material(x: torch.Tensor) -> Material:
-    """Smooth, and different at every point."""
+    """A smooth material that differs at every point."""
     wave = 0.5 + 0.3 * torch.sin(3 * x)
     return Material(wave, 0.55 + 0.4 * torch.sin(2 * x[:, :1]), 0.5 + 0.4 * torch.cos(2 * x[:, 1:2]))
 
@@ -54,7 +54,7 @@ def ball_run(
     host: torch.nn.Module | None = None,
     lobe: str = "spherical_gaussian",
 ) -> Run:
-    """A run without training. Its light is a map of 9×18 texels, one of them bright, and two lamps."""
+    """An untrained run. Its light is a map of 9×18 texels, one of which is bright, and two lamps."""
     config = tiny_config()
     config = dataclasses.replace(
         config,

@@ -1,4 +1,6 @@
-"""An asset, read again by other programs' readers, against the field and the sphere that it was made of."""
+"""An asset, read by the readers of other programs and compared with the field and the sphere that it was made
+from.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +57,9 @@ def to_scene(gltf: np.ndarray) -> np.ndarray:
 
 
 def random_points(shape: trimesh.Trimesh, count: int = 4000):
-    """Points on the triangles, evenly, and how to interpolate values of the vertices there."""
+    """Points distributed uniformly over the triangles, and a function that interpolates vertex values
+    there.
+    """
     points, face = trimesh.sample.sample_surface(shape, count, seed=1)
     weights = trimesh.triangles.points_to_barycentric(shape.triangles[face], points)
     return np.asarray(points), lambda values: (values[shape.faces[face]] * weights[..., None]).sum(1)
@@ -77,7 +81,7 @@ def gltf_tree(path: Path) -> dict:
     return json.loads(contents[20 : 20 + length])
 
 
-def test_textures_are_the_field(shape):
+def test_textures_agree_with_the_field(shape):
     points, at_vertices = random_points(shape)
     uv = at_vertices(shape.visual.uv)
     truth = material(torch.from_numpy(to_scene(points)))
@@ -94,7 +98,7 @@ def test_textures_are_the_field(shape):
     np.testing.assert_array_equal(pbr.baseColorFactor, 255)
 
 
-def test_the_files_beside_hold_the_same(asset, shape):
+def test_the_other_files_have_the_same_contents(asset, shape):
     pbr = shape.visual.material
     for name, texture in (("base_color", pbr.baseColorTexture), ("normal", pbr.normalTexture)):
         stored = read_image(asset / "textures" / f"{name}.png").pixels
@@ -112,17 +116,17 @@ def test_the_files_beside_hold_the_same(asset, shape):
     np.testing.assert_allclose(deviation, 255 * (0.5 + 0.5 * to_scene(points)), atol=2)
 
 
-def test_it_stands_upright_and_faces_outwards(shape):
+def test_the_surface_is_upright_and_faces_outwards(shape):
     scene = to_scene(np.array(shape.vertices))
     np.testing.assert_allclose(np.linalg.norm(scene, axis=1), RADIUS, atol=0.02)
-    # The first camera looks from above and from +X of the world: there, and not below, the sphere is whole.
+    # The first camera is above the sphere, on the side of +X: the sphere is complete there, but not below.
     from_centre = np.array(shape.vertices) - np.array([CENTRE[0], CENTRE[2], -CENTRE[1]])
     cosine = (np.array(shape.vertex_normals) * from_centre).sum(1) / np.linalg.norm(from_centre, axis=1)
     assert cosine.min() > 0.95
     assert ((shape.face_normals * (shape.triangles_center - shape.vertices.mean(0))).sum(1) > 0).all()
 
 
-def test_charts_lie_inside_the_texture_and_apart(shape):
+def test_charts_lie_inside_the_texture_and_do_not_overlap(shape):
     uv = np.array(shape.visual.uv)
     assert uv.min() >= 0
     assert uv.max() <= 1
@@ -144,7 +148,7 @@ def test_charts_lie_inside_the_texture_and_apart(shape):
     assert 0.4 < (inside == 1).mean() < 0.9
 
 
-def test_the_normal_map_turns_the_coarse_surface_into_the_fine_one(tmp_path):
+def test_the_normal_map_gives_the_normals_of_the_fine_surface(tmp_path):
     """By the frame of the file's own tangents. Ripples of 0.015 · 12 = 0.18, 10°, are finer than the coarse
     triangles."""
     asset = tmp_path / "asset"
@@ -185,7 +189,7 @@ def test_the_normal_map_turns_the_coarse_surface_into_the_fine_one(tmp_path):
     assert off(bumped) < 0.25 * off(n)
 
 
-def test_lamps_are_where_they_were(asset):
+def test_lamps_keep_their_positions(asset):
     tree = gltf_tree(asset / "asset.glb")
     assert tree["extensionsUsed"] == ["KHR_lights_punctual"]
     lights = tree["extensions"]["KHR_lights_punctual"]["lights"]
@@ -204,7 +208,7 @@ def test_lamps_are_where_they_were(asset):
     assert lights[1]["spot"] == {"innerConeAngle": 0.0, "outerConeAngle": pytest.approx(math.pi / 2)}
 
 
-def test_usd_opens_again(asset, shape):
+def test_usd_can_be_read(asset, shape):
     usd = pytest.importorskip("pxr.Usd")
     from pxr import UsdGeom, UsdLux, UsdShade
 
@@ -252,7 +256,7 @@ def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
     assert not (tmp_path / "out" / "asset").exists()
 
 
-def test_what_a_person_has_put_there_stays(tmp_path):
+def test_other_files_in_the_folder_are_kept(tmp_path):
     run = ball_run(tmp_path, kind="free")
     (tmp_path / "asset").mkdir()
     (tmp_path / "asset" / "mine.blend").write_text("work of a week")
@@ -267,13 +271,13 @@ def test_what_a_person_has_put_there_stays(tmp_path):
     assert "extensions" not in gltf_tree(tmp_path / "asset" / "asset.glb")
 
 
-def test_an_atlas_that_does_not_fit(tmp_path, monkeypatch):
+def test_an_atlas_that_does_not_fit_is_refused(tmp_path, monkeypatch):
     with pytest.raises(UserError, match=r"charts .* do not fit on a texture of 8×8; raise --texture-size"):
         write_ball(ball_run(tmp_path), tmp_path / "asset", 8)
     assert not (tmp_path / "asset").exists()
 
 
-def test_without_usd_the_rest_is_written(tmp_path, monkeypatch):
+def test_without_usd_the_other_files_are_written(tmp_path, monkeypatch):
     monkeypatch.setattr("neilfpp_method.export.asset.usd.Usd", None)
     write_ball(ball_run(tmp_path), tmp_path / "asset", 64)
     assert (tmp_path / "asset" / "asset.glb").is_file()

@@ -1,5 +1,4 @@
-"""`neilfpp export --what asset` from end to end, on a mesh that the run was given and on one that it
-found."""
+"""`neilfpp export --what asset` from end to end, with a given mesh and with a recovered surface."""
 
 from __future__ import annotations
 
@@ -70,7 +69,7 @@ def test_an_asset_of_a_given_mesh(given, tmp_path, capfd):
     assert len(shape.faces) <= 400
     world = np.array(shape.vertices)[:, [0, 2, 1]] * [1, -1, 1]
     np.testing.assert_allclose(np.linalg.norm(world - CENTRE, axis=1), RADIUS, atol=0.04)
-    # The texture holds what the run says.
+    # The texture agrees with the material of the run.
     run = load_run(given)
     row = (1 - shape.visual.uv[:, 1]) * 128 - 0.5
     column = shape.visual.uv[:, 0] * 128 - 0.5
@@ -82,7 +81,7 @@ def test_an_asset_of_a_given_mesh(given, tmp_path, capfd):
     assert np.abs(texel - truth).mean() < 2
     described = json.loads((out / "scene.json").read_text())
     assert len(described["cameras"]) == 6
-    # Some points are surer than others, and none is certain.
+    # The expected errors differ between points, and none is 0.
     deviation = read_image(out / "textures" / "deviation.png").pixels
     assert 0 < deviation.min() < deviation.max()
 
@@ -114,7 +113,7 @@ def test_a_run_without_a_material(tmp_path, capfd, monkeypatch):
     )
     command = ["export", run, "--what", "asset", "--checkpoint", "sdf_init", *SMALL]
     refused(capfd, command, "no material yet at step 4", leaves=tmp_path)
-    # Later there is one, on the surface that the run has found; its light is free at every point, so there is
+    # A later step has a material, on the recovered surface; the light is free at every point, so there is
     # no map.
     assert main(["export", str(run), "--what", "asset", *SMALL]) == 0
     out = run / "export" / "asset"

@@ -1,4 +1,4 @@
-"""Environment maps, lamps and cameras as other programs take them."""
+"""Environment maps, lamps and cameras as other programs interpret them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def unreal_place(direction: np.ndarray) -> tuple[float, float]:
 
 @pytest.mark.parametrize(("program", "place"), [("blender", blender_place), ("unreal", unreal_place)])
 @pytest.mark.parametrize("texel", [(3, 2), (5, 13), (1, 8)])
-def test_a_bright_texel_is_where_a_program_looks_for_it(program, place, texel):
+def test_a_bright_texel_is_where_the_program_expects_it(program, place, texel):
     row, column = texel
     radiance = torch.full((3, 9, 18), 0.1)
     radiance[:, row, column] = 5.0
@@ -57,8 +57,8 @@ def test_a_bright_texel_is_where_a_program_looks_for_it(program, place, texel):
 
 
 @pytest.mark.parametrize("program", ["blender", "unreal"])
-def test_the_map_brings_the_same_light(program):
-    """The mean over the sphere, and everywhere what our own light says."""
+def test_the_map_has_the_same_radiance(program):
+    """The mean over the sphere, and the radiance in all directions."""
     light = EnvironmentLight(9, 1.0)
     light.show(torch.rand(3, 9, 18, generator=torch.Generator().manual_seed(0)) + 0.1)
     picture = equirectangular(light.log_radiance.exp(), program).double().numpy()
@@ -72,7 +72,7 @@ def test_the_map_brings_the_same_light(program):
     np.testing.assert_allclose(mean, shown.mean(0).numpy(), rtol=5e-3)
 
 
-def test_a_fine_map_is_not_made_finer():
+def test_a_fine_map_is_not_refined():
     assert equirectangular(torch.rand(3, 700, 1400), "blender").shape == (700, 1400, 3)
     assert equirectangular(torch.rand(3, 200, 400), "blender").shape == (512, 1024, 3)
 
@@ -82,7 +82,7 @@ def test_a_fine_map_is_not_made_finer():
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Run:
-    """With square pixels and the lobe that other renderers have."""
+    """With square pixels and the lobe that other renderers use."""
     run = ball_run(tmp_path_factory.mktemp("ball"), lobe="ggx")
     views = tuple(replace(view, camera=replace(view.camera, fy=view.camera.fx)) for view in run.capture.views)
     return replace(run, capture=replace(run.capture, views=views))
@@ -94,7 +94,7 @@ def asset(run: Run) -> Path:
     return run.path / "asset"
 
 
-def test_our_own_map_lies_beside(run, asset):
+def test_the_map_in_the_own_layout_is_included(run, asset):
     shown = read_image(asset / "environment.exr").pixels
     np.testing.assert_allclose(shown, run.model.light.log_radiance.exp().permute(1, 2, 0).numpy(), rtol=1e-6)
     for program in ("blender", "unreal"):
@@ -133,8 +133,9 @@ def test_scripts_compile_and_are_those_of_the_package(asset, name):
 
 
 def own_picture(run: Run, view: str) -> tuple[np.ndarray, np.ndarray]:
-    """What the run's own rendering equation makes of the true sphere, (H, W, 3), and the pixels well within
-    it, (H, W), that no lamp stands in front of."""
+    """Image of the true sphere by the run's own rendering equation, (H, W, 3), and the pixels inside its
+    outline, (H, W), that show no lamp.
+    """
     camera = run.capture.normalisation.camera(next(v.camera for v in run.capture.views if v.name == view))
     rays = camera_rays(camera)
     position, hit = meet_ball(RayBatch(rays.origins, rays.directions), RADIUS)
@@ -149,8 +150,8 @@ def own_picture(run: Run, view: str) -> tuple[np.ndarray, np.ndarray]:
     return picture.view(camera.height, camera.width, 3).numpy(), within
 
 
-def test_mitsuba_shows_what_the_run_shows(run, asset, tmp_path, monkeypatch):
-    """Another renderer, by the written script: cameras, textures, axes, the map and both lamps at once."""
+def test_mitsuba_agrees_with_the_run(run, asset, tmp_path, monkeypatch):
+    """Another renderer with the exported script: cameras, textures, axes, the map and both lamps together."""
     pytest.importorskip("mitsuba")
     monkeypatch.syspath_prepend(str(asset))
     monkeypatch.delitem(sys.modules, "open_in_mitsuba", raising=False)
@@ -162,8 +163,8 @@ def test_mitsuba_shows_what_the_run_shows(run, asset, tmp_path, monkeypatch):
     picture = read_image(out).pixels
     truth, within = own_picture(run, "001")
     assert within.sum() > 150
-    # 31 dB: Mitsuba's diffuse lobe is Disney's, 4 % darker here. Without textures, or turned by a quarter, it
-    # is 20 and less.
+    # 31 dB: Mitsuba's diffuse lobe is Disney's, 4 % darker here. Without textures, or rotated by 90°, it
+    # is 20 dB or less.
     error = np.square(picture - truth)[within].mean()
     assert -10 * math.log10(error) > 29
     np.testing.assert_allclose(picture[within].mean(0), truth[within].mean(0), rtol=0.08)

@@ -1,5 +1,6 @@
-"""What of a surface stays in an asset: what cameras saw, no crumbs, no small holes, and no more triangles
-than it takes."""
+"""The surface of an asset: visible parts without small components and small holes, with as few triangles as
+the error permits.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ def surface(*shapes: trimesh.Trimesh) -> Surface:
 
 
 def camera(height: float, size: int = 40) -> Camera:
-    """At (0, 0, height), looking down; 53° wide."""
+    """A camera at (0, 0, height) that looks down, with a field of view of 53°."""
     w2c = np.diag([1.0, -1.0, -1.0, 1.0])
     w2c[2, 3] = height
     return Camera(float(size), float(size), size / 2, size / 2, size, size, w2c)
@@ -38,7 +39,7 @@ def ball(centre: tuple[float, float, float], radius: float, subdivisions: int = 
 
 @pytest.mark.parametrize("size", [2, 40])
 def test_a_camera_above_sees_the_upper_part(size):
-    """Also where triangles are far smaller than its pixels."""
+    """Also if triangles are much smaller than its pixels."""
     shape = surface(ball((0, 0, 0), 0.5))
     seen = visible_faces(shape, [camera(2.0, size)])
     # From 2 the horizon of a ball of radius 0.5 is at z = 0.5² / 2; triangles are 0.08 across.
@@ -47,7 +48,7 @@ def test_a_camera_above_sees_the_upper_part(size):
     assert not seen[middle < 0.125 - 0.04].any()
 
 
-def test_what_stands_behind_or_beside_the_picture_is_not_seen():
+def test_surfaces_behind_the_camera_or_outside_the_image_are_invisible():
     near, behind, beside = ball((0, 0, 0), 0.5), ball((0, 0, -0.9), 0.2), ball((3, 0, 0), 0.2)
     seen = visible_faces(surface(near, behind, beside), [camera(2.0)])
     first, second, third = np.split(seen, np.cumsum([len(near.faces), len(behind.faces)]))
@@ -56,7 +57,7 @@ def test_what_stands_behind_or_beside_the_picture_is_not_seen():
     assert not third.any()
 
 
-def test_the_inside_of_a_surface_is_not_seen():
+def test_the_inside_of_a_surface_is_invisible():
     turned = ball((0, 0, 0), 0.5)
     turned.invert()
     assert not visible_faces(surface(turned), [camera(2.0)]).any()
@@ -65,10 +66,10 @@ def test_the_inside_of_a_surface_is_not_seen():
 # ----------------------------------------------------------------------------------------------- what is kept
 
 
-def test_unseen_patches_go_unless_they_are_small():
+def test_invisible_patches_are_removed_unless_they_are_small():
     shape = surface(ball((0, 0, 0), 0.5, 4))
     z = shape.mesh().triangles_center[:, 2]
-    # A cap of 0.04 across that nobody saw stays; all below the equator goes, but for a ring.
+    # An invisible cap with a diameter of 0.04 is kept; below the equator only a ring is kept.
     top = shape.mesh().triangles_center[z.argmax()]
     seen = (z > 0) & (np.linalg.norm(shape.mesh().triangles_center - top, axis=1) > 0.4 * HOLE)
     kept = keep_visible(shape, seen).mesh()
@@ -77,13 +78,13 @@ def test_unseen_patches_go_unless_they_are_small():
     assert (np.linalg.norm(kept.triangles_center - top, axis=1) < 1e-9).any()
 
 
-def test_crumbs_go():
+def test_small_components_are_removed():
     kept = remove_small_components(surface(ball((0, 0, 0), 0.5), ball((1, 0, 0), 0.1), ball((0, 1, 0), 0.01)))
     assert kept.mesh().bounds[:, 0] == pytest.approx([-0.5, 1.1], abs=0.01)
     assert kept.mesh().bounds[1, 1] < 0.6
 
 
-def test_small_holes_are_closed_and_large_ones_stay():
+def test_small_holes_are_closed_and_large_ones_kept():
     whole = surface(ball((0, 0, 0), 0.5, 5))
     middle = whole.mesh().triangles_center
     holes = (np.linalg.norm(middle - [0, 0, 0.5], axis=1) < 0.02) | (middle[:, 2] < -0.4)
@@ -92,7 +93,7 @@ def test_small_holes_are_closed_and_large_ones_stay():
     assert 5 <= len(added) < 40
     mesh = trimesh.Trimesh(closed.vertices, closed.faces, process=False)
     assert mesh.is_winding_consistent
-    # Over the small hole the surface is whole again, and faces up.
+    # The small hole is closed, and its triangles face up.
     np.testing.assert_allclose(mesh.face_normals[-len(added) :, 2], 1, atol=0.02)
     tracer = first_hits(closed)
     for height, met in ((1.0, True), (-1.0, False)):
@@ -102,7 +103,7 @@ def test_small_holes_are_closed_and_large_ones_stay():
         assert found.valid[0] == met
 
 
-def test_nothing_seen_is_an_error():
+def test_no_visible_triangle_is_an_error():
     shape = surface(ball((0, 0, 0), 0.5))
     with pytest.raises(UserError, match="no training camera sees the surface"):
         clean(shape, np.zeros(len(shape.faces), dtype=bool))
@@ -111,7 +112,7 @@ def test_nothing_seen_is_an_error():
 # ------------------------------------------------------------------------------------------------ simplifying
 
 
-def test_points_come_down_on_the_surface_that_faces_their_way():
+def test_points_are_moved_to_the_surface_of_the_same_orientation():
     """Between two plates, above the lower one."""
     plates = trimesh.util.concatenate([trimesh.creation.box((1, 1, 0.02)) for _ in range(2)])
     plates.vertices[8:, 2] += 0.1
@@ -130,14 +131,14 @@ def test_points_come_down_on_the_surface_that_faces_their_way():
     np.testing.assert_allclose(short.position, [[0.1, 0.2, 0.03]], atol=1e-6)
 
 
-def test_an_error_decides_how_many_triangles():
+def test_the_number_of_triangles_depends_on_the_error():
     fine = surface(ball((0, 0, 0), 0.5, 5))
     sizes = []
     for error in (0.0, 0.003, 0.02):
         coarse = simplified(fine, 5000, error)
         assert len(coarse.surface.faces) <= 5000
         assert coarse.distance.near <= max(error, simplified(fine, 5000, 0.0).distance.near)
-        # The centre of a triangle with edges of length e lies e²/(6 r) below its corners: what all of them
+        # The centre of a triangle with edges of length e lies e²/(6 r) below its corners, which all of them
         # must keep.
         sphere = np.linalg.norm(coarse.surface.mesh().triangles_center, axis=1)
         assert np.abs(sphere - 0.5).mean() <= max(error, 0.001)
@@ -145,17 +146,17 @@ def test_an_error_decides_how_many_triangles():
     assert sizes[0] > sizes[1] > sizes[2]
 
 
-def test_a_distance_is_that_of_the_surfaces():
+def test_the_distance_is_that_between_the_surfaces():
     one, other = surface(ball((0, 0, 0), 0.5, 5)), surface(ball((0, 0, 0), 0.51, 5))
     assert distance_between(one, other).near == pytest.approx(0.01, abs=3e-4)
     assert distance_between(one, one).near == pytest.approx(0, abs=1e-5)
     assert distance_between(one, other).missed == 0
-    # Where half of the surface is not there, half is missed.
+    # If half of the surface is missing, half of the points are missed.
     half = one.part(one.mesh().triangles_center[:, 2] > 0)
     assert distance_between(one, half).missed == pytest.approx(0.5, abs=0.02)
 
 
-def test_few_triangles_stay_as_they_are():
+def test_a_coarse_surface_is_unchanged():
     box = surface(trimesh.creation.box((1, 1, 1)))
     kept = simplified(box, 5000, 0.0)
     assert len(kept.surface.faces) == 12

@@ -1,11 +1,10 @@
-"""Commands that are killed at random moments, and what they leave behind.
+"""Kill commands at random moments and check what they leave behind.
 
     python -m tests.hard_cases.faults.campaign FOLDER REPORT SEED KILLS
 
-This process loads the package once; every command runs in a copy of it (`fork`). REPORT holds the number
-of kills by command and signal, and every fault: a trace of the inside, an exit status that nobody expects,
-a file under its own name that cannot be read, or a result that is not, bit for bit, that of a command which
-nobody killed.
+This process loads the package once; every command runs in a copy of it (`fork`). REPORT has the number of
+kills by command and signal, and every fault: a traceback, an unexpected exit status, a file under its final
+name that cannot be read, or a result that is not bit for bit that of an uninterrupted command.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ EXPECTED = {0, -signal.SIGKILL, -signal.SIGTERM, 130, 143}
 
 @dataclass
 class Report:
-    """What was done, and what went wrong."""
+    """Counts of kills, and faults."""
 
     kills: Counter[str] = field(default_factory=Counter)
     files: int = 0
@@ -50,7 +49,7 @@ class Report:
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended: its status (negative: the signal), what it said on the standard error, seconds."""
+    """The end of a command: its exit status (negative: the signal), its standard error, and its seconds."""
 
     status: int
     said: str
@@ -64,7 +63,7 @@ def run(
     said, began = folder / "said", time.monotonic()
     said.write_text("")
     asking = {signal.SIGINT, signal.SIGTERM}
-    signal.pthread_sigmask(signal.SIG_BLOCK, asking)  # a copy takes them once it is a command
+    signal.pthread_sigmask(signal.SIG_BLOCK, asking)  # a copy receives them once it is a command
     child = os.fork()
     if not child:
         _become_command(said, words, asking)
@@ -72,13 +71,13 @@ def run(
     if kill is not None:
         time.sleep(after)
         for _ in range(1 + twice):
-            os.kill(child, kill)  # its end has not been waited for, so the number is still its own
+            os.kill(child, kill)  # it was not waited for, so its process id is still valid
     _, status = os.waitpid(child, 0)
     return Ended(os.waitstatus_to_exitcode(status), said.read_text(), time.monotonic() - began)
 
 
 def _become_command(said: Path, words: tuple[str, ...], asking: set[signal.Signals]) -> None:
-    """Never returns: what comes after it is the other process's."""
+    """Run a command in this process; never returns, because later code belongs to the parent process."""
     status = 1
     try:
         errors, nowhere = os.open(said, os.O_WRONLY | os.O_APPEND), os.open(os.devnull, os.O_WRONLY)
@@ -95,14 +94,16 @@ def _become_command(said: Path, words: tuple[str, ...], asking: set[signal.Signa
 
 
 def check_end(report: Report, what: str, ended: Ended) -> None:
-    """Nothing of the inside is shown, and the status is one of those that are meant."""
+    """Check that no traceback is printed and that the exit status is an expected one."""
     told = [line for line in ended.said.splitlines() if not line.startswith("step ")]
     if ended.status not in EXPECTED or "Traceback" in ended.said or "*** " in ended.said or len(told) > 1:
         report.faults.append(f"{what}: status {ended.status}: {ended.said[-800:]}")
 
 
 def check_files(report: Report, what: str, folder: Path) -> None:
-    """Every file that has its own name is whole. Files that are being written are hidden."""
+    """Check that every file under its final name is complete. Files that are being written have hidden
+    names.
+    """
     for path in folder.rglob("*"):
         if path.name.startswith(".") or not path.is_file():
             continue
@@ -114,7 +115,7 @@ def check_files(report: Report, what: str, folder: Path) -> None:
                 json.loads(path.read_text())
             elif path.suffix == ".png":
                 read_image(path)
-            elif path.suffix == ".exr":  # several layers: not a picture that a capture may have
+            elif path.suffix == ".exr":  # several layers: a capture cannot contain such an image
                 OpenEXR.File(str(path))
             elif path.suffix in (".ply", ".glb", ".obj"):
                 trimesh.load(path)
@@ -128,9 +129,7 @@ def train_words(folder: Path, out: Path, resume: bool) -> list[str]:
 
 
 def attack_training(report: Report, folder: Path, draw: random.Random, kills: int) -> Path:
-    """Kill trainings, up to four times each, and let each go on to its end; returns one that nobody
-    killed.
-    """
+    """Kill trainings, up to four times each, and let each finish; returns one that was not interrupted."""
     whole = folder / "whole"
     took = run(folder, *train_words(folder, whole, resume=False))
     if took.status:
@@ -172,7 +171,7 @@ COMMANDS = (
 
 
 def attack_command(report: Report, folder: Path, words: list[str], draw: random.Random, kills: int) -> None:
-    """Kill a command that reads a run, then let it come to its end: the run stays whole all the time."""
+    """Kill a command that reads a run, then let it finish; the run must stay intact throughout."""
     whole = run(folder, *words)
     if whole.status:
         report.faults.append(f"{words[0]}: cannot be run: {whole.said[-800:]}")

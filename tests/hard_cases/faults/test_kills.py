@@ -1,5 +1,5 @@
-"""Commands that are killed at random moments: no file is lost or halved, no run is other than it would
-have been, and nothing of the inside is shown.
+"""Commands that are killed at random moments lose no file, leave no incomplete file, give the same results,
+and print no traceback.
 """
 
 from __future__ import annotations
@@ -47,9 +47,7 @@ def test_a_few_kills_of_trainings(tmp_path: Path) -> None:
 
 
 @pytest.mark.hard
-def test_a_sigterm_while_a_command_starts_shows_nothing_of_the_inside(
-    tmp_path: Path, record_property
-) -> None:
+def test_a_sigterm_while_a_command_starts_prints_no_traceback(tmp_path: Path, record_property) -> None:
     root, draw = make_capture(tmp_path / "capture"), random.Random(0)
     command = [sys.executable, "-m", "neilfpp_method.cli", "inspect", str(root)]
     began = time.monotonic()

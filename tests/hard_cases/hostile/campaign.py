@@ -31,7 +31,7 @@ CHUNK = 500
 
 @dataclass
 class Progress:
-    """What became of the inputs of each reader so far, and how many of them there were."""
+    """The outcomes of the inputs of each reader so far, and their number."""
 
     outcomes: dict[str, Outcome] = field(default_factory=dict)
     done: dict[str, int] = field(default_factory=dict)
@@ -61,7 +61,7 @@ class Progress:
 
 
 def table(progress: Progress) -> str:
-    """What became of the inputs of each reader, in Markdown."""
+    """The outcomes of the inputs of each reader as a Markdown table."""
     rows = [
         "| reader | inputs | gave a value | refused in one line | faults | memory, MiB |",
         "|---|---|---|---|---|---|",

@@ -1,4 +1,4 @@
-"""Damage to files, by number: the same number does the same damage, so that a fault can be met again."""
+"""Damage to files by number: the same number gives the same damage, so that a fault can be reproduced."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ WORDS = [
 
 
 def mutated(data: bytes, number: int) -> bytes:
-    """The damaged contents of a file: one to three of the damages below."""
+    """Return the damaged contents of a file: one to three of the kinds of damage below."""
     draw = np.random.default_rng([number, len(data)])
     kinds = DAMAGES + (TEXT_DAMAGES if _is_text(data) else ())
     for _ in range(int(draw.choice([1, 1, 2, 3]))):
@@ -106,7 +106,7 @@ def _append(data: bytes, draw: Draw) -> bytes:
 
 
 def _say_another_word(data: bytes, draw: Draw) -> bytes:
-    """Put another word in the place of one; a word ends where a space or a sign of JSON is."""
+    """Replace a word by another one; words end at spaces and JSON punctuation."""
     ends = [i for i, sign in enumerate(data) if sign in b" \n\t,:[]{}"]
     if len(ends) < 2:
         return data

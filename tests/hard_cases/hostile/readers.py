@@ -1,4 +1,4 @@
-"""Every reader of files that others may have written: whole files for it to damage, and how it reads them."""
+"""Every reader of untrusted files: valid files to damage, and a function that reads them."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Reader:
 
 def _picture(channels: int, kind: type = np.float32) -> np.ndarray:
     values = np.random.default_rng(0).random((*SIZE, channels))
-    values[:9] = 0.25  # even parts are packed in another way than noise
+    values[:9] = 0.25  # constant parts are compressed in another way than noise
     return (values * (255 if kind is np.uint8 else 65_535 if kind is np.uint16 else 1)).astype(kind)
 
 

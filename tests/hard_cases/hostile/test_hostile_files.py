@@ -1,8 +1,8 @@
-"""Damaged files: every reader gives a good value or one line, and nothing else.
+"""Damaged files: every reader returns a valid value or an error of one line.
 
-What a damaged file must not do: end in a traceback, hang, take much memory, end the process by a native
-library, lead out of the capture, or run code. Counts and memory of the long campaign stand in
-docs/stability.md.
+A damaged file must not cause a traceback, a hang, a large use of memory, a crash of a native library, a read
+outside of the capture, or the execution of code. docs/stability.md has the counts and the memory of the long
+campaign.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ INPUTS = int(os.environ.get("HARD_INPUTS", "2000"))
 
 
 def attack(folder: Path, counts: dict[str, int], first: int) -> dict[str, dict]:
-    """What became of so many damaged files of each reader."""
+    """The outcomes of so many damaged files of each reader."""
     report = folder / "report.json"
     words = [f"{name}={count}" for name, count in counts.items()]
     command = ["-m", "tests.hard_cases.hostile.worker", str(folder), str(report), str(first), *words]
@@ -44,14 +44,14 @@ def check(outcomes: dict[str, dict], counts: dict[str, int]) -> None:
         assert outcome["refused"] > 0, f"{name}: nothing was damaged"
 
 
-def test_every_reader_meets_a_few_damaged_files(tmp_path: Path) -> None:
+def test_every_reader_handles_a_few_damaged_files(tmp_path: Path) -> None:
     check(attack(tmp_path, QUICK, first=0), QUICK)
 
 
 @pytest.mark.hard
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("name", READERS)
-def test_a_reader_meets_thousands(tmp_path: Path, record_property, name: str) -> None:
+def test_a_reader_handles_thousands_of_damaged_files(tmp_path: Path, record_property, name: str) -> None:
     counts = {name: round(INPUTS * READERS[name].share)}
     outcomes = attack(tmp_path, counts, first=1000)
     record_property("inputs", counts[name])
@@ -59,7 +59,7 @@ def test_a_reader_meets_thousands(tmp_path: Path, record_property, name: str) ->
     check(outcomes, counts)
 
 
-def test_the_same_number_does_the_same_damage() -> None:
+def test_the_same_number_gives_the_same_damage() -> None:
     data = bytes(range(256)) * 8
     assert [mutated(data, i) for i in range(50)] == [mutated(data, i) for i in range(50)]
     assert len({mutated(data, i) for i in range(50)}) > 40
@@ -74,9 +74,9 @@ def faults_of(program: str, folder: Path) -> list:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def test_the_worker_notices_what_it_is_for(tmp_path: Path) -> None:
-    """A traceback, a crash and a large allocation are faults, each with its number, and the next input
-    follows.
+def test_the_worker_detects_faults(tmp_path: Path) -> None:
+    """A traceback, a crash and a large allocation are faults, each reported with its number, and the next
+    input is read.
     """
     program = """
 import ctypes, json, sys
@@ -104,9 +104,9 @@ print(json.dumps([[fault[0], fault[2]] for fault in outcome.faults]))
         assert word in told
 
 
-def test_the_worker_limits_the_time_of_computing(tmp_path: Path) -> None:
-    """An endless loop is ended after its time of computing. Waiting, as on a loaded machine, is no fault for
-    much longer.
+def test_the_worker_limits_the_computing_time(tmp_path: Path) -> None:
+    """An endless loop is ended after the limit of computing time. Waiting, as on a loaded machine, is
+    permitted for much longer.
     """
     program = """
 import json, sys, time

@@ -1,10 +1,10 @@
-"""Damaged files in child processes, whose memory is bounded and which may die.
+"""Read damaged files in child processes, whose memory is limited and which may crash.
 
     python -m tests.hard_cases.hostile.worker FOLDER REPORT FIRST READER=COUNT …
 
-This process loads what readers need, once, and is then copied (`fork`) for each reader. A copy notes the
-number of the input that it reads, so that its parent knows which one was the end of it; the next copy goes on
-behind it. REPORT holds an `Outcome` for each reader.
+This process loads the modules of the readers once and is then copied (`fork`) for each reader. A copy records
+the number of the input that it reads, so that its parent knows which input ended it; the next copy continues
+after that input. REPORT has an `Outcome` for each reader.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def attack(reader: Reader, folder: Path, first: int, count: int) -> Outcome:
     capture.mkdir(parents=True)
     paths = reader.make(capture)
     whole = {path: path.read_bytes() for path in paths}
-    for path in paths:  # what is loaded at first use is no cost of a damaged file
+    for path in paths:  # modules that are loaded at first use do not count for a damaged file
         reader.read(capture, path)
     outcome, number, last = Outcome(), first, first + count
     while number < last:
@@ -137,7 +137,7 @@ def _write(told: Path, outcome: Outcome) -> None:
 
 
 def _fault(error: UserError) -> str | None:
-    """What is wrong with a complaint; none: nothing."""
+    """What is wrong with an error message; empty if nothing is."""
     if "\n" in str(error) or len(str(error)) > LONGEST_LINE or not error.remedy:
         return f"not one line with a remedy: {str(error)[:3000]!r}"
     cause: BaseException | None = error
