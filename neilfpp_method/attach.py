@@ -35,7 +35,7 @@ from neilfpp_method.hosts.foreign import ForeignHost, answers_secondary_rays, pr
 from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
-from neilfpp_method.model import NeilfModel
+from neilfpp_method.model import EVAL_RAYS, NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, stage_at, weigh
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
@@ -166,9 +166,8 @@ class AttachedNeilf(nn.Module):
         rendered = self._host_hits(rays, hits, moves_host=False)
         if rendered is None:
             return self.model.maps(rays)
-        chunk = self.model.config.train.eval_chunk
-        starts = range(0, max(len(rays), 1), chunk)
-        parts = [self.model.maps(rays[i : i + chunk], hits=rendered[i : i + chunk]) for i in starts]
+        starts = range(0, max(len(rays), 1), EVAL_RAYS)
+        parts = [self.model.maps(rays[i : i + EVAL_RAYS], hits=rendered[i : i + EVAL_RAYS]) for i in starts]
         return Maps(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Maps)))
 
     def param_groups(self) -> list[dict[str, Any]]:

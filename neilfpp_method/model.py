@@ -51,8 +51,12 @@ from neilfpp_method.structures import (
 )
 from neilfpp_method.timing.ledger import doing
 
-__all__ = ["NeilfModel"]
+__all__ = ["EVAL_RAYS", "NeilfModel"]
 
+EVAL_RAYS = 2048
+"""Largest number of rays in one call of `NeilfModel.maps`, so that the incident directions of their surface
+points fit in memory.
+"""
 CLEAR_OPACITY = 0.01
 """Opacity below which a ray counts as missing the scene, so that its pixel shows the light behind it."""
 SURFACE_OPACITY = 0.5

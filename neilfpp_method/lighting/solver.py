@@ -239,7 +239,12 @@ class MapSolver(nn.Module):
         # Where cameras saw the light directly, that fixes the scale.
         log_scale = self._log_scale(material) if sky is None else 0.0
         objective = Objective(
-            self.response, self.unit, self.config.fit, sky, self.config.monochrome, log_scale
+            self.response,
+            self.unit,
+            self.config.fit.steps,
+            sky=sky,
+            monochrome=self.config.monochrome,
+            log_scale=log_scale,
         )
         measured = solve_light(
             light,

@@ -85,7 +85,6 @@ def make_run(capture, model: NeilfModel | None = None, step: int = 10**6, specul
     config = preset("fast")
     config = dataclasses.replace(
         config,
-        train=dataclasses.replace(config.train, eval_chunk=1000),
         shading=dataclasses.replace(config.shading, specular=specular),
     )
     facts = SceneFacts("linear" if capture.hdr else "srgb", 0.5, 3.0, "none")

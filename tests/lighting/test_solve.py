@@ -23,8 +23,6 @@ from neilfpp_method.structures import Material, Observed
 from tests.lighting.surfaces import material, patches
 
 CONFIG = MapLightConfig(kind="auto", environment_height=12, fit=LightFitConfig(points=800, steps=150))
-KNOWN = dataclasses.replace(CONFIG, fit=dataclasses.replace(CONFIG.fit, evenness=0.0))
-"""Base colour is what surfaces have learned, and nothing else is known of the tint of light."""
 LAMP = torch.tensor([[0.3, -0.2, 0.5]])
 BULB = LampPlaces(LAMP, torch.zeros(1, 3))
 """Sends alike in all directions."""
@@ -67,19 +65,18 @@ def solve(
     unit: float,
     config: MapLightConfig,
     first: bool,
+    base_color_known: bool = False,
 ) -> Evidence | None:
-    objective = Objective("linear", unit, config.fit)
+    objective = Objective("linear", unit, config.fit.steps, base_color_known)
     return solve_light(LightModel(environment, lamps), seen, of, GGX, None, objective, config, first)
 
 
-def solved(
-    seen: Observed, of: Material, rounds: int, config: MapLightConfig = CONFIG
-) -> tuple[Lamps, object]:
+def solved(seen: Observed, of: Material, rounds: int, base_color_known: bool = False) -> tuple[Lamps, object]:
     torch.manual_seed(0)
     environment, lamps = EnvironmentLight(12, 0.7), Lamps(4, 0.06)
     for number in range(rounds):
         unit = seen.pixel.median().item()
-        evidence = solve(environment, lamps, seen, of, unit, config, first=number == 0)
+        evidence = solve(environment, lamps, seen, of, unit, CONFIG, number == 0, base_color_known)
     return lamps, evidence
 
 
@@ -89,7 +86,7 @@ def test_a_lamp_is_found_where_it_is_as_strong_and_which_way_it_shines(true, kno
     """Base colours that are known may be as uneven as they like; those that are not are even but for
     edges.
     """
-    lamps, _ = solved(*photographed(true, speckled=known), rounds=3, config=KNOWN if known else CONFIG)
+    lamps, _ = solved(*photographed(true, speckled=known), rounds=3, base_color_known=known)
     assert lamps.lit
     strongest = int(lamps.intensity.sum(-1).argmax())
     assert (lamps.position[strongest] - LAMP[0]).norm() < 0.03
@@ -196,7 +193,7 @@ def test_lamps_without_a_significant_gain_are_lit_only_with_lamps_if_undecided(m
     for doubt in (False, True):
         torch.manual_seed(0)
         light, unit = LightModel(EnvironmentLight(12, 0.7), Lamps(4, 0.06)), seen.pixel.median().item()
-        objective = Objective("linear", unit, CONFIG.fit)
+        objective = Objective("linear", unit, CONFIG.fit.steps)
         solve_light(light, seen, of, GGX, None, objective, CONFIG, first=False, lamps_if_undecided=doubt)
         lit.append(light.lamps.lit)
     assert lit[0] == 0
