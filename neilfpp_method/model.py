@@ -14,10 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from neilfpp_method import losses
-from neilfpp_method.fields.brdf import BrdfField
-from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.fields.exposure import PhotographGains, at_mean_exposure
-from neilfpp_method.fields.light import LightModel, make_light
+from neilfpp_method.fields import BrdfField, LightModel, PhotographGains, at_mean_exposure, make_light
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
 from neilfpp_method.incident import (
@@ -122,8 +119,7 @@ class NeilfModel(nn.Module):
         self.config = config
         self.lobe = _specular_lobe(config.shading)
         self.brdf.use(config.brdf)
-        if isinstance(self.light, EnvironmentLight):
-            self.light.be_even(config.light.environment_height == 1)
+        LightModel(self.light, self.lamps).use(config.light)
 
     # ----------------------------------------------------------------------------------------------- one step
 
