@@ -5,11 +5,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from neilfpp_method.hosts import base
 
-__all__ = ["CAPABILITIES", "Capability", "markdown"]
+__all__ = ["CAPABILITIES", "Capability", "markdown", "missing_capabilities"]
 
 
 @dataclass(frozen=True)
@@ -118,6 +119,11 @@ CAPABILITIES = (
     ),
 )
 """All optional methods, the most useful first."""
+
+
+def missing_capabilities(host: object) -> Mapping[str, str]:
+    """The optional methods that most hosts could have and this one lacks, with the consequence of each."""
+    return {c.method: c.without for c in CAPABILITIES if c.reported and not hasattr(host, c.method)}
 
 
 def markdown() -> str:

@@ -18,7 +18,7 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.shading.color import apply_response
 from neilfpp_method.structures import PixelBatch, RayBatch, SurfaceHits
 
-__all__ = ["FirstBatches", "check_batch", "check_points", "check_rows"]
+__all__ = ["FirstBatches"]
 
 BATCHES = 10
 """Number of batches that are checked; each check synchronises with the device."""
@@ -218,57 +218,3 @@ class FirstBatches:
         if kind not in self._warned:
             self._warned.add(kind)
             log.warning("%s: %s; %s", self.name, problem, remedy)
-
-
-def check_batch(batch: PixelBatch) -> None:
-    """Check shapes and types of a batch; cheap enough for every step.
-
-    Raises:
-        UserError: a tensor has integers, or another shape than one row per pixel.
-    """
-    for name in ("origins", "directions", "color"):
-        check_rows(name, getattr(batch, name), len(batch), 3)
-    for name in ("mask", "mask_known", "image_gradient"):
-        check_rows(name, getattr(batch, name), len(batch))
-
-
-def check_rows(name: str, value: Tensor, count: int, width: int | None = None) -> None:
-    """Check that a tensor has one row of floating-point numbers per pixel.
-
-    Args:
-        name: name of the tensor in messages.
-        value: the tensor.
-        count: number of pixels.
-        width: numbers per pixel, in a second axis; None: one number per pixel without a second axis.
-
-    Raises:
-        UserError: it does not.
-    """
-    if not value.is_floating_point():
-        remedy = (
-            "divide 8-bit pixels by 255 and attach with response='srgb'" if name == "color" else "give floats"
-        )
-        raise UserError(f"{name} of the batch is {value.dtype}", remedy)
-    wanted = (count,) if width is None else (count, width)
-    if tuple(value.shape) != wanted:
-        pixels = math.prod(value.shape[:-1]) if width is not None and value.ndim > 2 else count
-        shape = (
-            f"({pixels}, {width}): one row per pixel, reshape(-1, {width})"
-            if width
-            else f"({pixels},): one number per pixel"
-        )
-        raise UserError(f"{name} of the batch has the shape {tuple(value.shape)}", f"give {shape}")
-
-
-def check_points(name: str, x: Tensor, axes: int = 2) -> None:
-    """Check that points are (N, 3), or with `axes` = 3 directions (N, S, 3), of floating-point numbers.
-
-    Raises:
-        UserError: they have another shape, or are integers.
-    """
-    wanted = "(N, 3)" if axes == 2 else "(N, S, 3)"
-    if x.ndim != axes or x.shape[-1] != 3:
-        flat = f"{name}.reshape(-1, 3)" if axes == 2 and x.shape[-1:] == (3,) else f"the shape {wanted}"
-        raise UserError(f"{name} has the shape {tuple(x.shape)}, not {wanted}", f"give {flat}")
-    if not x.is_floating_point():
-        raise UserError(f"{name} is {x.dtype}", "give floats")
