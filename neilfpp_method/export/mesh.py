@@ -14,7 +14,7 @@ from jaxtyping import Float
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from neilfpp_method.data.images import replacing
+from neilfpp_method.data.ply import NORMAL, write_ply
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.base import HasSdf
 from neilfpp_method.hosts.mesh import MeshHost
@@ -126,14 +126,16 @@ def export_mesh(run: Run, path: Path, resolution: int = 256) -> trimesh.Trimesh:
     mesh = surface_mesh(run, resolution)
     device = next(run.model.parameters()).device
     position = torch.as_tensor(np.array(mesh.vertices), dtype=torch.float32, device=device)
+    columns = dict(zip(NORMAL, mesh.vertex_normals.astype(np.float32).T, strict=True))
     if run.has_material:
         material = materials_in_parts(run, position)
-        mesh.visual.vertex_colors = (tone_map(material.base_color) * 255.0).round().byte().cpu().numpy()
-        mesh.vertex_attributes["roughness"] = material.roughness[:, 0].cpu().numpy()
-        mesh.vertex_attributes["metallic"] = material.metallic[:, 0].cpu().numpy()
+        color = (tone_map(material.base_color) * 255.0).round().byte().cpu().numpy()
+        opaque = np.full(len(color), 255, dtype=np.uint8)
+        columns |= zip(("red", "green", "blue", "alpha"), (*color.T, opaque), strict=True)
+        columns["roughness"] = material.roughness[:, 0].cpu().numpy()
+        columns["metallic"] = material.metallic[:, 0].cpu().numpy()
     mesh.vertices = run.capture.normalisation.to_world(position.double()).cpu().numpy()
-    with replacing(path) as temporary:
-        temporary.write_bytes(mesh.export(file_type="ply", vertex_normal=True))
+    write_ply(path, np.array(mesh.vertices), columns, np.array(mesh.faces))
     return mesh
 
 
