@@ -45,6 +45,7 @@ def run(options: Report) -> None:
     contents.check()
     out = options.out or options.run / REPORT
     check_writable(out)
+    messages: list[str] = []
     with computing_fast(), progress_bar("report") as advance:
         write_report(
             options.run,
@@ -52,8 +53,10 @@ def run(options: Report) -> None:
             contents,
             str(pick_device(options.device)),
             lambda share: advance(share) if share >= TELLING else None,
+            messages.append,
         )
-    terminal().print(f"written to {out}", soft_wrap=True)
+    for line in (*messages, f"written to {out}"):
+        terminal().print(line, soft_wrap=True)
 
 
 def after_training(path: Path, device: str) -> None:

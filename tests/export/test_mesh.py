@@ -83,6 +83,13 @@ def test_surface_outside_the_scene_is_an_error():
         extract_mesh(lambda x: 1.3 - x.norm(dim=-1), radius=1.0, resolution=32)
 
 
+def test_a_grid_that_does_not_fit_in_memory_is_refused(monkeypatch):
+    monkeypatch.setattr("neilfpp_method.data.memory.available_memory", lambda: 8 * 64**3 - 1)
+    with pytest.raises(UserError, match=r"grid of 64³ points need about 0\.0 GB.*lower resolution"):
+        extract_mesh(sphere, radius=1.0, resolution=64)
+    extract_mesh(sphere, radius=1.0, resolution=56)
+
+
 # ------------------------------------------------------------------------------------------------------ a run
 
 

@@ -242,6 +242,22 @@ def test_a_run_that_was_stopped_says_how_it_goes_on(run: Path):
     page = page_of(run)
     assert "stopped before its first checkpoint" in page.text
     assert page.data == {}
+    messages: list[str] = []
+    write_report(run, run / "report.html", SMALL, say=messages.append)
+    assert [line.split(". ")[0] for line in messages] == ["the report has no views, surface and light"]
+    assert "--resume" in messages[0]
+
+
+def test_a_run_with_settings_only_has_no_report(run: Path, capfd):
+    for path in run.iterdir():
+        if path.name not in ("config.json", "capture.json", "scene.json", "effects.json"):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    assert main(["report", str(run)]) == 2
+    error = capfd.readouterr().err
+    assert f"{run}: nothing to report" in error
+    assert "before its first checkpoint" in error
+    assert "--resume" in error
+    assert not (run / "report.html").exists()
 
 
 def test_photographs_without_truth_or_test_views_have_a_page(tmp_path: Path):
