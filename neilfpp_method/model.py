@@ -46,7 +46,7 @@ from neilfpp_method.structures import (
     SurfaceHits,
     SurfacePixels,
 )
-from neilfpp_method.timing.ledger import doing
+from neilfpp_method.timing.ledger import timed
 
 __all__ = ["EVAL_RAYS", "NeilfModel"]
 
@@ -173,7 +173,7 @@ class NeilfModel(nn.Module):
         incident = self._incident(position, normal, wo, material, self.config.shading.train_samples)
 
         # 5. Rendering equation: outgoing radiance towards wo, compared with the pixel.
-        with doing("shading"):
+        with timed("shading"):
             shading = shade(material, normal, wo, incident, self.lobe)
         terms["physical"] = losses.photometric(
             shading.color, surface.pixel, self.facts.response, self.units.physical
@@ -191,7 +191,7 @@ class NeilfModel(nn.Module):
         rendered = slice(math.ceil(self.replay.share * len(batch)))
         return batch[rendered], None if hits is None else hits[rendered]
 
-    @doing("rendering")
+    @timed("rendering")
     def _render_host(
         self, batch: PixelBatch, plan: StagePlan, active: Mapping[str, float], hits: SurfaceHits | None
     ) -> tuple[SurfaceHits, dict[str, LossTerm]]:
@@ -224,7 +224,7 @@ class NeilfModel(nn.Module):
         color = at_mean_exposure(self.gains, batch.color, batch.view, self.facts.response)
         return replace(batch, color=color)
 
-    @doing("shading")
+    @timed("shading")
     def _surface_pixels(self, hits: SurfaceHits, pixels: PixelBatch) -> SurfacePixels:
         """Surface points to shade; the gradients of position and normal are scaled by the settings."""
         settings = self.config.loss
@@ -238,14 +238,14 @@ class NeilfModel(nn.Module):
             image_gradient=pixels.image_gradient,
         )
 
-    @doing("shading")
+    @timed("shading")
     def _material_and_priors(
         self, surface: SurfacePixels, active: Mapping[str, float]
     ) -> tuple[Material, dict[str, LossTerm]]:
         """The material of surface points, and its active priors L_smth and L_Lam."""
         priors = {}
         if "smoothness" in active:
-            with doing("regularisers"):
+            with timed("regularisers"):
                 sample = self.brdf.with_gradients(surface.position)
             material = sample.material
             priors["smoothness"] = losses.smoothness(
@@ -257,7 +257,7 @@ class NeilfModel(nn.Module):
             priors["lambertian"] = losses.lambertian(material)
         return material, priors
 
-    @doing("shading")
+    @timed("shading")
     def _incident(
         self,
         position: Float[Tensor, "N 3"],
@@ -271,7 +271,7 @@ class NeilfModel(nn.Module):
         drawn = draw_directions(sampler, self.light, n, wo, roughness, samples, self.lobe, self.training)
         return arriving(self.sources, position, drawn)
 
-    @doing("tracing")
+    @timed("tracing")
     def _inter_reflection(self, position: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]) -> LossTerm:
         """L_ref on random rays from surface points, at those that hit the scene."""
         traced = trace_light(
@@ -324,7 +324,7 @@ class NeilfModel(nn.Module):
         """Linear radiance that arrives at x from wi: from light and lamps, or from surfaces before them."""
         return incident_radiance(self.sources, x, wi)
 
-    @doing("shading")
+    @timed("shading")
     def shade(
         self,
         position: Float[Tensor, "N 3"],

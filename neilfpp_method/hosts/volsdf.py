@@ -18,7 +18,7 @@ from neilfpp_method.hosts.smooth_normals import smooth_normals
 from neilfpp_method.settings.types import NeilfConfig, VolumeConfig
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayBatch, SceneLight, SurfaceHits
-from neilfpp_method.timing.ledger import doing
+from neilfpp_method.timing.ledger import timed
 from neilfpp_method.volume.compositing import Weights, composite, depth_weights, sample_weights, share_near
 from neilfpp_method.volume.density import LaplaceDensity, laplace_depth
 from neilfpp_method.volume.distance_grid import GRID_RESOLUTION, cell_size, sample_grid, trace_grid
@@ -332,7 +332,7 @@ class VolSdfHost(nn.Module):
 
     # ------------------------------------------------------------------------------------------- regularisers
 
-    @doing("regularisers")
+    @timed("regularisers")
     def _regularisers(self, march: March, batch: PixelBatch, names: Collection[str]) -> dict[str, LossTerm]:
         terms = {}
         places = self._places(march) if {"eikonal", "surface", "hessian"} & set(names) else None

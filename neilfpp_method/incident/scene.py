@@ -9,7 +9,7 @@ from torch import Tensor
 from neilfpp_method.hosts.base import HasSurfaceWidth, Host, LightsItself
 from neilfpp_method.settings.types import InterReflectionConfig
 from neilfpp_method.structures import RayBatch, SceneLight, SceneTracer
-from neilfpp_method.timing.ledger import doing
+from neilfpp_method.timing.ledger import timed
 
 __all__ = ["off_surface", "scene_light", "scene_tracer"]
 
@@ -31,7 +31,7 @@ def scene_tracer(host: Host, config: InterReflectionConfig, hit_share: float) ->
     return lambda x, wi: scene_light(host, x, wi, config, hit_share)
 
 
-@doing("tracing")
+@timed("tracing")
 @torch.no_grad()
 def scene_light(
     host: Host,

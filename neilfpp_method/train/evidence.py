@@ -22,7 +22,7 @@ from neilfpp_method.effects.review import (
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import stage_at
 from neilfpp_method.structures import StepResult
-from neilfpp_method.timing.ledger import doing
+from neilfpp_method.timing.ledger import timed
 from neilfpp_method.train.light_record import note_fit
 from neilfpp_method.train.optimizer import seed_step
 from neilfpp_method.train.training import Training
@@ -40,13 +40,13 @@ def solve_light(run: Training, model: NeilfModel, computed: StepResult, step: in
     """
     fabric, solver = run.fabric, run.light_solver
     if fabric.is_global_zero:
-        with doing("light_fits"):
+        with timed("light_fits"):
             solver.observe(computed)
     if not fabric.broadcast(solver.due):
         return
     if fabric.is_global_zero:
         run.watch.after_fit(solver.points, step)
-        with doing("light_fits", apart=True):
+        with timed("light_fits", apart=True):
             evidence = solver.solve(model.brdf, model.scene)
         note_fit(run.fits, evidence, model.lamps.lit, step)
         _report(run, record_lamps(run.plan, evidence, model.lamps.lit, step + 1))
