@@ -28,7 +28,7 @@ from neilfpp_method.health.guard import StepGuard
 from neilfpp_method.health.measure import measure_hits
 from neilfpp_method.health.watch import Watch
 from neilfpp_method.hosts.answers import Rendered, as_hits
-from neilfpp_method.hosts.base import HasParameterGroups, LightsItself
+from neilfpp_method.hosts.base import HasParameterGroups, TracesLight
 from neilfpp_method.hosts.batches import check_batch, check_device_and_dtype, check_points, pixel_batch
 from neilfpp_method.hosts.capabilities import missing_capabilities
 from neilfpp_method.hosts.first_batches import FirstBatches
@@ -312,7 +312,7 @@ def attach_neilf(
     facts = SceneFacts(response, median_radiance, scale, "inverted_sphere" if open_scene else "constant")
     with torch.random.fork_rng(range(torch.cuda.device_count()) if torch.cuda.is_initialized() else []):
         proxy = proxy_for(adapted, config)
-        complete = adapted if isinstance(adapted, LightsItself) else ForeignHost(adapted, borrowed, proxy)
+        complete = adapted if isinstance(adapted, TracesLight) else ForeignHost(adapted, borrowed, proxy)
         attached = AttachedNeilf(NeilfModel(complete, config, facts, borrowed=borrowed), proxy)
     if config.known_map is not None:
         attached.model.light.show(read_environment(Path(config.known_map)))

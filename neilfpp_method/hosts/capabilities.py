@@ -53,7 +53,7 @@ CAPABILITIES = (
     ),
     Capability(
         "scene_light",
-        base.LightsItself,
+        base.TracesLight,
         "hard inter-reflection, shadow rays, the fit of environment map and lamps",
         "incident.scene",
         "a proxy traces hard inter-reflection",
@@ -61,7 +61,7 @@ CAPABILITIES = (
     ),
     Capability(
         "radiance",
-        base.KnowsRadiance,
+        base.HasRadiance,
         "the proxy",
         "hosts.foreign",
         "light between surfaces is the mean radiance that training rays saw there",
@@ -82,8 +82,8 @@ CAPABILITIES = (
         "the width of the surface depends only on the host's own training",
     ),
     Capability(
-        "may_meet",
-        base.KnowsMisses,
+        "may_hit",
+        base.PredictsMisses,
         "L_ref",
         "incident.traced",
         "every ray for L_ref is rendered",

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.answers import as_hits, in_precision, no_hits
-from neilfpp_method.hosts.base import Host, ImageHost, KnowsRadiance, LightsItself, RegularisedHits
+from neilfpp_method.hosts.base import HasRadiance, Host, ImageHost, RegularisedHits, TracesLight
 from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.image import rays_like
 from neilfpp_method.hosts.outputs import check_tensors, host_name
@@ -29,7 +29,7 @@ from neilfpp_method.volume.distance_grid import GRID_RESOLUTION
 __all__ = ["ForeignHost", "adapt_host", "answers_secondary_rays", "proxy_for"]
 
 PASSED_ON = (
-    "may_meet",
+    "may_hit",
     "surface_width",
     "smooth_normals",
     "parameter_groups",
@@ -80,9 +80,9 @@ def proxy_for(host: object, config: NeilfConfig) -> SurfaceProxy | None:
     """
     settings = config.inter_reflection
     cannot_trace = settings.mode != "off" and not answers_secondary_rays(host)
-    if isinstance(host, LightsItself) or not (cannot_trace or settings.mode == "hard"):
+    if isinstance(host, TracesLight) or not (cannot_trace or settings.mode == "hard"):
         return None
-    radiance = host.radiance if isinstance(host, KnowsRadiance) else None
+    radiance = host.radiance if isinstance(host, HasRadiance) else None
     return SurfaceProxy(config.volume.radius, GRID_RESOLUTION, config.shading.hit_share, radiance)
 
 

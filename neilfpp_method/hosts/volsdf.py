@@ -193,12 +193,12 @@ class VolSdfHost(nn.Module):
         return smooth_normals(lambda x: self._surface(x).gradient, position, normal, radius)
 
     @torch.no_grad()
-    def may_meet(self, rays: RayBatch) -> Bool[Tensor, " N"]:
+    def may_hit(self, rays: RayBatch) -> Bool[Tensor, " N"]:
         """Which rays that start at a surface may hit one, by the grid of empty space; all without a grid."""
         if self.empty_space is None:
             return torch.ones(len(rays), dtype=torch.bool, device=rays.origins.device)
         interval = sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
-        return self.empty_space.may_meet(self.sdf, rays, interval, self.surface_width())
+        return self.empty_space.may_hit(self.sdf, rays, interval, self.surface_width())
 
     def get_extra_state(self) -> dict[str, int | None]:
         """The age of the distance grid, for checkpoints."""

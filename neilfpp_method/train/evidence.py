@@ -12,7 +12,7 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.first_light import start_with
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.review import (
-    MOST_PIXELS,
+    MAX_PIXELS,
     needs_surface,
     record_lamps,
     review_light,
@@ -90,7 +90,7 @@ def _start_light(run: Training, model: NeilfModel, step: int) -> None:
 def _light_pixels(run: Training) -> int:
     """Maximum number of pixels for the search of the initial light; a budget may limit it."""
     most = None if run.pace is None else run.pace.plan.light_pixels
-    return MOST_PIXELS if most is None else most
+    return MAX_PIXELS if most is None else most
 
 
 def _review_effects(run: Training, model: NeilfModel, step: int, review: Review, stream: int) -> None:

@@ -23,9 +23,9 @@ from neilfpp_method.effects.material import JUDGED, seconds_of_evidence
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.effects.review import (
-    FEWEST_PIXELS,
+    MAX_PIXELS,
+    MIN_PIXELS,
     MIN_TRAIN_VIEWS,
-    MOST_PIXELS,
     record_facts,
     review_surface,
 )
@@ -148,8 +148,8 @@ def run_trial(
     light_pixels, light = None, 0.0
     if solver.seeks_start and len(capture.train_views) >= MIN_TRAIN_VIEWS and with_material:
         rate = seconds_of_pixel(device, plan.is_open("long-tails"), plan.is_open("metals"))
-        light_pixels = min(MOST_PIXELS, int(most_for_light / rate))
-        light_pixels = 0 if light_pixels < FEWEST_PIXELS else light_pixels
+        light_pixels = min(MAX_PIXELS, int(most_for_light / rate))
+        light_pixels = 0 if light_pixels < MIN_PIXELS else light_pixels
         light = rate * light_pixels
     surface = _timed(lambda: _review_surface(plan, model, pixels), wait)
     costs, picture, fitted = {}, 0.0, False

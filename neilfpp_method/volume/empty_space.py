@@ -110,7 +110,7 @@ class EmptySpace(nn.Module):
         return _span(edges, ~empty & ~opaque, interval)
 
     @torch.no_grad()
-    def may_meet(
+    def may_hit(
         self,
         sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]],
         rays: RayBatch,

@@ -212,7 +212,7 @@ def test_effects_and_times_are_shown_where_they_are_recorded(run: Path):
         "risk": "none",
     }
     (run / "effects.json").write_text(
-        json.dumps({"format": 1, "asked": "as-set", "decisions": [], "effects": [row]})
+        json.dumps({"format": 1, "request": "as-set", "decisions": [], "effects": [row]})
     )
     (run / "work.json").write_text(
         json.dumps({"format": 1, "seconds": {"sdf_init": {"rendering": 61.0, "data": 20.0}}})
