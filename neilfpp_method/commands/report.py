@@ -11,7 +11,7 @@ from neilfpp_method.commands.command import Command, Device, progress_bar, termi
 
 __all__ = ["COMMAND", "after_training"]
 
-TELLING = 0.1
+MIN_DONE_SHARE = 0.1
 """Share of the work after which the total time is estimated. Before, loading and compiling dominate."""
 
 
@@ -52,7 +52,7 @@ def run(options: Report) -> None:
             out,
             contents,
             str(pick_device(options.device)),
-            lambda share: advance(share) if share >= TELLING else None,
+            lambda share: advance(share) if share >= MIN_DONE_SHARE else None,
             messages.append,
         )
     for line in (*messages, f"written to {out}"):

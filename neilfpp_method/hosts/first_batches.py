@@ -26,21 +26,21 @@ UNIT = 1e-3
 """Largest difference of the length of a direction from 1."""
 OFF_RAY = 0.02
 """Largest distance of a hit from its ray, relative to its distance from the origin of the ray."""
-MAX_OFF = 0.5
+MAX_WRONG_SHARE = 0.5
 """Largest share of hits that may be off their rays or have normals that face away. A few blended hits do."""
-REACH = 1.5
+MAX_MEDIAN_DISTANCE = 1.5
 """Median distance of hits from the origin above which the scene is too large, scene units. An object in the
 unit sphere may stand on a ground.
 """
-VIEWED_AGAIN = 256
+MAX_REVIEWED_HITS = 256
 """Maximum number of hits that are rendered from another viewpoint, once."""
-ASIDE = 0.6
+VIEWPOINT_TANGENT = 0.6
 """Tangent of the angle between the other viewpoint and the direction halfway between normal and viewer."""
-APART = 0.01
+MAX_DISTANCE = 0.01
 """Largest distance between the hits of one point from two viewpoints, scene units, as in `check_host`."""
-MOVED = 0.4
+MAX_DISTANT_SHARE = 0.4
 """Largest share of points that may be farther apart; some are occluded from the other viewpoint."""
-SIZES = 30.0
+MAX_MEDIAN_RATIO = 30.0
 """Factor between the median of the pixels and `median_radiance` above which they do not belong together."""
 
 log = logging.getLogger(__name__)
@@ -151,7 +151,7 @@ class FirstBatches:
     def _check_median(self, color: Tensor) -> None:
         median = color.mean(-1).median().item()
         expected = apply_response(torch.tensor(self.facts.median_radiance), self.facts.response).item()
-        if median > 0 and not 1 / SIZES < median / expected < SIZES:
+        if median > 0 and not 1 / MAX_MEDIAN_RATIO < median / expected < MAX_MEDIAN_RATIO:
             self._warn(
                 "median",
                 f"the median of the pixels is {median:.3g}, but median_radiance means {expected:.3g}",
@@ -164,20 +164,20 @@ class FirstBatches:
         depth = (offset * directions).sum(-1)
         beside = (offset - depth[:, None] * directions).norm(dim=-1)
         off = ((beside > OFF_RAY * offset.norm(dim=-1)) | (depth <= 0)).float().mean().item()
-        if off > MAX_OFF:
+        if off > MAX_WRONG_SHARE:
             raise UserError(
                 f"{self.name}: {off:.0%} of its hits do not lie on their rays",
                 "return positions in the frame of the rays, origin + distance · direction, with unit "
                 "directions",
             )
         away = ((hits.normal[hit] * directions).sum(-1) > 0).float().mean().item()
-        if away > MAX_OFF:
+        if away > MAX_WRONG_SHARE:
             raise UserError(
                 f"{self.name}: {away:.0%} of its normals point away from the viewer",
                 "turn them outwards: normal = -normal",
             )
         reach = hits.position[hit].norm(dim=-1).median().item()
-        if reach > REACH:
+        if reach > MAX_MEDIAN_DISTANCE:
             self._warn(
                 "far",
                 f"half of its hits are {reach:.3g} or more from the origin",
@@ -197,19 +197,19 @@ class FirstBatches:
         The random state of the caller is not changed.
         """
         rows = torch.nonzero(hit)[:, 0]
-        rows = rows[:: math.ceil(len(rows) / VIEWED_AGAIN)]
+        rows = rows[:: math.ceil(len(rows) / MAX_REVIEWED_HITS)]
         position, back = hits.position[rows], -batch.directions[rows]
         distance = (position - batch.origins[rows]).norm(dim=-1, keepdim=True)
         tangent = normalize(torch.linalg.cross(hits.normal[rows], back.roll(1, dims=-1)), dim=-1)
-        way = normalize(hits.normal[rows] + back + ASIDE * tangent, dim=-1)
+        way = normalize(hits.normal[rows] + back + VIEWPOINT_TANGENT * tangent, dim=-1)
         with torch.random.fork_rng(devices=[position.device] if position.is_cuda else []):
             again = render(RayBatch(position + distance * way, -way))
-        same = again.is_hit(self.hit_share) & ((again.position - position).norm(dim=-1) < APART)
+        same = again.is_hit(self.hit_share) & ((again.position - position).norm(dim=-1) < MAX_DISTANCE)
         moved = 1.0 - same.float().mean().item()
-        if moved > MOVED:
+        if moved > MAX_DISTANT_SHARE:
             self._warn(
                 "moved",
-                f"{moved:.0%} of its hits are {APART} or more away when seen from another viewpoint",
+                f"{moved:.0%} of its hits are {MAX_DISTANCE} or more away when seen from another viewpoint",
                 "return distances along the unit ray, not z-depths; a host that is still being trained may "
                 "have no surface yet",
             )

@@ -12,7 +12,7 @@ from neilfpp_method.structures import RayBatch, SurfaceHits
 
 __all__ = ["CONDUCT_CHECKS"]
 
-RESTLESS = 0.005
+MAX_CHANGE = 0.005
 """Largest median change of positions between two calls, scene units, plus the width of a soft layer."""
 SPREAD = 3.0
 """Largest difference between a part of a batch and the whole, relative to that between two calls."""
@@ -64,7 +64,7 @@ def _repeatable(case: Case) -> None:
         f"half of its positions change by {moved:.2g} or more between calls: "
         "reduce the noise, or use more samples"
     )
-    case.require(moved <= RESTLESS + case.width, broken)
+    case.require(moved <= MAX_CHANGE + case.width, broken)
 
 
 def _same_without_gradient(case: Case) -> None:

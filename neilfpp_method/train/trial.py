@@ -56,7 +56,7 @@ FIT_PART = 8
 """A fit of a trial uses one in this many points, because a full first fit takes as long as a hundred steps.
 The time of a fit is assumed to be proportional to the number of points.
 """
-LOOSE = 1e-3
+TRIAL_HIT_SHARE = 1e-3
 """Minimum concentration of a hit in a trial. The density of an untrained field is spread out, so with the
 value of the settings no point would be shaded and no light fitted.
 """
@@ -128,7 +128,7 @@ def run_trial(
     facts = scene_facts(small, pixels, config)
     record_facts(plan, facts)
     config = plan.config_of_model
-    trial_config, fit_scale = changed(config, {"shading.hit_share": LOOSE}), 1.0
+    trial_config, fit_scale = changed(config, {"shading.hit_share": TRIAL_HIT_SHARE}), 1.0
     if config.light.kind != "free":
         points = max(1, config.light.fit.points // FIT_PART)
         trial_config = changed(trial_config, {"light.fit.every": FIT_EVERY, "light.fit.points": points})
