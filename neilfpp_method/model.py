@@ -162,7 +162,7 @@ class NeilfModel(nn.Module):
         is_surface = hits.is_hit(self.config.shading.hit_share) & (batch.mask > 0.5)
         rows = torch.nonzero(is_surface)[:, 0]
         rendered = self._surface_pixels(hits[rows], batch[rows])
-        surface = self.replay.beside_earlier(rendered) if reuses_points else rendered
+        surface = self.replay.with_earlier(rendered) if reuses_points else rendered
         position, normal, wo = surface.position, surface.normal, surface.wo
 
         # 3. Material: query the BRDF field B at the surface points.

@@ -186,13 +186,13 @@ def review_material(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: i
     return [plan.decide(name, measured, step) for name, measured in evidence.items()]
 
 
-def record_lamps(plan: Plan, evidence: Evidence | None, lit: int, step: int) -> list[Decision]:
+def record_lamps(plan: Plan, evidence: Evidence | None, count: int, step: int) -> list[Decision]:
     """Record the decision on lamps that the light solver has taken in a fit.
 
     Args:
         plan: the plan to which the decision is added.
         evidence: the comparison of the fits with and without lamps; None if there was none.
-        lit: number of lamps after the fit.
+        count: number of lamps after the fit.
         step: number of steps trained so far.
 
     Returns:
@@ -200,7 +200,7 @@ def record_lamps(plan: Plan, evidence: Evidence | None, lit: int, step: int) -> 
     """
     if evidence is None or not plan.is_open("lamps"):
         return []
-    before, on = plan.newest("lamps"), lit > 0
+    before, on = plan.newest("lamps"), count > 0
     if before is not None and before.on == on:
         return []
     where, threshold = ("in held-back views", 0.0) if evidence.in_views else ("at held-back points", MIN_GAIN)

@@ -250,7 +250,7 @@ class VolSdfHost(nn.Module):
         span = self._eval_space[1].may_show(self.sdf, rays, interval, self.surface_width())
         zeros = torch.zeros_like(interval.far)
         missed = SurfaceHits(
-            color=self._beyond(rays, torch.ones_like(zeros), at_far=torch.zeros_like(rays.origins)),
+            color=self._background(rays, torch.ones_like(zeros), at_far=torch.zeros_like(rays.origins)),
             position=rays.origins + interval.far[:, None] * rays.directions,
             normal=torch.zeros_like(rays.origins),
             opacity=zeros,
@@ -309,14 +309,15 @@ class VolSdfHost(nn.Module):
         depth = (weights * distances).sum(-1) + SPARE_WEIGHT * distances[:, -1]
         depth = depth / (opacity + SPARE_WEIGHT)
         return SurfaceHits(
-            color=composite(weights, radiance) + self._beyond(rays, intervals.transmittance, radiance[:, -1]),
+            color=composite(weights, radiance)
+            + self._background(rays, intervals.transmittance, radiance[:, -1]),
             position=rays.origins + depth[:, None] * rays.directions,
             normal=safe_normalize(composite(weights, normals)),
             opacity=opacity,
             concentration=share_near(distances, intervals.weights.detach(), depth.detach(), HIT_RADIUS),
         )
 
-    def _beyond(
+    def _background(
         self, rays: RayBatch, transmittance: Float[Tensor, " N"], at_far: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
         """Radiance from beyond the samples: that of the background, or without one R on the scene sphere.

@@ -48,8 +48,8 @@ def solve_light(run: Training, model: NeilfModel, computed: StepResult, step: in
         run.watch.after_fit(solver.points, step)
         with timed("light_fits", apart=True):
             evidence = solver.solve(model.brdf, model.scene)
-        note_fit(run.fits, evidence, model.lamps.lit, step)
-        _report(run, record_lamps(run.plan, evidence, model.lamps.lit, step + 1))
+        note_fit(run.fits, evidence, model.lamps.count, step)
+        _report(run, record_lamps(run.plan, evidence, model.lamps.count, step + 1))
     _share_light(run, model)
 
 
@@ -81,8 +81,8 @@ def _start_light(run: Training, model: NeilfModel, step: int) -> None:
             run.reporter.say(first.summary())
             start_with(model, first)
             evidence = run.light_solver.start(first.observed, first.material, model.scene, first.lamp_trial)
-            note_fit(run.fits, evidence, model.lamps.lit, step)
-            _report(run, record_lamps(run.plan, evidence, model.lamps.lit, step))
+            note_fit(run.fits, evidence, model.lamps.count, step)
+            _report(run, record_lamps(run.plan, evidence, model.lamps.count, step))
     _share_light(run, model)
     _share_decisions(run, model, decisions)
 

@@ -87,7 +87,7 @@ def test_a_lamp_is_found_where_it_is_as_strong_and_which_way_it_shines(true, kno
     edges.
     """
     lamps, _ = solved(*photographed(true, speckled=known), rounds=3, base_color_known=known)
-    assert lamps.lit
+    assert lamps.count
     strongest = int(lamps.intensity.sum(-1).argmax())
     assert (lamps.position[strongest] - LAMP[0]).norm() < 0.03
     assert lamps.intensity[strongest].tolist() == pytest.approx([0.9, 0.7, 0.4], rel=0.1)
@@ -97,7 +97,7 @@ def test_a_lamp_is_found_where_it_is_as_strong_and_which_way_it_shines(true, kno
 
 def test_under_a_sky_alone_no_lamp_is_lit():
     lamps, _ = solved(*photographed(None), rounds=2)
-    assert lamps.lit == 0
+    assert lamps.count == 0
 
 
 def test_proposals_keep_what_is_lit_and_stay_clear_of_surfaces():
@@ -153,7 +153,7 @@ def test_before_a_known_map_lamps_are_found_and_the_map_stays():
         unit = seen.pixel.median().item()
         evidence = solve(environment, lamps, seen, of, unit, known, first=False)
     assert torch.equal(environment.log_radiance, before)
-    assert lamps.lit
+    assert lamps.count
     assert 100 < evidence.points < 220  # a part of 800 points is some blocks
     assert (lamps.position[0] - LAMP[0]).norm() < 0.12
     beside = (lamps.position - LAMP).norm(dim=-1) < 0.3
@@ -168,7 +168,7 @@ def test_under_a_known_sky_alone_no_lamp_is_lit():
     known = dataclasses.replace(CONFIG, map="sky.exr")
     evidence = solve(environment, lamps, seen, of, seen.pixel.median().item(), known, first=True)
     assert evidence.points == 800  # the first time each has its turn
-    assert lamps.lit == 0
+    assert lamps.count == 0
 
 
 @pytest.mark.parametrize("count", [1, 3, 5])
@@ -195,6 +195,6 @@ def test_lamps_without_a_significant_gain_are_lit_only_with_lamps_if_undecided(m
         light, unit = LightModel(EnvironmentLight(12, 0.7), Lamps(4, 0.06)), seen.pixel.median().item()
         objective = Objective("linear", unit, CONFIG.fit.steps)
         solve_light(light, seen, of, GGX, None, objective, CONFIG, first=False, lamps_if_undecided=doubt)
-        lit.append(light.lamps.lit)
+        lit.append(light.lamps.count)
     assert lit[0] == 0
     assert lit[1] > 0
