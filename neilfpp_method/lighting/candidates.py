@@ -63,7 +63,7 @@ def propose(lamps: Lamps, surface: Float[Tensor, "N 3"], count: int) -> LampPlac
         At most `count` places: the lit lamps in their order, then random places near each of them, then
         random places in the whole scene.
     """
-    current, axis = lamps.position[: lamps.count], lamps.axis[: lamps.current]
+    current, axis = lamps.position[: lamps.count], lamps.axis[: lamps.count]
     moved = current.repeat_interleave(CLONES, 0)
     moved = moved + STEP * torch.randn_like(moved)
     # About half of the points of a cube lie in its ball, and some of those are too close to the surface.
