@@ -70,7 +70,7 @@ def measurements() -> Iterator[Measurement]:
             truth = hosts[WHOLE].eval().render(rays).position
             hosts[WHOLE].train()
             for name, host in hosts.items():
-                host.may_meet(rays)  # samples the grid
+                host.may_hit(rays)  # samples the grid
                 queries = queries_per_ray(host, rays) + (0 if name == WHOLE else share_of_grid)
                 off = (host.render(rays).position - truth).norm(dim=-1).median().item() / scale
                 yield Measurement(

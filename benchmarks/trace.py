@@ -42,7 +42,7 @@ def measurements() -> Iterator[Measurement]:
 
         rays = _Recorder(plain)
         hit, chosen = trace(rays).hit, trace(cached)
-        overlooked = (hit & ~cached.may_meet(rays.seen)).sum() / hit.sum()
+        overlooked = (hit & ~cached.may_hit(rays.seen)).sum() / hit.sum()
         slow, fast = median_seconds(lambda: trace(plain), lambda: trace(cached))
     yield Measurement("trace/rays that hit", hit.float().mean().item(), "of rays", "higher")
     yield Measurement("trace/rays rendered", len(chosen.hit) / len(hit), "of rays", "lower", tolerance=0.2)

@@ -82,13 +82,11 @@ def known_points(run: Run) -> Known:
 def solve_under_truth(run: Run, known: Known, fits: int) -> None:
     """Forget the light of the run, and set it anew."""
     model, settings = run.model, run.config.light
-    # The base colour is no unknown here.
-    settings = dataclasses.replace(settings, fit=dataclasses.replace(settings.fit, evenness=0.0))
     model.light.log_radiance.fill_(math.log(model.facts.median_radiance / 0.3))
-    model.lamps.lit = 0
-    light, objective = (
-        LightModel(model.light, model.lamps),
-        Objective(model.facts.response, model.units.physical, settings.fit),
+    model.lamps.count = 0
+    light = LightModel(model.light, model.lamps)
+    objective = Objective(
+        model.facts.response, model.units.physical, settings.fit.steps, base_color_known=True
     )
     for _ in range(fits):
         rows = torch.randperm(len(known.seen.position))[: settings.fit.points]
@@ -107,7 +105,7 @@ def line(run: Run, title: str) -> str:
         f"{name.removeprefix('incident_light_')} {x:.3f}" for name, x in figures.items()
     )
     lamps = run.model.lamps
-    for k in range(lamps.lit):
+    for k in range(lamps.count):
         place = run.capture.normalisation.to_world(lamps.position[k]).tolist()
         text += "\n" + 24 * " " + "lamp at " + ", ".join(f"{x:.2f}" for x in place)
         text += "; axis " + ", ".join(f"{x:.2f}" for x in lamps.axis[k].tolist())

@@ -28,21 +28,21 @@ from neilfpp_method.health.guard import StepGuard
 from neilfpp_method.health.measure import measure_hits
 from neilfpp_method.health.watch import Watch
 from neilfpp_method.hosts.answers import Rendered, as_hits
-from neilfpp_method.hosts.base import HasParameterGroups, Host, ImageHost, LightsItself
-from neilfpp_method.hosts.capabilities import CAPABILITIES
-from neilfpp_method.hosts.first_batches import FirstBatches, check_batch, check_points, check_rows
-from neilfpp_method.hosts.foreign import ForeignHost, answers_secondary_rays, proxy_for
-from neilfpp_method.hosts.function import CallableHost
+from neilfpp_method.hosts.base import HasParameterGroups, TracesLight
+from neilfpp_method.hosts.batches import check_batch, check_device_and_dtype, check_points, pixel_batch
+from neilfpp_method.hosts.capabilities import missing_capabilities
+from neilfpp_method.hosts.first_batches import FirstBatches
+from neilfpp_method.hosts.foreign import ForeignHost, adapt_host, answers_secondary_rays, proxy_for
 from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
-from neilfpp_method.model import NeilfModel
+from neilfpp_method.model import EVAL_RAYS, NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, stage_at, weigh
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import Maps, Material, PixelBatch, RayBatch, Shading, StepResult, SurfaceHits
 
-__all__ = ["AttachedNeilf", "CallableHost", "attach_neilf", "missing_capabilities", "pixel_batch"]
+__all__ = ["AttachedNeilf", "attach_neilf", "pixel_batch"]
 
 RADIANCE_SCALE = {"linear": 3.0, "srgb": 1.0}
 """Largest radiance of R by kind of image, HDR and LDR (METHOD §5)."""
@@ -108,7 +108,7 @@ class AttachedNeilf(nn.Module):
             UserError: the batch or the output of the host is invalid, or on another device.
         """
         check_batch(batch)
-        self._check_device_and_dtype(batch.rays)
+        check_device_and_dtype(batch.rays, self.model.brdf)
         self.first_batches.pixels(batch)
         position = self._position(step)
         weights = active_losses(position.stage, self.model.config, self.model.stages, position.share)
@@ -162,13 +162,12 @@ class AttachedNeilf(nn.Module):
                 )
             with torch.no_grad():
                 rays, hits = self.model.host.image_hits(rays, next(self.model.brdf.parameters()))
-        self._check_device_and_dtype(rays)
+        check_device_and_dtype(rays, self.model.brdf)
         rendered = self._host_hits(rays, hits, moves_host=False)
         if rendered is None:
             return self.model.maps(rays)
-        chunk = self.model.config.train.eval_chunk
-        starts = range(0, max(len(rays), 1), chunk)
-        parts = [self.model.maps(rays[i : i + chunk], hits=rendered[i : i + chunk]) for i in starts]
+        starts = range(0, max(len(rays), 1), EVAL_RAYS)
+        parts = [self.model.maps(rays[i : i + EVAL_RAYS], hits=rendered[i : i + EVAL_RAYS]) for i in starts]
         return Maps(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Maps)))
 
     def param_groups(self) -> list[dict[str, Any]]:
@@ -238,15 +237,6 @@ class AttachedNeilf(nn.Module):
             )
         # The position of a stage by name is unknown: step 0 of 2 never is the last step of the stage.
         return StagePosition(Stage(step), 0, 2)
-
-    def _check_device_and_dtype(self, rays: RayBatch) -> None:
-        own = next(self.model.brdf.parameters())
-        if rays.origins.device != own.device:
-            devices = f"rays on {rays.origins.device}, material and light on {own.device}"
-            raise UserError(devices, "move one of them, for example neilf.to(device)")
-        if rays.origins.dtype != own.dtype:
-            dtypes = f"rays are {rays.origins.dtype}, material and light {own.dtype}"
-            raise UserError(dtypes, "give rays.float(), or convert the other with neilf.double()")
 
     def _host_hits(self, rays: RayBatch, hits: Rendered | None, moves_host: bool) -> SurfaceHits | None:
         """The host's hits of camera rays, given or rendered; None if the model renders the host itself.
@@ -318,52 +308,16 @@ def attach_neilf(
     if isinstance(config, str):
         config = preset(config)
         config = replace(config, train=replace(config.train, sdf_steps=0)) if borrowed else config
-    adapted = _adapt(host, response)
+    adapted = adapt_host(host, response)
     facts = SceneFacts(response, median_radiance, scale, "inverted_sphere" if open_scene else "constant")
     with torch.random.fork_rng(range(torch.cuda.device_count()) if torch.cuda.is_initialized() else []):
         proxy = proxy_for(adapted, config)
-        complete = adapted if isinstance(adapted, LightsItself) else ForeignHost(adapted, borrowed, proxy)
+        complete = adapted if isinstance(adapted, TracesLight) else ForeignHost(adapted, borrowed, proxy)
         attached = AttachedNeilf(NeilfModel(complete, config, facts, borrowed=borrowed), proxy)
     if config.known_map is not None:
         attached.model.light.show(read_environment(Path(config.known_map)))
     log.warning("NeILF++ attached to %s: %s", host_name(adapted), _attachment_summary(attached, borrowed))
     return attached
-
-
-def missing_capabilities(host: object) -> Mapping[str, str]:
-    """The optional methods that most hosts could have and this one lacks, with the consequence of each.
-
-    `hosts.capabilities` lists all optional methods.
-    """
-    return {c.method: c.without for c in CAPABILITIES if c.reported and not hasattr(host, c.method)}
-
-
-def pixel_batch(origins: Tensor, directions: Tensor, color: Tensor, mask: Tensor | None = None) -> PixelBatch:
-    """Make a `PixelBatch` from the tensors of another training loop.
-
-    Args:
-        origins: ray origins (N, 3), scene frame.
-        directions: unit ray directions (N, 3).
-        color: pixel values (N, 3), linear or sRGB as declared to `attach_neilf`.
-        mask: 1 on the object and 0 off it (N,). None: all pixels may show the object.
-
-    Raises:
-        UserError: a tensor has another shape, or holds integers.
-    """
-    for name, rows in {"origins": origins, "directions": directions, "color": color}.items():
-        check_rows(name, rows, len(origins), 3)
-    if mask is not None:
-        check_rows("mask", mask, len(origins))
-    zeros, ones = torch.zeros_like(origins[:, 0]), torch.ones_like(origins[:, 0])
-    return PixelBatch(
-        origins=origins,
-        directions=directions,
-        color=color,
-        mask=ones if mask is None else mask,
-        mask_known=zeros if mask is None else ones,
-        image_gradient=zeros,
-        view=zeros.long(),
-    )
 
 
 def _attachment_summary(attached: AttachedNeilf, borrowed: bool) -> str:
@@ -383,18 +337,3 @@ def _attachment_summary(attached: AttachedNeilf, borrowed: bool) -> str:
 
 def _inner(host: object) -> object:
     return host.inner if isinstance(host, ForeignHost) else host
-
-
-def _adapt(host: object, response: str) -> Host | ImageHost:
-    if isinstance(host, nn.Module) and hasattr(host, "get_outputs") and hasattr(host, "config"):
-        from neilfpp_method.hosts.nerfstudio import NerfstudioHost
-
-        return NerfstudioHost(host, response=response)
-    if isinstance(host, Host | ImageHost):
-        return host
-    if callable(host):
-        return CallableHost(host)
-    raise UserError(
-        f"{type(host).__name__} is not a host",
-        "give an object with render(rays) or render_image(camera), or a function of (origins, directions)",
-    )

@@ -14,10 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from neilfpp_method import losses
-from neilfpp_method.fields.brdf import BrdfField
-from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.fields.exposure import PhotographGains, at_mean_exposure
-from neilfpp_method.fields.light import LightModel, make_light
+from neilfpp_method.fields import BrdfField, LightModel, PhotographGains, at_mean_exposure, make_light
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
 from neilfpp_method.incident import (
@@ -49,10 +46,14 @@ from neilfpp_method.structures import (
     SurfaceHits,
     SurfacePixels,
 )
-from neilfpp_method.timing.ledger import doing
+from neilfpp_method.timing.ledger import timed
 
-__all__ = ["NeilfModel"]
+__all__ = ["EVAL_RAYS", "NeilfModel"]
 
+EVAL_RAYS = 2048
+"""Largest number of rays in one call of `NeilfModel.maps`, so that the incident directions of their surface
+points fit in memory.
+"""
 CLEAR_OPACITY = 0.01
 """Opacity below which a ray counts as missing the scene, so that its pixel shows the light behind it."""
 SURFACE_OPACITY = 0.5
@@ -118,8 +119,7 @@ class NeilfModel(nn.Module):
         self.config = config
         self.lobe = _specular_lobe(config.shading)
         self.brdf.use(config.brdf)
-        if isinstance(self.light, EnvironmentLight):
-            self.light.be_even(config.light.environment_height == 1)
+        LightModel(self.light, self.lamps).use(config.light)
 
     # ----------------------------------------------------------------------------------------------- one step
 
@@ -162,7 +162,7 @@ class NeilfModel(nn.Module):
         is_surface = hits.is_hit(self.config.shading.hit_share) & (batch.mask > 0.5)
         rows = torch.nonzero(is_surface)[:, 0]
         rendered = self._surface_pixels(hits[rows], batch[rows])
-        surface = self.replay.beside_earlier(rendered) if reuses_points else rendered
+        surface = self.replay.with_earlier(rendered) if reuses_points else rendered
         position, normal, wo = surface.position, surface.normal, surface.wo
 
         # 3. Material: query the BRDF field B at the surface points.
@@ -173,7 +173,7 @@ class NeilfModel(nn.Module):
         incident = self._incident(position, normal, wo, material, self.config.shading.train_samples)
 
         # 5. Rendering equation: outgoing radiance towards wo, compared with the pixel.
-        with doing("shading"):
+        with timed("shading"):
             shading = shade(material, normal, wo, incident, self.lobe)
         terms["physical"] = losses.photometric(
             shading.color, surface.pixel, self.facts.response, self.units.physical
@@ -191,7 +191,7 @@ class NeilfModel(nn.Module):
         rendered = slice(math.ceil(self.replay.share * len(batch)))
         return batch[rendered], None if hits is None else hits[rendered]
 
-    @doing("rendering")
+    @timed("rendering")
     def _render_host(
         self, batch: PixelBatch, plan: StagePlan, active: Mapping[str, float], hits: SurfaceHits | None
     ) -> tuple[SurfaceHits, dict[str, LossTerm]]:
@@ -224,7 +224,7 @@ class NeilfModel(nn.Module):
         color = at_mean_exposure(self.gains, batch.color, batch.view, self.facts.response)
         return replace(batch, color=color)
 
-    @doing("shading")
+    @timed("shading")
     def _surface_pixels(self, hits: SurfaceHits, pixels: PixelBatch) -> SurfacePixels:
         """Surface points to shade; the gradients of position and normal are scaled by the settings."""
         settings = self.config.loss
@@ -238,14 +238,14 @@ class NeilfModel(nn.Module):
             image_gradient=pixels.image_gradient,
         )
 
-    @doing("shading")
+    @timed("shading")
     def _material_and_priors(
         self, surface: SurfacePixels, active: Mapping[str, float]
     ) -> tuple[Material, dict[str, LossTerm]]:
         """The material of surface points, and its active priors L_smth and L_Lam."""
         priors = {}
         if "smoothness" in active:
-            with doing("regularisers"):
+            with timed("regularisers"):
                 sample = self.brdf.with_gradients(surface.position)
             material = sample.material
             priors["smoothness"] = losses.smoothness(
@@ -257,7 +257,7 @@ class NeilfModel(nn.Module):
             priors["lambertian"] = losses.lambertian(material)
         return material, priors
 
-    @doing("shading")
+    @timed("shading")
     def _incident(
         self,
         position: Float[Tensor, "N 3"],
@@ -271,7 +271,7 @@ class NeilfModel(nn.Module):
         drawn = draw_directions(sampler, self.light, n, wo, roughness, samples, self.lobe, self.training)
         return arriving(self.sources, position, drawn)
 
-    @doing("tracing")
+    @timed("tracing")
     def _inter_reflection(self, position: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]) -> LossTerm:
         """L_ref on random rays from surface points, at those that hit the scene."""
         traced = trace_light(
@@ -324,7 +324,7 @@ class NeilfModel(nn.Module):
         """Linear radiance at x from wi: of the light, the lamps, or a surface that occludes them."""
         return incident_radiance(self.sources, x, wi)
 
-    @doing("shading")
+    @timed("shading")
     def shade(
         self,
         position: Float[Tensor, "N 3"],

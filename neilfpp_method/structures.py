@@ -202,7 +202,7 @@ class Incident(Indexable):
             source = torch.zeros((), dtype=torch.long, device=weight.device).expand(weight.shape)
         return Incident(drawn.wi, radiance, weight, source)
 
-    def beside(self, other: Incident) -> Incident:
+    def concatenate(self, other: Incident) -> Incident:
         """Concatenate the directions of both, for the same N points."""
         return Incident(
             *(torch.cat((getattr(self, f.name), getattr(other, f.name)), 1) for f in fields(self))
@@ -295,18 +295,19 @@ class StepResult(NamedTuple):
         terms: the active losses of the stage, before their weights.
         surface_rows: position, normal, wo and pixel of the surface points that this step rendered; no rows
             in a stage without material.
-        beyond_rows: direction and pixel of the rays that miss the scene; no rows in a stage without material.
+        background_rows: direction and pixel of the rays that miss the scene; no rows in a stage without
+            material.
     """
 
     terms: LossTerms
     surface_rows: Float[Tensor, "P 12"]
-    beyond_rows: Float[Tensor, "Q 6"]
+    background_rows: Float[Tensor, "Q 6"]
 
     @staticmethod
-    def of(terms: LossTerms, surface: Observed, beyond: PixelBatch) -> StepResult:
+    def of(terms: LossTerms, surface: Observed, background: PixelBatch) -> StepResult:
         """Pack loss terms, rendered surface points, and pixels whose rays miss the scene."""
         points = (surface.position, surface.normal, surface.wo, surface.pixel)
-        pixels = (beyond.directions, beyond.color)
+        pixels = (background.directions, background.color)
         return StepResult(terms, torch.cat(points, -1).detach(), torch.cat(pixels, -1))
 
     @property

@@ -12,9 +12,11 @@ import pytest
 import torch
 from torch import nn
 
-from neilfpp_method.attach import CallableHost, attach_neilf, missing_capabilities, pixel_batch
+from neilfpp_method.attach import attach_neilf, pixel_batch
 from neilfpp_method.data.images import write_exr
 from neilfpp_method.errors import UserError
+from neilfpp_method.hosts.capabilities import missing_capabilities
+from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.types import MapLightConfig

@@ -94,9 +94,10 @@ def _refused_by_a_benchmark(module: str, arguments: list[str]) -> str:
         unknown = {word for word in arguments if not word.startswith("-")} - SUITES.keys()
         if unknown:
             return f"no suite {unknown}"
-        module = "benchmarks.__main__"
     try:
         found = importlib.import_module(module)
+        if hasattr(found, "__path__"):
+            found = importlib.import_module(f"{module}.__main__")
     except ModuleNotFoundError as error:
         return str(error)
     if not arguments:

@@ -13,7 +13,7 @@ import torch
 
 from neilfpp_method import losses
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.base import LightsItself
+from neilfpp_method.hosts.base import TracesLight
 from neilfpp_method.incident.traced import trace_light
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, active_losses, weigh
@@ -296,7 +296,7 @@ def test_an_sdf_host_traces_its_grid():
     hard = dataclasses.replace(config.inter_reflection, mode="hard")
     config = dataclasses.replace(config, inter_reflection=hard)
     host = sphere_model(config).host
-    assert isinstance(host, LightsItself)
+    assert isinstance(host, TracesLight)
     out = torch.tensor([[0.0, 0.0, 1.0]])
     on_sphere = host.render(RayBatch(3.0 * out, -out)).position.detach()
     up = torch.nn.functional.normalize(

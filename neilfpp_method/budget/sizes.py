@@ -18,9 +18,9 @@ __all__ = ["Size", "next_size", "sized"]
 
 Size = Literal["small", "usual", "large"]
 
-FEW = 0.25
+FEW_STEPS_SHARE = 0.25
 """Share of the steps of the settings below which the small size is tried."""
-MANY = 2.0
+MANY_STEPS_SHARE = 2.0
 """Share of the steps of the settings above which the large size is tried."""
 
 FACTORS: Mapping[Size, Mapping[str, float]] = {
@@ -66,7 +66,7 @@ def next_size(share: float) -> Size:
     >>> [next_size(share) for share in (0.1, 0.25, 1.0, 2.5)]
     ['small', 'usual', 'usual', 'large']
     """
-    return "small" if share < FEW else "large" if share > MANY else "usual"
+    return "small" if share < FEW_STEPS_SHARE else "large" if share > MANY_STEPS_SHARE else "usual"
 
 
 def _value(config: NeilfConfig, name: str) -> int:

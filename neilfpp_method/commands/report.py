@@ -11,7 +11,7 @@ from neilfpp_method.commands.command import Command, Device, progress_bar, termi
 
 __all__ = ["COMMAND", "after_training"]
 
-TELLING = 0.1
+MIN_DONE_SHARE = 0.1
 """Share of the work after which the total time is estimated. Before, loading and compiling dominate."""
 
 
@@ -45,15 +45,18 @@ def run(options: Report) -> None:
     contents.check()
     out = options.out or options.run / REPORT
     check_writable(out)
+    messages: list[str] = []
     with computing_fast(), progress_bar("report") as advance:
         write_report(
             options.run,
             out,
             contents,
             str(pick_device(options.device)),
-            lambda share: advance(share) if share >= TELLING else None,
+            lambda share: advance(share) if share >= MIN_DONE_SHARE else None,
+            messages.append,
         )
-    terminal().print(f"written to {out}", soft_wrap=True)
+    for line in (*messages, f"written to {out}"):
+        terminal().print(line, soft_wrap=True)
 
 
 def after_training(path: Path, device: str) -> None:

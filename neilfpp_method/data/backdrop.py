@@ -26,7 +26,7 @@ PLACES = 65
 """Number of test points on each ray, evenly spaced inside the sphere around the scene box."""
 RADIUS = math.sqrt(3.0)
 """Radius of that sphere, scene units: it passes through the corners of the box."""
-ROOM = 0.9
+MIN_INSIDE_SHARE = 0.9
 """Share of the rays that must have a test point inside the visual hull."""
 
 
@@ -39,7 +39,7 @@ def leaves_room(outlines: Sequence[Outline], rays: RayBatch, normalisation: Norm
         normalisation: the transformation between the two frames.
     """
     held = agreement(outlines, _places(rays, normalisation)).reshape(len(rays), PLACES)
-    return bool((held >= AGREEMENT).any(axis=1).mean() >= ROOM)
+    return bool((held >= AGREEMENT).any(axis=1).mean() >= MIN_INSIDE_SHARE)
 
 
 def _places(rays: RayBatch, normalisation: Normalisation) -> Float64[np.ndarray, "P 3"]:

@@ -83,7 +83,7 @@ def _motion(
     size = fixed.shape[:2]
     still = np.eye(3)
     pair = _pair(fixed, moving, SIDES[1])
-    if min(pair.moving_seen.mean(), pair.fixed_seen.mean()) < MIN_OVERLAP:
+    if min(pair.moving_usable.mean(), pair.fixed_usable.mean()) < MIN_OVERLAP:
         return still
     starts = [still, _first_shift(pair)]
     motion = min(starts, key=lambda start: _difference(pair, start))
@@ -104,15 +104,15 @@ class _Pair:
     Attributes:
         fixed: the first image.
         moving: the second image.
-        fixed_seen: pixels of the first image that are neither dark nor clipped.
-        moving_seen: pixels of the second image that are neither dark nor clipped.
+        fixed_usable: pixels of the first image that are neither dark nor clipped.
+        moving_usable: pixels of the second image that are neither dark nor clipped.
         scale: the map from reduced to full pixels. Motions are given in full pixels.
     """
 
     fixed: Float32[np.ndarray, "h w"]
     moving: Float32[np.ndarray, "h w"]
-    fixed_seen: Bool[np.ndarray, "h w"]
-    moving_seen: Bool[np.ndarray, "h w"]
+    fixed_usable: Bool[np.ndarray, "h w"]
+    moving_usable: Bool[np.ndarray, "h w"]
     scale: Float64[np.ndarray, "3 3"]
 
     def warped(
@@ -121,8 +121,8 @@ class _Pair:
         """The second image after a motion, and the pixels that are usable in both images."""
         reduced = np.linalg.inv(self.scale) @ motion @ self.scale
         size, flags = self.fixed.shape[::-1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        seen = cv2.warpPerspective(self.moving_seen.astype(np.float32), reduced, size, flags=flags) > 0.99
-        return cv2.warpPerspective(self.moving, reduced, size, flags=flags), seen & self.fixed_seen
+        usable = cv2.warpPerspective(self.moving_usable.astype(np.float32), reduced, size, flags=flags) > 0.99
+        return cv2.warpPerspective(self.moving, reduced, size, flags=flags), usable & self.fixed_usable
 
 
 def _pair(fixed: Float32[np.ndarray, "H W 3"], moving: Float32[np.ndarray, "H W 3"], side: int) -> _Pair:
@@ -130,14 +130,14 @@ def _pair(fixed: Float32[np.ndarray, "H W 3"], moving: Float32[np.ndarray, "H W 
     share = min(1.0, side / max(height, width))
     size = (max(2, round(share * width)), max(2, round(share * height)))
     small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (fixed, moving)]
-    seen = [(image.max(axis=2) < MAX_VALUE) & (image.max(axis=2) > MIN_VALUE) for image in small]
+    usable = [(image.max(axis=2) < MAX_VALUE) & (image.max(axis=2) > MIN_VALUE) for image in small]
     first, second = (image.mean(axis=2) for image in small)
     steps = np.linspace(0, 1, 256)
     matched = np.interp(second, np.quantile(second, steps), np.quantile(first, steps)).astype(np.float32)
     across, down = width / size[0], height / size[1]
     # The centre of the first pixel is (0, 0), as in OpenCV.
     scale = np.array([[across, 0, (across - 1) / 2], [0, down, (down - 1) / 2], [0, 0, 1]])
-    return _Pair(first, matched, *seen, scale)
+    return _Pair(first, matched, *usable, scale)
 
 
 def _first_shift(pair: _Pair) -> Float64[np.ndarray, "3 3"]:
@@ -165,14 +165,14 @@ def _refined(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> Float64[np.ndar
     )
     centred = pair.scale @ np.array([[unit, 0, (width - 1) / 2], [0, unit, (height - 1) / 2], [0, 0, 1]])
     for _ in range(ROUNDS):
-        warped, seen = pair.warped(motion)
-        if seen.mean() < MIN_OVERLAP:
+        warped, usable = pair.warped(motion)
+        if usable.mean() < MIN_OVERLAP:
             break
-        off, known = (warped - pair.fixed)[seen], slopes[:, seen]
-        typical = 1.5 * np.median(np.abs(off - np.median(off))) + 1e-4
+        difference, usable_slopes = (warped - pair.fixed)[usable], slopes[:, usable]
+        typical = 1.5 * np.median(np.abs(difference - np.median(difference))) + 1e-4
         # Huber weights, because objects that move independently of the camera are outliers.
-        weighted = known / np.maximum(np.abs(off - np.median(off)) / typical, 1.0)
-        step = np.linalg.lstsq(weighted @ known.T, weighted @ off, rcond=1e-9)[0]
+        weighted = usable_slopes / np.maximum(np.abs(difference - np.median(difference)) / typical, 1.0)
+        step = np.linalg.lstsq(weighted @ usable_slopes.T, weighted @ difference, rcond=1e-9)[0]
         small = np.eye(3) + np.append(step[:8], 0).reshape(3, 3)
         change = centred @ np.linalg.inv(small) @ np.linalg.inv(centred)
         motion = motion @ change
@@ -184,10 +184,10 @@ def _refined(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> Float64[np.ndar
 
 def _difference(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> float:
     """The difference of the images after a motion: 1 − their correlation over the usable pixels."""
-    warped, seen = pair.warped(motion)
-    if seen.mean() < MIN_OVERLAP:
+    warped, usable = pair.warped(motion)
+    if usable.mean() < MIN_OVERLAP:
         return 1.0
-    a, b = pair.fixed[seen] - pair.fixed[seen].mean(), warped[seen] - warped[seen].mean()
+    a, b = pair.fixed[usable] - pair.fixed[usable].mean(), warped[usable] - warped[usable].mean()
     return 1.0 - float((a * b).mean() / max(a.std() * b.std(), 1e-12))
 
 

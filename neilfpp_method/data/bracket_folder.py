@@ -109,8 +109,8 @@ def _listed_groups(folder: Path, unreadable: Collection[Path]) -> Mapping[str, S
 
 
 def _images(folder: Path) -> list[Path]:
-    shown = {*IMAGE_SUFFIXES, *RAW_SUFFIXES}
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in shown and not p.name.startswith("."))
+    suffixes = {*IMAGE_SUFFIXES, *RAW_SUFFIXES}
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith("."))
 
 
 def _returning_groups(

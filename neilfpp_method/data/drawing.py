@@ -28,7 +28,7 @@ SMALL_SIDE = 256
 """Longest side of the reduced mask in which near pixels are computed, in pixels."""
 BLOCK = 1024
 """Number of pixels of a block, the unit of the counts of `PixelSet`; arrays are padded to whole blocks."""
-COUNTED = 2**14
+BLOCKS_AT_ONCE = 2**14
 """Number of blocks that are counted at once; bounds the memory."""
 
 
@@ -46,7 +46,10 @@ class PixelSet:
 
     def __init__(self, bits: UInt8[np.ndarray, " P"], of: int, are: int) -> None:
         self._bits, self._of, self._are = bits.reshape(-1, BLOCK), of, are
-        counts = [self._chosen(slice(k, k + COUNTED)).sum(axis=1) for k in range(0, len(self._bits), COUNTED)]
+        counts = [
+            self._chosen(slice(k, k + BLOCKS_AT_ONCE)).sum(axis=1)
+            for k in range(0, len(self._bits), BLOCKS_AT_ONCE)
+        ]
         self._before = np.concatenate([[0], np.concatenate(counts).cumsum()])
         self.count = int(self._before[-1])
 

@@ -75,8 +75,9 @@ def _half(color: Float32[np.ndarray, "H W 3"]) -> Encoded | None:
     brightest = float(color.max(initial=0.0))
     scale = 2.0 ** math.floor(math.log2(MAX_VALUE / brightest)) if brightest > 0 else 1.0
     some = color.reshape(-1)[:: -(-color.size // MEDIAN_SAMPLES)]
-    lit = some[some > 0]
-    if len(lit) and (not np.isfinite(np.float32(scale)) or float(np.median(lit)) * scale < MIN_MEDIAN):
+    positive = some[some > 0]
+    too_dark = len(positive) > 0 and float(np.median(positive)) * scale < MIN_MEDIAN
+    if len(positive) and (too_dark or not np.isfinite(np.float32(scale))):
         return None
     return Encoded((color * np.float32(scale)).astype(np.float16), scale)
 

@@ -182,8 +182,8 @@ class PixelDataset:
     @cached_property
     def _exposure(self) -> float:
         """Factor that brings the median of the object to middle grey; 1 if pixels are display values."""
-        lit = self._lit() if self.capture.hdr else ()
-        return MIDDLE_GREY / float(lit.median()) if len(lit) else 1.0
+        positive = self._positive_luminance() if self.capture.hdr else ()
+        return MIDDLE_GREY / float(positive.median()) if len(positive) else 1.0
 
     def _display_luminance(self, colors: Float32[np.ndarray, "*shape 3"]) -> Float32[Tensor, "*shape"]:
         """Display luminance; linear images are exposed so that the median of the object is middle grey."""
@@ -213,19 +213,19 @@ class PixelDataset:
         Raises:
             UserError: there is no such pixel.
         """
-        lit = self._lit()
-        if not len(lit):
+        positive = self._positive_luminance()
+        if not len(positive):
             raise UserError(
                 f"{self.capture.root}: all pixels of the object are black", "check images and masks"
             )
-        return float(lit.median())
+        return float(positive.median())
 
     def radiance_quantile(self, share: float) -> float:
         """Return the `share`-quantile of the linear values of all channels of valid object pixels."""
         values = self._of_the_object().flatten()
         return float(values.kthvalue(max(1, round(share * len(values)))).values)
 
-    def _lit(self) -> Float[Tensor, " L"]:
+    def _positive_luminance(self) -> Float[Tensor, " L"]:
         """Linear luminance of the object pixels that are not black."""
         values = luminance(self._of_the_object())
         return values[values > DARK * values.mean()]

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from neilfpp_method.data.images import replacing
+from neilfpp_method.data.ply import CODES_BY_NAME, NORMAL, POSITION, write_ply
 from neilfpp_method.data.views import Normalisation
 from neilfpp_method.errors import UserError
 from neilfpp_method.structures import OrientedPoints
@@ -24,17 +24,9 @@ __all__ = [
     "write_oriented_ply",
 ]
 
-OLD_NAMES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
-NEW_NAMES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
-CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
-TYPES = dict(zip(OLD_NAMES + NEW_NAMES, CODES + CODES, strict=True))
 BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": None}
 HEADER_LIMIT = 65_536
 """Largest number of bytes of the header of a PLY file."""
-ROUNDING = 1e-6
-"""Largest rounding error of a written position, as a share of the longest edge of the bounding box."""
-POSITION = ("x", "y", "z")
-NORMAL = ("nx", "ny", "nz")
 
 
 @dataclass(frozen=True)
@@ -101,31 +93,13 @@ def has_normals(path: Path) -> bool:
 def write_oriented_ply(path: Path, points: WorldPoints) -> Path:
     """Write points as binary PLY.
 
-    Numbers are in single precision, except that positions are in double precision if rounding them would move
-    a point by more than `ROUNDING` of the extent of the cloud, as in map coordinates.
+    Normals are in single precision, and positions in the precision that `write_ply` chooses.
 
     Returns:
         The path.
     """
-    kind = "double" if _needs_double(points.position) else "float"
-    columns = [(name, kind) for name in POSITION] + [(name, "float") for name in NORMAL]
-    properties = "".join(f"property {kind} {name}\n" for name, kind in columns)
-    vertices = f"element vertex {len(points.position)}\n"
-    head = f"ply\nformat binary_little_endian 1.0\n{vertices}{properties}end_header\n"
-    rows = np.empty(len(points.position), [(name, f"<{TYPES[kind]}") for name, kind in columns])
-    for values, names in ((points.position, POSITION), (points.normal, NORMAL)):
-        for name, column in zip(names, values.T, strict=True):
-            rows[name] = column
-    with replacing(path) as temporary:
-        temporary.write_bytes(head.encode("ascii") + rows.tobytes())
-    return path
-
-
-def _needs_double(position: Float64[np.ndarray, "N 3"]) -> bool:
-    if not len(position):
-        return False
-    moved = np.abs(position.astype(np.float32) - position).max()
-    return bool(moved > ROUNDING * np.ptp(position, axis=0).max())
+    normals = dict(zip(NORMAL, points.normal.astype("<f4").T, strict=True))
+    return write_ply(path, points.position, normals)
 
 
 def _read(path: Path) -> np.ndarray:
@@ -160,7 +134,7 @@ def _vertices(data: bytes) -> np.ndarray:
     if count < 0:
         raise ValueError("its header states a negative number of points")
     own = lines[elements[0] : elements[1] if len(elements) > 1 else None]
-    properties = [(words[2], TYPES[words[1]]) for words in own if words[0] == "property"]
+    properties = [(words[2], CODES_BY_NAME[words[1]]) for words in own if words[0] == "property"]
     body = data.index(b"\n", len(head)) + 1
     if order is None:
         text = io.StringIO(data[body:].decode("ascii"))

@@ -39,7 +39,7 @@ PIXELS_OF_A_VIEW = 2**17
 PIXELS_OF_A_RAY = 4
 """Number of training pixels per ray of the whole training. Of a larger number most would never be drawn; a
 smaller image has their means, with less noise."""
-SAME = 0.98
+MIN_REDUCING_SCALE = 0.98
 """Smallest scale that is rounded to 1, because so small a reduction is not worth resampling."""
 
 
@@ -108,7 +108,7 @@ def scale_for_pixels(views: Sequence[View], pixels: int) -> float:
     """Return the largest scale at which all views together have at most `pixels` pixels."""
     total = sum(math.prod(file_size(view)) for view in views)
     scale = math.sqrt(pixels / max(total, 1))
-    return 1.0 if scale >= SAME else round(scale, 4)
+    return 1.0 if scale >= MIN_REDUCING_SCALE else round(scale, 4)
 
 
 def scale_for_width(views: Sequence[View], width: int) -> float:

@@ -77,13 +77,13 @@ def _of_size(camera: Camera, height: int, width: int) -> Camera:
 class Sightings:
     """For each of P points, the number of views that see it and the number of silhouettes that contain it."""
 
-    seen: Int64[np.ndarray, " P"]
+    visible_in: Int64[np.ndarray, " P"]
     inside: Int64[np.ndarray, " P"]
 
 
 def sightings(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -> Sightings:
     """Count views and silhouettes for points in the frame of the cameras."""
-    seen, inside = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
+    visible_in, inside = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     for outline in outlines:
         camera = outline.view.camera
         image = project(camera, torch.from_numpy(points))
@@ -92,11 +92,11 @@ def sightings(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -
             image.depth.numpy(),
         )
         size = np.array([camera.width, camera.height])
-        shown = (depth > 0) & (pixel >= 0).all(axis=1) & (pixel < size).all(axis=1)
-        column, row = np.where(shown[:, None], pixel, 0).astype(np.int64).T
-        seen += shown | outline.complete
-        inside += shown & outline.inside[row, column]
-    return Sightings(seen, inside)
+        in_image = (depth > 0) & (pixel >= 0).all(axis=1) & (pixel < size).all(axis=1)
+        column, row = np.where(in_image[:, None], pixel, 0).astype(np.int64).T
+        visible_in += in_image | outline.complete
+        inside += in_image & outline.inside[row, column]
+    return Sightings(visible_in, inside)
 
 
 def agreement(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, " P"]:
@@ -104,5 +104,6 @@ def agreement(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -
 
     Points are in the frame of the cameras.
     """
-    found = sightings(outlines, points)
-    return np.where(found.seen >= len(outlines) / 2, found.inside / np.maximum(found.seen, 1), 0.0)
+    counts = sightings(outlines, points)
+    share = counts.inside / np.maximum(counts.visible_in, 1)
+    return np.where(counts.visible_in >= len(outlines) / 2, share, 0.0)

@@ -111,8 +111,8 @@ def visual_hull(outlines: Sequence[Outline], radius: float, resolution: int) -> 
     # Small silhouettes exclude the most points, so fewer points remain for the following views.
     for outline in sorted(outlines, key=lambda outline: float(outline.inside.mean())):
         found = sightings([outline], points[candidates])
-        seen_by[candidates] += found.seen
-        excluded_by[candidates] += found.seen - found.inside
+        seen_by[candidates] += found.visible_in
+        excluded_by[candidates] += found.visible_in - found.inside
         candidates = candidates[excluded_by[candidates] <= MAX_EXCLUDING_SHARE * len(outlines)]
     hull = np.zeros(len(points), bool)
     enough_views = seen_by[candidates] >= max(2, MIN_SEEN_SHARE * len(outlines))

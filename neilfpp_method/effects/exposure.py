@@ -118,11 +118,11 @@ def _log_values(pixels: PixelDataset, points: OrientedPoints) -> Float[Tensor, "
     log_values = torch.full((len(points), len(pixels.views), 3), torch.nan)
     for number, view in enumerate(pixels.views):
         camera = pixels.capture.normalisation.camera(view.camera)
-        shown = project(camera, points.position)
-        column, row = shown.pixel.floor().long().unbind(-1)
+        projected = project(camera, points.position)
+        column, row = projected.pixel.floor().long().unbind(-1)
         # The eight neighbouring pixels must lie in the image as well.
         within = (column > 0) & (row > 0) & (column < camera.width - 1) & (row < camera.height - 1)
-        at = torch.nonzero(within & (shown.depth > 0) & (_cosine(camera, points) > MIN_COSINE))[:, 0]
+        at = torch.nonzero(within & (projected.depth > 0) & (_cosine(camera, points) > MIN_COSINE))[:, 0]
         if len(at):
             log_values[at, number] = _around(pixels, number, column[at], row[at])
     return log_values

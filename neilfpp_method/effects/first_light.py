@@ -60,7 +60,7 @@ each with half the usual number of rounds.
 """
 MEASURED = 2000
 """Pixels of the products from which `seconds_of_pixel` is estimated."""
-REST = 0.3
+OVERHEAD_SHARE = 0.3
 """Share that tracing and the search for materials add to the descents of the light, on one core of a server:
 1270 pixels took 15.5 s, of which 13 s are descents by this count.
 """
@@ -160,7 +160,7 @@ def seconds_of_pixel(device: torch.device, with_lobe: bool, with_metals: bool) -
     # One fit per scale, two fits with and without lamps, and the final fit to all views.
     steps = (1 - 1 / FOLDS) * (whole + (len(SCALES) + 1) * carried) + carried
     steps += (LOBE_FITS * with_lobe + METAL_FITS * with_metals) * whole
-    return (1 + REST) * steps * seconds_of_step(MEASURED, device) / MEASURED
+    return (1 + OVERHEAD_SHARE) * steps * seconds_of_step(MEASURED, device) / MEASURED
 
 
 @torch.no_grad()

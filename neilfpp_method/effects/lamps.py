@@ -74,11 +74,11 @@ def _lamp_light(
     lamps: Lamps, observed: Observed, lobe: Lobe, scene: SceneTracer | None
 ) -> Float[Tensor, "K N 3"]:
     """Light of the lamps via points, with the layers of `from_texels_at`."""
-    places = LampPlaces(lamps.position[: lamps.lit], lamps.axis[: lamps.lit])
+    places = LampPlaces(lamps.position[: lamps.count], lamps.axis[: lamps.count])
     sight = in_sight(places, lamps.radius, observed.position, scene)
     layers = []
     for number, value in enumerate(ROUGHNESSES):
         roughness = torch.full_like(observed.position[:, :1], value)
         kernel = lamp_kernel(places, lamps.radius, sight, observed, roughness, lobe)
-        layers.append((kernel if number == 0 else kernel[1:]) @ lamps.intensity[: lamps.lit])
+        layers.append((kernel if number == 0 else kernel[1:]) @ lamps.intensity[: lamps.count])
     return torch.cat(layers)

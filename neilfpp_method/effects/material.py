@@ -63,7 +63,7 @@ REST = 0.5
 """Time of all work other than descent, as a share of that of descent (estimate)."""
 SHARED = (2, 4, 6, 8)
 """Indices in `ROUGHNESSES` that are tried as the common roughness of all places."""
-ANOTHER = 2
+MIN_INDEX_DIFFERENCE = 2
 """A place has another roughness than the common one if its index differs by at least this much."""
 LIGHT_FORMS: Mapping[str, Callable[[Tensor], Tensor]] = {
     "environment-map": lambda log_radiance: log_radiance.mean((1, 2), keepdim=True).expand_as(log_radiance),
@@ -244,7 +244,7 @@ def judge_material(
 
         shared = min(SHARED, key=lambda number: with_roughness(number, 0).fitted_error)
         shared_fits = [with_roughness(shared, turn) for turn in range(TURNS)]
-        counted = [(one.fit.roughness - shared).abs() >= ANOTHER for one in glossy_fits]
+        counted = [(one.fit.roughness - shared).abs() >= MIN_INDEX_DIFFERENCE for one in glossy_fits]
         measured["varying-roughness"] = _saved("varying-roughness", shared_fits, glossy_fits, counted)
     if "reflection" in names:
         measured["reflection"] = _saved("reflection", fit_all(Model(reflects=False)), glossy_fits)

@@ -60,8 +60,8 @@ def metals_evidence(places: Places, transport: Transport, typical: float) -> Mea
         errors = [
             unknown.mean(place_errors(fit, unknown, transport[held_back], typical)) for fit in (paint, metal)
         ]
-        shown = torch.bincount(unknown.place, minlength=places.count) > 0
-        gains.append(torch.where(shown, errors[0] - errors[1], torch.nan))
+        has_views = torch.bincount(unknown.place, minlength=places.count) > 0
+        gains.append(torch.where(has_views, errors[0] - errors[1], torch.nan))
     gain = torch.stack(gains).nanmean(0)
     what = "reduction of the error in held-back views by metals"
     return mean_of(gain[gain.isfinite()], what, WORTH)

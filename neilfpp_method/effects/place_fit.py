@@ -56,11 +56,11 @@ GAIN_RATE = 0.03
 """Learning rate of the logarithms of base colours."""
 SMOOTHNESS = 0.02
 """Weight of the map's total variation, as in preset `fast`."""
-BOUND = 0.95
+HIGH_BASE_COLOR = 0.95
 """Base colours above this value are penalised, so that the light takes up the scale before base colours reach
 1 and are clamped.
 """
-BOUND_WEIGHT = 1.0
+HIGH_BASE_COLOR_WEIGHT = 1.0
 """Weight of that penalty, the mean squared excess."""
 SCALE_WEIGHT = 10.0
 """Weight of the squared deviation of the mean log base colour from its given value."""
@@ -252,7 +252,7 @@ def _better_light(
             error = _relative_error(outgoing, places, typical)
             loss = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER)
             loss = loss + SMOOTHNESS * total_variation(log_radiance)
-            loss = loss + BOUND_WEIGHT * (base_color - BOUND).clamp_min(0).square().mean()
+            loss = loss + HIGH_BASE_COLOR_WEIGHT * (base_color - HIGH_BASE_COLOR).clamp_min(0).square().mean()
             if mean_base_color is not None:
                 off = _log_mean(base_color) - math.log(mean_base_color)
                 loss = loss + SCALE_WEIGHT * off.square()

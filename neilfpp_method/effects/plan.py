@@ -13,7 +13,7 @@ from neilfpp_method.settings.types import NeilfConfig
 
 __all__ = ["Decision", "Plan", "decided_settings"]
 
-By = Literal["asked", "settings", "files", "evidence"]
+By = Literal["option", "settings", "files", "evidence"]
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Decision:
         step: training step from which on the decision applies.
         effect: name of the effect, a key of `EFFECTS`.
         on: whether the effect is simulated.
-        by: origin of the decision: the option `--effects` ("asked"), the settings, the files of the capture
+        by: origin of the decision: the option `--effects` ("option"), the settings, the files of the capture
             before training, or evidence from the model in training.
         reason: explanation for the console and the report.
         evidence: the measurement; None if nothing was measured.
@@ -55,7 +55,7 @@ def decided_settings(settings: NeilfConfig, decisions: Sequence[Decision]) -> Ne
             continue
         if not decision.on:
             settings = switched(settings, EFFECTS[name], on=False)
-        elif decision.by == "asked":
+        elif decision.by == "option":
             settings = switched(settings, EFFECTS[name], on=True)
     return settings
 
@@ -86,11 +86,11 @@ class Plan:
             obstacle, is_on = effect.obstacle(settings), effect.is_on(settings)
             if name in request.named:
                 sign = "+" if request.named[name] else "-"
-                decide(name, request.named[name], "asked", f"--effects {sign}{name}")
+                decide(name, request.named[name], "option", f"--effects {sign}{name}")
             elif obstacle:
                 decide(name, is_on, "settings", obstacle)
             elif request.base in ("all", "none"):
-                decide(name, request.base == "all", "asked", f"--effects {request.base}")
+                decide(name, request.base == "all", "option", f"--effects {request.base}")
             elif request.base == "as-set":
                 decide(name, is_on, "settings", f"{'on' if is_on else 'off'} in the settings")
             elif not is_on:

@@ -14,7 +14,7 @@ __all__ = ["BASES", "EffectRequest", "check_effects", "parse_effects"]
 
 BASES = ("auto", "all", "none", "as-set")
 """How effects that are not named are decided: by evidence, all on, all off, or by the settings."""
-ELSEWHERE = {
+NOT_BY_EFFECTS = {
     "response": "it is read from the image files; override it with --response linear or srgb",
 }
 """Effects of the table that another option sets, with the remedy of the error message."""
@@ -57,8 +57,8 @@ def parse_effects(text: str) -> EffectRequest:
             raise UserError(f"--effects: '{word}' has no sign", f"write +{word} or -{word}")
         if sign not in "+-":
             raise _unknown(word, f"'{word}' is not a choice")
-        if name in ELSEWHERE:
-            raise UserError(f"--effects: {name} cannot be set here", ELSEWHERE[name])
+        if name in NOT_BY_EFFECTS:
+            raise UserError(f"--effects: {name} cannot be set here", NOT_BY_EFFECTS[name])
         if name not in EFFECTS:
             raise _unknown(name, f"no effect '{name}'")
         if name in named:

@@ -26,9 +26,9 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.structures import Observed, PixelBatch
 
 __all__ = [
-    "FEWEST_PIXELS",
+    "MAX_PIXELS",
+    "MIN_PIXELS",
     "MIN_TRAIN_VIEWS",
-    "MOST_PIXELS",
     "SURFACE_PIXELS",
     "needs_surface",
     "record_exposures",
@@ -57,9 +57,9 @@ AT_ONCE = 512
 """Maximum number of rays that are rendered at once; it bounds memory."""
 USUAL_VIEWS = 8
 """Number of views per place that is assumed when a number of pixels is converted to a number of places."""
-FEWEST_PIXELS = MIN_PLACES * USUAL_VIEWS
+MIN_PIXELS = MIN_PLACES * USUAL_VIEWS
 """Minimum number of pixels for an initial light."""
-MOST_PIXELS = PLACES * VIEWS
+MAX_PIXELS = PLACES * VIEWS
 """Maximum number of pixels of the places for the initial light."""
 
 
@@ -100,12 +100,12 @@ def needs_surface(plan: Plan) -> bool:
 
 @torch.no_grad()
 def review_light(
-    plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int, most: int = MOST_PIXELS
+    plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int, most: int = MAX_PIXELS
 ) -> tuple[list[Decision], FirstLight | None]:
     """Decide on the specular lobe and on metals if these are open, and find an initial light.
 
     The model uses the settings of the plan afterwards. The arguments are those of `review_surface`, and
-    `most`, the maximum number of pixels of the places; below `FEWEST_PIXELS` nothing is measured.
+    `most`, the maximum number of pixels of the places; below `MIN_PIXELS` nothing is measured.
 
     Returns:
         The decisions, and the initial light; the light is None if there are too few views or places, or if
@@ -113,7 +113,7 @@ def review_light(
     """
     if len(pixels.views) < MIN_TRAIN_VIEWS:
         return _not_measured(plan, step, f"fewer than {MIN_TRAIN_VIEWS} training views"), None
-    if most < FEWEST_PIXELS:
+    if most < MIN_PIXELS:
         return _not_measured(plan, step, "the budget leaves no time for it"), None
     mode = model.training
     model.eval()
@@ -186,13 +186,13 @@ def review_material(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: i
     return [plan.decide(name, measured, step) for name, measured in evidence.items()]
 
 
-def record_lamps(plan: Plan, evidence: Evidence | None, lit: int, step: int) -> list[Decision]:
+def record_lamps(plan: Plan, evidence: Evidence | None, count: int, step: int) -> list[Decision]:
     """Record the decision on lamps that the light solver has taken in a fit.
 
     Args:
         plan: the plan to which the decision is added.
         evidence: the comparison of the fits with and without lamps; None if there was none.
-        lit: number of lamps after the fit.
+        count: number of lamps after the fit.
         step: number of steps trained so far.
 
     Returns:
@@ -200,7 +200,7 @@ def record_lamps(plan: Plan, evidence: Evidence | None, lit: int, step: int) -> 
     """
     if evidence is None or not plan.is_open("lamps"):
         return []
-    before, on = plan.newest("lamps"), lit > 0
+    before, on = plan.newest("lamps"), count > 0
     if before is not None and before.on == on:
         return []
     where, threshold = ("in held-back views", 0.0) if evidence.in_views else ("at held-back points", MIN_GAIN)

@@ -58,7 +58,7 @@ def _ratio(title: str) -> Entry:
     return Entry(title, "%.2f", "lower", meaning)
 
 
-EXPOSED = "After the best factor per view and channel, because the exposure of a new view is unknown."
+SCALED_IMAGES = "After the best factor per view and channel, because the exposure of a new view is unknown."
 SCALED_LIGHT = "The same after the best factor per channel."
 
 ENTRIES: Mapping[str, Entry] = {
@@ -69,7 +69,7 @@ ENTRIES: Mapping[str, Entry] = {
     "volume_psnr_linear": _decibels(
         "Image, volume rendering, linear", "On linear radiance, which gives highlights the most weight."
     ),
-    "volume_psnr_exposed": _decibels("Image, volume rendering, same exposure", EXPOSED),
+    "volume_psnr_exposed": _decibels("Image, volume rendering, same exposure", SCALED_IMAGES),
     "pbr_psnr": _decibels(
         "Image, rendering equation", "Test views rendered from material and incident light, tone-mapped."
     ),
@@ -77,7 +77,7 @@ ENTRIES: Mapping[str, Entry] = {
     "pbr_psnr_linear": _decibels(
         "Image, rendering equation, linear", "On linear radiance, which gives highlights the most weight."
     ),
-    "pbr_psnr_exposed": _decibels("Image, rendering equation, same exposure", EXPOSED),
+    "pbr_psnr_exposed": _decibels("Image, rendering equation, same exposure", SCALED_IMAGES),
     "base_color_psnr": _decibels(
         "Base colour", "As estimated; images determine it only up to a factor per channel."
     ),

@@ -99,9 +99,9 @@ def light_sections(
 def _lamps_above(run: Run, point: LightPoint) -> Float[np.ndarray, "K 3"]:
     """Unit directions from a point to the lamps above its tangent plane."""
     lamps = run.model.lamps
-    if not lamps.lit:
+    if not lamps.count:
         return np.zeros((0, 3), np.float32)
-    offset = lamps.position[: lamps.lit].cpu().numpy() - point.position
+    offset = lamps.position[: lamps.count].cpu().numpy() - point.position
     offset = offset[offset @ point.normal > 0]
     return offset / np.linalg.norm(offset, axis=-1, keepdims=True)
 

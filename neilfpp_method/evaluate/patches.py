@@ -65,7 +65,7 @@ def _nearest_patch(wi: Float[Tensor, "N S 3"]) -> Int[Tensor, "N S"]:
 
 def patch_count(model: NeilfModel) -> int:
     """Number of patches K of a model: two sets of `PATCHES`, and one for each lamp that is lit."""
-    return 2 * PATCHES + model.lamps.lit
+    return 2 * PATCHES + model.lamps.count
 
 
 def by_patch(

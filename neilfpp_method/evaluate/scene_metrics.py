@@ -12,6 +12,7 @@ from neilfpp_method.data.truth import LightField
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.export.mesh import extract_mesh
 from neilfpp_method.hosts.volsdf import HIT_RADIUS
+from neilfpp_method.model import EVAL_RAYS
 from neilfpp_method.train.run import Run
 
 __all__ = ["chamfer_metrics", "light_metrics"]
@@ -83,7 +84,7 @@ def light_metrics(run: Run, field: LightField, mesh: Mesh | None) -> dict[str, f
 @torch.no_grad()
 def _incident_light(run: Run, field: LightField) -> Float[np.ndarray, "N S 3"]:
     device = next(run.model.parameters()).device
-    directions_at_once = run.config.train.eval_chunk * run.config.shading.eval_samples
+    directions_at_once = EVAL_RAYS * run.config.shading.eval_samples
     points = max(1, directions_at_once // field.wi.shape[1])
     chunks = zip(field.position.split(points), field.wi.split(points), strict=True)
     light = [run.model.incident_light(x.to(device), wi.to(device)).cpu() for x, wi in chunks]

@@ -33,19 +33,19 @@ def write_contact_sheet(run: Run, path: Path, rendered: Sequence[RenderedView] =
         path: the file to write.
         rendered: views that were rendered before; any other view is rendered here.
     """
-    shown = _with_shown_views(run)
+    displayed = _with_displayed_views(run)
     by_name = {view.name: view for view in rendered}
     rendered = [
         by_name.get(view.name) or render_view(run, run.capture.views.index(view))
-        for view in shown.capture.test_views
+        for view in displayed.capture.test_views
     ]
-    known = known_test_views(shown, rendered).views
+    known = known_test_views(displayed, rendered).views
     scale = albedo_scale(rendered, known) if run.has_material else None
     if run.has_material and run.capture.train_views:
         evidence = gather_evidence(run)
         rendered = [with_deviation(run, evidence, view, CONFIDENCE_STEP) for view in rendered]
-    views = view_sections(shown, rendered, known, scale)
-    light = light_sections(shown, rendered, scale) if run.has_material else []
+    views = view_sections(displayed, rendered, known, scale)
+    light = light_sections(displayed, rendered, scale) if run.has_material else []
     title = f"{run.capture.root.resolve().name}, {run.config.preset}"
     subtitle = f"step {run.step} of {sum(stage_steps(run.config.train).values())}"
     write_png(path, contact_sheet(title, subtitle, [*views, *light]))
@@ -55,16 +55,16 @@ def write_light_picture(run: Run, path: Path) -> bool:
     """Write a PNG with images of the incident light. Returns False, and writes nothing, if there are none."""
     if not run.has_material:
         return False
-    shown = _with_shown_views(run)
-    rendered = [render_view(run, run.capture.views.index(view)) for view in shown.capture.test_views]
-    scale = albedo_scale(rendered, known_test_views(shown, rendered).views)
-    sections = light_sections(shown, rendered, scale)
+    displayed = _with_displayed_views(run)
+    rendered = [render_view(run, run.capture.views.index(view)) for view in displayed.capture.test_views]
+    scale = albedo_scale(rendered, known_test_views(displayed, rendered).views)
+    sections = light_sections(displayed, rendered, scale)
     if sections:
         write_png(path, contact_sheet("", "", sections))
     return bool(sections)
 
 
-def _with_shown_views(run: Run) -> Run:
+def _with_displayed_views(run: Run) -> Run:
     """The run with up to three test views, chosen evenly from its test views or else its training views."""
     views = run.capture.test_views or run.capture.train_views
     rows = np.linspace(0, len(views) - 1, SHOWN_VIEWS).round().astype(int)

@@ -13,7 +13,7 @@ from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.views import Camera, Projection, project
 from neilfpp_method.fields.exposure import at_mean_exposure
-from neilfpp_method.model import NeilfModel
+from neilfpp_method.model import EVAL_RAYS, NeilfModel
 from neilfpp_method.structures import Indexable, PixelBatch, RayBatch
 
 __all__ = ["Sightings", "TrainingViews", "pixel_index"]
@@ -116,7 +116,7 @@ def _unoccluded(
     if scene is not None:
         return scene(position, direction[:, None]).distance[:, 0] >= distance - TOLERANCE
     unoccluded = torch.zeros_like(distance, dtype=torch.bool)
-    for rows in torch.arange(len(distance), device=distance.device).split(model.config.train.eval_chunk):
+    for rows in torch.arange(len(distance), device=distance.device).split(EVAL_RAYS):
         hits = model.host.render(RayBatch(centre.expand(len(rows), 3), -direction[rows]))
         unoccluded[rows] = hits.is_hit(share) & ((hits.position - position[rows]).norm(dim=-1) <= TOLERANCE)
     return unoccluded

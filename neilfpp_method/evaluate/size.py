@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import Any
 
 from neilfpp_method.data.scaling import (
+    MIN_REDUCING_SCALE,
     PIXELS_OF_A_VIEW,
-    SAME,
     at_scale,
     file_size,
     scale_for_pixels,
@@ -40,7 +40,7 @@ def at_size(run: Run, scale: float | None = None, width: int | None = None) -> R
         scale = scale_for_width(views, width)
     if scale is None:
         trained = sum(view.camera.width * view.camera.height for view in views)
-        if SAME**2 * trained <= PIXELS_OF_A_VIEW * len(views):
+        if MIN_REDUCING_SCALE**2 * trained <= PIXELS_OF_A_VIEW * len(views):
             return run
         scale = scale_for_pixels(views, PIXELS_OF_A_VIEW * len(views))
     return replace(run, capture=at_scale(run.capture, scale))

@@ -16,6 +16,7 @@ from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import View, camera_rays, project
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.sightings import pixel_index
+from neilfpp_method.model import EVAL_RAYS
 from neilfpp_method.shading.color import srgb_to_linear
 from neilfpp_method.structures import Maps
 from neilfpp_method.train.run import Run
@@ -54,14 +55,14 @@ def render_view(
 ) -> RenderedView:
     """Render view `view_index` of `run.capture.views` at the size of its camera. Deterministic.
 
-    Rays are processed in batches of `config.train.eval_chunk`. Each batch is spread over the whole view, so
+    Rays are processed in batches of `EVAL_RAYS`. Each batch is spread over the whole view, so
     that all batches take about the same time; `on_progress` is called with the fraction that is done after
     each. If the run has no material yet, `rgb` is the host's colour, and the maps of the material are 0.
     """
     view = run.capture.views[view_index]
     device = next(run.model.parameters()).device
     rays = camera_rays(run.capture.normalisation.camera(view.camera))
-    parts = -(-len(rays) // run.config.train.eval_chunk)
+    parts = -(-len(rays) // EVAL_RAYS)
     combined: dict[str, Tensor] = {}
     for k in range(parts):
         rows = torch.arange(k, len(rays), parts)

@@ -7,18 +7,14 @@ from pathlib import Path
 
 from rich.console import Console
 
-from neilfpp_method.errors import UserError
 from neilfpp_method.export.asset.command import AssetOptions, Bar, Deviations, check_asset, export_asset
 from neilfpp_method.export.light import check_light, export_light
-from neilfpp_method.export.mesh import export_mesh, has_surface
+from neilfpp_method.export.mesh import check_resolution, export_mesh, has_surface
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.output import check_folder
 from neilfpp_method.train.run import load_run
 
 __all__ = ["run_export"]
-
-MIN_RESOLUTION, MAX_RESOLUTION = 8, 2048
-"""Bounds of the resolution; a grid of 2048³ distances takes 34 GB."""
 
 
 def run_export(
@@ -55,11 +51,7 @@ def run_export(
     Raises:
         UserError: the run does not have what is requested.
     """
-    if not MIN_RESOLUTION <= resolution <= MAX_RESOLUTION:
-        raise UserError(
-            f"a surface cannot have a grid of {resolution} cells per side",
-            f"give {MIN_RESOLUTION} to {MAX_RESOLUTION} with --resolution",
-        )
+    check_resolution(resolution)
     trained = load_run(run, pick_device(device), checkpoint)
     out = out or run / "export"
     check_folder(out)

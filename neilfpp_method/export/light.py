@@ -89,10 +89,10 @@ def lamps_in_world(run: Run) -> list[dict[str, Any]]:
     """
     lamps = run.model.lamps
     frame = run.capture.normalisation
-    lit = slice(lamps.lit)
-    positions = frame.to_world(lamps.position[lit].double()).tolist()
-    axes = [axis if any(axis) else None for axis in lamps.axis[lit].tolist()]
-    intensities = (lamps.intensity[lit].double() * frame.scale**2).tolist()
+    used = slice(lamps.count)
+    positions = frame.to_world(lamps.position[used].double()).tolist()
+    axes = [axis if any(axis) else None for axis in lamps.axis[used].tolist()]
+    intensities = (lamps.intensity[used].double() * frame.scale**2).tolist()
     return [
         {
             "position": position,

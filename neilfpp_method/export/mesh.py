@@ -14,7 +14,8 @@ from jaxtyping import Float
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from neilfpp_method.data.images import replacing
+from neilfpp_method.data.memory import check_memory
+from neilfpp_method.data.ply import NORMAL, write_ply
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.base import HasSdf
 from neilfpp_method.hosts.mesh import MeshHost
@@ -23,7 +24,14 @@ from neilfpp_method.shading.color import tone_map
 from neilfpp_method.structures import Material
 from neilfpp_method.train.run import Run
 
-__all__ = ["export_mesh", "extract_mesh", "has_surface", "materials_in_parts", "surface_mesh"]
+__all__ = [
+    "check_resolution",
+    "export_mesh",
+    "extract_mesh",
+    "has_surface",
+    "materials_in_parts",
+    "surface_mesh",
+]
 
 Sdf = Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]
 
@@ -34,6 +42,10 @@ SLACK = 1.5
 points no part of the surface is lost, including the edges between blocks, if the slope of the field is below
 1.29.
 """
+MIN_RESOLUTION, MAX_RESOLUTION = 8, 2048
+"""Bounds of the resolution of a command; a grid of 2048³ distances takes 34 GB, its copy another 34 GB."""
+BYTES_PER_POINT = 8
+"""Memory of a grid point in bytes: its distance in the order of the blocks, and in the order of the grid."""
 POINTS_AT_ONCE = 65_536
 """Number of points per evaluation of the material, which bounds the memory."""
 
@@ -59,10 +71,13 @@ def extract_mesh(
         The mesh; faces are oriented outwards.
 
     Raises:
-        UserError: the field has no zero set within the sphere.
+        UserError: the field has no zero set within the sphere, or the grid does not fit in memory.
     """
     blocks = math.ceil(resolution / BLOCK)
-    step = 2.0 * radius / (blocks * BLOCK - 1)
+    edge = blocks * BLOCK
+    step = 2.0 * radius / (edge - 1)
+    remedy = "give a lower resolution, on the command line with --resolution"
+    check_memory(BYTES_PER_POINT * edge**3, f"the distances of a grid of {edge}³ points", remedy)
     volume = _sparse_grid(
         lambda x: torch.cat([sdf(part) for part in x.split(chunk)]), radius, blocks, step, device
     )
@@ -78,6 +93,19 @@ def extract_mesh(
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.remove_unreferenced_vertices()
     return mesh
+
+
+def check_resolution(resolution: int) -> None:
+    """Check the option --resolution of a command that extracts a mesh.
+
+    Raises:
+        UserError: it is out of range.
+    """
+    if not MIN_RESOLUTION <= resolution <= MAX_RESOLUTION:
+        raise UserError(
+            f"a surface cannot have a grid of {resolution} cells per side",
+            f"give {MIN_RESOLUTION} to {MAX_RESOLUTION} with --resolution",
+        )
 
 
 def has_surface(run: Run) -> bool:
@@ -126,14 +154,16 @@ def export_mesh(run: Run, path: Path, resolution: int = 256) -> trimesh.Trimesh:
     mesh = surface_mesh(run, resolution)
     device = next(run.model.parameters()).device
     position = torch.as_tensor(np.array(mesh.vertices), dtype=torch.float32, device=device)
+    columns = dict(zip(NORMAL, mesh.vertex_normals.astype(np.float32).T, strict=True))
     if run.has_material:
         material = materials_in_parts(run, position)
-        mesh.visual.vertex_colors = (tone_map(material.base_color) * 255.0).round().byte().cpu().numpy()
-        mesh.vertex_attributes["roughness"] = material.roughness[:, 0].cpu().numpy()
-        mesh.vertex_attributes["metallic"] = material.metallic[:, 0].cpu().numpy()
+        color = (tone_map(material.base_color) * 255.0).round().byte().cpu().numpy()
+        opaque = np.full(len(color), 255, dtype=np.uint8)
+        columns |= zip(("red", "green", "blue", "alpha"), (*color.T, opaque), strict=True)
+        columns["roughness"] = material.roughness[:, 0].cpu().numpy()
+        columns["metallic"] = material.metallic[:, 0].cpu().numpy()
     mesh.vertices = run.capture.normalisation.to_world(position.double()).cpu().numpy()
-    with replacing(path) as temporary:
-        temporary.write_bytes(mesh.export(file_type="ply", vertex_normal=True))
+    write_ply(path, np.array(mesh.vertices), columns, np.array(mesh.faces))
     return mesh
 
 

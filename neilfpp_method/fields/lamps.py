@@ -45,24 +45,24 @@ class LampRays:
 
 
 class Lamps(nn.Module):
-    """A set of spherical lamps of one radius, the first `lit` of which emit light.
+    """A set of spherical lamps of one radius, the first `count` of which emit light.
 
     A lamp with a zero axis is isotropic, like a bulb. A lamp with a unit axis has the intensity I cos θ at an
     angle θ from its axis, and none backwards, like a small window or a flat panel. Lamps are buffers, not
     parameters: they are solved for together with the environment map (`lighting`).
 
     Args:
-        most: maximum number of lamps.
+        capacity: maximum number of lamps.
         radius: radius of each lamp, scene units. It only affects the sharpness of reflections.
     """
 
-    def __init__(self, most: int, radius: float) -> None:
+    def __init__(self, capacity: int, radius: float) -> None:
         super().__init__()
         self.radius = radius
-        self.lit = 0
-        self.register_buffer("position", torch.zeros(most, 3))
-        self.register_buffer("axis", torch.zeros(most, 3))
-        self.register_buffer("intensity", torch.zeros(most, 3))
+        self.count = 0
+        self.register_buffer("position", torch.zeros(capacity, 3))
+        self.register_buffer("axis", torch.zeros(capacity, 3))
+        self.register_buffer("intensity", torch.zeros(capacity, 3))
 
     @torch.no_grad()
     def place(
@@ -71,27 +71,27 @@ class Lamps(nn.Module):
         intensity: Float[Tensor, "K 3"],
         axis: Float[Tensor, "K 3"] | None = None,
     ) -> None:
-        """Replace all lamps by these, or by the first `most` of them.
+        """Replace all lamps by these, or by the first `capacity` of them.
 
         Args:
             position: centers, scene frame.
             intensity: power per solid angle, on the axis if there is one.
             axis: unit axes, or zeros; if None, all lamps are isotropic.
         """
-        self.lit = min(len(position), len(self.position))
-        self.position.zero_()[: self.lit] = position[: self.lit]
+        self.count = min(len(position), len(self.position))
+        self.position.zero_()[: self.count] = position[: self.count]
         self.axis.zero_()
         if axis is not None:
-            self.axis[: self.lit] = axis[: self.lit]
-        self.intensity.zero_()[: self.lit] = intensity[: self.lit]
+            self.axis[: self.count] = axis[: self.count]
+        self.intensity.zero_()[: self.count] = intensity[: self.count]
 
     def rays_from(self, x: Float[Tensor, "N 3"]) -> LampRays:
         """Rays from points towards the center of each lit lamp."""
-        return rays_towards(x, self.position[: self.lit], self.axis[: self.lit], self.radius)
+        return rays_towards(x, self.position[: self.count], self.axis[: self.count], self.radius)
 
     def radiance(self) -> Float[Tensor, "K 3"]:
         """Radiance of the lit lamps on their axes: intensity over the area of the disc."""
-        return self.intensity[: self.lit] / (math.pi * self.radius**2)
+        return self.intensity[: self.count] / (math.pi * self.radius**2)
 
     def arriving(self, rays: LampRays) -> Float[Tensor, "N K 3"]:
         """Radiance along rays from the lit lamps, without occlusion."""
@@ -102,9 +102,9 @@ class Lamps(nn.Module):
     ) -> Float[Tensor, "N S 3"]:
         """Radiance of the lamps that directions hit closer than `before`; overlapping lamps add up."""
         total = torch.zeros_like(wi)
-        towards = self.position[: self.lit] - x[:, None]
+        towards = self.position[: self.count] - x[:, None]
         for offset, axis, radiance in zip(
-            towards.unbind(1), self.axis[: self.lit], self.radiance(), strict=True
+            towards.unbind(1), self.axis[: self.count], self.radiance(), strict=True
         ):
             along = dot(wi, offset)
             miss = offset.square().sum(-1)[:, None] - along.square()
@@ -114,11 +114,11 @@ class Lamps(nn.Module):
 
     def get_extra_state(self) -> dict[str, int]:
         """Number of lit lamps, for checkpoints."""
-        return {"lit": self.lit}
+        return {"count": self.count}
 
     def set_extra_state(self, state: dict[str, int]) -> None:
         """Restore what `get_extra_state` returned."""
-        self.lit = state["lit"]
+        self.count = state["count"]
 
 
 def rays_towards(

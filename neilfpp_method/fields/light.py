@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from neilfpp_method.fields.environment import EVEN_ROWS, EnvironmentLight
 from neilfpp_method.fields.incident_light import IncidentLightField
 from neilfpp_method.fields.lamps import Lamps
-from neilfpp_method.settings.types import FreeLightConfig, NeilfConfig
+from neilfpp_method.settings.types import FreeLightConfig, MapLightConfig, NeilfConfig
 from neilfpp_method.shading.sampling import Technique
 
 __all__ = ["Light", "LightModel", "make_light"]
@@ -49,6 +49,11 @@ class LightModel:
 
     light: nn.Module
     lamps: Lamps
+
+    def use(self, config: FreeLightConfig | MapLightConfig) -> None:
+        """Switch to other settings. Whether an environment map is even may change; its size must not."""
+        if isinstance(self.light, EnvironmentLight):
+            self.light.be_even(config.environment_height == 1)
 
 
 def make_light(config: NeilfConfig, response: str, initial_radiance: float) -> LightModel:

@@ -20,19 +20,19 @@ from neilfpp_method.structures import LossTerms, PixelBatch, RayBatch, SceneLigh
 
 __all__ = [
     "HasParameterGroups",
+    "HasRadiance",
     "HasSdf",
     "HasStages",
     "HasSurfaceWidth",
     "Host",
     "ImageHost",
-    "KnowsMisses",
-    "KnowsRadiance",
-    "LightsItself",
     "LimitsSurfaceWidth",
+    "PredictsMisses",
     "ReadsOutputs",
     "Regularised",
     "RegularisedHits",
     "SmoothsNormals",
+    "TracesLight",
 ]
 
 
@@ -80,7 +80,7 @@ class Regularised(Protocol):
 
 
 @runtime_checkable
-class LightsItself(Protocol):
+class TracesLight(Protocol):
     """A host that traces many rays cheaply. Without it hard inter-reflection renders every ray."""
 
     def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
@@ -89,16 +89,16 @@ class LightsItself(Protocol):
 
 
 @runtime_checkable
-class KnowsMisses(Protocol):
+class PredictsMisses(Protocol):
     """A host that can tell cheaply that rays miss the scene. Without it every ray of L_ref is rendered."""
 
-    def may_meet(self, rays: RayBatch) -> Bool[Tensor, " N"]:
+    def may_hit(self, rays: RayBatch) -> Bool[Tensor, " N"]:
         """Which rays, all of which start at a surface, may hit a surface; the others are not rendered."""
         ...
 
 
 @runtime_checkable
-class KnowsRadiance(Protocol):
+class HasRadiance(Protocol):
     """A host that can evaluate its radiance at surface points. Without it the proxy of a host that traces no
     rays returns the mean radiance of the training rays that hit there.
     """

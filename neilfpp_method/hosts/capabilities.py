@@ -5,11 +5,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from neilfpp_method.hosts import base
 
-__all__ = ["CAPABILITIES", "Capability", "markdown"]
+__all__ = ["CAPABILITIES", "Capability", "markdown", "missing_capabilities"]
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ CAPABILITIES = (
     ),
     Capability(
         "scene_light",
-        base.LightsItself,
+        base.TracesLight,
         "hard inter-reflection, shadow rays, the fit of environment map and lamps",
         "incident.scene",
         "a proxy traces hard inter-reflection",
@@ -60,7 +61,7 @@ CAPABILITIES = (
     ),
     Capability(
         "radiance",
-        base.KnowsRadiance,
+        base.HasRadiance,
         "the proxy",
         "hosts.foreign",
         "light between surfaces is the mean radiance that training rays saw there",
@@ -81,8 +82,8 @@ CAPABILITIES = (
         "the width of the surface depends only on the host's own training",
     ),
     Capability(
-        "may_meet",
-        base.KnowsMisses,
+        "may_hit",
+        base.PredictsMisses,
         "L_ref",
         "incident.traced",
         "every ray for L_ref is rendered",
@@ -118,6 +119,11 @@ CAPABILITIES = (
     ),
 )
 """All optional methods, the most useful first."""
+
+
+def missing_capabilities(host: object) -> Mapping[str, str]:
+    """The optional methods that most hosts could have and this one lacks, with the consequence of each."""
+    return {c.method: c.without for c in CAPABILITIES if c.reported and not hasattr(host, c.method)}
 
 
 def markdown() -> str:

@@ -18,7 +18,7 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.shading.color import apply_response
 from neilfpp_method.structures import PixelBatch, RayBatch, SurfaceHits
 
-__all__ = ["FirstBatches", "check_batch", "check_points", "check_rows"]
+__all__ = ["FirstBatches"]
 
 BATCHES = 10
 """Number of batches that are checked; each check synchronises with the device."""
@@ -26,23 +26,23 @@ UNIT = 1e-3
 """Largest difference of the length of a direction from 1."""
 OFF_RAY = 0.02
 """Largest distance of a hit from its ray, relative to its distance from the origin of the ray."""
-MAX_OFF = 0.5
+MAX_WRONG_SHARE = 0.5
 """Largest permitted share of hits that are off their rays or have normals that face away from the viewer.
 Blending over two surfaces causes a few such hits in a correct host.
 """
-REACH = 1.5
+MAX_MEDIAN_DISTANCE = 1.5
 """Median distance of hits from the origin above which the scene is too large, scene units. An object in the
 unit sphere may stand on a ground.
 """
-VIEWED_AGAIN = 256
+MAX_REVIEWED_HITS = 256
 """Maximum number of hits that are rendered from another viewpoint, once."""
-ASIDE = 0.6
+VIEWPOINT_TANGENT = 0.6
 """Tangent of the angle between the other viewpoint and the direction halfway between normal and viewer."""
-APART = 0.01
+MAX_DISTANCE = 0.01
 """Largest distance between the hits of one point from two viewpoints, scene units, as in `check_host`."""
-MOVED = 0.4
+MAX_DISTANT_SHARE = 0.4
 """Largest share of points that may be farther apart; some are occluded from the other viewpoint."""
-SIZES = 30.0
+MAX_MEDIAN_RATIO = 30.0
 """Factor between the median of the pixels and `median_radiance` above which one of them is probably wrong."""
 
 log = logging.getLogger(__name__)
@@ -153,7 +153,7 @@ class FirstBatches:
     def _check_median(self, color: Tensor) -> None:
         median = color.mean(-1).median().item()
         expected = apply_response(torch.tensor(self.facts.median_radiance), self.facts.response).item()
-        if median > 0 and not 1 / SIZES < median / expected < SIZES:
+        if median > 0 and not 1 / MAX_MEDIAN_RATIO < median / expected < MAX_MEDIAN_RATIO:
             self._warn(
                 "median",
                 f"the median of the pixels is {median:.3g}, but median_radiance means {expected:.3g}",
@@ -166,20 +166,20 @@ class FirstBatches:
         depth = (offset * directions).sum(-1)
         beside = (offset - depth[:, None] * directions).norm(dim=-1)
         off = ((beside > OFF_RAY * offset.norm(dim=-1)) | (depth <= 0)).float().mean().item()
-        if off > MAX_OFF:
+        if off > MAX_WRONG_SHARE:
             raise UserError(
                 f"{self.name}: {off:.0%} of its hits do not lie on their rays",
                 "return positions in the frame of the rays, origin + distance · direction, with unit "
                 "directions",
             )
         away = ((hits.normal[hit] * directions).sum(-1) > 0).float().mean().item()
-        if away > MAX_OFF:
+        if away > MAX_WRONG_SHARE:
             raise UserError(
                 f"{self.name}: {away:.0%} of its normals point away from the viewer",
                 "turn them outwards: normal = -normal",
             )
         reach = hits.position[hit].norm(dim=-1).median().item()
-        if reach > REACH:
+        if reach > MAX_MEDIAN_DISTANCE:
             self._warn(
                 "far",
                 f"half of its hits are {reach:.3g} or more from the origin",
@@ -199,19 +199,19 @@ class FirstBatches:
         The random state of the caller is not changed.
         """
         rows = torch.nonzero(hit)[:, 0]
-        rows = rows[:: math.ceil(len(rows) / VIEWED_AGAIN)]
+        rows = rows[:: math.ceil(len(rows) / MAX_REVIEWED_HITS)]
         position, back = hits.position[rows], -batch.directions[rows]
         distance = (position - batch.origins[rows]).norm(dim=-1, keepdim=True)
         tangent = normalize(torch.linalg.cross(hits.normal[rows], back.roll(1, dims=-1)), dim=-1)
-        way = normalize(hits.normal[rows] + back + ASIDE * tangent, dim=-1)
+        way = normalize(hits.normal[rows] + back + VIEWPOINT_TANGENT * tangent, dim=-1)
         with torch.random.fork_rng(devices=[position.device] if position.is_cuda else []):
             again = render(RayBatch(position + distance * way, -way))
-        same = again.is_hit(self.hit_share) & ((again.position - position).norm(dim=-1) < APART)
+        same = again.is_hit(self.hit_share) & ((again.position - position).norm(dim=-1) < MAX_DISTANCE)
         moved = 1.0 - same.float().mean().item()
-        if moved > MOVED:
+        if moved > MAX_DISTANT_SHARE:
             self._warn(
                 "moved",
-                f"{moved:.0%} of its hits are {APART} or more away when seen from another viewpoint",
+                f"{moved:.0%} of its hits are {MAX_DISTANCE} or more away when seen from another viewpoint",
                 "return distances along the unit ray, not z-depths; a host that is still being trained may "
                 "have no surface yet",
             )
@@ -220,57 +220,3 @@ class FirstBatches:
         if kind not in self._warned:
             self._warned.add(kind)
             log.warning("%s: %s; %s", self.name, problem, remedy)
-
-
-def check_batch(batch: PixelBatch) -> None:
-    """Check shapes and types of a batch; cheap enough for every step.
-
-    Raises:
-        UserError: a tensor has integers, or another shape than one row per pixel.
-    """
-    for name in ("origins", "directions", "color"):
-        check_rows(name, getattr(batch, name), len(batch), 3)
-    for name in ("mask", "mask_known", "image_gradient"):
-        check_rows(name, getattr(batch, name), len(batch))
-
-
-def check_rows(name: str, value: Tensor, count: int, width: int | None = None) -> None:
-    """Check that a tensor has one row of floating-point numbers per pixel.
-
-    Args:
-        name: name of the tensor in messages.
-        value: the tensor.
-        count: number of pixels.
-        width: numbers per pixel, in a second axis; None: one number per pixel without a second axis.
-
-    Raises:
-        UserError: it does not.
-    """
-    if not value.is_floating_point():
-        remedy = (
-            "divide 8-bit pixels by 255 and attach with response='srgb'" if name == "color" else "give floats"
-        )
-        raise UserError(f"{name} of the batch is {value.dtype}", remedy)
-    wanted = (count,) if width is None else (count, width)
-    if tuple(value.shape) != wanted:
-        pixels = math.prod(value.shape[:-1]) if width is not None and value.ndim > 2 else count
-        shape = (
-            f"({pixels}, {width}): one row per pixel, reshape(-1, {width})"
-            if width
-            else f"({pixels},): one number per pixel"
-        )
-        raise UserError(f"{name} of the batch has the shape {tuple(value.shape)}", f"give {shape}")
-
-
-def check_points(name: str, x: Tensor, axes: int = 2) -> None:
-    """Check that points are (N, 3), or with `axes` = 3 directions (N, S, 3), of floating-point numbers.
-
-    Raises:
-        UserError: they have another shape, or are integers.
-    """
-    wanted = "(N, 3)" if axes == 2 else "(N, S, 3)"
-    if x.ndim != axes or x.shape[-1] != 3:
-        flat = f"{name}.reshape(-1, 3)" if axes == 2 and x.shape[-1:] == (3,) else f"the shape {wanted}"
-        raise UserError(f"{name} has the shape {tuple(x.shape)}, not {wanted}", f"give {flat}")
-    if not x.is_floating_point():
-        raise UserError(f"{name} is {x.dtype}", "give floats")

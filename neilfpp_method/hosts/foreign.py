@@ -17,7 +17,8 @@ from torch import Tensor, nn
 from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.answers import as_hits, in_precision, no_hits
-from neilfpp_method.hosts.base import ImageHost, KnowsRadiance, LightsItself, RegularisedHits
+from neilfpp_method.hosts.base import HasRadiance, Host, ImageHost, RegularisedHits, TracesLight
+from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.image import rays_like
 from neilfpp_method.hosts.outputs import check_tensors, host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
@@ -25,10 +26,10 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import PixelBatch, RayBatch, SurfaceHits
 from neilfpp_method.volume.distance_grid import GRID_RESOLUTION
 
-__all__ = ["ForeignHost", "answers_secondary_rays", "proxy_for"]
+__all__ = ["ForeignHost", "adapt_host", "answers_secondary_rays", "proxy_for"]
 
 PASSED_ON = (
-    "may_meet",
+    "may_hit",
     "surface_width",
     "smooth_normals",
     "parameter_groups",
@@ -43,6 +44,30 @@ COARSE = (torch.float16, torch.bfloat16)
 log = logging.getLogger(__name__)
 
 
+def adapt_host(host: object, response: str) -> Host | ImageHost:
+    """Make a host of a host, an image host, a nerfstudio model, or a function of (origins, directions).
+
+    Args:
+        host: one of them.
+        response: meaning of pixel values, "linear" or "srgb", which a nerfstudio model also renders.
+
+    Raises:
+        UserError: it is none of them.
+    """
+    if isinstance(host, nn.Module) and hasattr(host, "get_outputs") and hasattr(host, "config"):
+        from neilfpp_method.hosts.nerfstudio import NerfstudioHost
+
+        return NerfstudioHost(host, response=response)
+    if isinstance(host, Host | ImageHost):
+        return host
+    if callable(host):
+        return CallableHost(host)
+    raise UserError(
+        f"{type(host).__name__} is not a host",
+        "give an object with render(rays) or render_image(camera), or a function of (origins, directions)",
+    )
+
+
 def answers_secondary_rays(host: object) -> bool:
     """Whether a host renders rays that start at a surface: not if it draws images, or declares otherwise."""
     return hasattr(host, "render") and bool(getattr(host, "answers_secondary_rays", True))
@@ -55,9 +80,9 @@ def proxy_for(host: object, config: NeilfConfig) -> SurfaceProxy | None:
     """
     settings = config.inter_reflection
     cannot_trace = settings.mode != "off" and not answers_secondary_rays(host)
-    if isinstance(host, LightsItself) or not (cannot_trace or settings.mode == "hard"):
+    if isinstance(host, TracesLight) or not (cannot_trace or settings.mode == "hard"):
         return None
-    radiance = host.radiance if isinstance(host, KnowsRadiance) else None
+    radiance = host.radiance if isinstance(host, HasRadiance) else None
     return SurfaceProxy(config.volume.radius, GRID_RESOLUTION, config.shading.hit_share, radiance)
 
 

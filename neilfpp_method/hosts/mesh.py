@@ -102,7 +102,7 @@ class MeshHost(nn.Module):
         radiance = self.radiance_field(met.position, wo, met.normal, met.position[:, :0])
         nothing, zeros = torch.zeros_like(rays.origins), torch.zeros_like(rays.origins[:, 0])
         return SurfaceHits(
-            color=self._beyond(rays, met.rows).to(radiance.dtype).index_put((met.rows,), radiance),
+            color=self._background(rays, met.rows).to(radiance.dtype).index_put((met.rows,), radiance),
             position=rays.origins.index_put((met.rows,), met.position),
             normal=nothing.index_put((met.rows,), met.normal),
             opacity=zeros.index_fill(0, met.rows, 1.0),
@@ -177,13 +177,13 @@ class MeshHost(nn.Module):
             self._tracers[device] = embree or tree_tracer(build_tree(self.triangles))
         return self._tracers[device]
 
-    def _beyond(self, rays: RayBatch, met: Int[Tensor, " K"]) -> Float[Tensor, "N 3"]:
+    def _background(self, rays: RayBatch, met: Int[Tensor, " K"]) -> Float[Tensor, "N 3"]:
         """Radiance of the background for rays that miss; rows of other rays are not meaningful."""
         if self.background is None:
             return self.background_color.expand(len(rays), 3)
         missed = torch.nonzero(torch.ones_like(rays.origins[:, 0]).index_fill(0, met, 0.0))[:, 0]
-        beyond = self.background(rays.origins[missed], rays.directions[missed])
-        return beyond.new_zeros(len(rays), 3).index_put((missed,), beyond)
+        radiance = self.background(rays.origins[missed], rays.directions[missed])
+        return radiance.new_zeros(len(rays), 3).index_put((missed,), radiance)
 
 
 def corner_normals(mesh: Mesh, outward: Float[Tensor, "F 3"]) -> Float[Tensor, "F 3 3"]:

@@ -219,7 +219,7 @@ class SurfaceProxy(nn.Module):
 
     @torch.no_grad()
     def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
-        """Light from the scene's surfaces (`hosts.base.LightsItself`); none before the first refresh.
+        """Light from the scene's surfaces (`hosts.base.TracesLight`); none before the first refresh.
 
         Rays start above the surface of the grid itself, so that its error casts no shadows.
         """

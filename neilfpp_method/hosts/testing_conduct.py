@@ -12,7 +12,7 @@ from neilfpp_method.structures import RayBatch, SurfaceHits
 
 __all__ = ["CONDUCT_CHECKS"]
 
-RESTLESS = 0.005
+MAX_CHANGE = 0.005
 """Largest permitted median change of positions between two calls, in scene units. The width of the soft layer
 is added to it.
 """
@@ -68,7 +68,7 @@ def _repeatable(case: Case) -> None:
         f"half of its positions change by {moved:.2g} or more between calls: "
         "reduce the noise, or use more samples"
     )
-    case.require(moved <= RESTLESS + case.width, broken)
+    case.require(moved <= MAX_CHANGE + case.width, broken)
 
 
 def _same_without_gradient(case: Case) -> None:

@@ -18,7 +18,7 @@ from neilfpp_method.hosts.smooth_normals import smooth_normals
 from neilfpp_method.settings.types import NeilfConfig, VolumeConfig
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayBatch, SceneLight, SurfaceHits
-from neilfpp_method.timing.ledger import doing
+from neilfpp_method.timing.ledger import timed
 from neilfpp_method.volume.compositing import Weights, composite, depth_weights, sample_weights, share_near
 from neilfpp_method.volume.density import LaplaceDensity, laplace_depth
 from neilfpp_method.volume.distance_grid import GRID_RESOLUTION, cell_size, sample_grid, trace_grid
@@ -195,12 +195,12 @@ class VolSdfHost(nn.Module):
         return smooth_normals(lambda x: self._surface(x).gradient, position, normal, radius)
 
     @torch.no_grad()
-    def may_meet(self, rays: RayBatch) -> Bool[Tensor, " N"]:
+    def may_hit(self, rays: RayBatch) -> Bool[Tensor, " N"]:
         """Which rays that start at a surface may hit one, by the grid of empty space; all without a grid."""
         if self.empty_space is None:
             return torch.ones(len(rays), dtype=torch.bool, device=rays.origins.device)
         interval = sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
-        return self.empty_space.may_meet(self.sdf, rays, interval, self.surface_width())
+        return self.empty_space.may_hit(self.sdf, rays, interval, self.surface_width())
 
     def get_extra_state(self) -> dict[str, int | None]:
         """The age of the distance grid, for checkpoints."""
@@ -252,7 +252,7 @@ class VolSdfHost(nn.Module):
         span = self._eval_space[1].may_show(self.sdf, rays, interval, self.surface_width())
         zeros = torch.zeros_like(interval.far)
         missed = SurfaceHits(
-            color=self._beyond(rays, torch.ones_like(zeros), at_far=torch.zeros_like(rays.origins)),
+            color=self._background(rays, torch.ones_like(zeros), at_far=torch.zeros_like(rays.origins)),
             position=rays.origins + interval.far[:, None] * rays.directions,
             normal=torch.zeros_like(rays.origins),
             opacity=zeros,
@@ -311,14 +311,15 @@ class VolSdfHost(nn.Module):
         depth = (weights * distances).sum(-1) + SPARE_WEIGHT * distances[:, -1]
         depth = depth / (opacity + SPARE_WEIGHT)
         return SurfaceHits(
-            color=composite(weights, radiance) + self._beyond(rays, intervals.transmittance, radiance[:, -1]),
+            color=composite(weights, radiance)
+            + self._background(rays, intervals.transmittance, radiance[:, -1]),
             position=rays.origins + depth[:, None] * rays.directions,
             normal=safe_normalize(composite(weights, normals)),
             opacity=opacity,
             concentration=share_near(distances, intervals.weights.detach(), depth.detach(), HIT_RADIUS),
         )
 
-    def _beyond(
+    def _background(
         self, rays: RayBatch, transmittance: Float[Tensor, " N"], at_far: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
         """Radiance from beyond the samples: that of the background, or without one R on the scene sphere.
@@ -334,7 +335,7 @@ class VolSdfHost(nn.Module):
 
     # ------------------------------------------------------------------------------------------- regularisers
 
-    @doing("regularisers")
+    @timed("regularisers")
     def _regularisers(self, march: March, batch: PixelBatch, names: Collection[str]) -> dict[str, LossTerm]:
         terms = {}
         places = self._places(march) if {"eikonal", "surface", "hessian"} & set(names) else None

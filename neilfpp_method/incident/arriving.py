@@ -47,7 +47,7 @@ def arriving(sources: Sources, x: Float[Tensor, "N 3"], drawn: IncidentSamples) 
         S incident directions per point, and one more for each lit lamp. Gradients reach the light.
     """
     incident = _from_light(sources, x, drawn)
-    return incident.beside(_from_lamps(sources, x)) if sources.lamps.lit else incident
+    return incident.concatenate(_from_lamps(sources, x)) if sources.lamps.count else incident
 
 
 def incident_radiance(
@@ -59,7 +59,7 @@ def incident_radiance(
     else:
         scene = sources.scene(x, wi)
         radiance, nearest = _behind_scene(scene, sources.light, x, wi), scene.distance
-    return radiance + sources.lamps.met(x, wi, nearest) if sources.lamps.lit else radiance
+    return radiance + sources.lamps.met(x, wi, nearest) if sources.lamps.count else radiance
 
 
 def _from_light(sources: Sources, x: Float[Tensor, "N 3"], drawn: IncidentSamples) -> Incident:
@@ -76,7 +76,7 @@ def _from_lamps(sources: Sources, x: Float[Tensor, "N 3"]) -> Incident:
     if sources.scene is not None:
         visibility = sources.scene(x, rays.wi).distance >= rays.distance
         radiance = radiance * visibility[..., None]
-    number = Source.LAMPS + torch.arange(sources.lamps.lit, device=x.device)
+    number = Source.LAMPS + torch.arange(sources.lamps.count, device=x.device)
     return Incident(rays.wi, radiance, rays.solid_angle, number.expand(rays.distance.shape))
 
 

@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.hosts.base import HasSurfaceWidth, Host, LightsItself
+from neilfpp_method.hosts.base import HasSurfaceWidth, Host, TracesLight
 from neilfpp_method.settings.types import InterReflectionConfig
 from neilfpp_method.structures import RayBatch, SceneLight, SceneTracer
-from neilfpp_method.timing.ledger import doing
+from neilfpp_method.timing.ledger import timed
 
 __all__ = ["off_surface", "scene_light", "scene_tracer"]
 
@@ -31,7 +31,7 @@ def scene_tracer(host: Host, config: InterReflectionConfig, hit_share: float) ->
     return lambda x, wi: scene_light(host, x, wi, config, hit_share)
 
 
-@doing("tracing")
+@timed("tracing")
 @torch.no_grad()
 def scene_light(
     host: Host,
@@ -42,7 +42,7 @@ def scene_light(
 ) -> SceneLight:
     """Light from the scene's surfaces at surface points, without gradient.
 
-    It uses the host's own tracing (`LightsItself`) if there is one; otherwise it renders all N·S rays.
+    It uses the host's own tracing (`TracesLight`) if there is one; otherwise it renders all N·S rays.
 
     Args:
         host: geometry and outgoing radiance.
@@ -52,7 +52,7 @@ def scene_light(
         hit_share: smallest concentration of the rendering weight that counts as a hit.
     """
     x = x.detach()
-    if isinstance(host, LightsItself):
+    if isinstance(host, TracesLight):
         return host.scene_light(x, wi)
     start = (x[:, None] + config.offset * wi).reshape(-1, 3)
     radiance, distance = [], []

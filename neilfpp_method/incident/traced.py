@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from neilfpp_method.hosts.base import Host, KnowsMisses
+from neilfpp_method.hosts.base import Host, PredictsMisses
 from neilfpp_method.incident.scene import off_surface
 from neilfpp_method.losses import scale_gradient
 from neilfpp_method.settings.types import InterReflectionConfig
@@ -69,8 +69,8 @@ def trace_light(
     wi = _cone_directions(normal, math.cos(math.radians(MAX_ANGLE_DEG)))
     start = off_surface(host, position, normal, wi, config.offset)
     worth = (start - position).norm(dim=-1) <= MAX_START
-    if isinstance(host, KnowsMisses):
-        worth &= host.may_meet(RayBatch(start, wi))
+    if isinstance(host, PredictsMisses):
+        worth &= host.may_hit(RayBatch(start, wi))
     rows = torch.nonzero(worth)[:, 0]
     position, start, wi = position[rows], start[rows], wi[rows]
     with torch.set_grad_enabled(torch.is_grad_enabled() and config.radiance_gradient > 0.0):

@@ -54,7 +54,7 @@ DISPLAY_LEVELS = 256
 """Number of levels of 8-bit images. Linear images with so few levels were converted from 8-bit images."""
 PIXELS_PER_LEVEL = 16
 """Smallest number of pixels per level with which the number of levels is meaningful."""
-BETTER_WITHOUT: Mapping[str, str] = {
+REMOVABLE: Mapping[str, str] = {
     "black": "black",
     "blurred": "blurred",
     "duplicate": "the same picture as another",
@@ -159,9 +159,9 @@ def views_to_leave_out(inspection: Inspection) -> Mapping[str, str]:
         {'IMG_0017': 'blurred'}
     """
     proposed = {
-        name: BETTER_WITHOUT[finding.kind]
+        name: REMOVABLE[finding.kind]
         for finding in inspection.findings
-        if finding.kind in BETTER_WITHOUT
+        if finding.kind in REMOVABLE
         for name in finding.views
     }
     return proposed if len(inspection.views) - len(proposed) >= MIN_COUNT else {}

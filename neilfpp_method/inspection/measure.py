@@ -94,23 +94,23 @@ def measure(view: View, hdr: bool) -> ViewFigures:
         return ViewFigures(view.name, unreadable=error.problem)
     sound = (np.isfinite(color) & (color >= 0)).all(axis=-1)
     usable = sound & valid
-    shown = usable & (_off_the_background(color, usable) if mask is False else mask)
+    chosen = usable & (_off_the_background(color, usable) if mask is False else mask)
     color = np.where(sound[..., None], color, np.float32(0.0))
     linear = color if hdr else srgb_to_linear(torch.from_numpy(color)).numpy()
     light = luminance(torch.from_numpy(linear)).numpy()
-    lit = light[shown & (light > DARK * light[shown].mean())] if shown.any() else light[shown]
-    low, high = np.percentile(lit, [1, 99.9]) if lit.size else (1.0, 1.0)
-    typical = float(np.exp(np.log(lit).mean(dtype=np.float64))) if lit.size else 0.0
+    bright = light[chosen & (light > DARK * light[chosen].mean())] if chosen.any() else light[chosen]
+    low, high = np.percentile(bright, [1, 99.9]) if bright.size else (1.0, 1.0)
+    typical = float(np.exp(np.log(bright).mean(dtype=np.float64))) if bright.size else 0.0
     return ViewFigures(
         name=view.name,
         luminance=typical,
         stops=float(np.log2(high / low)),
-        sharpness=_sharpness(light, shown, typical),
-        clipped=_clipped(image, color, shown),
+        sharpness=_sharpness(light, chosen, typical),
+        clipped=_clipped(image, color, chosen),
         invalid=float(1.0 - valid.mean()),
         broken=float((valid & ~sound).mean()),
-        pixels=int(shown.sum()),
-        levels=_levels(color[shown]),
+        pixels=int(chosen.sum()),
+        levels=_levels(color[chosen]),
         small=_fitted(linear, THUMBNAIL_SIDE),
     )
 
@@ -139,23 +139,26 @@ def _off_the_background(
     return ~(color == common).all(axis=-1) if even else np.ones(usable.shape, bool)
 
 
-def _sharpness(light: Float32[np.ndarray, "H W"], shown: Bool[np.ndarray, "H W"], typical: float) -> float:
+def _sharpness(light: Float32[np.ndarray, "H W"], chosen: Bool[np.ndarray, "H W"], typical: float) -> float:
     if typical <= 0:
         return 0.0
     grey = linear_to_srgb(torch.from_numpy(light * np.float32(MIDDLE_GREY / typical)).clamp(0, 1)).numpy()
-    grey, on_object = _fitted(grey, SHARPNESS_SIDE), _fitted(shown.astype(np.float32), SHARPNESS_SIDE) > 0.5
+    grey, on_object = (
+        _fitted(grey, SHARPNESS_SIDE),
+        _fitted(chosen.astype(np.float32), SHARPNESS_SIDE) > 0.5,
+    )
     if not on_object.any():
         return 0.0
     spread = float(grey[on_object].var())
     return float(cv2.Laplacian(grey, cv2.CV_32F)[on_object].var()) / spread if spread > 0 else 0.0
 
 
-def _clipped(image: ImageFile, color: Float32[np.ndarray, "H W 3"], shown: Bool[np.ndarray, "H W"]) -> float:
-    pixels = color[shown]
+def _clipped(image: ImageFile, color: Float32[np.ndarray, "H W 3"], chosen: Bool[np.ndarray, "H W"]) -> float:
+    pixels = color[chosen]
     if not len(pixels):
         return 0.0
     if not image.hdr:
-        return float((image.pixels[shown] >= FULL).any(axis=-1).mean())
+        return float((image.pixels[chosen] >= FULL).any(axis=-1).mean())
     # Clipping of a sensor gives many pixels the same level; without it, few pixels share the maximum.
     top = pixels >= pixels.max(axis=0) * (1 - PLATEAU_WIDTH)
     piled = (top.sum(axis=0) >= MIN_CLIPPED) & (pixels.max(axis=0) > pixels.min(axis=0))

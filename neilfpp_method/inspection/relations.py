@@ -54,9 +54,9 @@ def camera_placement(capture: Capture) -> CameraPlacement:
     centres = np.stack([camera.c2w[:, 3] for camera in cameras])
     away = []
     for camera in cameras:
-        seen = project(camera, torch.zeros(1, 3, dtype=torch.float64))
-        inside = (seen.pixel >= 0) & (seen.pixel < torch.tensor([camera.width, camera.height]))
-        away.append(not (bool(inside.all()) and float(seen.depth) > 0))
+        projected = project(camera, torch.zeros(1, 3, dtype=torch.float64))
+        inside = (projected.pixel >= 0) & (projected.pixel < torch.tensor([camera.width, camera.height]))
+        away.append(not (bool(inside.all()) and float(projected.depth) > 0))
     distance = np.linalg.norm(centres, axis=1, keepdims=True)
     directions = centres / distance.clip(1e-9)
     cosines = directions @ directions.T
@@ -95,10 +95,10 @@ def exposure_factors(luminances: Sequence[float], placement: CameraPlacement) ->
     light = np.array(luminances)
     scale = max(float(np.median(np.linalg.norm(placement.centres, axis=1))), 1e-9)
     pose = np.concatenate([placement.centres / scale, placement.axes], axis=1)
-    lit = light > 0
+    nonzero = light > 0
     factors = np.ones(len(light))
-    for i in np.flatnonzero(lit):
-        others = np.flatnonzero(lit & (np.arange(len(light)) != i))
+    for i in np.flatnonzero(nonzero):
+        others = np.flatnonzero(nonzero & (np.arange(len(light)) != i))
         if len(others):
             nearest = others[np.argsort(np.linalg.norm(pose[others] - pose[i], axis=1))[:NEIGHBOURS]]
             factors[i] = light[i] / np.median(light[nearest])

@@ -17,7 +17,7 @@ TRIM_THRESHOLD, MMAP_THRESHOLD, MMAP_MAX = -1, -3, -4
 """Numbers of the options of glibc's allocator (malloc.h)."""
 OWN_TRIM, OWN_MMAP, OWN_MAPS = 64 << 20, 32 << 20, 65_536
 """Values that glibc itself chooses for these options in a process with large arrays."""
-NEVER = 2**31 - 1
+NEVER_TRIM = 2**31 - 1
 """Trim threshold at which memory is never returned to the system."""
 
 
@@ -47,6 +47,6 @@ def _set(fast: bool) -> None:
         return
     mallopt(MMAP_THRESHOLD, OWN_MMAP)
     mallopt(MMAP_MAX, 0 if fast else OWN_MAPS)
-    mallopt(TRIM_THRESHOLD, NEVER if fast else OWN_TRIM)
+    mallopt(TRIM_THRESHOLD, NEVER_TRIM if fast else OWN_TRIM)
     if not fast:
         malloc_trim(0)

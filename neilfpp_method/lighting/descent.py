@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.lighting.objective import Objective, Target, nearest_points, unevenness
+from neilfpp_method.lighting.objective import EVENNESS, Objective, Target, nearest_points, unevenness
 
 __all__ = ["Unknown", "descend"]
 
@@ -42,7 +42,7 @@ def descend(
 ) -> Float[Tensor, ""]:
     """Minimise a loss over the unknowns and over factors ("gains") on the base colour of the points.
 
-    Every point has a gain per channel; if the weight of evenness is 0, all points share it. The mean
+    Every point has a gain per channel; if the base colours are known, all points share it. The mean
     logarithm of the gains is `objective.log_scale`, because the pixels of the points hardly determine
     the common scale of light and base colour. If the cameras have seen part of the light directly, that fixes
     the scale, and the mean is free.
@@ -52,15 +52,15 @@ def descend(
         gain_rate: learning rate of the logarithms of the gains.
         steps: number of Adam steps.
         target: the surface points; their base colour and positions define the evenness prior.
-        objective: its `config.evenness` is the weight of that prior.
+        objective: says whether base colours are known, and which scale of them is kept.
         loss_of: the other terms of the loss, as a function of the gains.
 
     Returns:
         The loss before the last step.
     """
-    weight, base_color = objective.config.evenness, target.material.base_color
-    log_gain = torch.zeros_like(base_color if weight > 0 else base_color[:1], requires_grad=True)
-    nearest = nearest_points(target.position) if weight > 0 else None
+    known, base_color = objective.base_color_known, target.material.base_color
+    log_gain = torch.zeros_like(base_color[:1] if known else base_color, requires_grad=True)
+    nearest = None if known else nearest_points(target.position)
     groups = [{"params": [u.value], "lr": u.rate} for u in (*unknowns, Unknown(log_gain, gain_rate))]
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL_RATE_SHARE ** (1 / steps))
@@ -71,7 +71,7 @@ def descend(
             ).exp()
             loss = loss_of(gain)
             if nearest is not None:
-                loss = loss + weight * unevenness(base_color * gain, nearest)
+                loss = loss + EVENNESS * unevenness(base_color * gain, nearest)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()

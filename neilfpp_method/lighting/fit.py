@@ -118,14 +118,14 @@ def fit_light(start: Light, transport: Transport, target: Target, objective: Obj
         start: initial value.
         transport: from the texels of the map, row by row, followed by the lamps.
         target: the points and their pixels.
-        objective: the terms and their weights; its settings also hold the number of steps.
+        objective: the terms, and the number of steps.
 
     Returns:
         The fitted light; `start` if there are no points or the result is not finite.
     """
     if not len(target.pixel):
         return start
-    config, unit = objective.config, objective.unit
+    unit = objective.unit
     texels = start.log_radiance[0].numel()
     channels = start.log_radiance.clone()
     log_radiance = channels.mean(0, keepdim=True) if objective.monochrome else channels
@@ -155,7 +155,7 @@ def fit_light(start: Light, transport: Transport, target: Target, objective: Obj
         return loss + objective.lamp_prior(unit * root.square().mean(-1), mean_transport @ strength)
 
     unknowns = (Unknown(log_radiance, RATE), Unknown(root, ROOT_RATE * RATE))
-    descend(unknowns, GAIN_RATE * RATE, config.steps, target, objective, loss_of)
+    descend(unknowns, GAIN_RATE * RATE, objective.steps, target, objective, loss_of)
     fitted = light()
     fitted = Light(fitted.log_radiance.detach(), fitted.intensity.detach())
     finite = fitted.log_radiance.isfinite().all() and fitted.intensity.isfinite().all()

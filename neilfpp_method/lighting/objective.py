@@ -17,12 +17,12 @@ from torch.nn import functional
 
 from neilfpp_method.lighting.sky import KnownSky
 from neilfpp_method.lighting.transport import Transport
-from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.shading.color import residual, response_slope
 from neilfpp_method.structures import Indexable, Material
 
 __all__ = [
     "DARK_FLOOR",
+    "EVENNESS",
     "FLOOR",
     "Objective",
     "Target",
@@ -41,6 +41,10 @@ OUTLIER = 0.1
 """Relative error at which the loss changes from quadratic to linear. There are points that no light explains,
 for example if the geometry is wrong there.
 """
+SMOOTHNESS = 0.02
+"""Weight of the total variation of the map's log radiance per texel, relative to the data term."""
+EVENNESS = 0.3
+"""Weight of the mean difference of log base colour between neighbouring points, relative to the data term."""
 SKY = 1.0
 """Weight, relative to the data term, of the deviation of the map's log radiance from what cameras saw of it
 directly. The weight is high because this observation is reliable and fixes the common scale of light and
@@ -90,7 +94,9 @@ class Objective:
         response: response of the capture, "linear" or "srgb".
         unit: change of a typical pixel per unit of log radiance (`response_slope`); for a linear response
             this is the pixel value itself. The denominator of relative errors depends on it.
-        config: weights of the terms.
+        steps: optimisation steps of `fit.fit_light`.
+        base_color_known: whether the base colours are correct up to one factor per channel. If False, a fit
+            also estimates the base colour of each point.
         sky: what cameras saw of the map directly; None if they saw nothing of it.
         monochrome: whether the map has one channel for all three colours.
         log_scale: mean logarithm of the factors that a fit applies to the base colours; 0 keeps their scale.
@@ -98,7 +104,8 @@ class Objective:
 
     response: str
     unit: float
-    config: LightFitConfig
+    steps: int
+    base_color_known: bool = False
     sky: KnownSky | None = None
     monochrome: bool = False
     log_scale: float = 0.0
@@ -138,7 +145,7 @@ class Objective:
 
     def map_prior(self, log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, ""]:
         """Priors on the map: smoothness, and agreement with what cameras saw of it directly."""
-        uneven = self.config.smoothness * total_variation(log_radiance)
+        uneven = SMOOTHNESS * total_variation(log_radiance)
         if self.sky is None or not log_radiance.numel():
             return uneven
         return uneven + SKY * self.sky.misfit(log_radiance)

@@ -39,7 +39,7 @@ class Replay(nn.Module):
         """Share of the rays of the next step that must be rendered."""
         return self.fresh if self.ring.full else 1.0
 
-    def beside_earlier(self, surface: SurfacePixels) -> SurfacePixels:
+    def with_earlier(self, surface: SurfacePixels) -> SurfacePixels:
         """The points of a step together with stored points of earlier steps, without gradients.
 
         The new points make up `share` of the result, and are stored in turn. If `fresh` is 1, the result is

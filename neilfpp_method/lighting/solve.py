@@ -94,7 +94,7 @@ def solve_light(
     from_candidates = from_lamps(places, lamps.radius, observed, material.roughness, lobe, scene)
     from_both = from_map.concatenate(from_candidates)
     intensity = no_lamps.new_zeros(len(places.position), 3)
-    intensity[: lamps.lit] = lamps.intensity[: lamps.lit]
+    intensity[: lamps.count] = lamps.intensity[: lamps.count]
     start = Light(unknown, intensity)
     if config.kind != "auto":
         found, measured = fit_light(start, from_both, target, objective), None
@@ -110,7 +110,7 @@ def solve_light(
             transports = (from_map[held_back], from_both[held_back])
             gains.append(compare((plain, found), transports, target[held_back], objective))
         measured = evidence(torch.cat(gains))
-        if not measured.favours(chosen=lamps_if_undecided or lamps.lit > 0):
+        if not measured.favours(chosen=lamps_if_undecided or lamps.count > 0):
             unknown.copy_(plain.log_radiance)
             lamps.place(no_lamps, no_lamps)
             return measured

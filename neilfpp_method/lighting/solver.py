@@ -171,11 +171,11 @@ class MapSolver(nn.Module):
 
     def observe(self, step: StepResult) -> None:
         """See `LightSolver.observe`."""
-        if not len(step.surface_rows) and not len(step.beyond_rows):
+        if not len(step.surface_rows) and not len(step.background_rows):
             return
         self.memory.remember(step.surface)
         if self.sky is not None:
-            self.sky.remember(*step.beyond_rows.split(3, -1))
+            self.sky.remember(*step.background_rows.split(3, -1))
 
     @property
     def seeks_start(self) -> bool:
@@ -197,13 +197,13 @@ class MapSolver(nn.Module):
         coarse = environment.at_most(START_ROWS) if self.sky is None else environment
         trial, rows = LightModel(copy.deepcopy(coarse), lamps), slice(self.config.fit.points)
         measured = self._solve(trial, observed[rows], material[rows], scene, first=True, at_start=True)
-        if lamps.lit and measured is not None:
+        if lamps.count and measured is not None:
             in_views = judge(lamps, self.lobe, scene)
             if in_views.gain < -in_views.deviation:
                 none = lamps.position[:0]
                 lamps.place(none, none)
                 measured = in_views
-        if lamps.lit:
+        if lamps.count:
             environment.resample(trial.light.log_radiance)
         return measured
 
@@ -239,7 +239,12 @@ class MapSolver(nn.Module):
         # If cameras saw the light directly, their pixels fix the scale.
         log_scale = self._log_scale(material) if sky is None else 0.0
         objective = Objective(
-            self.response, self.unit, self.config.fit, sky, self.config.monochrome, log_scale
+            self.response,
+            self.unit,
+            self.config.fit.steps,
+            sky=sky,
+            monochrome=self.config.monochrome,
+            log_scale=log_scale,
         )
         measured = solve_light(
             light,

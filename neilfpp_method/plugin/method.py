@@ -7,6 +7,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
+from neilfpp_method.model import EVAL_RAYS
 from neilfpp_method.plugin.datamanager import CaptureDataManagerConfig
 from neilfpp_method.plugin.dataparser import CaptureParserConfig
 from neilfpp_method.plugin.model import FieldAdamConfig, NeilfMethodConfig
@@ -31,14 +32,14 @@ def trainer(name: str, settings: NeilfConfig) -> TrainerConfig:
                 train_num_rays_per_batch=loop.rays,
                 eval_num_rays_per_batch=loop.rays,
             ),
-            model=NeilfMethodConfig(neilf=settings, eval_num_rays_per_chunk=loop.eval_chunk),
+            model=NeilfMethodConfig(neilf=settings, eval_num_rays_per_chunk=EVAL_RAYS),
         ),
         # Learning rates come from `pipeline.model.neilf.optimizer` and are set in each step.
         optimizers={
             field: {"optimizer": FieldAdamConfig(name=field), "scheduler": None}
             for field in sorted(GEOMETRY | MATERIAL)
         },
-        viewer=ViewerConfig(num_rays_per_chunk=loop.eval_chunk),
+        viewer=ViewerConfig(num_rays_per_chunk=EVAL_RAYS),
         vis="viewer",
     )
 

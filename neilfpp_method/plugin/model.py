@@ -287,7 +287,7 @@ class NeilfMethod(Model):
             return {}
         return {
             "lamp_gain": torch.tensor(self.evidence.gain),
-            "lamps": torch.tensor(float(self.neilf.lamps.lit)),
+            "lamps": torch.tensor(float(self.neilf.lamps.count)),
         }
 
     # ------------------------------------------------------------------------------------------------ outputs

@@ -87,8 +87,8 @@ def _bright_level(photo: Photo) -> float | None:
     except UserError:
         # `write_copies` reports this image.
         return None
-    lit = values[values > 0]
-    return float(np.percentile(lit, BRIGHT_PERCENTILE)) if len(lit) else None
+    positive = values[values > 0]
+    return float(np.percentile(positive, BRIGHT_PERCENTILE)) if len(positive) else None
 
 
 def _tone_mapped(radiance: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:

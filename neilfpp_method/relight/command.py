@@ -23,6 +23,7 @@ import numpy as np
 import torch
 
 from neilfpp_method.errors import UserError
+from neilfpp_method.export.mesh import check_resolution
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.relight.cameras import Shot, chosen_views, rays_through, turntable, view_shots
 from neilfpp_method.relight.comparison import compare, find_truth, read_truth
@@ -145,11 +146,11 @@ def _check(request: Request) -> None:
         "--scale": request.scale,
         "--width": request.width,
         "--bounces": request.bounces,
-        "--resolution": request.resolution,
     }
     for option, value in positive.items():
         if value is not None and not (0 < value < float("inf")):
             raise UserError(f"{option} is {value}", "give a positive number")
+    check_resolution(request.resolution)
     if request.bounces > MAX_BOUNCES:
         raise UserError(
             f"--bounces is {request.bounces}",

@@ -125,11 +125,11 @@ class Lamplight:
 
 def lamps_of_run(lamps: Lamps | None) -> Lamplight | None:
     """The lit lamps of a run; None if there are none, or none emits light."""
-    if lamps is None or not lamps.lit or not lamps.radiance().any():
+    if lamps is None or not lamps.count or not lamps.radiance().any():
         return None
-    lit = slice(lamps.lit)
+    used = slice(lamps.count)
     return Lamplight(
-        lamps.position[lit].clone(), lamps.axis[lit].clone(), lamps.radiance().clone(), lamps.radius
+        lamps.position[used].clone(), lamps.axis[used].clone(), lamps.radiance().clone(), lamps.radius
     )
 
 

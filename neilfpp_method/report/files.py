@@ -63,6 +63,11 @@ class Files:
     machine: Mapping[str, Any]
     notes: list[str]
 
+    @property
+    def has_results(self) -> bool:
+        """Whether any file has a result: a finding, a figure or a time, not only settings and effects."""
+        return any((self.findings, self.measured, self.timing, self.work, self.checks))
+
 
 def read_files(path: Path) -> Files:
     """Read the files of a run. A damaged file is skipped and noted, unless it holds the settings.

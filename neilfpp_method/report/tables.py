@@ -30,7 +30,7 @@ STAGE_TITLES = {
     "joint": "Joint",
 }
 
-READING = {
+EXPLANATIONS = {
     "Truth, estimate, error.": (
         "In images of the error, dark means small. If the capture has no truth for a map, the photograph is "
         "shown instead."
@@ -223,7 +223,9 @@ def settings_section(preset: str, changed: Sequence[Changed] | None) -> Html:
 
 def reading_section() -> Html:
     """Build the section that explains how to interpret the report."""
-    return element("ul", *(element("li", element("b", head), f" {text}") for head, text in READING.items()))
+    return element(
+        "ul", *(element("li", element("b", head), f" {text}") for head, text in EXPLANATIONS.items())
+    )
 
 
 def facts_section(facts: Mapping[str, str]) -> Html:

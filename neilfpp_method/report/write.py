@@ -30,6 +30,8 @@ RENDERING = 0.85
 """Fraction of the progress that rendering the views takes."""
 MAX_VIEWS = 64
 """Largest number of views; more would make a page that browsers open slowly."""
+BEFORE_CHECKPOINT = "Training was stopped before its first checkpoint"
+"""The reason why a report has no images."""
 MIN_SIZE, MAX_SIZE = 16, 2048
 """Smallest and largest longest side of a view, pixels."""
 
@@ -65,6 +67,7 @@ def write_report(
     options: ReportOptions = ReportOptions(),
     device: str = "cpu",
     on_progress: Callable[[float], None] = lambda share: None,
+    say: Callable[[str], None] = lambda text: None,
 ) -> Path:
     """Write the report of a run atomically.
 
@@ -75,21 +78,26 @@ def write_report(
         options: what the report contains.
         device: device on which views are rendered.
         on_progress: called with the fraction of the work that is done.
+        say: receives one line if the report has no images.
 
     Returns:
         `out`.
 
     Raises:
-        UserError: there is no run, its capture was moved, an option is out of range, or the file cannot be
-            written.
+        UserError: there is no run, or nothing is known of it except its settings; its capture was moved, an
+            option is out of range, or the file cannot be written.
     """
     options.check()
     files = read_files(path)
     run = load_run(path, device) if (path / "checkpoints" / "last.pt").is_file() else None
+    if run is None and not files.has_results:
+        raise UserError(f"{path}: nothing to report. {BEFORE_CHECKPOINT}", _how_to_continue(path))
     text = _without_model(files) if run is None else _with_model(run, files, options, on_progress)
     with replacing(out) as temporary:
         temporary.write_text(text, encoding="utf-8")
     on_progress(1.0)
+    if run is None:
+        say(f"the report has no views, surface and light. {BEFORE_CHECKPOINT}. {_how_to_continue(path)}")
     return out
 
 
@@ -136,7 +144,7 @@ def _with_model(run: Run, files: Files, options: ReportOptions, on_progress: Cal
 
 
 def _without_model(files: Files) -> str:
-    note = f"Training was stopped before its first checkpoint. {_how_to_continue(files.path)}"
+    note = f"{BEFORE_CHECKPOINT}. {_how_to_continue(files.path)}"
     sections = [
         ("health", "Health", tables.health_section(files.findings, [note, *files.notes])),
         *_from_files(files),

@@ -124,7 +124,7 @@ FAST: Mapping[str, Any] = {
     "light": {
         "kind": "auto",
         "environment_height": 48,
-        "fit": {"smoothness": 0.02, "every": 150},
+        "fit": {"every": 150},
     },
     "background.layers": 2,
     "background.width": 64,

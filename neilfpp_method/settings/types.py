@@ -98,9 +98,7 @@ class BrdfConfig:
 
 @dataclass(frozen=True)
 class LightFitConfig:
-    """The fit of environment map and lamps to stored surface points (`lighting`). Its weights are relative to
-    that of the data term, the relative error of the pixels.
-    """
+    """The fit of environment map and lamps to stored surface points (`lighting`)."""
 
     points: int = 1024
     """Surface points that the light is fitted to. Memory and time grow with points times texels."""
@@ -108,12 +106,6 @@ class LightFitConfig:
     """Training steps between two fits."""
     steps: int = 100
     """Optimization steps of a fit."""
-    smoothness: float = 0.03
-    """Weight of the total variation of log radiance per texel."""
-    evenness: float = 0.3
-    """Weight of the mean difference of log base color between neighboring points; a fit also estimates the
-    base color of each point. With 0 it only estimates a factor per channel on the base color of B.
-    """
 
 
 @dataclass(frozen=True)
@@ -367,8 +359,6 @@ class TrainConfig:
     """Seed. The random numbers of step k depend only on the seed and k."""
     checkpoint_every: int = 500
     """Steps between checkpoints."""
-    eval_chunk: int = 2048
-    """Rays per batch in evaluation; limits memory."""
 
 
 @dataclass(frozen=True)

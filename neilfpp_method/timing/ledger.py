@@ -2,10 +2,10 @@
 
 Code that computes marks the kind of its work. Without a ledger that costs a single comparison:
 
-    with doing("tracing"):
+    with timed("tracing"):
         hits = host.scene_light(x, wi)
 
-A ledger attributes every moment to exactly one kind: within `doing("tracing")` the clock of an enclosing
+A ledger attributes every moment to exactly one kind: within `timed("tracing")` the clock of an enclosing
 "shading" stands still. So its seconds add up to the time since it was made; work that no code has marked is
 "rest".
 
@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ContextDecorator, contextmanager
 from typing import Literal, get_args
 
-__all__ = ["EVERY", "PREPARATION", "WORK", "Ledger", "Work", "doing", "listening"]
+__all__ = ["EVERY", "PREPARATION", "WORK", "Ledger", "Work", "recording", "timed"]
 
 Work = Literal[
     "data",
@@ -32,7 +32,7 @@ Work = Literal[
     "gradients",
     "optimiser",
     "light_fits",
-    "looks",
+    "checks",
     "saving",
     "rest",
 ]
@@ -46,7 +46,7 @@ Work = Literal[
 - gradients: the backward pass of all of these;
 - optimiser: the optimizer step and its bookkeeping;
 - light_fits: fits of the map and the lamps;
-- looks: previews and measurements during training;
+- checks: previews and measurements during training;
 - saving: checkpoints;
 - rest: everything else.
 """
@@ -130,7 +130,7 @@ class Ledger:
             self._in_step, self._samples = False, self._synchronise is None
 
     def begin(self, work: Work, apart: bool) -> tuple[Work, bool]:
-        """Begin another kind of work; see `doing`. Returns the previous kind, for `back_to`."""
+        """Begin another kind of work; see `timed`. Returns the previous kind, for `restore`."""
         before = self._work, self._apart
         if not self._apart:
             if apart or self._samples:
@@ -139,7 +139,7 @@ class Ledger:
             self._work, self._apart = work, apart
         return before
 
-    def back_to(self, before: tuple[Work, bool]) -> None:
+    def restore(self, before: tuple[Work, bool]) -> None:
         """Return to the kind of work that `begin` returned."""
         if before == (self._work, self._apart):
             return
@@ -171,7 +171,7 @@ _ledger: Ledger | None = None
 
 
 @contextmanager
-def listening(ledger: Ledger) -> Iterator[Ledger]:
+def recording(ledger: Ledger) -> Iterator[Ledger]:
     """Make a ledger record all work in the context. Only one ledger of a process records at a time."""
     global _ledger
     before, _ledger = _ledger, ledger
@@ -181,7 +181,7 @@ def listening(ledger: Ledger) -> Iterator[Ledger]:
         _ledger = before
 
 
-class doing(ContextDecorator):
+class timed(ContextDecorator):
     """Mark the kind of work in a context, or in a decorated function, for the ledger that listens, if any.
 
     Args:
@@ -191,13 +191,13 @@ class doing(ContextDecorator):
     """
 
     def __init__(self, work: Work, apart: bool = False) -> None:
-        self._does = work, apart
+        self._kind = work, apart
         self._before: list[tuple[Ledger, tuple[Work, bool]] | None] = []
 
     def __enter__(self) -> None:
-        self._before.append(None if _ledger is None else (_ledger, _ledger.begin(*self._does)))
+        self._before.append(None if _ledger is None else (_ledger, _ledger.begin(*self._kind)))
 
     def __exit__(self, *_: object) -> None:
         before = self._before.pop()
         if before is not None:
-            before[0].back_to(before[1])
+            before[0].restore(before[1])

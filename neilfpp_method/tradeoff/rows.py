@@ -159,9 +159,9 @@ def measured(row: Row) -> Measured | None:
         return None
     known = read_json(row.out / METRICS) if _has_metrics(row.out) else {}
     figures = {name: float(known[name]) for name in FIGURES if isinstance(known.get(name), int | float)}
-    looks = read_checks(row.out)
-    if looks:
-        last = looks[-1]
+    checks = read_checks(row.out)
+    if checks:
+        last = checks[-1]
         figures["held_back_psnr"] = last.radiance if last.physical is None else last.physical
     return Measured(row.budget, row.config.train.seed, plan.took, figures)
 

@@ -31,7 +31,7 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, stage_steps
 from neilfpp_method.settings.check import check_config
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.timing.ledger import Ledger, listening
+from neilfpp_method.timing.ledger import Ledger, recording
 from neilfpp_method.train.budget_record import read_budget, write_budget
 from neilfpp_method.train.budgeted import (
     close_budget,
@@ -190,7 +190,7 @@ def run_training(
         capture = at_scale(capture, source.scale)
     check_training_memory(capture)
     fabric = launch(torch_device, devices, nodes)
-    with listening(ledger), _removed_on_failure(out), run_lock(out):
+    with recording(ledger), _removed_on_failure(out), run_lock(out):
         pixels = load_pixels(capture, out / PIXELS, fabric, console)
         if resume:
             facts = described.facts
@@ -228,7 +228,7 @@ def run_training(
     continue_with = continue_command(command, out, device, devices, nodes)
     with (
         run_lock(out),
-        listening(ledger),
+        recording(ledger),
         reporting(out, console, fabric.is_global_zero) as reporter,
         stop_request(continue_with) as stopped,
     ):
@@ -340,7 +340,7 @@ def _check(config: NeilfConfig) -> None:
         raise UserError(
             "the stages have no steps", "set --config.train.sdf-steps and the others to 0 or more"
         )
-    for name in ("rays", "checkpoint_every", "eval_chunk"):
+    for name in ("rays", "checkpoint_every"):
         if getattr(config.train, name) < 1:
             option = f"--config.train.{name.replace('_', '-')}"
             raise UserError(f"{option} is {getattr(config.train, name)}", "set it to 1 or more")

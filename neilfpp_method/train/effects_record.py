@@ -3,7 +3,7 @@
 The keys of the file are
 
 - `format`: 1;
-- `asked`: the value of `--effects`;
+- `request`: the value of `--effects`;
 - `decisions`: all decisions in order, with the attributes of `effects.plan.Decision`;
 - `effects`: a row per effect (`effects.table.rows`), which follows from the decisions and is stored for other
   programs.
@@ -36,7 +36,7 @@ def write_plan(run: Path, plan: Plan) -> None:
     decisions = [dataclasses.asdict(decision) for decision in plan.decisions]
     write_json(
         run / FILE,
-        {"format": FORMAT, "asked": str(plan.request), "decisions": decisions, "effects": rows(plan)},
+        {"format": FORMAT, "request": str(plan.request), "decisions": decisions, "effects": rows(plan)},
     )
 
 
@@ -64,7 +64,7 @@ def read_plan(run: Path, settings: NeilfConfig, before: int | None = None) -> Pl
         )
     try:
         decisions = [_decision(entry, str(path)) for entry in stored["decisions"]]
-        request = parse_effects(stored["asked"])
+        request = parse_effects(stored["request"])
     except (TypeError, AttributeError, KeyError) as error:
         # A key is missing, or a value is not an object.
         raise UserError(

@@ -12,7 +12,7 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.first_light import start_with
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.review import (
-    MOST_PIXELS,
+    MAX_PIXELS,
     needs_surface,
     record_lamps,
     review_light,
@@ -22,7 +22,7 @@ from neilfpp_method.effects.review import (
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import stage_at
 from neilfpp_method.structures import StepResult
-from neilfpp_method.timing.ledger import doing
+from neilfpp_method.timing.ledger import timed
 from neilfpp_method.train.light_record import note_fit
 from neilfpp_method.train.optimizer import seed_step
 from neilfpp_method.train.training import Training
@@ -40,16 +40,16 @@ def solve_light(run: Training, model: NeilfModel, computed: StepResult, step: in
     """
     fabric, solver = run.fabric, run.light_solver
     if fabric.is_global_zero:
-        with doing("light_fits"):
+        with timed("light_fits"):
             solver.observe(computed)
     if not fabric.broadcast(solver.due):
         return
     if fabric.is_global_zero:
         run.watch.after_fit(solver.points, step)
-        with doing("light_fits", apart=True):
+        with timed("light_fits", apart=True):
             evidence = solver.solve(model.brdf, model.scene)
-        note_fit(run.fits, evidence, model.lamps.lit, step)
-        _report(run, record_lamps(run.plan, evidence, model.lamps.lit, step + 1))
+        note_fit(run.fits, evidence, model.lamps.count, step)
+        _report(run, record_lamps(run.plan, evidence, model.lamps.count, step + 1))
     _share_light(run, model)
 
 
@@ -81,8 +81,8 @@ def _start_light(run: Training, model: NeilfModel, step: int) -> None:
             run.reporter.say(first.summary())
             start_with(model, first)
             evidence = run.light_solver.start(first.observed, first.material, model.scene, first.lamp_trial)
-            note_fit(run.fits, evidence, model.lamps.lit, step)
-            _report(run, record_lamps(run.plan, evidence, model.lamps.lit, step))
+            note_fit(run.fits, evidence, model.lamps.count, step)
+            _report(run, record_lamps(run.plan, evidence, model.lamps.count, step))
     _share_light(run, model)
     _share_decisions(run, model, decisions)
 
@@ -90,7 +90,7 @@ def _start_light(run: Training, model: NeilfModel, step: int) -> None:
 def _light_pixels(run: Training) -> int:
     """Maximum number of pixels for the search of the initial light; a budget may limit it."""
     most = None if run.pace is None else run.pace.plan.light_pixels
-    return MOST_PIXELS if most is None else most
+    return MAX_PIXELS if most is None else most
 
 
 def _review_effects(run: Training, model: NeilfModel, step: int, review: Review, stream: int) -> None:

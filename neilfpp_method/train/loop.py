@@ -29,7 +29,7 @@ from neilfpp_method.schedule import (
 )
 from neilfpp_method.settings.facts import RadianceUnits
 from neilfpp_method.structures import LossTerms
-from neilfpp_method.timing.ledger import doing
+from neilfpp_method.timing.ledger import timed
 from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.evidence import apply_plan, review_before_stage, solve_light
 from neilfpp_method.train.health_record import read_findings, write_findings
@@ -72,13 +72,13 @@ def train(run: Training) -> None:
         position = stage_at(step, run.config.train)
         step = _train_stage(run, model, optimizer, step, position)
         if run.fabric.is_global_zero:
-            with doing("looks", apart=True):
+            with timed("checks", apart=True):
                 run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
         if step < total_steps(run.config.train):
-            with doing("looks", apart=True):
+            with timed("checks", apart=True):
                 review_before_stage(run, model, step)
         _save(run, optimizer, step, also=position.stage.value)
-        with doing("looks", apart=True):
+        with timed("checks", apart=True):
             model.eval()
             run.preview(model, position.stage)
             model.train()
@@ -105,7 +105,7 @@ def _train_stage(
             seed_step(settings.seed, step, run.fabric.global_rank)
             at = StagePosition(stage, number, length)
             set_rates(optimizer, run.config.optimizer, at, background_waits=not run.model.facts.far_points)
-            with doing("data"):
+            with timed("data"):
                 batch = run.pixels.sample(settings.rays, gradients)
             moment = Moment.before_step(model, batch, at)
             computed = wrapped(batch, stage)
@@ -138,13 +138,13 @@ def _keep_pace(run: Training, position: StagePosition, step: int) -> int:
     return stage_steps(revised)[position.stage]
 
 
-@doing("looks", apart=True)
+@timed("checks", apart=True)
 def _check_quality(run: Training, model: NeilfModel, position: StagePosition, step: int) -> None:
     if run.fabric.is_global_zero:
         run.quality.check_when_due(model, position, step, run.ledger.total)
 
 
-@doing("optimiser")
+@timed("optimiser")
 def _update(
     run: Training,
     model: NeilfModel,
@@ -160,7 +160,7 @@ def _update(
     """
     optimizer.zero_grad(set_to_none=True)
     if total.loss.requires_grad:
-        with doing("gradients"):
+        with timed("gradients"):
             run.fabric.backward(total.loss)
     norms = gradient_norms(model)
     psnr = _psnr(terms, run.model.units)
@@ -228,7 +228,7 @@ def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
 # ------------------------------------------------------------------------------------------- state and record
 
 
-@doing("saving", apart=True)
+@timed("saving", apart=True)
 def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str | None = None) -> None:
     if run.fabric.is_global_zero:
         try:

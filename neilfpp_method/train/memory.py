@@ -17,7 +17,7 @@ READING = 48
 """
 COUNTED = 3 * 8 / 1024
 """Bytes per pixel of all views for the index of three sets of pixels: 8 bytes per block of 1024."""
-LOADED = 0.8e9
+BASE_BYTES = 0.8e9
 """Bytes of the libraries, the statistics of the images, and a model of preset `fast`."""
 
 
@@ -29,7 +29,7 @@ def training_bytes(views: Sequence[View]) -> int:
     """
     largest = max(math.prod(file_size(view)) for view in views)
     pixels = sum(view.camera.width * view.camera.height for view in views)
-    return int(LOADED + READING * largest + COUNTED * pixels)
+    return int(BASE_BYTES + READING * largest + COUNTED * pixels)
 
 
 def check_training_memory(capture: Capture) -> None:

@@ -13,9 +13,8 @@ from neilfpp_method.data.images import write_png
 from neilfpp_method.data.scaling import file_size, scaled_view
 from neilfpp_method.data.view_pixels import read_colors
 from neilfpp_method.data.views import View, camera_rays
-from neilfpp_method.model import NeilfModel
+from neilfpp_method.model import EVAL_RAYS, NeilfModel
 from neilfpp_method.schedule import Stage
-from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.structures import RayBatch
 
@@ -44,9 +43,7 @@ def write_preview(model: NeilfModel, capture: Capture, stage: Stage, path: Path)
     shape = (view.camera.height, view.camera.width, 3)
     panels = [_photograph(view, capture.hdr)]
     rays = camera_rays(capture.normalisation.camera(view.camera))
-    panels += [
-        p.reshape(shape) for p in _panels(model, rays, model.config, model.stages[stage].moves_material)
-    ]
+    panels += [p.reshape(shape) for p in _panels(model, rays, model.stages[stage].moves_material)]
     picture = np.concatenate([(p.clip(0.0, 1.0) * 255.0 + 0.5).astype(np.uint8) for p in panels], axis=1)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_png(path, picture)
@@ -69,11 +66,11 @@ def _photograph(view: View, hdr: bool) -> np.ndarray:
     return (tone_map(pixels) if hdr else pixels).numpy()
 
 
-def _panels(model: NeilfModel, rays: RayBatch, config: NeilfConfig, with_material: bool) -> list[np.ndarray]:
+def _panels(model: NeilfModel, rays: RayBatch, with_material: bool) -> list[np.ndarray]:
     device = next(model.parameters()).device
     chunks = [
-        model.maps(rays[start : start + config.train.eval_chunk].to(device), with_material)
-        for start in range(0, len(rays), config.train.eval_chunk)
+        model.maps(rays[start : start + EVAL_RAYS].to(device), with_material)
+        for start in range(0, len(rays), EVAL_RAYS)
     ]
 
     def joined(name: str) -> Tensor:

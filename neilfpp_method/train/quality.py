@@ -4,7 +4,7 @@ The pixels are rendered as evaluation renders test views, and the PSNR is comput
 `pbr_psnr`, from clipped values encoded as sRGB. A check is made after every tenth of a stage, but at least
 `MIN_STEPS` steps after the previous check, and at the end of each stage. Checks within a stage are postponed
 while all checks together have taken more than `MAX_SHARE` of the time of the run. The record is
-`RUN/quality.json`; its key `looks` holds the checks.
+`RUN/quality.json`; its key `checks` holds the checks.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def _psnr(rendered: Float[Tensor, "N 3"], photograph: Float[Tensor, "N 3"]) -> f
 def write_checks(run: Path, quality: Quality) -> None:
     """Write the measurements so far, and the number of held-back pixels, into the run folder."""
     checks = [dataclasses.asdict(check) for check in quality.checks]
-    write_json(run / FILE, {"format": FORMAT, "pixels": len(quality.pixels), "looks": checks})
+    write_json(run / FILE, {"format": FORMAT, "pixels": len(quality.pixels), "checks": checks})
 
 
 def has_checks(run: Path) -> bool:
@@ -151,12 +151,12 @@ def read_checks(run: Path, before: int | None = None) -> Sequence[QualityCheck]:
     if not path.is_file():
         return []
     stored = read_json(path)
-    if stored.get("format") != FORMAT or not isinstance(stored.get("looks"), list):
+    if stored.get("format") != FORMAT or not isinstance(stored.get("checks"), list):
         raise UserError(
             f"{path}: a record of another version", "remove the file, or use the version that wrote it"
         )
     try:
-        checks = [from_dict(QualityCheck, check, str(path)) for check in stored["looks"]]
+        checks = [from_dict(QualityCheck, check, str(path)) for check in stored["checks"]]
     except (TypeError, AttributeError) as error:
         # A key is missing, or a value is not an object.
         raise UserError(

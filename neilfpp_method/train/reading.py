@@ -11,12 +11,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.errors import UserError
-from neilfpp_method.timing.ledger import doing
+from neilfpp_method.timing.ledger import timed
 
 __all__ = ["load_pixels"]
 
 
-@doing("data", apart=True)
+@timed("data", apart=True)
 def load_pixels(capture: Capture, folder: Path, fabric: Fabric, console: Console) -> PixelDataset:
     """Read the training pixels into a folder in the first process, and open them there in all processes.
 

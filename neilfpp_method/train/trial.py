@@ -23,9 +23,9 @@ from neilfpp_method.effects.material import JUDGED, seconds_of_evidence
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.effects.review import (
-    FEWEST_PIXELS,
+    MAX_PIXELS,
+    MIN_PIXELS,
     MIN_TRAIN_VIEWS,
-    MOST_PIXELS,
     record_facts,
     review_surface,
 )
@@ -56,7 +56,7 @@ FIT_PART = 8
 """A fit of a trial uses one in this many points, because a full first fit takes as long as a hundred steps.
 The time of a fit is assumed to be proportional to the number of points.
 """
-LOOSE = 1e-3
+TRIAL_HIT_SHARE = 1e-3
 """Minimum concentration of a hit in a trial. The density of an untrained field is spread out, so with the
 value of the settings no point would be shaded and no light fitted.
 """
@@ -130,7 +130,7 @@ def run_trial(
     facts = scene_facts(small, pixels, config)
     record_facts(plan, facts)
     config = plan.config_of_model
-    trial_config, fit_scale = changed(config, {"shading.hit_share": LOOSE}), 1.0
+    trial_config, fit_scale = changed(config, {"shading.hit_share": TRIAL_HIT_SHARE}), 1.0
     if config.light.kind != "free":
         points = max(1, config.light.fit.points // FIT_PART)
         trial_config = changed(trial_config, {"light.fit.every": FIT_EVERY, "light.fit.points": points})
@@ -150,8 +150,8 @@ def run_trial(
     light_pixels, light = None, 0.0
     if solver.seeks_start and len(capture.train_views) >= MIN_TRAIN_VIEWS and with_material:
         rate = seconds_of_pixel(device, plan.is_open("long-tails"), plan.is_open("metals"))
-        light_pixels = min(MOST_PIXELS, int(most_for_light / rate))
-        light_pixels = 0 if light_pixels < FEWEST_PIXELS else light_pixels
+        light_pixels = min(MAX_PIXELS, int(most_for_light / rate))
+        light_pixels = 0 if light_pixels < MIN_PIXELS else light_pixels
         light = rate * light_pixels
     surface = _timed(lambda: _review_surface(plan, model, pixels), wait)
     costs, picture, fitted = {}, 0.0, False

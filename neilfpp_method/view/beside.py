@@ -15,9 +15,9 @@ from neilfpp_method.view.command import check_viser
 __all__ = ["viewer_beside"]
 
 HOST = "127.0.0.1"
-ENDED = (0, 130)
+NORMAL_EXITS = (0, 130)
 """Exit statuses of a viewer that was stopped on purpose; Ctrl-C reaches both processes."""
-PATIENCE = 10.0
+SECONDS_TO_END = 10.0
 """Seconds after which a viewer that was asked to end is killed."""
 
 
@@ -52,11 +52,11 @@ def viewer_beside(
             if process.poll() is None:
                 process.terminate()
                 try:
-                    process.wait(PATIENCE)
+                    process.wait(SECONDS_TO_END)
                 except subprocess.TimeoutExpired:
                     process.kill()
                     process.wait()
-            elif process.returncode not in ENDED:
+            elif process.returncode not in NORMAL_EXITS:
                 errors.seek(0)
                 lines = errors.read().decode(errors="replace").strip().splitlines()
                 say(f"the viewer ended early: {lines[-1] if lines else process.returncode}")

@@ -9,6 +9,7 @@ from importlib import metadata
 from pathlib import Path
 
 from neilfpp_method.errors import UserError
+from neilfpp_method.export.mesh import check_resolution
 from neilfpp_method.relight.maps import Layout, check_map, map_names, read_map
 from neilfpp_method.relight.sky import Sky
 from neilfpp_method.train.device import pick_device
@@ -56,6 +57,7 @@ def view(
     Raises:
         UserError: an option is invalid, or viser is missing.
     """
+    check_resolution(request.resolution)
     check_viser()
     check_free(request.host, request.port)
     skies = _skies(request.env, request.env_layout)

@@ -44,7 +44,7 @@ STOPS = 8.0
 """Largest exposure in both directions, stops."""
 CAMERA, HELD_OUT, PICKED = (70, 110, 130), (200, 130, 60), (220, 60, 60)
 """Colours of training cameras, of held-out cameras, and of the selected point, sRGB bytes."""
-NOTHING = np.full((8, 16, 3), 238, np.uint8)
+EMPTY_IMAGE = np.full((8, 16, 3), 238, np.uint8)
 """A grey image, shown before there is another one."""
 START_WIDTH = 400
 """Width of the camera from which a new session starts, pixels; only its pose is used."""
@@ -140,13 +140,13 @@ class Session:
         with gui.add_folder("Light at a point", visible=self.subject.surface is not None and has_pbr):
             self.point_text = gui.add_markdown("Click the surface.")
             self.point_light = gui.add_image(
-                NOTHING, label="Incident light; up is at the top, directions below the surface are grey"
+                EMPTY_IMAGE, label="Incident light; up is at the top, directions below the surface are grey"
             )
         with gui.add_folder("Cameras"):
             names = [view.name for view in run.capture.views]
             self.cameras_on = gui.add_checkbox("Show", False)
             self.view = gui.add_dropdown("Go to", ["–", *names])
-            self.photograph = gui.add_image(NOTHING, label="The photograph", visible=False)
+            self.photograph = gui.add_image(EMPTY_IMAGE, label="The photograph", visible=False)
         self.cameras_on.on_update(lambda _: self._show_cameras())
         self.view.on_update(lambda _: self._go_to(self.view.value))
         self.status = gui.add_markdown("")

@@ -27,7 +27,7 @@ LAYERS = {
     "normal": "normal",
 }
 """Layers by name, with their titles on the page."""
-OF_MATERIAL = {"pbr", "base_color", "roughness", "metallic"}
+MATERIAL_LAYERS = {"pbr", "base_color", "roughness", "metallic"}
 """Layers that need a material."""
 
 
@@ -55,7 +55,7 @@ class Subject:
         """Names of the layers that can be shown."""
         if self.surface is None:
             return ("radiance",)
-        return tuple(name for name in LAYERS if self.run.has_material or name not in OF_MATERIAL)
+        return tuple(name for name in LAYERS if self.run.has_material or name not in MATERIAL_LAYERS)
 
 
 @dataclass(frozen=True)

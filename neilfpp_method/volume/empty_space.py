@@ -24,7 +24,7 @@ from neilfpp_method.volume.intersect import Interval
 
 __all__ = ["EmptySpace", "Span"]
 
-LOOK_UPS = 128
+RAY_PARTS = 128
 """Number of parts of a ray; the grid is read once in each."""
 RESOLUTION = 64
 """Vertices along an edge of the grid."""
@@ -110,7 +110,7 @@ class EmptySpace(nn.Module):
         return _span(edges, ~empty & ~opaque, interval)
 
     @torch.no_grad()
-    def may_meet(
+    def may_hit(
         self,
         sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]],
         rays: RayBatch,
@@ -155,7 +155,7 @@ class EmptySpace(nn.Module):
 
     def _edges(self, interval: Interval) -> Float[Tensor, "N E"]:
         """The ends of the equal parts of each ray."""
-        share = torch.linspace(0, 1, LOOK_UPS + 1, device=self.distance.device, dtype=interval.near.dtype)
+        share = torch.linspace(0, 1, RAY_PARTS + 1, device=self.distance.device, dtype=interval.near.dtype)
         return torch.lerp(interval.near[:, None], interval.far[:, None], share)
 
     def _read(self, rays: RayBatch, edges: Float[Tensor, "N E"]) -> Float[Tensor, "N K"]:
@@ -185,7 +185,7 @@ class EmptySpace(nn.Module):
     ) -> bool:
         """Whether the field itself is empty at one random point of each ray, if the grid says so there."""
         at = torch.rand_like(edges[:, :1])
-        part = (at * LOOK_UPS).long().clamp_max(LOOK_UPS - 1)
+        part = (at * RAY_PARTS).long().clamp_max(RAY_PARTS - 1)
         distance = torch.lerp(edges[:, :1], edges[:, -1:], at)
         actual = sdf(rays.origins + distance * rays.directions)
         return not bool((empty.gather(-1, part)[:, 0] & (actual <= clearance)).any())
@@ -201,7 +201,7 @@ class EmptySpace(nn.Module):
 
 def _span(edges: Float[Tensor, "N E"], taken: Bool[Tensor, "N K"], interval: Interval) -> Span:
     first = taken.to(torch.int8).argmax(dim=-1, keepdim=True)
-    last = LOOK_UPS - taken.flip(-1).to(torch.int8).argmax(dim=-1, keepdim=True)
+    last = RAY_PARTS - taken.flip(-1).to(torch.int8).argmax(dim=-1, keepdim=True)
     some = taken.any(-1)
     return Span(
         some,

@@ -145,7 +145,7 @@ def test_agreement_is_a_share_of_the_views_that_contain_the_point():
     outlines = ring(8)
     points = np.array([[0.0, 0.0, 0.0], [5.0, 5.0, 5.0]])
     found = sightings(outlines, points)
-    assert found.seen.tolist() == [8, 8]
+    assert found.visible_in.tolist() == [8, 8]
     assert found.inside.tolist() == [8, 0]
     assert agreement(outlines, points).tolist() == [1.0, 0.0]
 

@@ -34,9 +34,9 @@ def lamp(position: tuple[float, float, float], intensity: float) -> Lamps:
 
 def lit_by(lamps: Lamps, observed: Observed, material: Material) -> Observed:
     """The same points with the light of the lamps added to their pixels."""
-    places = LampPlaces(lamps.position[: lamps.lit], lamps.axis[: lamps.lit])
+    places = LampPlaces(lamps.position[: lamps.count], lamps.axis[: lamps.count])
     sent = from_lamps(places, lamps.radius, observed, material.roughness, LOBE, None)
-    added = sent.outgoing(material, lamps.intensity[: lamps.lit])
+    added = sent.outgoing(material, lamps.intensity[: lamps.count])
     return dataclasses.replace(observed, pixel=observed.pixel + added)
 
 
@@ -81,17 +81,17 @@ def test_the_solver_starts_with_lamps_that_held_back_views_do_not_contradict(gai
     judged = []
 
     def judge(proposed: Lamps, lobe: object, scene: object) -> Evidence:
-        judged.append(proposed.lit)
+        judged.append(proposed.count)
         return Evidence(gain, 0.01, 100, in_views=True)
 
     torch.manual_seed(0)
     solver = model.light_solver()
     evidence = solver.start(observed, material, None, judge)
     assert judged[0] >= 1
-    assert (model.lamps.lit > 0) is kept
+    assert (model.lamps.count > 0) is kept
     assert torch.equal(model.light.log_radiance, before) is not kept
     assert evidence.in_views is not kept
     plan = Plan.begin(EffectRequest("auto"), fast)
-    decision = record_lamps(plan, evidence, model.lamps.lit, step=0)[0]
+    decision = record_lamps(plan, evidence, model.lamps.count, step=0)[0]
     assert decision.on is kept
     assert ("in held-back views" in decision.reason) is not kept

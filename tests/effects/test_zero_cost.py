@@ -44,7 +44,7 @@ def test_without_lamps_there_is_one_fit_and_no_candidate(lamps, monkeypatch):
         assert max(sources) > texels
     else:
         assert sources == [texels]
-        assert model.lamps.lit == 0
+        assert model.lamps.count == 0
 
 
 def test_without_an_open_background_there_is_no_field_of_it():

@@ -21,7 +21,7 @@ from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.data.truth import LightField, Truth
 from neilfpp_method.errors import UserError
-from neilfpp_method.evaluate import protocols, scene_metrics
+from neilfpp_method.evaluate import protocols, scene_metrics, views
 from neilfpp_method.evaluate.protocols import evaluate, protocol, write_metrics
 from neilfpp_method.evaluate.scene_metrics import light_metrics
 from neilfpp_method.evaluate.views import (
@@ -85,7 +85,6 @@ def make_run(capture, model: NeilfModel | None = None, step: int = 10**6, specul
     config = preset("fast")
     config = dataclasses.replace(
         config,
-        train=dataclasses.replace(config.train, eval_chunk=1000),
         shading=dataclasses.replace(config.shading, specular=specular),
     )
     facts = SceneFacts("linear" if capture.hdr else "srgb", 0.5, 3.0, "none")
@@ -105,6 +104,8 @@ def captures(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def _few_points(monkeypatch):
     monkeypatch.setattr(scene_metrics, "SURFACE_POINTS", 20_000)
+    monkeypatch.setattr(scene_metrics, "EVAL_RAYS", 1000)
+    monkeypatch.setattr(views, "EVAL_RAYS", 1000)
     monkeypatch.setattr(scene_metrics, "MESH_RESOLUTION", 64)
     # The known sphere has no material field; test_confidence tests the confidence.
     monkeypatch.setattr(protocols, "confidence_metrics", lambda run, pairs: {})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +83,13 @@ def test_surface_outside_the_scene_is_an_error():
         extract_mesh(lambda x: 1.3 - x.norm(dim=-1), radius=1.0, resolution=32)
 
 
+def test_a_grid_that_does_not_fit_in_memory_is_refused(monkeypatch):
+    monkeypatch.setattr("neilfpp_method.data.memory.available_memory", lambda: 8 * 64**3 - 1)
+    with pytest.raises(UserError, match=r"grid of 64³ points need about 0\.0 GB.*lower resolution"):
+        extract_mesh(sphere, radius=1.0, resolution=64)
+    extract_mesh(sphere, radius=1.0, resolution=56)
+
+
 # ------------------------------------------------------------------------------------------------------ a run
 
 
@@ -125,6 +133,20 @@ def test_export_is_in_the_frame_of_the_capture_with_colours(tmp_path: Path):
     assert (stored["roughness"] == 1).all()
     assert (stored["metallic"] == 0).all()
     assert {path.name for path in tmp_path.iterdir()} == {"capture", "mesh.ply"}
+
+
+def test_export_keeps_vertices_at_map_coordinates(tmp_path: Path):
+    run = make_run(tmp_path, Ball(), step=4)
+    offset = np.array([5e6, 4e5, 0.0])
+    moved = dataclasses.replace(
+        run.capture.normalisation, centre=tuple(np.array(run.capture.normalisation.centre) + offset)
+    )
+    far = dataclasses.replace(run, capture=dataclasses.replace(run.capture, normalisation=moved))
+    export_mesh(run, tmp_path / "near.ply", resolution=32)
+    export_mesh(far, tmp_path / "far.ply", resolution=32)
+    near, far = (trimesh.load_mesh(tmp_path / f"{name}.ply", process=False) for name in ("near", "far"))
+    np.testing.assert_allclose(far.vertices - offset, near.vertices, rtol=0, atol=1e-6)
+    assert np.array_equal(far.faces, near.faces)
 
 
 def test_export_before_the_material_stage_has_no_colours(tmp_path: Path):

@@ -26,7 +26,7 @@ def test_at_most_the_maximum_number_of_lamps_is_lit():
     few.place(
         torch.tensor([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]]), torch.tensor([[0.2, 0.2, 0.2], [0.3, 0.6, 0.9]])
     )
-    assert few.lit == 1
+    assert few.count == 1
     torch.testing.assert_close(few.position, torch.tensor([[0.0, 0.0, 1.0]]))
 
 
@@ -87,6 +87,6 @@ def test_a_checkpoint_has_the_number_of_lit_lamps():
     before.axis[0] = torch.tensor([0.0, 0.0, -1.0])
     again = Lamps(3, radius=0.05)
     again.load_state_dict(before.state_dict())
-    assert again.lit == 2
+    assert again.count == 2
     assert torch.equal(again.axis, before.axis)
     assert torch.equal(again.radiance(), lamps().radiance())

@@ -14,7 +14,6 @@ from neilfpp_method.fields.lamps import LampPlaces, Lamps
 from neilfpp_method.lighting.fit import Light, fit_light
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.transport import from_lamps, from_texels, in_sight, lamp_kernel
-from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.shading.brdf import GGX, SPHERICAL_GAUSSIAN
 from neilfpp_method.structures import Material, Observed
 from tests.hard_cases.test_fields import DTYPES, assert_bounded
@@ -108,6 +107,6 @@ def test_a_fit_to_impossible_observations(pixel, base_color, metallic):
     )
     start = Light(sky.log_radiance, torch.zeros(3, 3))
     target = Target(seen.position, material, torch.full((count, 3), pixel))
-    found = fit_light(start, carried, target, Objective("linear", max(pixel, 1.0), LightFitConfig(steps=50)))
+    found = fit_light(start, carried, target, Objective("linear", max(pixel, 1.0), steps=50))
     assert_bounded(found.log_radiance, found.intensity, bound=1e12)
     assert found.intensity.min() >= 0

@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.mutants import DOCUMENT, MUTANTS, planted
+from benchmarks.mutants.faults import MUTANTS
+from benchmarks.mutants.planting import planted
+from benchmarks.mutants.table import DOCUMENT
 
 REPOSITORY = Path(__file__).parents[2]
 

@@ -23,7 +23,7 @@ from neilfpp_method.fields.lamps import LampPlaces
 from neilfpp_method.lighting.fit import Light, fit_light
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.transport import from_lamps, from_texels
-from neilfpp_method.settings.types import FrequencyConfig, HashGridConfig, LightFitConfig
+from neilfpp_method.settings.types import FrequencyConfig, HashGridConfig
 from neilfpp_method.shading import LOBES, evaluate, sample_directions, srgb_to_linear
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.shading.color import linear_to_srgb, residual
@@ -359,7 +359,7 @@ def test_a_light_fit_is_finite_and_not_negative(pixel, firefly, count, seed):
         from_lamps(places, 0.06, seen, made_of.roughness, GGX, None)
     )
     target = Target(seen.position, made_of, color)
-    objective = Objective("linear", max(pixel, 1e-3), LightFitConfig(steps=20))
+    objective = Objective("linear", max(pixel, 1e-3), steps=20)
     found = fit_light(Light(sky.log_radiance, torch.zeros(1, 3)), carried, target, objective)
     assert_finite(found.log_radiance, bound=100.0)
     assert_finite(found.intensity, bound=1e18)
@@ -376,7 +376,7 @@ def test_a_light_fit_follows_the_unit_of_the_images(exponent, seed):
         sky = EnvironmentLight(4, unit_of_images)
         carried = from_texels(sky, seen, made_of.roughness, GGX, None)
         pixel = unit_of_images * (0.2 + seen.normal[:, 2:].clamp_min(0)).expand(40, 3)
-        objective = Objective("linear", 0.5 * unit_of_images, LightFitConfig(steps=20))
+        objective = Objective("linear", 0.5 * unit_of_images, steps=20)
         start = Light(sky.log_radiance, torch.zeros(0, 3))
         target = Target(seen.position, made_of, pixel)
         found.append(fit_light(start, carried, target, objective).log_radiance)

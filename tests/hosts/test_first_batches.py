@@ -11,7 +11,8 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.attach import attach_neilf, pixel_batch
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.first_batches import BATCHES, check_points
+from neilfpp_method.hosts.batches import check_points
+from neilfpp_method.hosts.first_batches import BATCHES
 from neilfpp_method.structures import RayBatch
 from tests.hosts.balls import Ball, BallHost, ball_rays
 from tests.scenes import tiny_config

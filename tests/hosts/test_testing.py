@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from neilfpp_method.attach import CallableHost
+from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.testing import CHECKS, check_host
 from neilfpp_method.structures import RayBatch
 from tests.hosts.balls import Ball, BallHost, ball_rays

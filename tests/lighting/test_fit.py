@@ -12,7 +12,6 @@ from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.fit import Evidence, Light, fit_light
 from neilfpp_method.lighting.objective import Objective, Target, nearest_points, total_variation, unevenness
 from neilfpp_method.lighting.transport import Transport, from_texels
-from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.shading.rendering_equation import shade
 from neilfpp_method.shading.sampling import sample_directions
@@ -28,11 +27,11 @@ def fit(
     image: torch.Tensor,
     unit: float,
     steps: int,
-    evenness: float = LightFitConfig().evenness,
+    base_color_known: bool = False,
 ) -> None:
     """Set a map by a fit without lamps."""
     start = Light(environment.log_radiance, torch.zeros(0, 3))
-    objective = Objective("linear", unit, LightFitConfig(steps=steps, evenness=evenness))
+    objective = Objective("linear", unit, steps, base_color_known)
     found = fit_light(start, carried, Target(seen.position, of, image), objective)
     environment.log_radiance.copy_(found.log_radiance)
 
@@ -83,11 +82,11 @@ def lamp(height: int) -> EnvironmentLight:
 
 @pytest.mark.parametrize("tint", [1.0, 0.6])
 @pytest.mark.parametrize(
-    ("made_of", "evenness", "steps"),
-    [("speckles", 0.0, [200]), ("patches", 0.3, 4 * [100]), ("speckles", 0.3, 4 * [100])],
+    ("made_of", "known", "steps"),
+    [("speckles", True, [200]), ("patches", False, 4 * [100]), ("speckles", False, 4 * [100])],
     ids=["known", "even", "uneven"],
 )
-def test_a_lamp_is_found_with_its_position_and_brightness(tint, made_of, evenness, steps):
+def test_a_lamp_is_found_with_its_position_and_brightness(tint, made_of, known, steps):
     """Also if the base colour is wrong by one factor, which light and base colour share, and if fits follow
     each other and every point has its own colour.
     """
@@ -102,7 +101,7 @@ def test_a_lamp_is_found_with_its_position_and_brightness(tint, made_of, evennes
     carried = from_texels(found, seen, of.roughness, GGX, None)
     guess = Material(of.base_color * tint, of.roughness, of.metallic)
     for number in steps:
-        fit(found, carried, seen, guess, image, image.median().item(), number, evenness)
+        fit(found, carried, seen, guess, image, image.median().item(), number, known)
 
     green = found.log_radiance[1]
     row, column = divmod(int(green.argmax()), 48)

@@ -73,9 +73,9 @@ def test_replayed_points_keep_their_pixels():
         return SurfacePixels(column, column + 0.1, column + 0.2, column + 0.3, values + 0.4)
 
     for start in (0, 20):
-        given = memory.beside_earlier(numbered(torch.arange(start, start + 20.0)))
+        given = memory.with_earlier(numbered(torch.arange(start, start + 20.0)))
         assert len(given) == 20
-    together = memory.beside_earlier(numbered(torch.arange(40.0, 50.0)))
+    together = memory.with_earlier(numbered(torch.arange(40.0, 50.0)))
     assert len(together) == 40
     number = together.position[:, 0]
     assert number[:10].tolist() == list(range(40, 50))

@@ -16,14 +16,12 @@ from neilfpp_method.lighting.candidates import FoundLamps
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.settle import settle_lamps
 from neilfpp_method.lighting.transport import Transport, from_lamps, in_sight, lamp_kernel
-from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.structures import Material, Observed
 from tests.lighting.surfaces import half_room, material, patches, points
 
 RADIUS = 0.06
-EVENNESS = LightFitConfig().evenness
-"""Where base colour is not known. With a weight of 0 it is known, up to a factor."""
+STEPS = 100
 TRUE = FoundLamps(
     LampPlaces(
         torch.tensor([[0.5, -0.3, 0.6], [-0.6, 0.4, 0.5]]), torch.tensor([[0.0, 0.0, 0.0], [0.6, 0.0, -0.8]])
@@ -45,9 +43,9 @@ def photographed(lamps: FoundLamps, speckled: bool) -> tuple[Observed, Material,
     return dataclasses.replace(seen, pixel=image), of, beside
 
 
-def settled(start: FoundLamps, true: FoundLamps, evenness: float) -> FoundLamps:
-    seen, of, beside = photographed(true, speckled=evenness == 0)
-    objective = Objective("linear", seen.pixel.median().item(), LightFitConfig(evenness=evenness))
+def settled(start: FoundLamps, true: FoundLamps, base_color_known: bool) -> FoundLamps:
+    seen, of, beside = photographed(true, speckled=base_color_known)
+    objective = Objective("linear", seen.pixel.median().item(), STEPS, base_color_known)
     return settle_lamps(
         start, RADIUS, beside, seen, Target(seen.position, of, seen.pixel), GGX, None, objective
     )
@@ -75,8 +73,8 @@ def test_a_wall_occludes_a_lamp():
     assert in_sight(lamps, RADIUS, x, half_room).tolist() == [[True, False, True]]
 
 
-@pytest.mark.parametrize(("evenness", "as_tinted"), [(0.0, 0.03), (EVENNESS, 0.06)])
-def test_candidates_around_a_lamp_become_one_lamp_at_its_position(evenness, as_tinted):
+@pytest.mark.parametrize(("base_color_known", "as_tinted"), [(True, 0.03), (False, 0.06)])
+def test_candidates_around_a_lamp_become_one_lamp_at_its_position(base_color_known, as_tinted):
     """If the base colour is unknown, a light close to white is preferred: a part of the lamp's tint is
     assigned to the surfaces.
     """
@@ -85,15 +83,15 @@ def test_candidates_around_a_lamp_become_one_lamp_at_its_position(evenness, as_t
     pieces = FoundLamps(
         LampPlaces(true.places.position + offsets, torch.zeros(4, 3)), 0.4 * true.intensity.expand(4, 3)
     )
-    found = settled(pieces, true, evenness)
+    found = settled(pieces, true, base_color_known)
     assert len(found.intensity) == 1
     torch.testing.assert_close(found.places.position, true.places.position, rtol=0, atol=0.01)
     torch.testing.assert_close(found.intensity.sum(), true.intensity.sum(), rtol=0.03, atol=0)
     torch.testing.assert_close(found.intensity, true.intensity, rtol=as_tinted, atol=0)
 
 
-@pytest.mark.parametrize("evenness", [0.0, EVENNESS])
-def test_two_lamps_stay_separate_and_move_to_their_positions(evenness):
+@pytest.mark.parametrize("base_color_known", [True, False])
+def test_two_lamps_stay_separate_and_move_to_their_positions(base_color_known):
     torch.manual_seed(0)
     start = FoundLamps(
         LampPlaces(
@@ -102,7 +100,7 @@ def test_two_lamps_stay_separate_and_move_to_their_positions(evenness):
         ),
         0.7 * TRUE.intensity,
     )
-    found = settled(start, TRUE, evenness)
+    found = settled(start, TRUE, base_color_known)
     torch.testing.assert_close(found.places.position, TRUE.places.position, rtol=0, atol=0.02)
     torch.testing.assert_close(found.places.axis, TRUE.places.axis, rtol=0, atol=0.1)
     torch.testing.assert_close(found.intensity, TRUE.intensity, rtol=0.1, atol=0)
@@ -116,14 +114,16 @@ def test_a_lamp_is_of_the_kind_that_explains_the_points(number, start):
     row = slice(number, number + 1)
     true = FoundLamps(TRUE.places[row], TRUE.intensity[row])
     found = settled(
-        FoundLamps(LampPlaces(true.places.position + 0.05, start[None]), true.intensity), true, EVENNESS
+        FoundLamps(LampPlaces(true.places.position + 0.05, start[None]), true.intensity),
+        true,
+        base_color_known=False,
     )
     assert found.places.axis.any() == true.places.axis.any()
     torch.testing.assert_close(found.places.axis, true.places.axis, rtol=0, atol=0.1)
 
 
-@pytest.mark.parametrize(("evenness", "within"), [(EVENNESS, 0.07), (0.0, math.inf)])
-def test_base_colours_learned_under_a_misplaced_lamp_do_not_keep_it_there(evenness, within):
+@pytest.mark.parametrize(("base_color_known", "within"), [(False, 0.07), (True, math.inf)])
+def test_base_colours_learned_under_a_misplaced_lamp_do_not_keep_it_there(base_color_known, within):
     """The only evidence against the misplaced lamp is that the base colours then contain its light."""
     true = FoundLamps(TRUE.places[:1], TRUE.intensity[:1])
     astray = FoundLamps(
@@ -145,13 +145,13 @@ def test_base_colours_learned_under_a_misplaced_lamp_do_not_keep_it_there(evenne
     pixel = under_true.outgoing(of, true.intensity)
     torch.testing.assert_close(under_astray.outgoing(learned, astray.intensity), pixel)
 
-    objective = Objective("linear", pixel.median().item(), LightFitConfig(evenness=evenness))
+    objective = Objective("linear", pixel.median().item(), STEPS, base_color_known)
     found = settle_lamps(
         astray, RADIUS, even, seen, Target(seen.position, learned, pixel), None, None, objective
     )
     off = (found.places.position - true.places.position).norm(dim=-1).min()
     assert off < within
-    assert evenness > 0 or off > 0.15
+    assert not base_color_known or off > 0.15
 
 
 @pytest.mark.parametrize("broken", ["no points", "no lamps", "a pixel that is no number"])
@@ -164,7 +164,7 @@ def test_without_information_lamps_are_unchanged(broken):
         start = FoundLamps(TRUE.places[:0], TRUE.intensity[:0])
     else:
         seen.pixel[0] = torch.nan
-    target, objective = Target(seen.position, of, seen.pixel), Objective("linear", 0.3, LightFitConfig())
+    target, objective = Target(seen.position, of, seen.pixel), Objective("linear", 0.3, STEPS)
     found = settle_lamps(start, RADIUS, beside, seen, target, GGX, None, objective)
     torch.testing.assert_close(found.places.position, start.places.position)
     torch.testing.assert_close(found.intensity, start.intensity)

@@ -15,7 +15,6 @@ from neilfpp_method.lighting.fit import Light, fit_light
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.sky import HALF_WEIGHT_SPREAD, SkySightings
 from neilfpp_method.lighting.transport import from_texels
-from neilfpp_method.settings.types import LightFitConfig
 from neilfpp_method.shading.color import linear_to_srgb
 from tests.lighting.surfaces import material, points
 
@@ -93,8 +92,8 @@ def test_a_fit_keeps_observed_texels_and_estimates_the_others():
     wrong = dataclasses.replace(of, base_color=0.7 * of.base_color)
 
     def error(known: SkySightings | None) -> torch.Tensor:
-        config = LightFitConfig(steps=300)
-        objective = Objective("linear", image.median().item(), config, known and known.known())
+        unit = image.median().item()
+        objective = Objective("linear", unit, steps=300, sky=known and known.known())
         start = Light(torch.full((3, HEIGHT, 2 * HEIGHT), math.log(0.5)), torch.zeros(0, 3))
         found = fit_light(start, carried, Target(seen.position, wrong, image), objective)
         return (found.log_radiance - truth.log()).abs().mean(0)

@@ -23,8 +23,6 @@ from neilfpp_method.structures import Material, Observed
 from tests.lighting.surfaces import material, patches
 
 CONFIG = MapLightConfig(kind="auto", environment_height=12, fit=LightFitConfig(points=800, steps=150))
-KNOWN = dataclasses.replace(CONFIG, fit=dataclasses.replace(CONFIG.fit, evenness=0.0))
-"""Base colour is what surfaces have learned, and nothing else is known of the tint of light."""
 LAMP = torch.tensor([[0.3, -0.2, 0.5]])
 BULB = LampPlaces(LAMP, torch.zeros(1, 3))
 """Sends alike in all directions."""
@@ -67,19 +65,18 @@ def solve(
     unit: float,
     config: MapLightConfig,
     first: bool,
+    base_color_known: bool = False,
 ) -> Evidence | None:
-    objective = Objective("linear", unit, config.fit)
+    objective = Objective("linear", unit, config.fit.steps, base_color_known)
     return solve_light(LightModel(environment, lamps), seen, of, GGX, None, objective, config, first)
 
 
-def solved(
-    seen: Observed, of: Material, rounds: int, config: MapLightConfig = CONFIG
-) -> tuple[Lamps, object]:
+def solved(seen: Observed, of: Material, rounds: int, base_color_known: bool = False) -> tuple[Lamps, object]:
     torch.manual_seed(0)
     environment, lamps = EnvironmentLight(12, 0.7), Lamps(4, 0.06)
     for number in range(rounds):
         unit = seen.pixel.median().item()
-        evidence = solve(environment, lamps, seen, of, unit, config, first=number == 0)
+        evidence = solve(environment, lamps, seen, of, unit, CONFIG, number == 0, base_color_known)
     return lamps, evidence
 
 
@@ -87,8 +84,8 @@ def solved(
 @pytest.mark.parametrize("known", [True, False])
 def test_a_lamp_is_found_with_its_position_intensity_and_kind(true, known):
     """Known base colours may vary arbitrarily; unknown ones are constant except for edges."""
-    lamps, _ = solved(*photographed(true, speckled=known), rounds=3, config=KNOWN if known else CONFIG)
-    assert lamps.lit
+    lamps, _ = solved(*photographed(true, speckled=known), rounds=3, base_color_known=known)
+    assert lamps.count
     strongest = int(lamps.intensity.sum(-1).argmax())
     assert (lamps.position[strongest] - LAMP[0]).norm() < 0.03
     assert lamps.intensity[strongest].tolist() == pytest.approx([0.9, 0.7, 0.4], rel=0.1)
@@ -98,7 +95,7 @@ def test_a_lamp_is_found_with_its_position_intensity_and_kind(true, known):
 
 def test_under_only_a_sky_no_lamp_is_lit():
     lamps, _ = solved(*photographed(None), rounds=2)
-    assert lamps.lit == 0
+    assert lamps.count == 0
 
 
 def test_proposals_include_lit_lamps_and_keep_clear_of_surfaces():
@@ -154,7 +151,7 @@ def test_lamps_are_found_under_a_known_map_which_is_unchanged():
         unit = seen.pixel.median().item()
         evidence = solve(environment, lamps, seen, of, unit, known, first=False)
     assert torch.equal(environment.log_radiance, before)
-    assert lamps.lit
+    assert lamps.count
     assert 100 < evidence.points < 220  # a part of 800 points is some blocks
     assert (lamps.position[0] - LAMP[0]).norm() < 0.12
     beside = (lamps.position - LAMP).norm(dim=-1) < 0.3
@@ -169,7 +166,7 @@ def test_under_only_a_known_sky_no_lamp_is_lit():
     known = dataclasses.replace(CONFIG, map="sky.exr")
     evidence = solve(environment, lamps, seen, of, seen.pixel.median().item(), known, first=True)
     assert evidence.points == 800  # in the first decision each point is held back once
-    assert lamps.lit == 0
+    assert lamps.count == 0
 
 
 @pytest.mark.parametrize("count", [1, 3, 5])
@@ -192,8 +189,8 @@ def test_lamps_without_a_significant_gain_are_lit_only_with_lamps_if_undecided(m
     for doubt in (False, True):
         torch.manual_seed(0)
         light, unit = LightModel(EnvironmentLight(12, 0.7), Lamps(4, 0.06)), seen.pixel.median().item()
-        objective = Objective("linear", unit, CONFIG.fit)
+        objective = Objective("linear", unit, CONFIG.fit.steps)
         solve_light(light, seen, of, GGX, None, objective, CONFIG, first=False, lamps_if_undecided=doubt)
-        lit.append(light.lamps.lit)
+        lit.append(light.lamps.count)
     assert lit[0] == 0
     assert lit[1] > 0

@@ -280,6 +280,8 @@ def test_a_time_per_view_is_kept(given, sky, tmp_path):
     [
         (["--env", "missing.exr"], ("missing.exr", "no such image")),
         (["--spp", "0"], ("--spp is 0",)),
+        (["--resolution", "0"], ("0 cells per side", "give 8 to 2048")),
+        (["--resolution", "100000"], ("100000 cells per side", "give 8 to 2048")),
         (["--bounces", "100"], ("--bounces is 100",)),
         (["--scale", "0.5", "--width", "10"], ("--scale and --width",)),
         (["--set", "gloss=1"], ("gloss=1", "roughness")),

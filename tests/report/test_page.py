@@ -212,7 +212,7 @@ def test_effects_and_times_are_shown_if_they_are_recorded(run: Path):
         "risk": "none",
     }
     (run / "effects.json").write_text(
-        json.dumps({"format": 1, "asked": "as-set", "decisions": [], "effects": [row]})
+        json.dumps({"format": 1, "request": "as-set", "decisions": [], "effects": [row]})
     )
     (run / "work.json").write_text(
         json.dumps({"format": 1, "seconds": {"sdf_init": {"rendering": 61.0, "data": 20.0}}})
@@ -242,6 +242,22 @@ def test_the_page_of_a_stopped_run_says_how_to_continue(run: Path):
     page = page_of(run)
     assert "stopped before its first checkpoint" in page.text
     assert page.data == {}
+    messages: list[str] = []
+    write_report(run, run / "report.html", SMALL, say=messages.append)
+    assert [line.split(". ")[0] for line in messages] == ["the report has no views, surface and light"]
+    assert "--resume" in messages[0]
+
+
+def test_a_run_with_settings_only_has_no_report(run: Path, capfd):
+    for path in run.iterdir():
+        if path.name not in ("config.json", "capture.json", "scene.json", "effects.json"):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    assert main(["report", str(run)]) == 2
+    error = capfd.readouterr().err
+    assert f"{run}: nothing to report" in error
+    assert "before its first checkpoint" in error
+    assert "--resume" in error
+    assert not (run / "report.html").exists()
 
 
 def test_photographs_without_truth_or_test_views_have_a_page(tmp_path: Path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from neilfpp_method.timing.ledger import EVERY, FIRST, Ledger, doing, listening
+from neilfpp_method.timing.ledger import EVERY, FIRST, Ledger, recording, timed
 
 
 class Clock:
@@ -26,12 +26,12 @@ class Clock:
 
 def test_nested_work_is_counted_separately():
     clock = Clock()
-    with listening(Ledger(now=clock)) as ledger:
+    with recording(Ledger(now=clock)) as ledger:
         clock.time = 1.0
         ledger.enter("joint")
-        with ledger.step(0), doing("shading"):
+        with ledger.step(0), timed("shading"):
             clock.time += 2.0
-            with doing("tracing"):
+            with timed("tracing"):
                 clock.time += 4.0
             clock.time += 8.0
         clock.time += 16.0
@@ -46,11 +46,11 @@ def test_marks_within_a_fit_are_ignored_and_an_error_ends_it():
     clock = Clock()
 
     def fit():
-        with doing("light_fits", apart=True), doing("tracing"):
+        with timed("light_fits", apart=True), timed("tracing"):
             clock.time += 3.0
             raise ValueError
 
-    with listening(Ledger(now=clock)) as ledger:
+    with recording(Ledger(now=clock)) as ledger:
         with pytest.raises(ValueError):
             fit()
         clock.time += 1.0
@@ -60,13 +60,13 @@ def test_marks_within_a_fit_are_ignored_and_an_error_ends_it():
 def test_a_decorated_function_may_call_itself():
     clock = Clock()
 
-    @doing("rendering")
+    @timed("rendering")
     def render(depth: int) -> None:
         clock.time += 1.0
         if depth:
             render(depth - 1)
 
-    with listening(Ledger(now=clock)) as ledger:
+    with recording(Ledger(now=clock)) as ledger:
         render(2)
         clock.time += 5.0
     assert ledger.seconds() == {"preparation": {"rendering": 3.0, "rest": 5.0}}
@@ -87,17 +87,17 @@ def test_a_device_is_sampled_and_its_time_is_divided():
     step, 2 s in a fit.
     """
     clock, steps = Clock(), EVERY + FIRST + 1
-    with listening(Ledger(synchronise=clock.synchronise, now=clock)) as ledger:
+    with recording(Ledger(synchronise=clock.synchronise, now=clock)) as ledger:
         ledger.enter("joint")
         for number in range(steps):
             with ledger.step(number):
-                with doing("rendering"):
+                with timed("rendering"):
                     clock.lag += 3.0
-                with doing("shading"):
+                with timed("shading"):
                     clock.lag += 1.0
                 if number == 5:
                     clock.synchronise()
-                    with doing("light_fits", apart=True):
+                    with timed("light_fits", apart=True):
                         clock.lag += 2.0
         clock.synchronise()
     seconds = ledger.seconds()["joint"]

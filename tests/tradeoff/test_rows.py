@@ -73,7 +73,7 @@ def test_a_row_that_differs_in_any_setting_is_refused_by_name(tmp_path, words, c
         assert f"brdf.width is {before}, not 24; choose another --out" in capsys.readouterr().err
 
     for name, key, value, message in (
-        ("effects.json", "asked", "none", "--effects is none, not auto"),
+        ("effects.json", "request", "none", "--effects is none, not auto"),
         ("plan.json", "budget", 119.0, "the budget in seconds is 119.0, not 120.0"),
         ("capture.json", "response", "srgb", "capture.response is srgb, not auto"),
     ):

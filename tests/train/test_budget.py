@@ -17,7 +17,7 @@ from neilfpp_method.cli import main
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest, parse_effects
-from neilfpp_method.effects.review import MOST_PIXELS, review_light
+from neilfpp_method.effects.review import MAX_PIXELS, review_light
 from neilfpp_method.errors import Stopped, UserError
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.timing.ledger import Ledger
@@ -187,7 +187,7 @@ def test_the_initial_light_is_planned_with_as_many_pixels_as_the_time_permits(tm
         )
 
     whole = trial(1e9)
-    assert whole.light_pixels == MOST_PIXELS
+    assert whole.light_pixels == MAX_PIXELS
     first, later = whole.costs.stages["material_init"], whole.costs.stages["joint"]
     assert first.first_fit == 0.0  # it is part of the search
     assert first.start > 100 * later.start

@@ -107,11 +107,11 @@ def test_a_very_small_capture_is_not_checked(tmp_path):
     [
         {"format": 9},
         {"format": 1},
-        {"format": 1, "looks": [1]},
-        {"format": 1, "looks": [{"step": 1}]},
+        {"format": 1, "checks": [1]},
+        {"format": 1, "checks": [{"step": 1}]},
         {
             "format": 1,
-            "looks": [
+            "checks": [
                 {"step": 1, "stage": "joint", "seconds": 1e999, "radiance": 1, "physical": None, "took": 0}
             ],
         },

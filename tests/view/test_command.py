@@ -38,6 +38,10 @@ def ends(capsys, *words: str) -> str:
     return capsys.readouterr().err
 
 
+def test_a_surface_of_too_many_cells_is_refused(found, capsys):
+    assert "100000 cells per side" in ends(capsys, str(found), "--resolution", "100000")
+
+
 def test_the_page_is_served_until_it_is_ended(found, port):
     pytest.importorskip("viser")
     said, served = [], []

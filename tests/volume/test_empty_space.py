@@ -157,9 +157,9 @@ def test_fewer_queries_find_the_same_surface(sdf):
 # ---------------------------------------------------------------------------------- rays that leave a surface
 
 
-def may_meet(sdf, rays, beta=0.01):
+def may_hit(sdf, rays, beta=0.01):
     whole = sphere_interval(rays.origins, rays.directions, RADIUS)
-    return EmptySpace(RADIUS).may_meet(sdf, rays, whole, torch.tensor(beta))
+    return EmptySpace(RADIUS).may_hit(sdf, rays, whole, torch.tensor(beta))
 
 
 def leaving(steepest=0.2, height=0.06):
@@ -173,7 +173,7 @@ def leaving(steepest=0.2, height=0.06):
 
 
 def test_rays_that_leave_a_sphere_hit_nothing():
-    assert may_meet(sphere, leaving()).float().mean() < 0.03
+    assert may_hit(sphere, leaving()).float().mean() < 0.03
 
 
 @settings(max_examples=25, deadline=None)
@@ -204,7 +204,7 @@ def test_no_thin_plate_in_front_of_a_ray_is_missed(share, seed, tilt, log_beta):
             foil(x), (x.norm(dim=-1) - 0.9).abs() + 0.03
         )  # a shell that all rays leave or pass
 
-    assert may_meet(scene, RayBatch(origins, directions)[meets], 10.0**log_beta).all()
+    assert may_hit(scene, RayBatch(origins, directions)[meets], 10.0**log_beta).all()
 
 
 # ----------------------------------------------------------------------------------------- a field that moves

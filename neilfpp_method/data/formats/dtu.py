@@ -131,12 +131,12 @@ def _normalisation(matrices: Mapping[str, np.ndarray], count: int, archive: Path
 
 def _files(root: Path, folder: Path) -> tuple[Path, ...]:
     """The images of a folder, in the order of their names, which must agree with that of their numbers."""
-    shown = (
+    candidates = (
         file
         for file in folder.iterdir()
         if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
     )
-    files = sorted(shown)
+    files = sorted(candidates)
     numbers = [int(file.stem) for file in files if file.stem.isdecimal()]
     if len(numbers) == len(files) and numbers != sorted(numbers):
         raise UserError(

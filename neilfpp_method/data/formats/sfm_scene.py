@@ -114,8 +114,8 @@ def _refuse_strays(views: tuple[View, ...], listed: set[str], scene: Path) -> No
     """Images beside the listed ones that the scene file lacks: a user may believe that they are used."""
     for folder in sorted({view.image.parent for view in views}):
         for file in sorted(folder.iterdir()):
-            shown = file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
-            if shown and file.stem not in listed:
+            is_image = file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
+            if is_image and file.stem not in listed:
                 raise UserError(
                     f"{file}: an image without a camera in {scene}", "add its camera, or move it away"
                 )

@@ -168,14 +168,17 @@ def _focal_lengths(entry: Entry, frame: Entry, width: int, height: int) -> tuple
 
     def focal(place: Entry, axis: str, size: int) -> float | None:
         length, angle = place.get(f"fl_{axis}"), place.get(f"camera_angle_{axis}")
-        return (length and length.number()) or _focal(angle and angle.number(), size)
+        from_angle = None if angle is None else _focal(angle, size)
+        return (length and length.number()) or from_angle
 
+    # Angles that are not used are checked as well: a wrong one may mean that the lengths are wrong, too.
     fx, fy = focal(frame, "x", width), focal(frame, "y", height)
+    shared_fx, shared_fy = focal(entry, "x", width), focal(entry, "y", height)
     if (fx and not frame.get("fl_x")) or (fy and not frame.get("fl_y")):
         # At least one of them is from an angle of the frame.
         fx = fx or fy
     else:
-        fx, fy = fx or focal(entry, "x", width), fy or focal(entry, "y", height)
+        fx, fy = fx or shared_fx, fy or shared_fy
     if fx is None:
         raise UserError(
             f"{frame.where}: no focal length", "add fl_x, in pixels, or camera_angle_x, in radians"
@@ -183,8 +186,11 @@ def _focal_lengths(entry: Entry, frame: Entry, width: int, height: int) -> tuple
     return fx, fy or fx
 
 
-def _focal(angle: float | None, size: int) -> float | None:
-    return None if angle is None or not 0 < angle < np.pi else size / (2 * np.tan(angle / 2))
+def _focal(entry: Entry, size: int) -> float:
+    angle = entry.number()
+    if not 0 < angle < np.pi:
+        raise UserError(f"{entry.where}: {angle:g} is no angle of view", "give radians, above 0 and below π")
+    return size / (2 * np.tan(angle / 2))
 
 
 def _pose(entry: Entry) -> Float64[np.ndarray, "4 4"]:

@@ -48,7 +48,7 @@ GAMMA = 1 / 2.2
 """Exponent for the PSNR of albedo (official code)."""
 VIEWS_OF_THE_FACTOR = 20
 """Number of views from which the factor of albedo is computed (official code)."""
-LEAST = 1e-6
+MIN_ESTIMATE = 1e-6
 """Lower bound of the estimated albedo in a division (official code)."""
 BORDER = 5
 """Width of the border that SSIM leaves out, pixels: half of its window."""
@@ -77,7 +77,7 @@ def albedo_factor(
     estimate: Float[np.ndarray, "P 3"], truth: Float[np.ndarray, "P 3"]
 ) -> Float[np.ndarray, " 3"]:
     """Median of truth / estimate per channel; of an even number of values, the lower of the middle two."""
-    ratio = np.sort(truth / np.maximum(estimate, LEAST), axis=0)
+    ratio = np.sort(truth / np.maximum(estimate, MIN_ESTIMATE), axis=0)
     return ratio[(len(ratio) - 1) // 2]
 
 

@@ -25,7 +25,7 @@ Blender and three.js: the centre looks along +X, and +Y is a quarter of the widt
 `direction_to_equirectangular`). Unreal: its +X, which is +X here, is at three quarters of the width, and its
 −Y, which is +Y here, is in the centre (`LookupLongLat` of the texture compressor).
 """
-FINER, ENOUGH = 4, 512
+UPSAMPLING, MAX_UPSAMPLED_ROWS = 4, 512
 """Number of rows relative to the original map, and the number above which no rows are added. The finer grid
 preserves the bilinear interpolation between the original texels.
 """
@@ -35,7 +35,7 @@ def equirectangular(
     radiance: Float[Tensor, "3 H W"], program: Literal["blender", "unreal"]
 ) -> Float[Tensor, "h w 3"]:
     """Resample an environment map to the layout of a program; linear RGB, width = 2 · height."""
-    height = max(radiance.shape[1], min(FINER * radiance.shape[1], ENOUGH))
+    height = max(radiance.shape[1], min(UPSAMPLING * radiance.shape[1], MAX_UPSAMPLED_ROWS))
     width = 2 * height
     theta = math.pi * (torch.arange(height, dtype=torch.float64)[:, None] + 0.5) / height
     turns = (torch.arange(width, dtype=torch.float64) + 0.5) / width + LEFT_EDGE[program]

@@ -6,9 +6,9 @@ from importlib import resources
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from neilfpp_method.data.images import write_exr, write_png
+from neilfpp_method.data.ply import NORMAL, write_ply
 from neilfpp_method.export.asset.atlas import Unwrapped
 from neilfpp_method.export.asset.bake import Textures
 from neilfpp_method.export.asset.environment import equirectangular
@@ -53,7 +53,10 @@ def write_asset(run: Run, mesh: Unwrapped, textures: Textures, out: Path) -> Non
         (folder / "asset.glb").write_bytes(glb_bytes(mesh, textures, scene["lamps"]))
         if has_usd():
             (folder / "asset.usda").write_text(usd_text(mesh, scene["lamps"]))
-        (folder / "mesh.ply").write_bytes(_ply(mesh))
+        # Texture coordinates u and v, v upwards, for programs that do not read glTF.
+        rows = np.concatenate((mesh.normals, mesh.uv), axis=1).astype(np.float32)
+        columns = dict(zip((*NORMAL, "u", "v"), rows.T, strict=True))
+        write_ply(folder / "mesh.ply", mesh.vertices, columns, mesh.faces)
         if radiance is not None:
             write_exr(folder / "environment.exr", {"RGB": radiance.permute(1, 2, 0).numpy()})
             for program in ("blender", "unreal"):
@@ -63,11 +66,3 @@ def write_asset(run: Run, mesh: Unwrapped, textures: Textures, out: Path) -> Non
         for name in SCRIPTS:
             source = resources.files("neilfpp_method.export.asset.scripts") / name
             (folder / name).write_text(source.read_text("utf-8"), "utf-8")
-
-
-def _ply(mesh: Unwrapped) -> bytes:
-    """The mesh as PLY with texture coordinates u and v, v upwards, for programs that do not read glTF."""
-    shape = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.normals, process=False)
-    u, v = mesh.uv.astype(np.float32).T
-    shape.vertex_attributes.update(u=u, v=v)
-    return shape.export(file_type="ply", vertex_normal=True)

@@ -174,6 +174,17 @@ def test_the_focal_length_of_a_frame_takes_precedence(
     assert (second.fx, second.fy) == pytest.approx((fx, fy))
 
 
+@pytest.mark.parametrize("angle", [0.0, -0.7, 4.0])
+@pytest.mark.parametrize("in_frame", [False, True])
+def test_an_impossible_angle_of_view_beside_a_focal_length_is_refused(
+    tmp_path: Path, angle: float, in_frame: bool
+) -> None:
+    scene(tmp_path)
+    edit(tmp_path, lambda c: (c["frames"][1] if in_frame else c).update(camera_angle_x=angle, fl_x=30.0))
+    place = "frames.1.camera_angle_x" if in_frame else "camera_angle_x"
+    refused(tmp_path, f"transforms.json: {place}: {angle:g} is no angle of view", "radians")
+
+
 # ------------------------------------------------------------------------------------------- files and splits
 
 

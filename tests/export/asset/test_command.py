@@ -14,8 +14,8 @@ from neilfpp_method.cli import main
 from neilfpp_method.data.images import read_image
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.train.run import load_run
+from tests.commands.calls import refused
 from tests.data.make_capture import CENTRE, RADIUS, SCALE, make_capture, srgb
-from tests.test_cli import refused
 from tests.train.small_runs import small_config, solved_light
 
 SMALL = ["--device", "cpu", "--texture-size", "128", "--faces", "400", "--resolution", "32"]

@@ -361,7 +361,7 @@ def _run(folder: Path) -> list[Path]:
         },
         "effects.json": {
             "format": 1,
-            "asked": "auto,-lamps",
+            "request": "auto,-lamps",
             "effects": [],
             "decisions": [
                 {

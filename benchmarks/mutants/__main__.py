@@ -1,0 +1,40 @@
+"""Plant faults one at a time, and print which quick test notices each.
+
+    python -m benchmarks.mutants            plant all of them, and print the table
+    python -m benchmarks.mutants --write    also write it into docs/stability.md
+    python -m benchmarks.mutants --only V   plant those whose module or description contains this word
+
+The exit status is 1 if a fault is not noticed, or if a test fails without one.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import tyro
+
+from benchmarks.mutants.faults import MUTANTS
+from benchmarks.mutants.planting import try_all
+from benchmarks.mutants.table import table, write_table
+
+
+def main(write: bool = False, only: str = "") -> int:
+    """Plant faults one at a time, and say which quick test notices each.
+
+    Args:
+        write: put the table into docs/stability.md; rows of faults that were not planted stay as they are.
+        only: those whose module, or description, has this in it.
+    """
+    chosen = [mutant for mutant in MUTANTS if only in mutant.module or only in mutant.what]
+    verdicts = try_all(
+        chosen, lambda v: print(f"{v.mutant.what}: {v.noticed_by or 'NOT NOTICED'}", flush=True)
+    )
+    caught = sum(verdict.noticed_by is not None for verdict in verdicts)
+    print(f"\n{table(verdicts)}\n{caught} of {len(verdicts)} faults are noticed")
+    if write:
+        write_table(verdicts)
+    return int(caught < len(verdicts))
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(main))

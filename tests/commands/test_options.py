@@ -1,0 +1,84 @@
+"""Command lines and settings that are refused."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.commands.calls import refused
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["paint"], ("unknown command 'paint'", "train", "eval")),
+        (["tran", "--data", "x"], ("unknown command 'tran'", "did you mean neilfpp train?")),
+        (["train", "--dta", "x"], ("--dta", "did you mean --data?", "neilfpp train --help")),
+        (
+            ["train", "--data", "x", "--config.shading.specular", "False"],
+            ("did you mean --config.shading.no-specular?",),
+        ),
+        (
+            ["train", "--data", "x", "--config.shading.specular", "true"],
+            ("did you mean --config.shading.specular?",),
+        ),
+        (["train", "--preset", "slow"], ("unknown preset 'slow'", "fast", "paper-ngp")),
+        (["train", "--preset=slow"], ("unknown preset 'slow'",)),
+        (["train", "--preset"], ("--preset", "neilfpp train --help")),
+        (["train", "--data", "x", "--colour", "red"], ("--colour", "neilfpp train --help")),
+        (["train", "--data", "x", "--config.train.rayss", "3"], ("did you mean --config.train.rays?",)),
+        (["train", "--data", "x", "--config.train.rays", "few"], ("--config.train.rays", "'few'")),
+        (["train", "--response", "hdr"], ("--response", "linear", "srgb")),
+        (["train", "--test-every", "often"], ("--test-every", "'often'")),
+        (["train"], ("--data",)),
+        (["train", "--resume"], ("--resume needs the run's folder", "--out")),
+        (["train", "teapot"], ("teapot", "did you mean --data teapot?", "neilfpp train --help")),
+        (["eval"], ("missing: PATH (The run folder); see neilfpp eval --help",)),
+        (
+            ["prepare"],
+            (
+                "missing: PATH (Folder of photographs, with its sub-folders), ",
+                ", --out PATH (Folder of the capture); ",
+            ),
+        ),
+        (["eval", "a", "b"], ("b", "neilfpp eval --help")),
+        (["export", "a", "--checkpoint", "first"], ("--checkpoint", "sdf_init")),
+        (["render", "a", "--views", "best"], ("--views", "test")),
+    ],
+)
+def test_a_command_line_that_makes_no_sense(tmp_path, monkeypatch, capfd, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    refused(capfd, arguments, *words, leaves=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--config.train.rays", "0"], ("--config.train.rays is 0",)),
+        (["--config.train.checkpoint-every", "0"], ("--config.train.checkpoint-every is 0",)),
+        (["--config.train.joint-steps", "-1"], ("no steps",)),
+        (["--config.loss.volume", "0"], ("--config.loss.volume",)),
+        (["--devices", "0"], ("--devices",)),
+        (["--device", "cuda:99"], ("no device 'cuda:99' here", "cpu")),
+        (["--device", "abacus"], ("no device 'abacus' here", "cpu")),
+        (["--device", "meta"], ("no device 'meta' here", "cpu")),
+        (["--test-every", "1"], ("all 6 views are held out",)),
+        (["--format", "tape"], ("unknown capture format 'tape'", "sfm_scene", "colmap")),
+        (["--format", "colmap"], ("not a capture of the format colmap", "sparse/0")),
+    ],
+)
+def test_settings_that_cannot_be(tmp_path, monkeypatch, capture, capfd, options, words):
+    monkeypatch.chdir(tmp_path)
+    command = ["train", "--data", capture, "--preset", "tiny", "--device", "cpu", *options]
+    refused(capfd, command, *words, leaves=tmp_path)
+
+
+def test_a_real_process_says_one_line_and_no_more(tmp_path):
+    """No warning of a library before it, no traceback after it."""
+    command = [sys.executable, "-m", "neilfpp_method.cli", "train", "--data", str(tmp_path / "nowhere")]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert process.returncode == 2
+    assert process.stdout == ""
+    assert process.stderr == f"error: {tmp_path / 'nowhere'}: no such folder; give the folder of a capture\n"
