@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,7 +19,7 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.shading.color import apply_response
 from neilfpp_method.structures import PixelBatch, RayBatch, SurfaceHits
 
-__all__ = ["FirstBatches", "check_batch", "check_points", "check_rows"]
+__all__ = ["FirstBatches", "check_batch", "check_like", "check_points", "check_rows"]
 
 BATCHES = 10
 """Number of batches that are checked; each check synchronises with the device."""
@@ -31,6 +32,10 @@ MAX_OFF = 0.5
 REACH = 1.5
 """Median distance of hits from the origin above which the scene is too large, scene units. An object in the
 unit sphere may stand on a ground.
+"""
+LOST = 10.0
+"""Median distance of hits from the origin above which nothing can be estimated: the fields of material and
+light end at the scene's bounding box, `volume.radius`.
 """
 VIEWED_AGAIN = 256
 """Maximum number of hits that are rendered from another viewpoint, once."""
@@ -100,6 +105,11 @@ class FirstBatches:
                     f"{name} of {int(rows.sum())} of {len(batch)} pixels are not finite",
                     "leave those pixels out",
                 )
+        if len(batch) and not (batch.mask.min() >= 0 and batch.mask.max() <= 1):
+            raise UserError(
+                f"mask is between {batch.mask.min():.3g} and {batch.mask.max():.3g}",
+                "give 1 on the object and 0 off it; divide 8-bit masks by 255",
+            )
         self._check_colors(batch.color[batch.mask > 0.5])
 
     def hits(self, batch: PixelBatch, hits: SurfaceHits) -> None:
@@ -177,12 +187,12 @@ class FirstBatches:
                 "turn them outwards: normal = -normal",
             )
         reach = hits.position[hit].norm(dim=-1).median().item()
+        far = f"half of its hits are {reach:.3g} or more from the origin"
+        remedy = "move and scale cameras and host so that the object lies in the unit sphere"
+        if reach > LOST:
+            raise UserError(f"{self.name}: {far}", f"{remedy} (docs/hosts.md, Other units)")
         if reach > REACH:
-            self._warn(
-                "far",
-                f"half of its hits are {reach:.3g} or more from the origin",
-                "move and scale cameras and host so that the object lies in the unit sphere",
-            )
+            self._warn("far", far, remedy)
 
     @torch.no_grad()
     def _check_another_view(
@@ -220,19 +230,21 @@ class FirstBatches:
             log.warning("%s: %s; %s", self.name, problem, remedy)
 
 
-def check_batch(batch: PixelBatch) -> None:
+def check_batch(batch: Any) -> None:
     """Check shapes and types of a batch; cheap enough for every step.
 
     Raises:
-        UserError: a tensor has integers, or another shape than one row per pixel.
+        UserError: it is no `PixelBatch`, or a tensor has integers or another shape than one row per pixel.
     """
+    if not isinstance(batch, PixelBatch):
+        raise UserError(f"the batch is a {type(batch).__name__}", "make one with attach.pixel_batch")
     for name in ("origins", "directions", "color"):
         check_rows(name, getattr(batch, name), len(batch), 3)
     for name in ("mask", "mask_known", "image_gradient"):
         check_rows(name, getattr(batch, name), len(batch))
 
 
-def check_rows(name: str, value: Tensor, count: int, width: int | None = None) -> None:
+def check_rows(name: str, value: Any, count: int, width: int | None = None) -> None:
     """Check that a tensor has one row of floating-point numbers per pixel.
 
     Args:
@@ -244,6 +256,8 @@ def check_rows(name: str, value: Tensor, count: int, width: int | None = None) -
     Raises:
         UserError: it does not.
     """
+    if not isinstance(value, Tensor):
+        raise UserError(f"{name} of the batch is a {type(value).__name__}", "give a tensor: torch.as_tensor")
     if not value.is_floating_point():
         remedy = (
             "divide 8-bit pixels by 255 and attach with response='srgb'" if name == "color" else "give floats"
@@ -260,15 +274,41 @@ def check_rows(name: str, value: Tensor, count: int, width: int | None = None) -
         raise UserError(f"{name} of the batch has the shape {tuple(value.shape)}", f"give {shape}")
 
 
-def check_points(name: str, x: Tensor, axes: int = 2) -> None:
+def check_points(name: str, x: Any, axes: int = 2) -> None:
     """Check that points are (N, 3), or with `axes` = 3 directions (N, S, 3), of floating-point numbers.
 
     Raises:
         UserError: they have another shape, or are integers.
     """
+    if not isinstance(x, Tensor):
+        raise UserError(f"{name} is a {type(x).__name__}", "give a tensor: torch.as_tensor")
     wanted = "(N, 3)" if axes == 2 else "(N, S, 3)"
     if x.ndim != axes or x.shape[-1] != 3:
         flat = f"{name}.reshape(-1, 3)" if axes == 2 and x.shape[-1:] == (3,) else f"the shape {wanted}"
         raise UserError(f"{name} has the shape {tuple(x.shape)}, not {wanted}", f"give {flat}")
     if not x.is_floating_point():
         raise UserError(f"{name} is {x.dtype}", "give floats")
+
+
+def check_like(name: str, value: Tensor, own: Tensor) -> None:
+    """Check that a tensor has the device and the type of the parameters of material and light.
+
+    Args:
+        name: name of the tensor in messages.
+        value: the tensor.
+        own: a parameter.
+
+    Raises:
+        UserError: it does not, or the parameters are in half precision.
+    """
+    if own.dtype in (torch.float16, torch.bfloat16):
+        raise UserError(
+            f"material and light are {own.dtype}, which is too coarse for positions",
+            "convert them with neilf.float(), and use torch.autocast for speed",
+        )
+    if value.device != own.device:
+        devices = f"{name} on {value.device}, material and light on {own.device}"
+        raise UserError(devices, "move one of them, for example neilf.to(device)")
+    if value.dtype != own.dtype:
+        dtypes = f"{name} {'are' if name == 'rays' else 'is'} {value.dtype}, material and light {own.dtype}"
+        raise UserError(dtypes, f"give {name}.float(), or convert the other with neilf.double()")
