@@ -50,10 +50,10 @@ CARRIED_ROUNDS = 2
 """Alternations of light and material in a fit that starts from the fit of another scale or of fewer views."""
 
 
-LOBE_FITS = 3
-"""Fits to all pixels that take as long as evidence for the lobe: four to three quarters of them."""
-METAL_FITS = 3
-"""Fits to all pixels that take as long as evidence for metals: four to four fifths of them."""
+LOBE_FITS = 3.6
+"""Fits to all pixels that take as long as evidence for the lobe: eight shorter ones to three quarters."""
+METAL_FITS = 3.8
+"""Fits to all pixels that take as long as evidence for metals: eight shorter ones to four fifths."""
 MEASURED = 2000
 """Pixels of the products from which `seconds_of_pixel` is estimated."""
 REST = 0.3

@@ -137,7 +137,7 @@ class Plan:
             reason = f"requires {effect.needs}, which is off"
             self.decisions.append(Decision(0, name, False, cause.by, reason))
 
-    def decide(self, name: str, measured: Measurement, step: int, starts_off: bool = False) -> Decision:
+    def decide(self, name: str, measured: Measurement, step: int) -> Decision:
         """Decide an open effect by evidence and record the decision.
 
         The effect stays as it is if there are too few samples, or if evidence only advises (see
@@ -147,11 +147,9 @@ class Plan:
             name: name of the effect.
             measured: the evidence.
             step: number of steps trained so far.
-            starts_off: whether the effect counts as off so far, even if the settings have it on, so that
-                only significant evidence keeps it on (see `Measurement.favours`).
         """
         before = self.is_on(name)
-        favoured = measured.favours(before and not starts_off)
+        favoured = measured.favours(before)
         advised = EFFECTS[name].advised
         on = before if favoured is None or advised else favoured
         reason = f"{measured.summary()}; shown as advice only" if advised else measured.summary()

@@ -129,7 +129,7 @@ def review_light(
         ), None
     if plan.is_open("long-tails") and plan.newest("long-tails") is None:
         measured = lobe_evidence(places, model.scene, typical, model.brdf.metals)
-        decisions.append(plan.decide("long-tails", measured, step, starts_off=True))
+        decisions.append(plan.decide("long-tails", measured, step))
         model.use(plan.config)
     first = None
     if model.lobe is not None:

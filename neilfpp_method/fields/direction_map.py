@@ -13,7 +13,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["interpolate", "map_directions", "texels_of"]
+__all__ = [
+    "directions_within",
+    "interpolate",
+    "map_directions",
+    "texel_centers",
+    "texel_solid_angles",
+    "texels_of",
+]
 
 
 def interpolate(values: Float[Tensor, "C H W"], wi: Float[Tensor, "M S 3"]) -> Float[Tensor, "M S C"]:
@@ -40,6 +47,39 @@ def map_directions(height: int, width: int) -> Float[Tensor, "height width 3"]:
     phi = 2 * math.pi * (torch.arange(width, dtype=torch.float64)[None] + 0.5) / width
     axes = (phi.sin() * theta.sin(), phi.cos() * theta.sin(), theta.cos().expand(-1, width))
     return torch.stack(axes, -1).float()
+
+
+def texel_solid_angles(height: int, width: int) -> Float[Tensor, " T"]:
+    """Solid angles of the texels, row by row, in sr; their sum is 4π."""
+    edges = _cos_edges(height)
+    rows = (edges[:-1] - edges[1:]) * 2 * math.pi / width
+    return rows[:, None].expand(-1, width).reshape(-1)
+
+
+def directions_within(
+    texel: Int[Tensor, "*B"], down: Float[Tensor, "*B"], across: Float[Tensor, "*B"], height: int, width: int
+) -> Float[Tensor, "*B 3"]:
+    """Directions in texels, at shares of their height and width.
+
+    Uniform shares are uniform in solid angle.
+    """
+    row, column = texel // width, texel % width
+    edges = _cos_edges(height).to(down)
+    cos_theta = torch.lerp(edges[row], edges[row + 1], down)
+    phi = 2 * math.pi * (column + across) / width
+    sin_theta = ((1 - cos_theta) * (1 + cos_theta)).clamp_min(0).sqrt()
+    return torch.stack((phi.sin() * sin_theta, phi.cos() * sin_theta, cos_theta), -1)
+
+
+def texel_centers(height: int, width: int) -> Float[Tensor, "T 3"]:
+    """The direction that halves the solid angle of each texel in height and width, row by row."""
+    half = torch.full((height * width,), 0.5)
+    return directions_within(torch.arange(height * width), half, half, height, width)
+
+
+def _cos_edges(height: int) -> Float[Tensor, " E"]:
+    """Cosines of the polar angles that bound the rows: halfway between neighboring rows."""
+    return ((torch.arange(height + 1) - 0.5).clamp(0, height - 1) * math.pi / (height - 1)).cos()
 
 
 def _columns_and_rows(

@@ -11,18 +11,23 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from neilfpp_method.fields.direction_map import interpolate, map_directions, texels_of
+from neilfpp_method.fields.direction_map import (
+    directions_within,
+    interpolate,
+    map_directions,
+    texel_solid_angles,
+)
+from neilfpp_method.fields.map_sampling import radiance_times_cosine
 from neilfpp_method.shading.color import luminance
 from neilfpp_method.shading.sampling import Technique
-from neilfpp_method.structures import IncidentSamples
 
 __all__ = ["EVEN_ROWS", "EnvironmentLight", "TexelDirections"]
 
 UNIFORM_SHARE = 0.1
-"""Share of the samples that are uniform over the sphere, so that the density is positive everywhere."""
+"""Share of the samples that ignore the radiance, so that the density is positive above every horizon."""
 MEAN_OF_CELL = (1 / 8, 3 / 4)
 """Weights of each neighbor and of the cell itself in the mean, over a cell, of the linear interpolation
 between cell centers.
@@ -58,7 +63,6 @@ class EnvironmentLight(nn.Module):
     def __init__(self, height: int, initial_radiance: float) -> None:
         super().__init__()
         self.register_buffer("log_radiance", torch.full((3, height, 2 * height), math.log(initial_radiance)))
-        self.register_buffer("cos_edges", _cos_edges(height), persistent=False)
         self.even = False
         # The size of a given map is not in the settings: take it from the checkpoint.
         self.register_load_state_dict_pre_hook(_take_size)
@@ -113,82 +117,42 @@ class EnvironmentLight(nn.Module):
         return interpolate(self.log_radiance.exp(), wi)
 
     def technique(self, normal: Float[Tensor, "N 3"]) -> Technique | None:
-        """Sampling of directions in proportion to the radiance; some lie below the horizon of a normal.
+        """Sampling of directions in proportion to the radiance times the cosine about a normal.
 
         None for an even light.
         """
-        if self.even:
-            return None
-        return Technique(lambda count, stochastic: self.sample(normal, count, stochastic).wi, self.pdf)
-
-    @torch.no_grad()
-    def sample(self, like: Float[Tensor, "N 3"], count: int, stochastic: bool) -> IncidentSamples:
-        """Sample `count` directions of the sphere per row of `like`, in proportion to the radiance."""
-        shape = (len(like), count)
-        strata = torch.arange(count, device=like.device, dtype=like.dtype)
-        within = (
-            torch.rand(3, *shape, device=like.device, dtype=like.dtype)
-            if stochastic
-            else like.new_full((3, *shape), 0.5)
-        )
-        cell = torch.searchsorted(self._texel_shares().cumsum(0), (strata + within[0]) / count)
-        wi = self._within(cell, within[1], within[2])
-        return IncidentSamples(wi, self.pdf(wi))
+        return None if self.even else radiance_times_cosine(self._texel_shares(), normal)
 
     @torch.no_grad()
     def texel_directions(self, like: Float[Tensor, "N 3"]) -> TexelDirections:
         """Sample a random direction in every texel, for each row of `like`: T strata of the sphere."""
         _, height, width = self.log_radiance.shape
-        cell = torch.arange(height * width, device=like.device).expand(len(like), -1)
-        within = torch.rand(2, *cell.shape, device=like.device, dtype=like.dtype)
-        return TexelDirections(self._within(cell, within[0], within[1]), self._texel_solid_angles())
-
-    @torch.no_grad()
-    def pdf(self, wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S"]:
-        """Density of `sample` per steradian over the sphere; constant within a texel."""
-        return (self._texel_shares() / self._texel_solid_angles())[
-            texels_of(wi, *self.log_radiance.shape[1:])
-        ]
+        texel = torch.arange(height * width, device=like.device).expand(len(like), -1)
+        within = torch.rand(2, *texel.shape, device=like.device, dtype=like.dtype)
+        wi = directions_within(texel, within[0], within[1], height, width)
+        return TexelDirections(wi, self._texel_solid_angles())
 
     def _resize(self, height: int, width: int) -> None:
         """Replace the map by one of this size, with undefined content."""
         self.log_radiance = self.log_radiance.new_zeros(3, height, width)
-        self.cos_edges = _cos_edges(height).to(self.log_radiance)
-
-    def _within(
-        self, cell: Int[Tensor, "N S"], down: Float[Tensor, "N S"], across: Float[Tensor, "N S"]
-    ) -> Float[Tensor, "N S 3"]:
-        """Directions in texels, at shares of their height and width; uniform shares are uniform in area."""
-        _, height, width = self.log_radiance.shape
-        cell = cell.clamp_max(height * width - 1)
-        row, column = cell // width, cell % width
-        cos_theta = torch.lerp(self.cos_edges[row], self.cos_edges[row + 1], down)
-        phi = 2 * math.pi * (column + across) / width
-        sin_theta = ((1 - cos_theta) * (1 + cos_theta)).clamp_min(0).sqrt()
-        return torch.stack((phi.sin() * sin_theta, phi.cos() * sin_theta, cos_theta), -1)
 
     def _texel_solid_angles(self) -> Float[Tensor, " T"]:
-        width = self.log_radiance.shape[2]
-        rows = (self.cos_edges[:-1] - self.cos_edges[1:]) * 2 * math.pi / width
-        return rows[:, None].expand(-1, width).reshape(-1)
+        return texel_solid_angles(*self.log_radiance.shape[1:]).to(self.log_radiance)
 
-    def _texel_shares(self) -> Float[Tensor, " T"]:
-        """Probability of each texel: the mean of the interpolated radiance over it times its solid angle.
+    @torch.no_grad()
+    def _texel_shares(self) -> Float[Tensor, "H W"]:
+        """Share of each texel in all light: its mean interpolated radiance times its solid angle.
 
         A neighbor of a bright texel gets its share, because interpolation makes it bright, too.
         """
-        solid_angles = self._texel_solid_angles()
-        mean = luminance(self.log_radiance.detach().permute(1, 2, 0).exp())
+        solid_angle = self._texel_solid_angles()
+        mean = luminance(self.log_radiance.permute(1, 2, 0).exp())
         mean = MEAN_OF_CELL[0] * (mean.roll(1, 1) + mean.roll(-1, 1)) + MEAN_OF_CELL[1] * mean
         above, below = torch.cat((mean[:1], mean[:-1])), torch.cat((mean[1:], mean[-1:]))
         mean = MEAN_OF_CELL[0] * (above + below) + MEAN_OF_CELL[1] * mean
-        power = mean.reshape(-1) * solid_angles
-        return (1 - UNIFORM_SHARE) * power / power.sum() + UNIFORM_SHARE * solid_angles / (4 * math.pi)
-
-
-def _cos_edges(height: int) -> Float[Tensor, " E"]:
-    """Cosines of the polar angles that bound the rows: halfway between neighboring rows."""
-    return ((torch.arange(height + 1) - 0.5).clamp(0, height - 1) * math.pi / (height - 1)).cos()
+        solid_angle = solid_angle.view_as(mean)
+        power = mean * solid_angle
+        return (1 - UNIFORM_SHARE) * power / power.sum() + UNIFORM_SHARE * solid_angle / (4 * math.pi)
 
 
 def _take_size(light: EnvironmentLight, state: Mapping[str, Any], prefix: str, *_: object) -> None:

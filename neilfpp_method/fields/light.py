@@ -36,7 +36,10 @@ class Light(Protocol):
         ...
 
     def technique(self, normal: Float[Tensor, "N 3"]) -> Technique | None:
-        """Sampling of directions in proportion to the radiance; None if the light cannot be sampled."""
+        """Sampling of directions in proportion to the radiance times the cosine about a normal.
+
+        Its density must be positive in all directions above the horizon. None if the light cannot be sampled.
+        """
         ...
 
 

@@ -12,8 +12,8 @@ from neilfpp_method.structures import IncidentSamples
 
 __all__ = ["directions_for_viewers", "draw_directions"]
 
-BY_COSINE, BY_LIGHT, BY_LOBE = 24, 24, 3
-"""Directions of `directions_for_viewers` by technique: cosine, light, and the lobe of each viewer."""
+BY_LIGHT, BY_LOBE = 48, 3
+"""Directions of `directions_for_viewers` by technique: light, and the lobe of each viewer."""
 
 WITHOUT_LOBE = {"mis": "no_lobe", "lobe": "cosine"}
 """Samplers that replace those that sample the lobe, for Lambertian surfaces, which have none."""
@@ -53,13 +53,10 @@ def directions_for_viewers(
 ) -> IncidentSamples:
     """Choose incident directions for all V viewers of a point together, the same at every call.
 
-    Cosine, light and the lobes of all viewers are combined by the balance heuristic. Arguments as in
-    `draw_directions`.
+    The light (the cosine if it cannot be sampled) and the lobes of all viewers are combined by the balance
+    heuristic. Arguments as in `draw_directions`.
     """
-    techniques = [(cosine(normal), BY_COSINE)]
-    towards_light = light.technique(normal)
-    if towards_light is not None:
-        techniques.append((towards_light, BY_LIGHT))
+    techniques = [(light.technique(normal) or cosine(normal), BY_LIGHT)]
     if lobe is not None:
         techniques += [
             (specular_lobe(normal, direction, roughness, lobe), BY_LOBE) for direction in wo.unbind(1)

@@ -139,7 +139,7 @@ FAST: Mapping[str, Any] = {
     "volume.normal_radius": 0.15,
     "shading.lobe": "ggx",
     "shading.sampler": "mis",
-    "shading.train_samples": 32,
+    "shading.train_samples": 64,
     "shading.eval_samples": 128,
     "inter_reflection.mode": "hard",
     "inter_reflection.rays_per_point": 0.25,

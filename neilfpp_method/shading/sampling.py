@@ -37,13 +37,14 @@ __all__ = [
     "sample_directions",
     "specular_lobe",
     "sphere_lattice",
+    "strata",
 ]
 
 GOLDEN_TURN = (3 - math.sqrt(5)) / 2
 """The golden angle as a share of a full turn."""
 
-LOBE_SHARE, LIGHT_SHARE = 0.25, 0.5
-"""Shares of the directions of "mis" for lobe and light, if the light can be sampled; cosine has the rest
+LOBE_SHARE = 0.25
+"""Share of the directions of "mis" for the lobe if the light can be sampled, which has the rest
 (docs/performance.md).
 """
 
@@ -71,11 +72,14 @@ class _Lattice:
 
 def _lattice(n: Float[Tensor, "N 3"], count: int, stochastic: bool) -> _Lattice:
     k = torch.arange(count, device=n.device, dtype=n.dtype).expand(len(n), count)
-    if stochastic:
-        return _Lattice(
-            (k + torch.rand_like(k)) / count, (k * GOLDEN_TURN + torch.rand_like(n[:, :1])).frac()
-        )
-    return _Lattice((k + 0.5) / count, (k * GOLDEN_TURN).frac())
+    shift = torch.rand_like(n[:, :1]) if stochastic else 0.0
+    return _Lattice(strata(n, count, stochastic), (k * GOLDEN_TURN + shift).frac())
+
+
+def strata(like: Float[Tensor, "N 3"], count: int, stochastic: bool) -> Float[Tensor, "N S"]:
+    """One number in each of `count` equal intervals of [0, 1], for each row: random, or the midpoint."""
+    k = torch.arange(count, device=like.device, dtype=like.dtype).expand(len(like), count)
+    return (k + (torch.rand_like(k) if stochastic else 0.5)) / count
 
 
 def _about(
@@ -190,8 +194,8 @@ def sample_directions(
     """Sample `count` incident directions per point, in at least float32.
 
     The kinds are "fibonacci", "cosine", "lobe", "mis" and "no_lobe". "mis" is half cosine and half lobe; with
-    a `light` it is cosine, lobe and light. "no_lobe" is half cosine and half light; only cosine if `light` is
-    None.
+    a `light`, whose technique contains the cosine, it is light and lobe. "no_lobe" is the light; the cosine
+    if `light` is None.
 
     Raises:
         UserError: there is no such sampler.
@@ -203,17 +207,10 @@ def sample_directions(
     elif kind == "lobe":
         techniques = [(specular_lobe(n, wo, roughness, lobe), count)]
     elif kind == "mis":
-        to_light = 0 if light is None else int(LIGHT_SHARE * count)
-        to_lobe = int(LOBE_SHARE * count) if to_light else count // 2
-        techniques = [
-            (cosine(n), count - to_lobe - to_light),
-            (specular_lobe(n, wo, roughness, lobe), to_lobe),
-        ]
-        techniques += [(light, to_light)] if light is not None else []
+        to_lobe = count // 2 if light is None else int(LOBE_SHARE * count)
+        techniques = [(light or cosine(n), count - to_lobe), (specular_lobe(n, wo, roughness, lobe), to_lobe)]
     elif kind == "no_lobe":
-        to_light = 0 if light is None else int(LIGHT_SHARE * count)
-        techniques = [(cosine(n), count - to_light)]
-        techniques += [(light, to_light)] if light is not None else []
+        techniques = [(light or cosine(n), count)]
     else:
         raise UserError(f"unknown sampler '{kind}'", "choose fibonacci, cosine, lobe, mis or no_lobe")
     return combine(techniques, stochastic)
