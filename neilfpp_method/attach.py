@@ -27,12 +27,13 @@ from neilfpp_method.health.cases import Health
 from neilfpp_method.health.guard import StepGuard
 from neilfpp_method.health.measure import measure_hits
 from neilfpp_method.health.watch import Watch
+from neilfpp_method.hosts.adapt import adapt, check_parameter_groups
 from neilfpp_method.hosts.answers import Rendered, as_hits
 from neilfpp_method.hosts.base import HasParameterGroups, TracesLight
-from neilfpp_method.hosts.batches import check_batch, check_device_and_dtype, check_points, pixel_batch
+from neilfpp_method.hosts.batches import check_batch, check_like, check_points, pixel_batch
 from neilfpp_method.hosts.capabilities import missing_capabilities
 from neilfpp_method.hosts.first_batches import FirstBatches
-from neilfpp_method.hosts.foreign import ForeignHost, adapt_host, answers_secondary_rays, proxy_for
+from neilfpp_method.hosts.foreign import ForeignHost, answers_secondary_rays, proxy_for
 from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
 from neilfpp_method.model import EVAL_RAYS, NeilfModel
@@ -108,7 +109,7 @@ class AttachedNeilf(nn.Module):
             UserError: the batch or the output of the host is invalid, or on another device.
         """
         check_batch(batch)
-        check_device_and_dtype(batch.rays, self.model.brdf)
+        self._check_device_and_dtype("rays", batch.origins)
         self.first_batches.pixels(batch)
         position = self._position(step)
         weights = active_losses(position.stage, self.model.config, self.model.stages, position.share)
@@ -162,7 +163,7 @@ class AttachedNeilf(nn.Module):
                 )
             with torch.no_grad():
                 rays, hits = self.model.host.image_hits(rays, next(self.model.brdf.parameters()))
-        check_device_and_dtype(rays, self.model.brdf)
+        self._check_device_and_dtype("rays", rays.origins)
         rendered = self._host_hits(rays, hits, moves_host=False)
         if rendered is None:
             return self.model.maps(rays)
@@ -190,12 +191,15 @@ class AttachedNeilf(nn.Module):
     def materials(self, x: Float[Tensor, "N 3"]) -> Material:
         """Base color, roughness and metallic at points of the scene frame."""
         check_points("x", x)
+        self._check_device_and_dtype("x", x)
         return self.model.materials(x)
 
     def incident_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
         """Linear radiance that arrives at surface points x from directions wi."""
         check_points("x", x)
         check_points("wi", wi, axes=3)
+        self._check_device_and_dtype("x", x)
+        self._check_device_and_dtype("wi", wi)
         return self.model.incident_light(x, wi)
 
     def shade(self, hits: SurfaceHits, wo: Float[Tensor, "N 3"]) -> Shading:
@@ -238,6 +242,9 @@ class AttachedNeilf(nn.Module):
         # The position of a stage by name is unknown: step 0 of 2 never is the last step of the stage.
         return StagePosition(Stage(step), 0, 2)
 
+    def _check_device_and_dtype(self, name: str, value: Tensor) -> None:
+        check_like(name, value, next(self.model.brdf.parameters()))
+
     def _host_hits(self, rays: RayBatch, hits: Rendered | None, moves_host: bool) -> SurfaceHits | None:
         """The host's hits of camera rays, given or rendered; None if the model renders the host itself.
 
@@ -252,6 +259,8 @@ class AttachedNeilf(nn.Module):
             return host.camera_hits(rays)
 
     def _observe(self, batch: PixelBatch, hits: SurfaceHits) -> None:
+        if len(batch) == 0:
+            return
         self.first_batches.hits(batch, hits)
         self._last_rendered = batch, hits.detach()
         if isinstance(self.model.host, ForeignHost):
@@ -289,8 +298,8 @@ def attach_neilf(
         A module with the losses, maps and parameters of material and light.
 
     Raises:
-        UserError: the host has none of these forms, no preset has this name, an argument is out of range, or
-            the environment map that the settings name cannot be used.
+        UserError: the host has none of these forms or takes other arguments, no preset has this name, an
+            argument is out of range, or the environment map that the settings name cannot be used.
     """
     if response not in RADIANCE_SCALE:
         raise UserError(
@@ -304,11 +313,17 @@ def attach_neilf(
         )
     if not 0 < scale < math.inf:
         raise UserError(f"radiance_scale is {scale}", "give the largest radiance of the host, above 0")
+    adapted = adapt(host, response)
     borrowed = not isinstance(host, HasParameterGroups)
+    if not borrowed:
+        check_parameter_groups(host)
     if isinstance(config, str):
         config = preset(config)
         config = replace(config, train=replace(config.train, sdf_steps=0)) if borrowed else config
-    adapted = adapt_host(host, response)
+    if not isinstance(config, NeilfConfig):
+        raise UserError(
+            f"config is a {type(config).__name__}", "give a NeilfConfig, or the name of a preset, as 'fast'"
+        )
     facts = SceneFacts(response, median_radiance, scale, "inverted_sphere" if open_scene else "constant")
     with torch.random.fork_rng(range(torch.cuda.device_count()) if torch.cuda.is_initialized() else []):
         proxy = proxy_for(adapted, config)

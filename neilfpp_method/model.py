@@ -98,7 +98,7 @@ class NeilfModel(nn.Module):
         self.facts, self.borrowed = facts, borrowed
         self.units = radiance_units(config, facts)
         self.stages = _stage_table(host, borrowed)
-        self.check_outputs = OutputCheck(host, config.shading.hit_share)
+        self.check_outputs = OutputCheck(host, config.shading.hit_share, may_be_constant=borrowed)
         self.observers: list[Callable[[PixelBatch, SurfaceHits], None]] = []
         self.brdf = BrdfField(config.brdf, config.encoding, config.volume.radius)
         has_gains = config.optimizer.exposure > 0 and len(facts.log_gains) > 0

@@ -298,7 +298,6 @@ BAD_ANSWERS = [
     (lambda c, p, n: (c, p, n.detach().numpy()), r"its normal is a ndarray; return a floating-point tensor"),
     (lambda c, p, n: (c.to("meta"), p, n), r"its color is on meta, the rays are on cpu; move the host"),
     (lambda c, p, n: (c, p, 3.0 * n), r"its normal is not a unit vector: that of a hit has the length 3"),
-    (lambda c, p, n: (c.detach(), p, n), r"its color has no gradient to the host's parameters"),
 ]
 
 

@@ -117,7 +117,7 @@ class Capture:
                 f"{self.root.resolve().name} ({self.format}): {len(self.views)} views of {size}, "
                 f"{len(self.train_views)} to train on and {len(self.test_views)} to test on",
                 f"pixels: {'linear HDR' if self.hdr else 'display values (sRGB)'}; "
-                f"mask files: {masks or 'none'}; "
+                f"mask files: {_of(masks, len(self.views))}; "
                 f"point cloud: {self.point_cloud.name if self.point_cloud else 'none'}",
                 f"scene: centre ({x:.3g}, {y:.3g}, {z:.3g}), 1 scene unit = {self.normalisation.scale:.4g} "
                 "world units" + FOUND[self.scene_from],
@@ -169,6 +169,11 @@ def load_capture(
         point_cloud=files.point_cloud,
         scene_from=files.scene_from,
     )
+
+
+def _of(count: int, views: int) -> str:
+    """The number of mask files, with that of the views if some have none."""
+    return f"{count} of {views}" if 0 < count < views else str(count or "none")
 
 
 def _recognise(root: Path) -> str:

@@ -38,6 +38,8 @@ MAX_SIDE = 65_536
 """Longest side of an image, in pixels."""
 MAX_PIXELS = 2**30
 """Largest number of pixels of an image; bounds the memory."""
+LABEL = 1.001 / 255
+"""Largest value of a mask file, in [0, 1], at which it contains labels instead of brightness: 1 of 255."""
 RADIANCE_HEADER = 4096
 """Largest size of the header of a Radiance HDR file, in bytes."""
 
@@ -71,8 +73,10 @@ class ImageFile:
         """The values of a mask file, in [0, 1]: its alpha channel if it has one, else its brightest channel.
 
         Tools that cut out objects write the mask as the alpha channel of a white image or of the photograph.
+        Segmentation tools write the labels 0 and 1; a file whose largest value is 1 of 255 is read as such.
         """
-        return self.pixels.max(axis=-1) if self.alpha is None else self.alpha
+        values = self.pixels.max(axis=-1) if self.alpha is None else self.alpha
+        return (values > 0).astype(np.float32) if 0 < values.max() <= LABEL else values
 
 
 # --------------------------------------------------------------------------------------------- kinds of files

@@ -150,7 +150,8 @@ def _carve(outlines: Sequence[Outline], start: Normalisation) -> Normalisation:
         held = grid[agreement(outlines, grid) >= AGREEMENT]
         if not len(held):
             raise UserError(
-                "no point of the scene lies in all masks", "check masks and cameras, or add a scene box"
+                "no point of the scene lies in all masks",
+                "check the cameras and the masks, which are white on the object, or add a scene box",
             )
         low, high = held.min(axis=0) - cell, held.max(axis=0) + cell
     return _box(low, high)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import torch
@@ -63,16 +64,27 @@ def _siren_(layer: nn.Linear) -> None:
     nn.init.uniform_(layer.weight, -bound, bound)
 
 
+# Named functions and not lambdas, so that networks can be pickled.
+def _relu_and_slope(z: Tensor) -> UnitSample:
+    return UnitSample(torch.relu(z), (z > 0).to(z.dtype))
+
+
+def _sine(z: Tensor) -> Tensor:
+    return torch.sin(SINE_FREQUENCY * z)
+
+
+def _sine_and_slope(z: Tensor) -> UnitSample:
+    return UnitSample(_sine(z), SINE_FREQUENCY * torch.cos(SINE_FREQUENCY * z))
+
+
 ACTIVATIONS: Mapping[str, Activation] = {
     "softplus": Activation(
-        lambda z: softplus(z, SOFTPLUS_SHARPNESS), lambda z: softplus_and_slope(z, SOFTPLUS_SHARPNESS), _he_
+        partial(softplus, sharpness=SOFTPLUS_SHARPNESS),
+        partial(softplus_and_slope, sharpness=SOFTPLUS_SHARPNESS),
+        _he_,
     ),
-    "relu": Activation(torch.relu, lambda z: UnitSample(torch.relu(z), (z > 0).to(z.dtype)), _he_),
-    "sine": Activation(
-        lambda z: torch.sin(SINE_FREQUENCY * z),
-        lambda z: UnitSample(torch.sin(SINE_FREQUENCY * z), SINE_FREQUENCY * torch.cos(SINE_FREQUENCY * z)),
-        _siren_,
-    ),
+    "relu": Activation(torch.relu, _relu_and_slope, _he_),
+    "sine": Activation(_sine, _sine_and_slope, _siren_),
 }
 
 

@@ -4,6 +4,7 @@
 |---------------------------|--------------------------------------------------------------|
 | `SurfaceHits`             | none                                                         |
 | dictionary                | by the host's `read_outputs`, else by the names below        |
+| named tuple               | as a dictionary, if it has a color and a normal by name      |
 | (color, position, normal) | as the result of a function: a ray with a zero normal misses |
 
 | field         | names in a dictionary                                                             |
@@ -40,8 +41,8 @@ COLOR, POSITION, DEPTH, NORMAL = ("color", "rgb"), ("position",), ("depth",), ("
 OPACITY, CONCENTRATION = ("opacity", "accumulation", "alpha"), ("concentration",)
 
 
-def as_hits(host: object, rays: RayBatch, rendered: Rendered) -> SurfaceHits:
-    """Convert what a host rendered for rays to hits; see the tables of this module.
+def as_hits(host: object, rays: RayBatch, rendered: Any) -> SurfaceHits:
+    """Convert what a host rendered for rays, in any form of `Rendered`, to hits; see the tables above.
 
     Example:
         >>> hits = as_hits(host, rays, {"rgb": rgb, "depth": depth, "normal": normal, "accumulation": alpha})
@@ -50,13 +51,15 @@ def as_hits(host: object, rays: RayBatch, rendered: Rendered) -> SurfaceHits:
         UserError: an output is missing, or its shape does not match the rays.
     """
     name = host_name(host)
+    if _has_names(rendered):
+        rendered = rendered._asdict()
     if isinstance(rendered, Mapping):
         reads = isinstance(host, ReadsOutputs)
         hits = host.read_outputs(rays, rendered) if reads else _from_dictionary(name, rays, rendered)
-    elif isinstance(rendered, tuple | list):
-        hits = function_hits(name, rays, rendered)
-    else:
+    elif all(hasattr(rendered, f.name) for f in fields(SurfaceHits)):
         hits = rendered
+    else:
+        hits = function_hits(name, rays, rendered)
     check_tensors(name, rays, {f.name: getattr(hits, f.name, None) for f in fields(SurfaceHits)})
     return hits
 
@@ -109,6 +112,12 @@ def _from_dictionary(name: str, rays: RayBatch, outputs: Mapping[str, Tensor]) -
     concentration = _optional(outputs, CONCENTRATION)
     known = opacity.detach() if concentration is None else _column(name, "concentration", rays, concentration)
     return SurfaceHits(color, position, normal, opacity, known)
+
+
+def _has_names(rendered: object) -> bool:
+    """Whether this is a named tuple whose names identify color and normal, in any order."""
+    names = getattr(rendered, "_fields", ())
+    return all(any(name in names for name in group) for group in (COLOR, NORMAL))
 
 
 def _optional(outputs: Mapping[str, Tensor], names: Sequence[str]) -> Tensor | None:

@@ -34,6 +34,10 @@ MAX_MEDIAN_DISTANCE = 1.5
 """Median distance of hits from the origin above which the scene is too large, scene units. An object in the
 unit sphere may stand on a ground.
 """
+LOST_DISTANCE = 10.0
+"""Median distance of hits from the origin above which nothing can be estimated: the fields of material and
+light end at the scene's bounding box, `volume.radius`.
+"""
 MAX_REVIEWED_HITS = 256
 """Maximum number of hits that are rendered from another viewpoint, once."""
 VIEWPOINT_TANGENT = 0.6
@@ -102,6 +106,11 @@ class FirstBatches:
                     f"{name} of {int(rows.sum())} of {len(batch)} pixels are not finite",
                     "leave those pixels out",
                 )
+        if len(batch) and not (batch.mask.min() >= 0 and batch.mask.max() <= 1):
+            raise UserError(
+                f"mask is between {batch.mask.min():.3g} and {batch.mask.max():.3g}",
+                "give 1 on the object and 0 off it; divide 8-bit masks by 255",
+            )
         self._check_colors(batch.color[batch.mask > 0.5])
 
     def hits(self, batch: PixelBatch, hits: SurfaceHits) -> None:
@@ -179,12 +188,12 @@ class FirstBatches:
                 "turn them outwards: normal = -normal",
             )
         reach = hits.position[hit].norm(dim=-1).median().item()
+        far = f"half of its hits are {reach:.3g} or more from the origin"
+        remedy = "move and scale cameras and host so that the object lies in the unit sphere"
+        if reach > LOST_DISTANCE:
+            raise UserError(f"{self.name}: {far}", f"{remedy} (docs/hosts.md, Other units)")
         if reach > MAX_MEDIAN_DISTANCE:
-            self._warn(
-                "far",
-                f"half of its hits are {reach:.3g} or more from the origin",
-                "move and scale cameras and host so that the object lies in the unit sphere",
-            )
+            self._warn("far", far, remedy)
 
     @torch.no_grad()
     def _check_another_view(

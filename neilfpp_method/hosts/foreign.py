@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection
-from dataclasses import fields
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -17,16 +15,15 @@ from torch import Tensor, nn
 from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.answers import as_hits, in_precision, no_hits
-from neilfpp_method.hosts.base import HasRadiance, Host, ImageHost, RegularisedHits, TracesLight
-from neilfpp_method.hosts.function import CallableHost
+from neilfpp_method.hosts.base import HasRadiance, ImageHost, RegularisedHits, TracesLight
 from neilfpp_method.hosts.image import rays_like
-from neilfpp_method.hosts.outputs import check_tensors, host_name
+from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import PixelBatch, RayBatch, SurfaceHits
 from neilfpp_method.volume.distance_grid import GRID_RESOLUTION
 
-__all__ = ["ForeignHost", "adapt_host", "answers_secondary_rays", "proxy_for"]
+__all__ = ["ForeignHost", "answers_secondary_rays", "proxy_for"]
 
 PASSED_ON = (
     "may_hit",
@@ -42,30 +39,6 @@ COARSE = (torch.float16, torch.bfloat16)
 """Types that are too coarse for positions."""
 
 log = logging.getLogger(__name__)
-
-
-def adapt_host(host: object, response: str) -> Host | ImageHost:
-    """Make a host of a host, an image host, a nerfstudio model, or a function of (origins, directions).
-
-    Args:
-        host: one of them.
-        response: meaning of pixel values, "linear" or "srgb", which a nerfstudio model also renders.
-
-    Raises:
-        UserError: it is none of them.
-    """
-    if isinstance(host, nn.Module) and hasattr(host, "get_outputs") and hasattr(host, "config"):
-        from neilfpp_method.hosts.nerfstudio import NerfstudioHost
-
-        return NerfstudioHost(host, response=response)
-    if isinstance(host, Host | ImageHost):
-        return host
-    if callable(host):
-        return CallableHost(host)
-    raise UserError(
-        f"{type(host).__name__} is not a host",
-        "give an object with render(rays) or render_image(camera), or a function of (origins, directions)",
-    )
 
 
 def answers_secondary_rays(host: object) -> bool:
@@ -126,7 +99,7 @@ class ForeignHost(nn.Module):
             return self.proxy.render(rays)
         if not hasattr(self.inner, "render"):
             return self.camera_hits(rays)
-        return self._usable(rays, self.inner.render(rays))
+        return self.read(rays, self.inner.render(rays))
 
     def camera_hits(self, rays: RayBatch) -> SurfaceHits:
         """Hits of camera rays by the host itself.
@@ -139,7 +112,7 @@ class ForeignHost(nn.Module):
                 f"{self.name} draws whole images, not rays",
                 "pass its hits: losses(batch, step, hits) and maps(rays, hits), see docs/hosts.md",
             )
-        return no_hits(rays) if len(rays) == 0 else self._usable(rays, self.inner.render(rays))
+        return no_hits(rays) if len(rays) == 0 else self.read(rays, self.inner.render(rays))
 
     def image_hits(self, camera: Camera, like: Tensor) -> tuple[RayBatch, SurfaceHits]:
         """The rays of all pixels of a camera, and the host's hits.
@@ -174,11 +147,7 @@ class ForeignHost(nn.Module):
         if len(batch) == 0:
             return RegularisedHits(no_hits(batch.rays), {})
         rendered = self.inner.render_regularised(batch, names)
-        return RegularisedHits(self._usable(batch.rays, rendered.hits), rendered.terms)
-
-    def _usable(self, rays: RayBatch, hits: Any) -> SurfaceHits:
-        check_tensors(self.name, rays, {f.name: getattr(hits, f.name, None) for f in fields(SurfaceHits)})
-        return self._precise(rays, hits)
+        return RegularisedHits(self.read(batch.rays, rendered.hits), rendered.terms)
 
     def _precise(self, rays: RayBatch, hits: SurfaceHits) -> SurfaceHits:
         if hits.position.dtype in COARSE and not self.coarse_said:

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 from torch import Tensor
 
-from neilfpp_method.hosts.answers import as_hits, function_hits
+from neilfpp_method.hosts.answers import Rendered, as_hits
 from neilfpp_method.structures import RayBatch, SurfaceHits
 
 __all__ = ["CallableHost", "RenderFunction"]
 
-RenderFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor] | Mapping[str, Tensor]]
+RenderFunction = Callable[[Tensor, Tensor], Rendered]
 
 
 class CallableHost:
     """Makes a host of a function (origins, directions) → (color, position, normal).
 
-    A ray whose normal is shorter than ½ or not finite is a miss. The function may return a dictionary
-    instead, which is read as `hosts.answers` says. This class is not an `nn.Module`, so that a function that
-    is one is not registered as a submodule.
+    A ray whose normal is shorter than ½ or not finite is a miss. The function may return a dictionary or
+    `SurfaceHits` instead, which is read as `hosts.answers` says. This class is not an `nn.Module`, so that a
+    function that is one is not registered as a submodule.
     """
 
     def __init__(self, function: RenderFunction) -> None:
@@ -32,7 +32,4 @@ class CallableHost:
         Raises:
             UserError: it does not return tensors of the right shape on the device of the rays.
         """
-        answer = self.function(rays.origins, rays.directions)
-        if isinstance(answer, Mapping):
-            return as_hits(self, rays, answer)
-        return function_hits(self.name, rays, answer)
+        return as_hits(self, rays, self.function(rays.origins, rays.directions))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import fields
 from typing import Any
 
@@ -18,6 +19,8 @@ SHAPES = {"color": (3,), "position": (3,), "normal": (3,), "opacity": (), "conce
 UNIT = 1e-2
 """Largest difference of the length of a normal from 1: blending in half precision loses some digits."""
 
+log = logging.getLogger(__name__)
+
 
 class OutputCheck:
     """Rejects invalid outputs of a host.
@@ -29,12 +32,15 @@ class OutputCheck:
     Args:
         host: the host whose outputs are checked.
         hit_share: smallest concentration of a hit.
+        may_be_constant: whether the host may have nothing to train, as a function or a frozen model.
     """
 
-    def __init__(self, host: object, hit_share: float) -> None:
+    def __init__(self, host: object, hit_share: float, may_be_constant: bool = False) -> None:
         self.name = host_name(host)
         self.hit_share = hit_share
+        self.may_be_constant = may_be_constant
         self.normals_known = False
+        self._warned_of_constant = False
 
     def __call__(self, rays: RayBatch, hits: Any, color_moves: bool) -> None:
         """Check the output of one call.
@@ -42,19 +48,26 @@ class OutputCheck:
         Args:
             rays: the rays that were rendered.
             hits: what the host returned, `SurfaceHits` if the host is correct.
-            color_moves: whether the color must carry a gradient to the host.
+            color_moves: whether the color should carry a gradient to the host.
 
         Raises:
             UserError: an output is invalid; the message names host, output and remedy.
         """
         check_tensors(self.name, rays, {f.name: getattr(hits, f.name, None) for f in fields(SurfaceHits)})
         if color_moves and not hits.color.requires_grad:
-            raise UserError(
-                f"{self.name}: its color has no gradient to the host's parameters, which this stage trains",
-                "render without torch.no_grad and without detach, or set train.joint_steps to 0",
-            )
+            self._constant_color()
         if not self.normals_known:
             self.normals_known = check_normals(self.name, hits, self.hit_share)
+
+    def _constant_color(self) -> None:
+        """Report a color without gradient in a stage that trains the host."""
+        problem = f"{self.name}: its color has no gradient to the host's parameters, which this stage trains"
+        remedy = "render without torch.no_grad and without detach"
+        if not self.may_be_constant:
+            raise UserError(problem, f"{remedy}, or set train.joint_steps to 0")
+        if not self._warned_of_constant:
+            self._warned_of_constant = True
+            log.warning("%s: only material and light are trained; to train the host, %s", problem, remedy)
 
 
 def host_name(host: object) -> str:

@@ -76,7 +76,7 @@ def check_host(
     copy = rays.origins.clone(), rays.directions.clone()
     before = Modes.of(modules, parameters)
     try:
-        hits = render_checked(host, name, rays)
+        hits = render_checked(host, rays)
         stages = host.stages if isinstance(host, HasStages) else STAGES
         trains_geometry = any("geometry" in plan.moves for plan in stages.values())
         hit = hits.is_hit(HIT_SHARE).detach()
@@ -162,7 +162,7 @@ def _colors(case: Case) -> None:
 def _misses(case: Case) -> None:
     outward = -case.rays.directions
     away = RayBatch(case.rays.origins + FAR * outward, outward)
-    missed = render_checked(case.host, case.name, away)
+    missed = render_checked(case.host, away)
     for field in fields(SurfaceHits):
         finite = getattr(missed, field.name).isfinite().all()
         case.require(finite, f"its {field.name} is not finite for a ray that misses")
@@ -186,7 +186,7 @@ def _gradients_flow(case: Case) -> None:
 def _gradients_stop(case: Case) -> None:
     before = [p.grad for p in case.parameters]
     with torch.no_grad():
-        held = case.host.render(case.rays)
+        held = render_checked(case.host, case.rays)
     for field in fields(SurfaceHits):
         leaks = getattr(held, field.name).requires_grad
         case.require(not leaks, f"its {field.name} carries a gradient under torch.no_grad: detach it there")

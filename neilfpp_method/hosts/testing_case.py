@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from neilfpp_method.errors import UserError
+from neilfpp_method.hosts.answers import as_hits
 from neilfpp_method.hosts.base import HasSurfaceWidth, Host
-from neilfpp_method.hosts.outputs import check_tensors
 from neilfpp_method.structures import RayBatch, SurfaceHits
 
 __all__ = ["HIT_SHARE", "Case", "ContractBroken", "Modes", "render_checked"]
@@ -83,7 +83,7 @@ class Case:
         """Render rays after seeding; the random state is restored."""
         with torch.random.fork_rng(devices=[rays.origins.device] if rays.origins.is_cuda else []):
             torch.manual_seed(seed)
-            return render_checked(self.host, self.name, rays)
+            return render_checked(self.host, rays)
 
     def constants(self, rays: RayBatch, seed: int = 0) -> SurfaceHits:
         """As `seeded`, without gradients."""
@@ -96,15 +96,13 @@ class Case:
         return float(self.host.surface_width()) if isinstance(self.host, HasSurfaceWidth) else 0.0
 
 
-def render_checked(host: Host, name: str, rays: RayBatch) -> SurfaceHits:
+def render_checked(host: Host, rays: RayBatch) -> SurfaceHits:
     """Render rays, and check shapes, types and devices of the result.
 
     Raises:
         ContractBroken: rendering fails with a `UserError`, or the result is invalid.
     """
     try:
-        hits = host.render(rays)
-        check_tensors(name, rays, {f.name: getattr(hits, f.name, None) for f in fields(SurfaceHits)})
+        return as_hits(host, rays, host.render(rays))
     except UserError as error:
         raise ContractBroken(str(error)) from error
-    return hits

@@ -21,6 +21,8 @@ THUMBNAIL = (32, 32)
 """Width and height of the thumbnails that are compared, in pixels."""
 SAME = 0.02
 """Root mean square difference of standardised thumbnails below which two views are duplicates."""
+LIT = 0.99
+"""Quantile of the lit pixels of a picture above which brightness is clipped before pictures are compared."""
 SEEN_ANGLE = 30.0
 """Largest angle between a covered direction and the nearest view, in degrees."""
 SPHERE = 1000
@@ -105,6 +107,16 @@ def exposure_factors(luminances: Sequence[float], placement: CameraPlacement) ->
     return factors
 
 
+def _grey(picture: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
+    """Brightness, clipped at the brightest hundredth of the picture.
+
+    A sun or a broken pixel of HDR images would otherwise determine the correlation of all pictures.
+    """
+    grey = picture.mean(axis=-1)
+    lit = grey[grey > 0]
+    return np.minimum(grey, np.quantile(lit, LIT)) if lit.size else grey
+
+
 def duplicates(pictures: Sequence[Float[np.ndarray, "_ _ 3"]]) -> tuple[tuple[int, int], ...]:
     """Return the pairs of pictures that are equal except for compression and brightness.
 
@@ -112,7 +124,7 @@ def duplicates(pictures: Sequence[Float[np.ndarray, "_ _ 3"]]) -> tuple[tuple[in
     of a single colour are ignored.
     """
     thumbnails = np.stack(
-        [cv2.resize(np.sqrt(p.mean(axis=-1)), THUMBNAIL, interpolation=cv2.INTER_AREA) for p in pictures]
+        [cv2.resize(np.sqrt(_grey(p)), THUMBNAIL, interpolation=cv2.INTER_AREA) for p in pictures]
     )
     flat = thumbnails.reshape(len(pictures), -1)
     spread = flat.std(axis=1)

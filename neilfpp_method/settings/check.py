@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import asdict
+
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.types import InterReflectionConfig, NeilfConfig
 
 __all__ = ["check_config"]
+
+COUNTS = {
+    "train": ("rays", "checkpoint_every", "eval_chunk"),
+    "shading": ("train_samples", "eval_samples"),
+    "volume": ("initial_samples", "samples"),
+}
+"""Settings that are at least 1, by group."""
+SHARES = {"shading": ("hit_share",), "brdf": ("initial_base_color", "initial_metallic")}
+"""Settings between 0 and 1, by group."""
 
 
 def check_config(config: NeilfConfig) -> None:
@@ -14,6 +26,7 @@ def check_config(config: NeilfConfig) -> None:
     Raises:
         UserError: a share or a rate is out of range, or two settings exclude each other.
     """
+    _check_ranges(config)
     if not 0 < config.train.fresh <= 1:
         raise UserError(f"--config.train.fresh is {config.train.fresh}", "set it above 0 and at most to 1")
     if config.volume.beta_final < 0:
@@ -27,6 +40,28 @@ def check_config(config: NeilfConfig) -> None:
             "set every value of final above 0, and the others to 0 or more",
         )
     _check_inter_reflection(config.inter_reflection, config.light.kind)
+
+
+def _check_ranges(config: NeilfConfig) -> None:
+    for group, names in COUNTS.items():
+        for name in names:
+            _require(getattr(getattr(config, group), name) >= 1, config, group, name, "1 or more")
+    for group, names in SHARES.items():
+        for name in names:
+            _require(0 <= getattr(getattr(config, group), name) <= 1, config, group, name, "0 to 1")
+    for name in ("radius", "beta_init"):
+        value = getattr(config.volume, name)
+        _require(0 < value < math.inf, config, "volume", name, "a number above 0")
+    for group in ("loss", "optimizer"):
+        for name, value in asdict(getattr(config, group)).items():
+            if isinstance(value, int | float):
+                _require(0 <= value < math.inf, config, group, name, "0 or more")
+
+
+def _require(passed: bool, config: NeilfConfig, group: str, name: str, wanted: str) -> None:
+    if not passed:
+        option = f"--config.{group.replace('_', '-')}.{name.replace('_', '-')}"
+        raise UserError(f"{option} is {getattr(getattr(config, group), name)}", f"set it to {wanted}")
 
 
 def _check_inter_reflection(settings: InterReflectionConfig, light: str) -> None:

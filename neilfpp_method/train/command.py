@@ -340,10 +340,6 @@ def _check(config: NeilfConfig) -> None:
         raise UserError(
             "the stages have no steps", "set --config.train.sdf-steps and the others to 0 or more"
         )
-    for name in ("rays", "checkpoint_every"):
-        if getattr(config.train, name) < 1:
-            option = f"--config.train.{name.replace('_', '-')}"
-            raise UserError(f"{option} is {getattr(config.train, name)}", "set it to 1 or more")
     check_config(config)
     if config.known_map is not None:
         check_environment(Path(config.known_map))

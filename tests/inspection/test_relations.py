@@ -56,6 +56,16 @@ def test_duplicates_survive_compression_size_and_brightness() -> None:
     assert duplicates([*pictures, 0.5 * small, rough, shifted, black, black]) == ((1, 5), (2, 4))
 
 
+def test_a_bright_pixel_makes_no_duplicates() -> None:
+    rng = np.random.default_rng(0)
+    pictures = [
+        cv2.GaussianBlur(rng.uniform(0, 1, (90, 120, 3)).astype(np.float32), (0, 0), 6) for _ in range(3)
+    ]
+    for picture in pictures:
+        picture[2, 2] = 65_504.0
+    assert duplicates([*pictures, pictures[1]]) == ((1, 3),)
+
+
 def test_coverage_by_cameras(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path, views=12))
     placement = camera_placement(capture)

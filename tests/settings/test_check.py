@@ -22,6 +22,23 @@ WRONG = {
     "no rays are fresh": (preset("fast"), "train", {"fresh": 0.0}, "train.fresh is 0"),
     "more than all are fresh": (preset("fast"), "train", {"fresh": 1.5}, "train.fresh is 1.5"),
     "a surface of negative width": (preset("fast"), "volume", {"beta_final": -0.1}, "beta-final is -0.1"),
+    "no incident directions": (
+        preset("fast"),
+        "shading",
+        {"train_samples": 0},
+        "train-samples is 0; set it to 1",
+    ),
+    "no rays": (preset("fast"), "train", {"rays": 0}, "--config.train.rays is 0; set it to 1 or more"),
+    "more than the whole weight": (preset("fast"), "shading", {"hit_share": 1.5}, "hit-share is 1.5"),
+    "a rate that climbs": (
+        preset("fast"),
+        "optimizer",
+        {"brdf": -0.1},
+        "optimizer.brdf is -0.1; set it to 0",
+    ),
+    "a rate that is no number": (preset("fast"), "optimizer", {"light": float("nan")}, "light is nan"),
+    "a negative weight": (preset("fast"), "loss", {"volume": -1.0}, "loss.volume is -1.0"),
+    "a scene without extent": (preset("fast"), "volume", {"radius": 0.0}, "volume.radius is 0.0"),
     "a map that L_ref cannot teach": (preset("fast"), "inter_reflection", {"mode": "soft"}, "L_ref"),
 }
 

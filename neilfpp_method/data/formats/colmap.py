@@ -1,8 +1,9 @@
 """Reader of COLMAP models, text or binary, with or without rigs, and with any camera model but panoramas.
 
-    sparse/0, sparse, … or the folder itself    cameras, images, points3D (.bin or .txt)
+    sparse/0, sparse, … or the folder itself    cameras, images, points3D (.bin or .txt); of several models
+                                                  sparse/0, sparse/1, … the largest
     images/, or beside the model                the images; an EXR file may replace a listed image
-    masks/<image>.png or masks/<stem>.png       optional: masks
+    masks/<image>.png or masks/<stem>.png       optional: masks; the folder may also be called mask
     fused.ply or dense/fused.ply                optional: COLMAP's dense points with normals
     object_point_cloud.ply                      optional: points of the object only, from which the scene box
                                                   is computed (NeRO's scenes)
@@ -29,7 +30,10 @@ from neilfpp_method.errors import UserError
 __all__ = ["LAYOUT", "camera_of", "model_folder", "open_model", "read", "recognise"]
 
 LAYOUT = "a COLMAP model in sparse/0, sparse or the folder itself"
-MODELS = ("sparse/0", "sparse", ".", "colmap/sparse/0", "dense/sparse", "dense/0/sparse")
+NUMBERED = ("sparse", "colmap/sparse")
+"""Folders in which COLMAP's mapper writes one or more models: 0, 1, …"""
+MODELS = ("sparse", ".", "dense/sparse", "dense/0/sparse")
+MASK_FOLDERS = ("masks", "mask")
 IMAGE_FOLDERS = ("images", "dense/images", "dense/0/images", ".")
 OBJECT = "object_point_cloud.ply"
 POINT_CLOUDS = ("fused.ply", "dense/fused.ply", "dense/0/fused.ply")
@@ -65,13 +69,14 @@ def read(root: Path) -> CaptureFiles:
         raise UserError(
             f"{root}: there is no images/{first}", "put the images of the model into the folder images"
         )
+    masks = next((root / name for name in MASK_FOLDERS if (root / name).is_dir()), root / MASK_FOLDERS[0])
     views = []
     for index, (image, listed, name) in enumerate(zip(registered, names, view_names(names), strict=True)):
         file = stored_image(root, inputs / listed, f"{folder}: {listed}")
         w2c = np.concatenate([image.cam_from_world().matrix(), [[0.0, 0.0, 0.0, 1.0]]])
         camera = camera_of(image.camera, w2c, f"{folder}: {listed}")
-        views.append(View(name, index, camera, file, _mask(root, listed)))
-    check_masks(root / "masks", views)
+        views.append(View(name, index, camera, file, _mask(masks, root, listed)))
+    check_masks(masks, views)
     if (root / OBJECT).is_file():
         points = read_positions(inside(root, root / OBJECT))
     else:
@@ -124,17 +129,33 @@ def camera_of(camera: pycolmap.Camera, w2c: Float64[np.ndarray, "4 4"], where: s
 
 
 def model_folder(root: Path) -> Path | None:
-    """Return the folder of the complete model; None if there is none."""
-    for place in MODELS:
-        folder = root / place
-        if any(all((folder / f"{name}{suffix}").is_file() for name in FILES) for suffix in (".bin", ".txt")):
-            return folder
-    return None
+    """Return the folder of the complete model; None if there is none.
+
+    COLMAP writes several models if it cannot connect all images. The largest of them is used, which is not
+    always the first.
+    """
+    for place in NUMBERED:
+        numbered = [folder for folder in (root / place).glob("[0-9]*") if _model_files(folder)]
+        if numbered:
+            return max(sorted(numbered), key=lambda folder: _model_size(root, folder))
+    return next((root / place for place in MODELS if _model_files(root / place)), None)
 
 
-def _mask(root: Path, image: str) -> Path | None:
+def _model_files(folder: Path) -> list[Path]:
+    """The files of a model, binary if there are both; empty if it is not complete."""
+    for suffix in (".bin", ".txt"):
+        files = [folder / f"{name}{suffix}" for name in FILES]
+        if all(file.is_file() for file in files):
+            return files
+    return []
+
+
+def _model_size(root: Path, folder: Path) -> int:
+    """Size of the file of the images, which grows with their number and that of their points, in bytes."""
+    return inside(root, _model_files(folder)[1]).stat().st_size
+
+
+def _mask(masks: Path, root: Path, image: str) -> Path | None:
     """The mask of an image: <image>.png, COLMAP's own convention, or <stem>.png, that of other tools."""
-    named = root / "masks" / f"{image}.png"
-    return (
-        named if inside(root, named).is_file() else stored(root, (root / "masks" / image).with_suffix(".png"))
-    )
+    named = masks / f"{image}.png"
+    return named if inside(root, named).is_file() else stored(root, (masks / image).with_suffix(".png"))

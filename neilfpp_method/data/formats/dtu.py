@@ -139,9 +139,10 @@ def _files(root: Path, folder: Path) -> tuple[Path, ...]:
     files = sorted(candidates)
     numbers = [int(file.stem) for file in files if file.stem.isdecimal()]
     if len(numbers) == len(files) and numbers != sorted(numbers):
+        after = next(i for i in range(1, len(numbers)) if numbers[i] < numbers[i - 1])
         raise UserError(
-            f"{folder}: by name {files[0].name} comes first, by number {min(numbers)}: whose camera is whose "
-            "is not certain",
+            f"{folder}: by name {files[after - 1].name} comes before {files[after].name}, by number after "
+            "it, so it is not certain which camera belongs to which image",
             "pad the numbers with zeros: 007, 010",
         )
     return tuple(inside(root, file) for file in files)

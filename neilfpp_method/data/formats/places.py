@@ -15,7 +15,7 @@ __all__ = ["check_masks", "stored", "stored_image", "view_names"]
 def stored(root: Path, path: Path) -> Path | None:
     """Return the file, or the file of the same name with another image suffix; None if neither exists.
 
-    A scene may list 000.png although the file is 000.exr.
+    A scene may list 000.png although the file is 000.exr or 000.PNG.
 
     Raises:
         UserError: the path leads out of `root`, or two files with other suffixes exist.
@@ -24,11 +24,22 @@ def stored(root: Path, path: Path) -> Path | None:
         return path
     base = path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
     candidates = [base.with_name(base.name + suffix) for suffix in IMAGE_SUFFIXES]
-    existing = [inside(root, file) for file in candidates if file.is_file()]
+    existing = [inside(root, file) for file in candidates if file.is_file()] or _upper_case(root, base)
     if len(existing) > 1:
         names = " and ".join(file.name for file in existing)
         raise UserError(f"{path}: does not exist, and {names} are both possible", "keep one of them")
     return existing[0] if existing else None
+
+
+def _upper_case(root: Path, base: Path) -> list[Path]:
+    """The images with this name and a suffix of any case, such as IMG_7.JPG; found by listing the folder."""
+    if not base.parent.is_dir():
+        return []
+    return [
+        inside(root, file)
+        for file in sorted(base.parent.iterdir())
+        if file.stem == base.name and file.suffix.lower() in IMAGE_SUFFIXES
+    ]
 
 
 def stored_image(root: Path, path: Path, where: str) -> Path:

@@ -12,6 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.images import read_image, write_png
 from neilfpp_method.data.lens import LENSES, PINHOLES
 from neilfpp_method.data.views import project
 from neilfpp_method.errors import UserError
@@ -139,6 +140,40 @@ def test_the_dense_cloud_and_masks_are_found(tmp_path: Path) -> None:
     capture = load_capture(tmp_path)
     assert capture.point_cloud == tmp_path / "fused.ply"
     assert [view.mask.name for view in capture.views][2:4] == ["002.png", "003.png.png"]
+
+
+def test_masks_in_a_folder_called_mask_with_labels(tmp_path: Path) -> None:
+    write(material(tmp_path), reconstruction(colmap_camera("PINHOLE")))
+    (tmp_path / "masks").rename(tmp_path / "mask")
+    expected = [read_image(view.mask).mask for view in load_capture(tmp_path).views]
+    assert 0 < np.mean(expected) < 1
+    for file in (tmp_path / "mask").iterdir():
+        write_png(file, (read_image(file).mask > 0.5).astype(np.uint8))
+    for view, mask in zip(load_capture(tmp_path).views, expected, strict=True):
+        assert np.array_equal(read_image(view.mask).mask > 0.5, mask > 0.5)
+
+
+def test_masks_of_some_views_are_counted(tmp_path: Path) -> None:
+    write(material(tmp_path), reconstruction(colmap_camera("PINHOLE")))
+    next((tmp_path / "masks").iterdir()).unlink()
+    assert f"mask files: {VIEWS - 1} of {VIEWS}" in load_capture(tmp_path).summary
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_the_largest_of_several_models_is_read(tmp_path: Path, text: bool) -> None:
+    model = reconstruction(colmap_camera("PINHOLE"))
+    write(material(tmp_path, masks=None), model, "sparse/1", text)
+    for i in range(2, VIEWS + 1):
+        model.deregister_frame(i)
+    write(tmp_path, model, "sparse/0", text)
+    assert len(load_capture(tmp_path).views) == VIEWS
+
+
+def test_images_with_suffixes_in_capital_letters(tmp_path: Path) -> None:
+    write(material(tmp_path, masks=None), reconstruction(colmap_camera("PINHOLE")))
+    for file in (tmp_path / "images").iterdir():
+        file.rename(file.with_suffix(".EXR"))
+    assert {view.image.suffix for view in load_capture(tmp_path).views} == {".EXR"}
 
 
 def test_masks_of_other_names_are_an_error(tmp_path: Path) -> None:

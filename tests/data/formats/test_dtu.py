@@ -137,7 +137,7 @@ def test_numbers_without_leading_zeros_are_refused(tmp_path: Path) -> None:
     assert [view.name for view in load_capture(tmp_path).views] == ["07", "08", "09", "10", "11", "12"]
     for path in sorted((tmp_path / "image").iterdir()):
         path.rename(path.with_stem(str(int(path.stem))))
-    refused(tmp_path, "10.exr comes first", "pad the numbers")
+    refused(tmp_path, "12.exr comes before 7.exr, by number after it", "pad the numbers")
 
 
 def test_images_and_cameras_must_match(tmp_path: Path) -> None:
