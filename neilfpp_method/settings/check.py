@@ -11,7 +11,7 @@ from neilfpp_method.settings.types import InterReflectionConfig, NeilfConfig
 __all__ = ["check_config"]
 
 COUNTS = {
-    "train": ("rays", "checkpoint_every", "eval_chunk"),
+    "train": ("rays", "checkpoint_every"),
     "shading": ("train_samples", "eval_samples"),
     "volume": ("initial_samples", "samples"),
 }
