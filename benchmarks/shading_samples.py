@@ -80,10 +80,8 @@ class Scene:
         return specular_lobe(self.normal, self.wo, even, LOBE)
 
     def to_light(self) -> Technique:
-        """Sampling of the map."""
-        return Technique(
-            lambda count, stochastic: self.map.sample(self.normal, count, stochastic).wi, self.map.pdf
-        )
+        """Sampling of the map times the cosine."""
+        return self.map.technique(self.normal)
 
 
 Draw = Callable[[Scene, float, int], IncidentSamples]

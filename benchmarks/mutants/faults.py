@@ -145,7 +145,7 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "strata are not moved",
         SAMPLING,
-        "(k + torch.rand_like(k)) / count",
+        "(k + (torch.rand_like(k) if stochastic else 0.5)) / count",
         "(k + 0.5) / count",
         "shading/test_sampling.py",
     ),
@@ -239,17 +239,24 @@ MUTANTS: Sequence[Mutant] = (
     # Light.
     Mutant(
         "rows of the map counted from below",
-        "fields/environment.py",
+        "fields/direction_map.py",
         "((torch.arange(height + 1) - 0.5)",
         "((height - torch.arange(height + 1) - 0.5)",
         "fields/test_environment.py",
     ),
     Mutant(
         "density of the map without solid angles",
-        "fields/environment.py",
-        "(self._texel_shares() / self._texel_solid_angles())[",
-        "(self._texel_shares())[",
-        "fields/test_environment.py",
+        "fields/map_sampling.py",
+        "(share / solid_angle)[texel]",
+        "share[texel]",
+        "fields/test_map_sampling.py",
+    ),
+    Mutant(
+        "sampling of the map without the cosine",
+        "fields/map_sampling.py",
+        "power * cosine.clamp_min(0)",
+        "power * torch.ones_like(cosine)",
+        "fields/test_map_sampling.py",
     ),
     Mutant(
         "lamps fall off with the distance, not its square",

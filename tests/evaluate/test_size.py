@@ -57,7 +57,7 @@ def test_a_perfect_estimate_is_perfect_at_half_the_size(tmp_path: Path) -> None:
     shares: list[float] = []
     rendered = render_test_views(run, shares.append)
     assert shares == sorted(shares)
-    assert shares[0] == pytest.approx(1 / 10)  # two views of five parts each: 4800 rays by 1000
+    assert shares[0] == pytest.approx(1 / 6)  # two views of three parts each: 4800 rays by EVAL_RAYS
     assert shares[-1] == 1.0
     for view, known in zip(rendered, known_test_views(run, rendered).views, strict=True):
         assert view.maps["rgb"].shape == known.image.shape == (60, 80, 3)
