@@ -101,7 +101,7 @@ def test_a_resumed_run_ends_like_an_uninterrupted_one(data: Path, tmp_path: Path
     before, after = weights(first), weights(second)
     assert differences(before["light.log_radiance"], after["light.log_radiance"]), "it was solved for again"
     if kind == "distant_near":
-        assert before["lamps._extra_state"]["lit"] > 0, "there were lamps to be saved"
+        assert before["lamps._extra_state"]["count"] > 0, "there were lamps to be saved"
 
 
 def test_a_known_map_is_read_once_and_then_part_of_the_run(data: Path, tmp_path: Path) -> None:
