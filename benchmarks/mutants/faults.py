@@ -247,7 +247,7 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "density of the map without solid angles",
         "fields/map_sampling.py",
-        "(share / solid_angle)[texel]",
+        "(share / cells.solid_angle)[texel]",
         "share[texel]",
         "fields/test_map_sampling.py",
     ),

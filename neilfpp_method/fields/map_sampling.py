@@ -44,6 +44,7 @@ class _Cells:
         last: position in `order` of the last texel of each cell.
         center: unit direction of the center of each cell.
         radius: upper bound on the angle between a center and a direction of its cell, radians.
+        solid_angle: solid angle of each texel, sr.
     """
 
     of_texel: Int[Tensor, " T"]
@@ -52,6 +53,7 @@ class _Cells:
     last: Int[Tensor, " C"]
     center: Float[Tensor, "C 3"]
     radius: float
+    solid_angle: Float[Tensor, " T"]
 
 
 @torch.no_grad()
@@ -93,8 +95,7 @@ def radiance_times_cosine(share: Float[Tensor, "H W"], normal: Float[Tensor, "N 
     def pdf(wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S"]:
         texel = texels_of(wi, height, width)
         cell = cells.of_texel[texel]
-        solid_angle = texel_solid_angles(height, width).to(share)
-        return probability.gather(1, cell) * (share / solid_angle)[texel] / power[cell]
+        return probability.gather(1, cell) * (share / cells.solid_angle)[texel] / power[cell]
 
     return Technique(draw, pdf)
 
@@ -115,4 +116,6 @@ def _cells(height: int, width: int, device: torch.device) -> _Cells:
     # A texel reaches at most half its height and width beyond its center.
     to_center = (directions * center[of_texel]).sum(-1).clamp(-1, 1).acos().max().item()
     half = math.hypot(math.pi / (height - 1), 2 * math.pi / width) / 2
-    return _Cells(of_texel, order, last - size + 1, last, center, min(to_center + half, math.pi / 2))
+    radius = min(to_center + half, math.pi / 2)
+    solid_angle = texel_solid_angles(height, width).to(device)
+    return _Cells(of_texel, order, last - size + 1, last, center, radius, solid_angle)
