@@ -16,7 +16,7 @@ from neilfpp_method.effects.material import JUDGED, material_evidence
 from neilfpp_method.effects.measurement import Measurement
 from neilfpp_method.effects.metals import metals_evidence
 from neilfpp_method.effects.place_fit import place_transport
-from neilfpp_method.effects.places import gather_places
+from neilfpp_method.effects.places import Places, gather_places
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.visibility import self_visibility
 from neilfpp_method.lighting.fit import MIN_GAIN, Evidence
@@ -30,6 +30,7 @@ __all__ = [
     "MIN_PIXELS",
     "MIN_TRAIN_VIEWS",
     "SURFACE_PIXELS",
+    "gather_light_places",
     "needs_surface",
     "record_exposures",
     "record_facts",
@@ -117,10 +118,7 @@ def review_light(
         return _not_measured(plan, step, "the budget leaves no time for it"), None
     mode = model.training
     model.eval()
-    surface = _rendered_surface(model, pixels.sample(LIGHT_PIXELS, gradients=False)).observed
-    count = min(PLACES, most // USUAL_VIEWS)
-    position, normal = surface.position[:count], surface.normal[:count]
-    places = gather_places(model, pixels, position, normal, VIEWS).in_views(MIN_VIEWS).first(most)
+    places = gather_light_places(model, pixels, most)
     typical, decisions = model.facts.median_radiance, []
     if len(places.place.unique()) < MIN_PLACES:
         model.train(mode)
@@ -140,6 +138,15 @@ def review_light(
         first = find_first_light(places, transport, typical, model.brdf.metals)
     model.train(mode)
     return decisions, first
+
+
+@torch.no_grad()
+def gather_light_places(model: NeilfModel, pixels: PixelDataset, most: int = MAX_PIXELS) -> Places:
+    """Places on the visible surface that several training views show, with at most `most` pixels."""
+    surface = _rendered_surface(model, pixels.sample(LIGHT_PIXELS, gradients=False)).observed
+    count = min(PLACES, most // USUAL_VIEWS)
+    position, normal = surface.position[:count], surface.normal[:count]
+    return gather_places(model, pixels, position, normal, VIEWS).in_views(MIN_VIEWS).first(most)
 
 
 @torch.no_grad()
