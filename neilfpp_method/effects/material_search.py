@@ -31,11 +31,27 @@ from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.transport import arriving_at
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import Material, Observed
 
-__all__ = ["SearchedMaterial", "search_materials", "teach"]
+__all__ = [
+    "SEARCH_AT",
+    "SEARCH_SHARE",
+    "SearchedMaterial",
+    "can_search",
+    "is_search_due",
+    "search_materials",
+    "teach",
+]
 
+SEARCH_AT = (1 / 3, 2 / 3)
+"""Shares of material init after which materials are searched."""
+
+SEARCH_SHARE = 0.2
+"""Time of a search as a share of that of the search for the initial light, with all its evidence, at the same
+pixels (measured on `spot_city`: 22 of 105 s).
+"""
 DRAWS = 2
 """Random directions per texel and pixel."""
 NEIGHBOURS_SHARE = 1 / 150
@@ -62,6 +78,13 @@ RATE = 5e-3
 """Learning rate of the field."""
 
 
+def is_search_due(position: StagePosition) -> bool:
+    """Whether materials are searched after `position.step` steps of a stage."""
+    return position.stage is Stage.MATERIAL_INIT and any(
+        position.step - 1 < share * position.length <= position.step for share in SEARCH_AT
+    )
+
+
 @dataclass(frozen=True)
 class SearchedMaterial:
     """The material that the BRDF field should have at N points.
@@ -76,21 +99,27 @@ class SearchedMaterial:
     material: Material
     share: float
 
+    def summary(self) -> str:
+        """One line for the console."""
+        return f"material search: {self.share:.0%} of the places have a better material"
+
+
+def can_search(model: NeilfModel) -> bool:
+    """Whether the light is an environment map and surfaces have a specular lobe."""
+    return model.lobe is not None and isinstance(model.light, EnvironmentLight)
+
 
 @torch.no_grad()
-def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial | None:
+def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
     """Search for better materials at places, under the current light of a model.
 
     Args:
-        model: gives the light, the scene, the lobe and the materials.
+        model: gives the light, the scene, the lobe and the materials; see `can_search`.
         places: places with their pixels in the training views, in linear radiance.
 
     Returns:
-        Materials at the points that the pixels show. None if the light is no environment map, or surfaces
-        have no specular lobe.
+        Materials at the points that the pixels show.
     """
-    if model.lobe is None or not isinstance(model.light, EnvironmentLight):
-        return None
     numbers, place = places.place.unique(return_inverse=True)
     places = Places(len(numbers), place, places.view, places.observed)
     position = places.mean(places.observed.position)

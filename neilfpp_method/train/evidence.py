@@ -10,11 +10,11 @@ from collections.abc import Callable, Sequence
 
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.first_light import start_with
-from neilfpp_method.effects.material_search import search_materials, teach
+from neilfpp_method.effects.material_search import is_search_due
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.review import (
     MAX_PIXELS,
-    gather_light_places,
+    improve_material,
     needs_surface,
     record_lamps,
     review_light,
@@ -22,7 +22,7 @@ from neilfpp_method.effects.review import (
     review_surface,
 )
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.schedule import Stage, StagePosition, stage_at
+from neilfpp_method.schedule import StagePosition, stage_at
 from neilfpp_method.structures import StepResult
 from neilfpp_method.timing.ledger import timed
 from neilfpp_method.train.light_record import note_fit
@@ -31,8 +31,6 @@ from neilfpp_method.train.training import Training
 
 __all__ = ["apply_plan", "review_before_stage", "search_material", "solve_light"]
 
-SEARCH_AT = (1 / 3, 2 / 3)
-"""Shares of the material stage after which materials are searched."""
 Review = Callable[[Plan, NeilfModel, PixelDataset, int], list[Decision]]
 """Measures with the model after so many steps and adds its decisions to the plan."""
 
@@ -92,24 +90,18 @@ def _start_light(run: Training, model: NeilfModel, step: int) -> None:
 
 
 def search_material(run: Training, model: NeilfModel, position: StagePosition, step: int) -> None:
-    """At the times of `SEARCH_AT`, search for better materials and teach them to the BRDF field.
+    """When it is due, search for better materials and train the BRDF field on them.
 
     The first process does this for all.
     """
-    if position.stage is not Stage.MATERIAL_INIT or not any(
-        position.step - 1 < share * position.length <= position.step for share in SEARCH_AT
-    ):
+    if not is_search_due(position):
         return
     if run.fabric.is_global_zero:
-        with timed("checks", apart=True):
+        with timed("light_fits", apart=True):
             seed_step(run.config.train.seed, -6 - step)
-            model.eval()
-            places = gather_light_places(model, run.pixels, _light_pixels(run))
-            searched = search_materials(model, places) if len(places.place) else None
-            model.train()
-            if searched is not None:
-                teach(model.brdf, searched)
-                run.reporter.say(f"material: {searched.share:.0%} of the places have a better one")
+            summary = improve_material(model, run.pixels, _light_pixels(run))
+        if summary is not None:
+            run.reporter.say(summary)
     if run.fabric.world_size > 1:
         model.brdf.load_state_dict(run.fabric.broadcast(model.brdf.state_dict()))
 

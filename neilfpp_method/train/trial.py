@@ -20,6 +20,7 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import PIXELS_OF_A_VIEW, at_scale, scale_for_pixels
 from neilfpp_method.effects.first_light import seconds_of_pixel
 from neilfpp_method.effects.material import JUDGED, seconds_of_evidence
+from neilfpp_method.effects.material_search import SEARCH_AT, SEARCH_SHARE
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.effects.review import (
@@ -171,10 +172,11 @@ def run_trial(
         # is made within the stage.
         first_fit = fit_scale * first if begins else 0.0
         before = (light + first_fit if light_pixels else 0.0) if begins else 0.0
+        searches = len(SEARCH_AT) * SEARCH_SHARE * light if stage is Stage.MATERIAL_INIT else 0.0
         costs[stage.value] = StageCost(
             steps,
             step,
-            fit=fit_scale * later / every,
+            fit=fit_scale * later / every + searches / steps,
             start=(surface + place_seconds if moves else 0.0) + before,
             end=picture + 2 * health_check,
             first_fit=0.0 if light_pixels else first_fit,

@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import pytest
 import torch
 
-from neilfpp_method.effects.material_search import SearchedMaterial, search_materials, teach
+from neilfpp_method.effects.material_search import (
+    SEARCH_AT,
+    SearchedMaterial,
+    can_search,
+    is_search_due,
+    search_materials,
+    teach,
+)
 from neilfpp_method.effects.place_fit import ROUGHNESSES
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.brdf import BrdfField
@@ -16,6 +24,7 @@ from neilfpp_method.fields.lamps import LampPlaces
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.transport import arriving_at, from_lamps, from_texels_at
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.shading import LOBES
 from neilfpp_method.structures import Material
@@ -82,11 +91,21 @@ def test_a_scene_without_metals_gets_none():
     assert search_materials(model, metal).material.metallic.max() == 0
 
 
-def test_nothing_is_searched_under_a_free_light_or_without_highlights(places: Places):
-    model = trained_to(PAINT, places)
+def test_nothing_is_searched_under_a_free_light_or_without_highlights():
+    model = sphere_model(preset("fast"))
+    assert can_search(model)
     model.lobe = None
-    assert search_materials(model, places) is None
-    assert search_materials(sphere_model(preset("paper-ngp")), places) is None
+    assert not can_search(model)
+    assert not can_search(sphere_model(preset("paper-ngp")))
+
+
+def test_a_search_is_due_once_at_each_of_its_times():
+    for length in (3, 7, 1500):
+        due = [
+            n for n in range(1, length + 1) if is_search_due(StagePosition(Stage.MATERIAL_INIT, n, length))
+        ]
+        assert due == [math.ceil(share * length) for share in SEARCH_AT]
+    assert not any(is_search_due(StagePosition(Stage.JOINT, n, 30)) for n in range(31))
 
 
 def test_a_field_learns_the_material_where_it_differs_and_keeps_it_elsewhere():
