@@ -39,7 +39,6 @@ __all__ = [
     "SEARCH_AT",
     "SEARCH_SHARE",
     "SearchedMaterial",
-    "can_search",
     "is_search_due",
     "search_materials",
     "teach",
@@ -78,13 +77,6 @@ RATE = 5e-3
 """Learning rate of the field."""
 
 
-def is_search_due(position: StagePosition) -> bool:
-    """Whether materials are searched after `position.step` steps of a stage."""
-    return position.stage is Stage.MATERIAL_INIT and any(
-        position.step - 1 < share * position.length <= position.step for share in SEARCH_AT
-    )
-
-
 @dataclass(frozen=True)
 class SearchedMaterial:
     """The material that the BRDF field should have at N points.
@@ -104,9 +96,16 @@ class SearchedMaterial:
         return f"material search: {self.share:.0%} of the places have a better material"
 
 
-def can_search(model: NeilfModel) -> bool:
-    """Whether the light is an environment map and surfaces have a specular lobe."""
-    return model.lobe is not None and isinstance(model.light, EnvironmentLight)
+def is_search_due(model: NeilfModel, position: StagePosition) -> bool:
+    """Whether materials are searched after `position.step` steps of a stage.
+
+    They never are if the light is no environment map, or if surfaces have no specular lobe.
+    """
+    if model.lobe is None or not isinstance(model.light, EnvironmentLight):
+        return False
+    return position.stage is Stage.MATERIAL_INIT and any(
+        position.step - 1 < share * position.length <= position.step for share in SEARCH_AT
+    )
 
 
 @torch.no_grad()
@@ -114,7 +113,7 @@ def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
     """Search for better materials at places, under the current light of a model.
 
     Args:
-        model: gives the light, the scene, the lobe and the materials; see `can_search`.
+        model: gives the light, the scene, the lobe and the materials; its light is an environment map.
         places: places with their pixels in the training views, in linear radiance.
 
     Returns:
