@@ -90,6 +90,7 @@ class AttachedNeilf(nn.Module):
         self.step_guard = StepGuard(log.warning)
         self.watch = Watch(None, log.warning)
         self._steps, self._with_material = 0, False
+        self._start_tried, self._searched = False, -1
         self._last_rendered: tuple[PixelBatch, SurfaceHits] | None = None
         model.observers.append(self._observe)
 
@@ -123,6 +124,8 @@ class AttachedNeilf(nn.Module):
         if not weights:
             # A zero that requires a gradient: a loop without a loss of its own may still call backward.
             return Total(torch.zeros((), device=batch.origins.device, requires_grad=True), {})
+        if self.training:
+            self._before_step(position)
         moves_host = self.model.stages[position.stage].moves_host
         result = self.model(batch, position.stage, self._host_hits(batch.rays, hits, moves_host))
         total = weigh(result.terms, weights)
@@ -224,18 +227,21 @@ class AttachedNeilf(nn.Module):
 
     # ------------------------------------------------------------------------------------------ inside a step
 
-    def _after_step(self, result: StepResult, position: StagePosition, number: int) -> None:
-        """Solve for light and material if that is due, and check the health of the training."""
-        plan = self.model.stages[position.stage]
-        if plan.moves_material:
-            self.places.remember(result.surface)
-        self.light_solver.observe(result)
-        if self.places.is_ready or not self.light_solver.seeks_start:
-            self._solve(replace(position, step=position.step + 1), number)
-        self._with_material = plan.moves_material
-        self.watch.after_step(plan, result, number)
-        if position.step + 1 == position.length:
-            self.health()
+    def _before_step(self, position: StagePosition) -> None:
+        """Start the light, or search for better materials, if this is due.
+
+        This changes parameters, which is not allowed between the losses of a step and their gradients.
+        """
+        if not self.model.stages[position.stage].moves_material:
+            return
+        if self.light_solver.seeks_start and self.places.is_ready and not self._start_tried:
+            self._start_tried = True
+            self._start_light()
+        if is_search_due(self.model, position) and position.step != self._searched:
+            self._searched = position.step
+            summary = improve_material(self.model, self.places.places())
+            if summary is not None:
+                log.warning("NeILF++ %s", summary)
 
     def _start_light(self) -> None:
         """Set an initial light and material that explain the remembered surface points (`first_light`).
@@ -254,17 +260,20 @@ class AttachedNeilf(nn.Module):
             start_with(model, first)
             self.light_solver.start(first.observed, first.material, model.scene, first.lamp_trial)
 
-    def _solve(self, done: StagePosition, number: int) -> None:
-        """Start or fit the light, and search for better materials, if due after `done.step` steps."""
-        if self.light_solver.seeks_start:
-            self._start_light()
-        if self.light_solver.due:
-            self.watch.after_fit(self.light_solver.points, number)
-        self.light_solver.solve(self.model.brdf, self.model.scene)
-        if is_search_due(self.model, done):
-            summary = improve_material(self.model, self.places.places())
-            if summary is not None:
-                log.warning("NeILF++ %s", summary)
+    def _after_step(self, result: StepResult, position: StagePosition, number: int) -> None:
+        """Solve for the light if that is due, and check the health of the training."""
+        plan = self.model.stages[position.stage]
+        if plan.moves_material:
+            self.places.remember(result.surface)
+        self.light_solver.observe(result)
+        if self._start_tried or not self.light_solver.seeks_start:
+            if self.light_solver.due:
+                self.watch.after_fit(self.light_solver.points, number)
+            self.light_solver.solve(self.model.brdf, self.model.scene)
+        self._with_material = plan.moves_material
+        self.watch.after_step(plan, result, number)
+        if position.step + 1 == position.length:
+            self.health()
 
     def _position(self, step: int | Stage | str) -> StagePosition:
         if not isinstance(step, str):

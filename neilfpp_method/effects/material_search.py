@@ -61,6 +61,10 @@ of the same look are often of one material.
 """
 MAX_RATIO = 0.8
 """A material replaces that of the field if its error is at most this share of the error of the field."""
+MIN_CHANGE = 0.5
+"""A material replaces that of the field only if its metallic differs by at least this much. Smaller
+differences, and those of roughness alone, are no local optima, and the field is more exact than the grid.
+"""
 MIN_LOSS = 0.005
 """Loss of the field below which its material is kept: that of relative errors of 3 %, which the steps of the
 grid cause as well.
@@ -137,8 +141,9 @@ def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
     near = neighbours(torch.cat((position, look), -1), NEIGHBOURS_SHARE)
     best = best_materials(arriving, places, typical, METALLICS if model.brdf.metals else METALLICS[:1], near)
     loss = _loss_of(current, arriving, places, typical, near)
-    is_better = (loss > MIN_LOSS) & (best.loss < MAX_RATIO * loss)
     found = on_grid(best.base_color, best.roughness, best.metallic)
+    is_other = (found.metallic - current.metallic)[:, 0].abs() >= MIN_CHANGE
+    is_better = is_other & (loss > MIN_LOSS) & (best.loss < MAX_RATIO * loss)
     own = model.brdf(places.observed.position)
     material = _where(is_better[place], found[place], own)
     return SearchedMaterial(places.observed.position, material, is_better.float().mean().item())
