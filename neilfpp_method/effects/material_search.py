@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from neilfpp_method.effects.place_fit import (
+from neilfpp_method.effects.material_grid import (
     METALLICS,
     ROUGHNESSES,
     best_materials,

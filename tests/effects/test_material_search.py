@@ -8,6 +8,7 @@ import math
 import pytest
 import torch
 
+from neilfpp_method.effects.material_grid import ROUGHNESSES
 from neilfpp_method.effects.material_search import (
     SEARCH_AT,
     SearchedMaterial,
@@ -15,7 +16,6 @@ from neilfpp_method.effects.material_search import (
     search_materials,
     teach,
 )
-from neilfpp_method.effects.place_fit import ROUGHNESSES
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
