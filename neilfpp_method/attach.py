@@ -66,7 +66,7 @@ class AttachedNeilf(nn.Module):
         proxy: traces rays between surfaces if the host cannot do it cheaply; `proxy.report()` measures its
             error. None if the host traces these rays itself, or if the settings trace no rays.
         light_solver: stores surface points of the training steps and solves for the light at intervals.
-        places: stores more of them, finds an initial light, and searches for better materials.
+        places: stores more of them, finds an initial light, and searches for paint taken for metal.
         missing: the optional methods that the host does not have, and the consequence of each.
         step_guard: skips steps of guarded optimizers (`guard`) whose losses or gradients are not finite.
         watch: problems found so far; `health()` summarises them.

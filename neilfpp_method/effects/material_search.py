@@ -1,9 +1,12 @@
-"""Search the material of surface places under the current light, to leave local optima of training.
+"""Search for paint that training has taken for metal, under the current light.
 
 Gradient descent cannot change a dark metal into a black paint: halfway between the two, the error is larger
 than at both ends. Under the light of a half-trained model it is easy to see which of the two explains the
 views better, so every roughness and metallic of a grid is tried at some thousand places. The BRDF field is
-then trained to have the better material where one was found, and its own everywhere else.
+then trained to be paint where paint is better, and to keep its values everywhere else.
+
+The opposite change is not made: of 18 places of two scenes at which a search found metal in place of paint,
+one was metal, whereas 87 % of the changes to paint were right.
 """
 
 from __future__ import annotations
@@ -62,7 +65,7 @@ of the same look are often of one material.
 MAX_RATIO = 0.8
 """A material replaces that of the field if its error is at most this share of the error of the field."""
 MIN_CHANGE = 0.5
-"""A material replaces that of the field only if its metallic differs by at least this much. Smaller
+"""A material replaces that of the field only if its metallic is lower by at least this much. Smaller
 differences, and those of roughness alone, are no local optima, and the field is more exact than the grid.
 """
 MIN_LOSS = 0.005
@@ -88,7 +91,7 @@ class SearchedMaterial:
     Attributes:
         position: the points, scene frame.
         material: their material.
-        share: share of the places whose material differs from that of the field.
+        share: share of the places whose metal becomes paint.
     """
 
     position: Float[Tensor, "N 3"]
@@ -97,7 +100,7 @@ class SearchedMaterial:
 
     def summary(self) -> str:
         """One line for the console."""
-        return f"material search: {self.share:.0%} of the places have a better material"
+        return f"material search: {self.share:.0%} of the places are paint that was taken for metal"
 
 
 def is_search_due(model: NeilfModel, position: StagePosition) -> bool:
@@ -114,7 +117,7 @@ def is_search_due(model: NeilfModel, position: StagePosition) -> bool:
 
 @torch.no_grad()
 def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
-    """Search for better materials at places, under the current light of a model.
+    """Search for paint that was taken for metal, under the current light of a model.
 
     Args:
         model: gives the light, which is an environment map, the scene, the lobe and the materials.
@@ -133,7 +136,7 @@ def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
     loss = _loss_of(current, arriving, places, typical, near)
     best = best_materials(arriving, places, typical, METALLICS, near)
     found = on_grid(best.base_color, best.roughness, best.metallic)
-    is_other = (found.metallic - current.metallic)[:, 0].abs() >= MIN_CHANGE
+    is_other = (current.metallic - found.metallic)[:, 0] >= MIN_CHANGE
     is_better = is_other & (loss > MIN_LOSS) & (best.loss < MAX_RATIO * loss)
     material = _where(is_better[place], found[place], model.brdf(places.observed.position))
     return SearchedMaterial(places.observed.position, material, is_better.float().mean().item())

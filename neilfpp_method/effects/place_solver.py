@@ -68,7 +68,7 @@ class PlaceSolver(nn.Module):
         self._steps += 1
 
     def before_step(self, model: NeilfModel, light_solver: LightSolver, position: StagePosition) -> None:
-        """Start the light, or search for better materials, if this is due before a step with material.
+        """Start the light, or search for paint taken for metal, if this is due before a step with material.
 
         This changes parameters, which is not allowed between the losses of a step and their gradients.
         """

@@ -156,7 +156,7 @@ def light_places(model: NeilfModel, pixels: PixelDataset, most: int = MAX_PIXELS
 
 
 def improve_material(model: NeilfModel, places: Places) -> str | None:
-    """Search for better materials at places, and train the BRDF field on them (`effects.material_search`).
+    """Search for paint taken for metal, and train the BRDF field on them (`effects.material_search`).
 
     Args:
         model: see `material_search.can_search`.

@@ -233,7 +233,7 @@ class NeilfMethod(Model):
         self.computed = None
 
     def _search_material(self, step: int) -> None:
-        """Search for better materials when this is due, as in the standalone loop."""
+        """Search for paint taken for metal when this is due, as in the standalone loop."""
         position = stage_at(step, self.config.neilf.train)
         if not is_search_due(self.neilf, dataclasses.replace(position, step=position.step + 1)):
             return

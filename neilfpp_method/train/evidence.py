@@ -92,7 +92,7 @@ def _start_light(run: Training, model: NeilfModel, step: int) -> None:
 
 
 def search_material(run: Training, model: NeilfModel, position: StagePosition, step: int) -> None:
-    """When it is due, search for better materials and train the BRDF field on them.
+    """When it is due, search for paint taken for metal, and train the BRDF field on it.
 
     The first process does this for all.
     """

@@ -1,4 +1,4 @@
-"""The search for better materials at places, and the training of the BRDF field on what it finds."""
+"""The search for paint that was taken for metal, and the training of the BRDF field on what it finds."""
 
 from __future__ import annotations
 
@@ -80,6 +80,12 @@ def test_the_right_material_is_kept(places: Places):
     before = model.brdf(places.observed.position)
     kept = (searched.material.metallic == before.metallic).float().mean()
     assert kept > 0.8
+
+
+def test_paint_does_not_become_metal():
+    one = torch.ones(COUNT, 1)
+    metal = ball(0.6 * one.expand(-1, 3), 0.3 * one, one, LOBE, VIEWS, fine_sky())
+    assert search_materials(trained_to(PAINT, metal), metal).share == 0
 
 
 def due_after(model: NeilfModel, length: int) -> list[int]:
