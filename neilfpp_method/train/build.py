@@ -25,8 +25,9 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import OrientedPoints
+from neilfpp_method.train.optimizer import seed_step
 
-__all__ = ["build_model", "cloud_summary", "exposures_of", "scene_facts", "show_known_light"]
+__all__ = ["build_model", "cloud_summary", "exposures_of", "initial_model", "scene_facts", "show_known_light"]
 
 LDR_SCALE = 1.0
 """Largest radiance that R can represent for LDR input, as published: the scale of its sigmoid."""
@@ -99,6 +100,18 @@ def build_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> Nei
             cloud lies in the scene.
     """
     return NeilfModel(HOSTS[config.host.kind](capture, facts, config), config, facts)
+
+
+def initial_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> NeilfModel:
+    """Build the model with which a training starts: random weights of the seed, and the known light if any.
+
+    Raises:
+        UserError: see `build_model` and `show_known_light`.
+    """
+    seed_step(config.train.seed, step=-1)
+    model = build_model(capture, facts, config)
+    show_known_light(model)
+    return model
 
 
 def show_known_light(model: NeilfModel) -> None:

@@ -57,6 +57,7 @@ __all__ = [
     "Run",
     "check_free",
     "create_run",
+    "last_checkpoint",
     "load_checkpoint",
     "load_run",
     "load_weights",
@@ -299,6 +300,11 @@ def _described(kind: type[Part], values: Any, where: str) -> Part:
 
 
 # ------------------------------------------------------------------------------------------------ checkpoints
+
+
+def last_checkpoint(run: Path) -> Path:
+    """The file of the newest checkpoint of a run, from which it continues."""
+    return run / "checkpoints" / "last.pt"
 
 
 def save_checkpoint(
