@@ -137,7 +137,8 @@ class EnvironmentLight(nn.Module):
         self.log_radiance = self.log_radiance.new_zeros(3, height, width)
 
     def _texel_solid_angles(self) -> Float[Tensor, " T"]:
-        return texel_solid_angles(*self.log_radiance.shape[1:]).to(self.log_radiance)
+        _, height, width = self.log_radiance.shape
+        return texel_solid_angles(height, width, self.log_radiance.device).to(self.log_radiance.dtype)
 
     @torch.no_grad()
     def _texel_shares(self) -> Float[Tensor, "H W"]:

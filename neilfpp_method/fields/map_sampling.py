@@ -110,12 +110,12 @@ def _cells(height: int, width: int, device: torch.device) -> _Cells:
     order = of_texel.argsort(stable=True)
     size = of_texel.bincount()
     last = size.cumsum(0) - 1
-    directions = texel_centers(height, width).to(device)
+    directions = texel_centers(height, width, device)
     center = torch.zeros(len(size), 3, device=device).index_add(0, of_texel, directions)
     center = torch.nn.functional.normalize(center, dim=-1)
     # A texel reaches at most half its height and width beyond its center.
     to_center = (directions * center[of_texel]).sum(-1).clamp(-1, 1).acos().max().item()
     half = math.hypot(math.pi / (height - 1), 2 * math.pi / width) / 2
     radius = min(to_center + half, math.pi / 2)
-    solid_angle = texel_solid_angles(height, width).to(device)
+    solid_angle = texel_solid_angles(height, width, device)
     return _Cells(of_texel, order, last - size + 1, last, center, radius, solid_angle)
