@@ -83,10 +83,12 @@ def environment(direction: np.ndarray) -> np.ndarray:
     return 50.0 * lamp[:, None] + 0.2 * (1.1 + direction)
 
 
-def test_a_perfect_mirror(tmp_path):
-    def mirror(normal: np.ndarray, seen_along: np.ndarray) -> np.ndarray:
-        return environment(seen_along - 2.0 * (seen_along * normal).sum(-1, keepdims=True) * normal)
+def mirror(normal: np.ndarray, seen_along: np.ndarray) -> np.ndarray:
+    """The mirrored environment."""
+    return environment(seen_along - 2.0 * (seen_along * normal).sum(-1, keepdims=True) * normal)
 
+
+def test_a_perfect_mirror(tmp_path):
     root = repaint(make_capture(tmp_path / "mirror", masks=True), mirror)
     assert max(read_image(view.image).pixels.max() for view in load_capture(root).views) > 10.0
     trains(root, tmp_path / "run")
@@ -132,9 +134,6 @@ odd = {"steps": 12, "solved": True, "may_rest": frozenset({"light"})}
 
 
 def test_a_mirror_under_a_fitted_light(tmp_path):
-    def mirror(normal: np.ndarray, seen_along: np.ndarray) -> np.ndarray:
-        return environment(seen_along - 2.0 * (seen_along * normal).sum(-1, keepdims=True) * normal)
-
     trains(repaint(make_capture(tmp_path / "mirror", masks=True), mirror), tmp_path / "run", **odd)
 
 

@@ -38,11 +38,6 @@ TICK = 0.1
 """Seconds that pass at every look at the clock: some two seconds a step."""
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_capture(tmp_path_factory.mktemp("capture") / "sphere")
-
-
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> None:
     """A ledger whose clock advances at every reading, and a trial in which steps cost half as much."""
