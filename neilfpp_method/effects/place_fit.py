@@ -28,11 +28,20 @@ from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import Material, Observed, SceneTracer
 
 __all__ = [
+    "METALLICS",
+    "ROUGHNESSES",
+    "BestMaterials",
     "PlaceFit",
     "any_map",
+    "best_materials",
     "fit_places",
+    "mean_loss",
+    "neighbours",
+    "on_grid",
+    "outgoing_radiance",
     "place_errors",
     "place_transport",
+    "relative_error",
     "seconds_of_step",
 ]
 
@@ -103,9 +112,35 @@ class PlaceFit:
 
     def material(self, place: Int[Tensor, " N"]) -> Material:
         """Materials of the places with these numbers."""
-        roughness = torch.tensor(ROUGHNESSES, device=place.device)[self.roughness[place]]
-        metallic = torch.tensor(METALLICS, device=place.device)[self.metallic[place]]
-        return Material(self.base_color[place], roughness[:, None], metallic[:, None])
+        return on_grid(self.base_color[place], self.roughness[place], self.metallic[place])
+
+
+@dataclass(frozen=True)
+class BestMaterials:
+    """The materials of P places that explain their pixels best under a fixed light.
+
+    Attributes:
+        base_color: base colour of each place.
+        roughness: roughness of each place, as an index in `ROUGHNESSES`.
+        metallic: metallic of each place, as an index in `METALLICS`.
+        loss: mean loss of the pixels of each place and its neighbours.
+    """
+
+    base_color: Float[Tensor, "P 3"]
+    roughness: Int[Tensor, " P"]
+    metallic: Int[Tensor, " P"]
+    loss: Float[Tensor, " P"]
+
+
+def on_grid(
+    base_color: Float[Tensor, "N 3"], roughness: Int[Tensor, " N"], metallic: Int[Tensor, " N"]
+) -> Material:
+    """The material with these indices in `ROUGHNESSES` and `METALLICS`."""
+    values = [
+        torch.tensor(grid, device=index.device)[index][:, None]
+        for grid, index in ((ROUGHNESSES, roughness), (METALLICS, metallic))
+    ]
+    return Material(base_color, *values)
 
 
 @torch.no_grad()
@@ -173,11 +208,13 @@ def fit_places(
     """
     base_color = START_BASE_COLOR if mean_base_color is None else mean_base_color
     fit = _even_start(places, typical, base_color) if start is None else start
-    near = _neighbours(places)
+    near = neighbours(places.mean(places.observed.position), NEIGHBOURS_SHARE)
     for turn in range(rounds):
         steps = FIRST_STEPS if start is None and turn == 0 else STEPS
         fit = _better_light(fit, places, transport, typical, steps, mean_base_color, form)
-        fit = _best_material(fit, places, transport, typical, METALLICS if metals else METALLICS[:1], near)
+        arriving = torch.stack([part.float() @ fit.radiance for part in transport.sources]) + transport.scene
+        best = best_materials(arriving, places, typical, METALLICS if metals else METALLICS[:1], near)
+        fit = PlaceFit(fit.log_radiance, best.base_color, best.roughness, best.metallic)
     return fit
 
 
@@ -192,11 +229,10 @@ def _even_start(places: Places, typical: float, base_color: float) -> PlaceFit:
     )
 
 
-def _neighbours(places: Places) -> Int[Tensor, "P K"]:
-    """Indices of the K places nearest to each place, including itself."""
-    centre = places.mean(places.observed.position)
-    count = max(1, min(places.count, round(NEIGHBOURS_SHARE * places.count)))
-    return torch.cdist(centre, centre).topk(count, largest=False).indices
+def neighbours(features: Float[Tensor, "P F"], share: float) -> Int[Tensor, "P M"]:
+    """Indices of the nearest places of each place, including itself: this share of all places."""
+    count = max(1, min(len(features), round(share * len(features))))
+    return torch.cdist(features, features).topk(count, largest=False).indices
 
 
 @torch.no_grad()
@@ -205,8 +241,8 @@ def place_errors(fit: PlaceFit, places: Places, transport: Transport, typical: f
     selected = _at_roughness(transport, fit.roughness[places.place])
     sent = selected.arriving(fit.radiance)
     material = fit.material(places.place)
-    outgoing = _outgoing(sent, material.base_color, material.metallic)
-    return _relative_error(outgoing, places, typical).abs().clamp_max(1).mean(-1)
+    outgoing = outgoing_radiance(sent, material.base_color, material.metallic)
+    return relative_error(outgoing, places, typical).abs().clamp_max(1).mean(-1)
 
 
 def _at_roughness(transport: Transport, number: Int[Tensor, " N"]) -> Transport:
@@ -216,14 +252,17 @@ def _at_roughness(transport: Transport, number: Int[Tensor, " N"]) -> Transport:
     return Transport(transport.sources[layers, rows].float(), transport.scene[layers, rows])
 
 
-def _outgoing(sent: Tensor, base_color: Tensor, metallic: Tensor) -> Tensor:
+def outgoing_radiance(
+    sent: Float[Tensor, "3 N 3"], base_color: Float[Tensor, "N 3"], metallic: Float[Tensor, "N 1"]
+) -> Float[Tensor, "N 3"]:
     """Outgoing radiance from the diffuse, facing and grazing parts (see `lighting.transport`)."""
     diffuse, facing, grazing = sent
     reflectance = 0.04 * (1 - metallic) + base_color * metallic
     return (1 - metallic) * base_color * diffuse + reflectance * facing + grazing
 
 
-def _relative_error(outgoing: Tensor, places: Places, typical: float) -> Tensor:
+def relative_error(outgoing: Float[Tensor, "N 3"], places: Places, typical: float) -> Float[Tensor, "N 3"]:
+    """Error of rendered pixels relative to the recorded ones."""
     pixel = places.observed.pixel
     return (outgoing - pixel) / (pixel + FLOOR * typical)
 
@@ -248,8 +287,8 @@ def _better_light(
         for _ in range(steps):
             base_color = fit.base_color * gain.exp()
             sent = selected.arriving(form(log_radiance).exp().flatten(1).t())
-            outgoing = _outgoing(sent, base_color.clamp(0, 1)[places.place], metallic)
-            error = _relative_error(outgoing, places, typical)
+            outgoing = outgoing_radiance(sent, base_color.clamp(0, 1)[places.place], metallic)
+            error = relative_error(outgoing, places, typical)
             loss = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER)
             loss = loss + SMOOTHNESS * total_variation(log_radiance)
             loss = loss + HIGH_BASE_COLOR_WEIGHT * (base_color - HIGH_BASE_COLOR).clamp_min(0).square().mean()
@@ -268,27 +307,33 @@ def _log_mean(base_color: Float[Tensor, "P 3"]) -> Float[Tensor, ""]:
 
 
 @torch.no_grad()
-def _best_material(
-    fit: PlaceFit,
+def best_materials(
+    arriving: Float[Tensor, "K N 3"],
     places: Places,
-    transport: Transport,
     typical: float,
     metallics: tuple[float, ...],
-    near: Int[Tensor, "P K"],
-) -> PlaceFit:
-    """Choose roughness and metallic of each place from all pairs of the grids, under a fixed light.
+    near: Int[Tensor, "P M"],
+) -> BestMaterials:
+    """Choose the material of each place from all pairs of the grids, under a fixed light.
 
-    For each pair, the base colour of a place is the best one by iteratively reweighted least squares;
-    outgoing radiance is linear in it. The pair with the smallest error at the place and its neighbours is
-    chosen.
+    For each pair of roughness and metallic, the base colour of a place is the best one by iteratively
+    reweighted least squares; outgoing radiance is linear in it. The pair with the smallest error at the place
+    and its neighbours is chosen.
+
+    Args:
+        arriving: the parts of outgoing radiance under the light (`lighting.transport.from_texels_at`).
+        places: the places with their pixels, in linear radiance.
+        typical: radiance of a typical pixel.
+        metallics: values of metallic that are tried, the first ones of `METALLICS`.
+        near: indices of the neighbours of each place, including itself (`neighbours`).
     """
-    layers = torch.stack([part.float() @ fit.radiance for part in transport.sources]) + transport.scene
-    diffuse, unit = layers[0], places.observed.pixel + FLOOR * typical
-    pixels = torch.bincount(places.place, minlength=places.count).to(unit.dtype)
-    best = torch.full((places.count,), torch.inf, device=unit.device)
-    base_color, roughness, metallic = fit.base_color.clone(), fit.roughness.clone(), fit.metallic.clone()
+    diffuse, unit = arriving[0], places.observed.pixel + FLOOR * typical
+    lowest = torch.full((places.count,), torch.inf, device=unit.device)
+    base_color = torch.full((places.count, 3), MIN_BASE_COLOR, device=unit.device)
+    roughness = torch.zeros(places.count, dtype=torch.long, device=unit.device)
+    metallic = torch.zeros_like(roughness)
     for k in range(len(ROUGHNESSES)):
-        facing, grazing = layers[1 + 2 * k], layers[2 + 2 * k]
+        facing, grazing = arriving[1 + 2 * k], arriving[2 + 2 * k]
         for j, m in enumerate(metallics):
             # The relative error of a pixel is base_color · slope − target.
             slope = ((1 - m) * diffuse + m * facing) / unit
@@ -299,11 +344,17 @@ def _best_material(
                 candidate = (places.mean(weight * slope * target) / squares).clamp(MIN_BASE_COLOR, 1)
                 error = candidate[places.place] * slope - target
                 weight = 1 / error.abs().clamp_min(OUTLIER)
-            zero = torch.zeros_like(error)
-            loss = functional.smooth_l1_loss(error, zero, beta=OUTLIER, reduction="none").mean(-1)
-            loss = (pixels * places.mean(loss))[near].sum(1) / pixels[near].sum(1).clamp_min(1)
-            better = loss < best
-            best = torch.where(better, loss, best)
+            loss = mean_loss(error, places, near)
+            better = loss < lowest
+            lowest = torch.where(better, loss, lowest)
             base_color = torch.where(better[:, None], candidate, base_color)
             roughness, metallic = torch.where(better, k, roughness), torch.where(better, j, metallic)
-    return PlaceFit(fit.log_radiance, base_color, roughness, metallic)
+    return BestMaterials(base_color, roughness, metallic, lowest)
+
+
+def mean_loss(error: Float[Tensor, "N 3"], places: Places, near: Int[Tensor, "P M"]) -> Float[Tensor, " P"]:
+    """Mean Huber loss of the relative errors of all pixels of each place and its neighbours."""
+    zero = torch.zeros_like(error)
+    loss = functional.smooth_l1_loss(error, zero, beta=OUTLIER, reduction="none").mean(-1)
+    pixels = torch.bincount(places.place, minlength=places.count).to(loss.dtype)
+    return (pixels * places.mean(loss))[near].sum(1) / pixels[near].sum(1).clamp_min(1)

@@ -13,7 +13,7 @@ grazing part of the BRDF. The vectors d, f and g are the light that arrives from
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -22,11 +22,20 @@ from torch import Tensor
 
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import LampPlaces, rays_towards
+from neilfpp_method.fields.light import LightModel
 from neilfpp_method.shading.brdf import Lobe, diffuse_reflectance, normal_reflectance, specular_terms
 from neilfpp_method.shading.frame import dot
 from neilfpp_method.structures import Material, Observed, SceneLight, SceneTracer
 
-__all__ = ["Transport", "from_lamps", "from_texels", "from_texels_at", "in_sight", "lamp_kernel"]
+__all__ = [
+    "Transport",
+    "arriving_at",
+    "from_lamps",
+    "from_texels",
+    "from_texels_at",
+    "in_sight",
+    "lamp_kernel",
+]
 
 PAIRS_AT_ONCE = 2**18
 """Maximum number of pairs of a point and a direction that are traced at once; it bounds memory."""
@@ -165,10 +174,55 @@ def from_texels_at(
         Layer 0 is the diffuse part; layers 1 + 2k and 2 + 2k are the facing and grazing parts at roughness
         number k. `sources` has half precision.
     """
+    return _joined(list(_texel_parts_at(environment, points, observed, place, roughnesses, lobe, scene)))
+
+
+@torch.no_grad()
+def arriving_at(
+    light: LightModel,
+    points: Observed,
+    observed: Observed,
+    place: Int[Tensor, " N"],
+    roughnesses: Sequence[float],
+    lobe: Lobe,
+    scene: SceneTracer | None,
+) -> Float[Tensor, "K N 3"]:
+    """The parts of outgoing radiance that a known map and known lamps cause at several roughnesses.
+
+    The arguments and the first dimension of the result are those of `from_texels_at`. No transport matrix is
+    stored, so that the map may have any size.
+    """
+    environment, lamps = light.light, light.lamps
+    radiance = environment.log_radiance.exp().flatten(1).t()
+    parts = _texel_parts_at(environment, points, observed, place, roughnesses, lobe, scene)
+    total = torch.cat([part.sources.float() @ radiance + part.scene for part in parts], 1)
+    if lamps.count:
+        places = LampPlaces(lamps.position[: lamps.count], lamps.axis[: lamps.count])
+        sight = in_sight(places, lamps.radius, points.position, scene)[place]
+        for number, value in enumerate(roughnesses):
+            roughness = torch.full_like(observed.position[:, :1], value)
+            kernel = lamp_kernel(places, lamps.radius, sight, observed, roughness, lobe)
+            sent = kernel @ lamps.intensity[: lamps.count]
+            layers = slice(1 + 2 * number, 3 + 2 * number)
+            total[layers] += sent[1:]
+            if number == 0:
+                total[0] += sent[0]
+    return total
+
+
+def _texel_parts_at(
+    environment: EnvironmentLight,
+    points: Observed,
+    observed: Observed,
+    place: Int[Tensor, " N"],
+    roughnesses: Sequence[float],
+    lobe: Lobe,
+    scene: SceneTracer | None,
+) -> Iterator[Transport]:
+    """The parts of `from_texels_at` for consecutive spans of pixels."""
     texels = environment.log_radiance[0].numel()
     spans = _spans(len(points), texels)
     rays = _joined_rays([_texel_rays(environment, points[span], scene) for span in spans])
-    parts = []
     for span in _spans(len(observed), texels):
         part = observed[span]
         shared = rays[place[span]].redrawn(environment, part)
@@ -177,10 +231,10 @@ def from_texels_at(
             roughness = torch.full_like(part.position[:, :1], value)
             kernel = _kernel(part, roughness, shared.wi, shared.weight, lobe)
             layers.append(shared.transport(kernel if number == 0 else kernel[1:]))
-        parts.append(
-            Transport(torch.cat([x.sources.half() for x in layers]), torch.cat([x.scene for x in layers]))
+        yield Transport(
+            torch.cat([layer.sources.half() for layer in layers]),
+            torch.cat([layer.scene for layer in layers]),
         )
-    return _joined(parts)
 
 
 @dataclass(frozen=True)

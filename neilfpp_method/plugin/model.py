@@ -21,9 +21,10 @@ from torch import Tensor, nn
 
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.first_light import start_with
+from neilfpp_method.effects.material_search import is_search_due
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest
-from neilfpp_method.effects.review import review_light
+from neilfpp_method.effects.review import improve_material, review_light
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.health.cases import Health
@@ -228,7 +229,18 @@ class NeilfMethod(Model):
         if self.light_solver.due:
             self.watch.after_fit(self.light_solver.points, step)
         self.evidence = self.light_solver.solve(self.neilf.brdf, self.neilf.scene) or self.evidence
+        self._search_material(step)
         self.computed = None
+
+    def _search_material(self, step: int) -> None:
+        """Search for better materials when this is due, as in the standalone loop."""
+        position = stage_at(step, self.config.neilf.train)
+        if not is_search_due(dataclasses.replace(position, step=position.step + 1)):
+            return
+        seed_step(self.config.neilf.train.seed, -6 - (step + 1))
+        summary = improve_material(self.neilf, self.pixels.on(self.device))
+        if summary is not None:
+            CONSOLE.log(summary)
 
     def _check_and_save(self, trainer: Trainer, step: int) -> None:
         """Check the health at the end of a stage; write the run folder then and when nerfstudio saves."""

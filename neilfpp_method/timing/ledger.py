@@ -45,7 +45,7 @@ Work = Literal[
 - shading: material, light and the rendering equation;
 - gradients: the backward pass of all of these;
 - optimiser: the optimizer step and its bookkeeping;
-- light_fits: fits of the map and the lamps;
+- light_fits: fits of the map and the lamps, and searches for materials under them;
 - checks: previews and measurements during training;
 - saving: checkpoints;
 - rest: everything else.

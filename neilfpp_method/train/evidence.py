@@ -10,9 +10,11 @@ from collections.abc import Callable, Sequence
 
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.first_light import start_with
+from neilfpp_method.effects.material_search import is_search_due
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.review import (
     MAX_PIXELS,
+    improve_material,
     needs_surface,
     record_lamps,
     review_light,
@@ -20,14 +22,14 @@ from neilfpp_method.effects.review import (
     review_surface,
 )
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.schedule import stage_at
+from neilfpp_method.schedule import StagePosition, stage_at
 from neilfpp_method.structures import StepResult
 from neilfpp_method.timing.ledger import timed
 from neilfpp_method.train.light_record import note_fit
 from neilfpp_method.train.optimizer import seed_step
 from neilfpp_method.train.training import Training
 
-__all__ = ["apply_plan", "review_before_stage", "solve_light"]
+__all__ = ["apply_plan", "review_before_stage", "search_material", "solve_light"]
 
 Review = Callable[[Plan, NeilfModel, PixelDataset, int], list[Decision]]
 """Measures with the model after so many steps and adds its decisions to the plan."""
@@ -85,6 +87,23 @@ def _start_light(run: Training, model: NeilfModel, step: int) -> None:
             _report(run, record_lamps(run.plan, evidence, model.lamps.count, step))
     _share_light(run, model)
     _share_decisions(run, model, decisions)
+
+
+def search_material(run: Training, model: NeilfModel, position: StagePosition, step: int) -> None:
+    """When it is due, search for better materials and train the BRDF field on them.
+
+    The first process does this for all.
+    """
+    if not is_search_due(position):
+        return
+    if run.fabric.is_global_zero:
+        with timed("light_fits", apart=True):
+            seed_step(run.config.train.seed, -6 - step)
+            summary = improve_material(model, run.pixels, _light_pixels(run))
+        if summary is not None:
+            run.reporter.say(summary)
+    if run.fabric.world_size > 1:
+        model.brdf.load_state_dict(run.fabric.broadcast(model.brdf.state_dict()))
 
 
 def _light_pixels(run: Training) -> int:

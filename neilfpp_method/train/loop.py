@@ -31,7 +31,7 @@ from neilfpp_method.settings.facts import RadianceUnits
 from neilfpp_method.structures import LossTerms
 from neilfpp_method.timing.ledger import timed
 from neilfpp_method.train.effects_record import read_plan, write_plan
-from neilfpp_method.train.evidence import apply_plan, review_before_stage, solve_light
+from neilfpp_method.train.evidence import apply_plan, review_before_stage, search_material, solve_light
 from neilfpp_method.train.health_record import read_findings, write_findings
 from neilfpp_method.train.light_record import read_fits, write_fits
 from neilfpp_method.train.optimizer import (
@@ -115,6 +115,7 @@ def _train_stage(
         run.watch.after_step(model.stages[stage], computed, step)
         number, step = number + 1, step + 1
         length = _keep_pace(run, StagePosition(stage, number, length), step)
+        search_material(run, model, StagePosition(stage, number, length), step)
         _check_quality(run, model, StagePosition(stage, number, length), step)
         run.seconds[stage.value] = before + time.perf_counter() - started
         if number == length:

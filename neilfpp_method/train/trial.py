@@ -21,6 +21,7 @@ from neilfpp_method.data.scaling import PIXELS_OF_A_VIEW, at_scale, scale_for_pi
 from neilfpp_method.data.views import View
 from neilfpp_method.effects.first_light import seconds_of_pixel
 from neilfpp_method.effects.material import JUDGED, seconds_of_evidence
+from neilfpp_method.effects.material_search import SEARCH_AT, SEARCH_SHARE
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.effects.review import (
@@ -204,10 +205,12 @@ def run_trial(work: Workload, limits: TrialLimits) -> Trial:
     costs, times = {}, _StageTimes()
     for stage, steps in lengths.items():
         times = _measure_stage(setup, stage, limits.steps / len(lengths))
+        fit = _fit_seconds(setup, times.fits[-1:]) / _steps_per_fit(setup.config)
+        searches = len(SEARCH_AT) * SEARCH_SHARE * search.seconds if stage is Stage.MATERIAL_INIT else 0.0
         cost = StageCost(
             steps,
             step=sum(times.steps) / len(times.steps),
-            fit=_fit_seconds(setup, times.fits[-1:]) / _steps_per_fit(setup.config),
+            fit=fit + searches / steps,
             start=0.0,
             end=times.picture + 2 * times.health_check,
         )

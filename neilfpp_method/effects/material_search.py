@@ -1,0 +1,181 @@
+"""Search the material of surface places under the current light, to leave local optima of training.
+
+Gradient descent cannot change a dark metal into a black paint: halfway between the two, the error is larger
+than at both ends. Under the light of a half-trained model it is easy to see which of the two explains the
+views better, so every roughness and metallic of a grid is tried at some thousand places. The BRDF field is
+then trained to have the better material where one was found, and its own everywhere else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from neilfpp_method.effects.place_fit import (
+    METALLICS,
+    ROUGHNESSES,
+    best_materials,
+    mean_loss,
+    neighbours,
+    on_grid,
+    outgoing_radiance,
+    relative_error,
+)
+from neilfpp_method.effects.places import Places
+from neilfpp_method.fields.brdf import BrdfField
+from neilfpp_method.fields.environment import EnvironmentLight
+from neilfpp_method.fields.light import LightModel
+from neilfpp_method.lighting.transport import arriving_at
+from neilfpp_method.model import NeilfModel
+from neilfpp_method.schedule import Stage, StagePosition
+from neilfpp_method.shading.frame import safe_normalize
+from neilfpp_method.structures import Material, Observed
+
+__all__ = [
+    "SEARCH_AT",
+    "SEARCH_SHARE",
+    "SearchedMaterial",
+    "can_search",
+    "is_search_due",
+    "search_materials",
+    "teach",
+]
+
+SEARCH_AT = (1 / 3, 2 / 3)
+"""Shares of material init after which materials are searched."""
+
+SEARCH_SHARE = 0.2
+"""Time of a search as a share of that of the search for the initial light, with all its evidence, at the same
+pixels (measured on `spot_city`: 22 of 105 s).
+"""
+DRAWS = 2
+"""Random directions per texel and pixel."""
+NEIGHBOURS_SHARE = 1 / 150
+"""Share of the places whose errors are added when the material of a place is chosen."""
+COLOR_SCALE = 0.2
+"""Distance in scene units that counts as much as a factor e of base colour when neighbours are chosen: places
+of the same look are often of one material.
+"""
+MAX_RATIO = 0.8
+"""A material replaces that of the field if its error is at most this share of the error of the field."""
+MIN_LOSS = 0.005
+"""Loss of the field below which its material is kept: that of relative errors of 3 %, which the steps of the
+grid cause as well.
+"""
+MIN_ROUGHNESS = 0.05
+"""Roughnesses are raised to at least this value before they are rounded to the grid in log roughness."""
+MIN_BASE_COLOR = 0.02
+"""Base colours are raised to at least this value before their logarithms are compared."""
+STEPS = 150
+"""Training steps of the field."""
+BATCH = 4096
+"""Points per training step of the field."""
+RATE = 5e-3
+"""Learning rate of the field."""
+
+
+def is_search_due(position: StagePosition) -> bool:
+    """Whether materials are searched after `position.step` steps of a stage."""
+    return position.stage is Stage.MATERIAL_INIT and any(
+        position.step - 1 < share * position.length <= position.step for share in SEARCH_AT
+    )
+
+
+@dataclass(frozen=True)
+class SearchedMaterial:
+    """The material that the BRDF field should have at N points.
+
+    Attributes:
+        position: the points, scene frame.
+        material: their material.
+        share: share of the places whose material differs from that of the field.
+    """
+
+    position: Float[Tensor, "N 3"]
+    material: Material
+    share: float
+
+    def summary(self) -> str:
+        """One line for the console."""
+        return f"material search: {self.share:.0%} of the places have a better material"
+
+
+def can_search(model: NeilfModel) -> bool:
+    """Whether the light is an environment map and surfaces have a specular lobe."""
+    return model.lobe is not None and isinstance(model.light, EnvironmentLight)
+
+
+@torch.no_grad()
+def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
+    """Search for better materials at places, under the current light of a model.
+
+    Args:
+        model: gives the light, the scene, the lobe and the materials; see `can_search`.
+        places: places with their pixels in the training views, in linear radiance.
+
+    Returns:
+        Materials at the points that the pixels show.
+    """
+    numbers, place = places.place.unique(return_inverse=True)
+    places = Places(len(numbers), place, places.view, places.observed)
+    position = places.mean(places.observed.position)
+    normal = safe_normalize(places.mean(places.observed.normal))
+    points = Observed(position, normal, normal, torch.zeros_like(normal))
+    light = LightModel(model.light, model.lamps)
+    arriving = (
+        sum(
+            arriving_at(light, points, places.observed, place, ROUGHNESSES, model.lobe, model.scene)
+            for _ in range(DRAWS)
+        )
+        / DRAWS
+    )
+    current, typical = model.brdf(position), model.facts.median_radiance
+    look = COLOR_SCALE * current.base_color.clamp_min(MIN_BASE_COLOR).log()
+    near = neighbours(torch.cat((position, look), -1), NEIGHBOURS_SHARE)
+    best = best_materials(arriving, places, typical, METALLICS if model.brdf.metals else METALLICS[:1], near)
+    loss = _loss_of(current, arriving, places, typical, near)
+    is_better = (loss > MIN_LOSS) & (best.loss < MAX_RATIO * loss)
+    found = on_grid(best.base_color, best.roughness, best.metallic)
+    own = model.brdf(places.observed.position)
+    material = _where(is_better[place], found[place], own)
+    return SearchedMaterial(places.observed.position, material, is_better.float().mean().item())
+
+
+def _loss_of(
+    material: Material, arriving: Float[Tensor, "K N 3"], places: Places, typical: float, near: Tensor
+) -> Float[Tensor, " P"]:
+    """The loss of `best_materials` for given materials, with roughness rounded to the grid."""
+    grid = torch.tensor(ROUGHNESSES, device=near.device).log()
+    k = (material.roughness.clamp_min(MIN_ROUGHNESS).log() - grid).abs().argmin(1)[places.place]
+    rows = torch.arange(len(k), device=k.device)
+    sent = torch.stack((arriving[0], arriving[1 + 2 * k, rows], arriving[2 + 2 * k, rows]))
+    pixel = material[places.place]
+    error = relative_error(outgoing_radiance(sent, pixel.base_color, pixel.metallic), places, typical)
+    return mean_loss(error, places, near)
+
+
+def _where(condition: Bool[Tensor, " N"], yes: Material, no: Material) -> Material:
+    columns = ("base_color", "roughness", "metallic")
+    return Material(*(torch.where(condition[:, None], getattr(yes, c), getattr(no, c)) for c in columns))
+
+
+@torch.enable_grad()
+def teach(brdf: BrdfField, searched: SearchedMaterial) -> None:
+    """Train a BRDF field until it has the given material at the given points."""
+    optimizer = torch.optim.Adam(brdf.parameters(), lr=RATE, betas=(0.9, 0.99))
+    target = searched.material
+    for _ in range(STEPS):
+        rows = torch.randint(len(searched.position), (BATCH,), device=searched.position.device)
+        material = brdf(searched.position[rows])
+        loss = sum(
+            functional.mse_loss(getattr(material, name), getattr(target, name)[rows])
+            for name in ("base_color", "roughness", "metallic")
+        )
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+    optimizer.zero_grad(set_to_none=True)

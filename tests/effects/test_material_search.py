@@ -1,0 +1,148 @@
+"""The search for better materials at places, and the training of the BRDF field on what it finds."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from neilfpp_method.effects.material_search import (
+    SEARCH_AT,
+    SearchedMaterial,
+    can_search,
+    is_search_due,
+    search_materials,
+    teach,
+)
+from neilfpp_method.effects.place_fit import ROUGHNESSES
+from neilfpp_method.effects.places import Places
+from neilfpp_method.fields.brdf import BrdfField
+from neilfpp_method.fields.environment import EnvironmentLight
+from neilfpp_method.fields.lamps import LampPlaces
+from neilfpp_method.fields.light import LightModel
+from neilfpp_method.lighting.transport import arriving_at, from_lamps, from_texels_at
+from neilfpp_method.model import NeilfModel
+from neilfpp_method.schedule import Stage, StagePosition
+from neilfpp_method.settings.presets import preset
+from neilfpp_method.shading import LOBES
+from neilfpp_method.structures import Material
+from tests.effects.balls import ball, sky
+from tests.scenes import sphere_model
+
+COUNT, VIEWS = 160, 6
+LOBE = LOBES["ggx"]
+PAINT = Material(torch.full((1, 3), 0.07), torch.full((1, 1), 0.45), torch.zeros(1, 1))
+METAL = Material(torch.full((1, 3), 0.14), torch.full((1, 1), 0.7), torch.full((1, 1), 0.95))
+
+
+def fine_sky() -> EnvironmentLight:
+    """The sky as a map of the size that training uses."""
+    environment = EnvironmentLight(48, 1.0)
+    environment.resample(sky().log_radiance)
+    return environment
+
+
+@pytest.fixture(scope="module")
+def places() -> Places:
+    """A ball of black paint."""
+    material = (value.expand(COUNT, -1) for value in vars(PAINT).values())
+    return ball(*material, LOBE, VIEWS, fine_sky())
+
+
+def trained_to(material: Material, places: Places) -> NeilfModel:
+    """A model under the true sky whose BRDF field has one material."""
+    config = preset("fast")
+    shading = dataclasses.replace(config.shading, lobe="ggx")
+    model = sphere_model(dataclasses.replace(config, shading=shading))
+    model.light.resample(sky().log_radiance)
+    model.facts = dataclasses.replace(model.facts, median_radiance=places.observed.pixel.median().item())
+    model.brdf.start_at(material)
+    return model
+
+
+def test_black_paint_that_was_learned_as_dark_metal_becomes_paint(places: Places):
+    model = trained_to(METAL, places)
+    searched = search_materials(model, places)
+    assert searched.share > 0.8
+    teach(model.brdf, searched)
+    with torch.no_grad():
+        learned = model.brdf(places.observed.position)
+    assert learned.metallic.median() < 0.1
+    assert learned.roughness.median() == pytest.approx(0.45, abs=0.12)
+    assert learned.base_color.median() == pytest.approx(0.07, abs=0.03)
+
+
+def test_the_right_material_is_kept(places: Places):
+    model = trained_to(PAINT, places)
+    searched = search_materials(model, places)
+    assert searched.share < 0.2
+    before = model.brdf(places.observed.position)
+    kept = (searched.material.metallic == before.metallic).float().mean()
+    assert kept > 0.8
+
+
+def test_a_scene_without_metals_gets_none():
+    one = torch.ones(COUNT, 1)
+    metal = ball(0.6 * one.expand(-1, 3), 0.3 * one, one, LOBE, VIEWS)
+    model = trained_to(PAINT, metal)
+    model.brdf.use(dataclasses.replace(model.config.brdf, metals=False))
+    assert search_materials(model, metal).material.metallic.max() == 0
+
+
+def test_nothing_is_searched_under_a_free_light_or_without_highlights():
+    model = sphere_model(preset("fast"))
+    assert can_search(model)
+    model.lobe = None
+    assert not can_search(model)
+    assert not can_search(sphere_model(preset("paper-ngp")))
+
+
+def test_a_search_is_due_once_at_each_of_its_times():
+    for length in (3, 7, 1500):
+        due = [
+            n for n in range(1, length + 1) if is_search_due(StagePosition(Stage.MATERIAL_INIT, n, length))
+        ]
+        assert due == [math.ceil(share * length) for share in SEARCH_AT]
+    assert not any(is_search_due(StagePosition(Stage.JOINT, n, 30)) for n in range(31))
+
+
+def test_a_field_learns_the_material_where_it_differs_and_keeps_it_elsewhere():
+    config = preset("fast")
+    torch.manual_seed(0)
+    field = BrdfField(config.brdf, config.encoding, 1.0)
+    position = 2 * torch.rand(3000, 3) - 1
+    left = (position[:, :1] < 0).float()
+    own = field(position)
+    material = Material(
+        (own.base_color * (1 - left) + 0.8 * left).detach(),
+        (own.roughness * (1 - left) + 0.2 * left).detach(),
+        (own.metallic * (1 - left) + 0.9 * left).detach(),
+    )
+    teach(field, SearchedMaterial(position, material, 0.5))
+    learned = field(position)
+    for name in ("base_color", "roughness", "metallic"):
+        off = (getattr(learned, name) - getattr(material, name)).abs()
+        assert off.median() < 0.03, name
+
+
+def test_light_at_several_roughnesses_is_the_transport_times_the_light(places: Places):
+    observed, place = places.observed[:40], torch.arange(40)
+    model = trained_to(PAINT, places)
+    model.lamps.place(torch.tensor([[0.0, 0.0, 2.0]]), torch.full((1, 3), 5.0))
+    arguments = (observed, observed, place, ROUGHNESSES[:3], LOBE, None)
+    torch.manual_seed(0)
+    arriving = arriving_at(LightModel(model.light, model.lamps), *arguments)
+    torch.manual_seed(0)
+    transport = from_texels_at(model.light, *arguments)
+    radiance = model.light.log_radiance.exp().flatten(1).t()
+    expected = transport.sources.float() @ radiance
+    lamp = LampPlaces(model.lamps.position[:1], model.lamps.axis[:1])
+    for number, value in enumerate(ROUGHNESSES[:3]):
+        rough = torch.full((40, 1), value)
+        lamps = from_lamps(lamp, model.lamps.radius, observed, rough, LOBE, None).sources
+        sent = lamps @ model.lamps.intensity[:1]
+        expected[1 + 2 * number : 3 + 2 * number] += sent[1:]
+        expected[0] += sent[0] if number == 0 else 0
+    torch.testing.assert_close(arriving, expected, rtol=1e-4, atol=1e-5)
