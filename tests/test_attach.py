@@ -251,7 +251,7 @@ def test_missing_capabilities_are_logged_once_in_one_line(caplog):
     assert missing_capabilities(sphere_model().host) == {}
 
 
-def test_a_nerfstudio_model_is_recognised_by_its_attributes(monkeypatch):
+def test_a_nerfstudio_model_is_recognized_by_its_attributes(monkeypatch):
     class Adapter(BallHost):
         def __init__(self, model, response):
             super().__init__()
@@ -328,7 +328,7 @@ def test_a_function_may_return_a_dictionary():
         incomplete.losses(pixels(), Stage.MATERIAL_INIT)
 
 
-def test_a_colour_without_gradient_is_accepted_if_it_is_not_trained():
+def test_a_color_without_gradient_is_accepted_if_it_is_not_trained():
     neilf = attach_neilf(spoiled(lambda c, p, n: (c.detach(), p, n)), tiny_config())
     assert neilf.losses(pixels(), Stage.MATERIAL_INIT).loss.isfinite()
 

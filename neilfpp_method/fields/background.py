@@ -100,8 +100,8 @@ class InvertedSphere(nn.Module):
         density = self.radius * functional.softplus(trunk[..., 0])
         towards_viewer = self.direction(-directions)[:, None].expand(-1, self.samples, -1)
         color = self.scale * torch.sigmoid(self.head(torch.cat((trunk[..., 1:], towards_viewer), -1)))
-        travelled = (1 / self.radius - inverse).expand(len(points), -1)
-        weights = render_weights(density, travelled, origins.new_full((len(points),), 1 / self.radius))
+        traveled = (1 / self.radius - inverse).expand(len(points), -1)
+        weights = render_weights(density, traveled, origins.new_full((len(points),), 1 / self.radius))
         return composite(weights.weights, color) + weights.transmittance[:, None] * color[:, -1]
 
     def _encoded(

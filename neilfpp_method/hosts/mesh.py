@@ -16,9 +16,9 @@ from torch import Tensor, nn
 
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.fields.background import background_field
-from neilfpp_method.fields.outgoing_radiance import MID_GREY, OutgoingRadianceField
+from neilfpp_method.fields.outgoing_radiance import MID_GRAY, OutgoingRadianceField
 from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_tracer, meet, tree_tracer
-from neilfpp_method.hosts.smooth_normals import NEIGHBOURS, smooth_normals
+from neilfpp_method.hosts.smooth_normals import NEIGHBORS, smooth_normals
 from neilfpp_method.schedule import FIXED_GEOMETRY
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.frame import safe_normalize
@@ -70,7 +70,7 @@ class MeshHost(nn.Module):
         radiance_scale: float,
         background: str = "constant",
         background_color: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        radiance_start: float = MID_GREY,
+        radiance_start: float = MID_GRAY,
     ) -> None:
         super().__init__()
         radius = config.volume.radius
@@ -133,7 +133,7 @@ class MeshHost(nn.Module):
         """Normals smoothed within `volume.normal_radius` of hits; the hit normals if it is 0."""
         if self.normal_radius == 0:
             return normal
-        up = normal.repeat_interleave(NEIGHBOURS, 0)
+        up = normal.repeat_interleave(NEIGHBORS, 0)
 
         def normals_below(x: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
             met = self.cross(RayBatch(x + self.normal_radius * up, -up))

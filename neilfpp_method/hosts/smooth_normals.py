@@ -19,11 +19,11 @@ from torch.nn import functional
 
 from neilfpp_method.shading.frame import local_frame, safe_normalize
 
-__all__ = ["NEIGHBOURS", "smooth_normals"]
+__all__ = ["NEIGHBORS", "smooth_normals"]
 
 RINGS = ((6, 1 / 3), (10, 2 / 3), (16, 1.0))
 """Number of neighbors on each ring around the point, and the ring's radius relative to the outermost."""
-NEIGHBOURS = sum(count for count, _ in RINGS)
+NEIGHBORS = sum(count for count, _ in RINGS)
 """Number of points at which normals are evaluated, per shaded point."""
 UNLIKE = 0.2
 """Residual of a unit normal at which its weight is 1/√e; it corresponds to 11.5°."""
@@ -43,7 +43,7 @@ def smooth_normals(
     """Smoothed unit normals at surface points.
 
     Args:
-        gradient: gradient of the signed distance; called with `NEIGHBOURS` points around each point.
+        gradient: gradient of the signed distance; called with `NEIGHBORS` points around each point.
         position: points on the surface, scene frame.
         normal: their unit normals, not smoothed.
         radius: radius of the neighborhood, scene units. Relief that is finer than this and flatter than about
@@ -58,7 +58,7 @@ def smooth_normals(
     residual = normals - normal[:, None]
     for _ in range(ROUNDS):
         weighted = design * torch.exp(-residual.square().sum(-1, keepdim=True) / (2 * UNLIKE**2))
-        # The ridge makes the matrix regular. `solve` would synchronise with the device to check that.
+        # The ridge makes the matrix regular. `solve` would synchronize with the device to check that.
         coefficients = torch.linalg.solve_ex(weighted.mT @ design + ridge, weighted.mT @ normals).result
         residual = normals - design @ coefficients
     return safe_normalize(coefficients[:, 0])

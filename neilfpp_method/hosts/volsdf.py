@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from neilfpp_method import losses
 from neilfpp_method.fields.background import background_field
-from neilfpp_method.fields.outgoing_radiance import MID_GREY, OutgoingRadianceField
+from neilfpp_method.fields.outgoing_radiance import MID_GRAY, OutgoingRadianceField
 from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.base import RegularisedHits
 from neilfpp_method.hosts.smooth_normals import smooth_normals
@@ -83,7 +83,7 @@ class VolSdfHost(nn.Module):
         background: str,
         background_color: tuple[float, float, float] = (0.0, 0.0, 0.0),
         points: OrientedPoints | None = None,
-        radiance_start: float = MID_GREY,
+        radiance_start: float = MID_GRAY,
         cameras: Float[Tensor, "V 3"] | None = None,
     ) -> None:
         super().__init__()

@@ -80,7 +80,7 @@ def run_training(
         >>> run = load_run(run_training(request, Console()))                                # doctest: +SKIP
     """
     device = pick_device(request.device)
-    ledger = Ledger(synchronise=waiting(device))
+    ledger = Ledger(synchronize=waiting(device))
     if request.resume:
         run = open_run(request, ledger)
         if run is None:

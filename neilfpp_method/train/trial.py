@@ -211,7 +211,6 @@ def run_trial(work: Workload, limits: TrialLimits) -> Trial:
             steps,
             step=sum(times.steps) / len(times.steps),
             fit=fit + searches / steps,
-            start=0.0,
             end=times.picture + 2 * times.health_check,
         )
         if stage in with_material:

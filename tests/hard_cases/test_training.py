@@ -18,7 +18,7 @@ from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.errors import UserError
 from neilfpp_method.train.loop import train
-from tests.data.make_capture import CENTRE, RADIUS, SCALE, make_capture, srgb
+from tests.data.make_capture import CENTER, RADIUS, SCALE, make_capture, srgb
 from tests.train.small_runs import small_config, small_training, solved_light
 
 pytestmark = pytest.mark.usefixtures("without_shape_checks")
@@ -171,7 +171,7 @@ def test_cameras_inside_the_object(tmp_path, solved):
     scene = json.loads(path.read_text())
     for k, track in scene["camera_track_map"]["images"].items():
         w2c = np.reshape(track["camera"]["extrinsic"], (4, 4))
-        eye = CENTRE - 0.2 * RADIUS * w2c[2, :3]
+        eye = CENTER - 0.2 * RADIUS * w2c[2, :3]
         w2c[:3, 3] = -w2c[:3, :3] @ eye
         track["camera"]["extrinsic"] = w2c.tolist()
         image = root / "inputs" / "images" / f"{int(k):03d}.exr"

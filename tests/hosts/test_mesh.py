@@ -25,7 +25,7 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import PRESETS, fixed_geometry
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import RayBatch
-from tests.data.make_capture import CENTRE, make_capture
+from tests.data.make_capture import CENTER, make_capture
 from tests.scenes import sphere_batch, tiny_config
 from tests.train.small_runs import small_config
 
@@ -356,7 +356,7 @@ def test_a_mesh_is_given_by_its_path_and_loaded_again(tmp_path: Path, monkeypatc
     shape = trimesh.load_mesh(tmp_path / "scan.ply", process=False)
     trimesh.Trimesh(shape.vertices, shape.faces[:, ::-1], process=False).export(tmp_path / "inside.ply")
     assert "see the inside" in error("--host", "mesh", "--mesh", str(tmp_path / "inside.ply"))
-    trimesh.Trimesh(shape.vertices - CENTRE + 90.0, shape.faces, process=False).export(tmp_path / "away.ply")
+    trimesh.Trimesh(shape.vertices - CENTER + 90.0, shape.faces, process=False).export(tmp_path / "away.ply")
     assert "no camera sees this mesh" in error("--host", "mesh", "--mesh", str(tmp_path / "away.ply"))
 
     out = tmp_path / "run"

@@ -125,7 +125,7 @@ def test_only_the_named_losses_are_computed(sharp):
     assert sharp.render_regularised(batch, []).terms == {}
 
 
-def test_regularisers_cover_the_whole_scene():
+def test_regularizers_cover_the_whole_scene():
     """For G = c · x the losses are known at every point, so their means and counts show which points are
     used.
     """

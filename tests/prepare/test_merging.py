@@ -69,8 +69,8 @@ def test_brackets_become_a_linear_capture(tmp_path: Path, capsys) -> None:
     capture = load_capture(tmp_path / "out")
     assert capture.hdr
     assert [view.name for view in capture.views] == [f"{i:03}" for i in range(POSES)]
-    *_, centres, rotations = to_truth(capture, {f"{i:03}": pose(i, POSES) for i in range(POSES)})
-    assert centres < 0.01
+    *_, centers, rotations = to_truth(capture, {f"{i:03}": pose(i, POSES) for i in range(POSES)})
+    assert centers < 0.01
     assert rotations < 0.3
     scales = []
     for i, view in enumerate(capture.views):

@@ -42,7 +42,7 @@ TICK = 0.1
 def clock(monkeypatch: pytest.MonkeyPatch) -> None:
     """A ledger whose clock advances at every reading, and a trial in which steps cost half as much."""
 
-    def ticking(synchronise: object = None) -> Ledger:
+    def ticking(synchronize: object = None) -> Ledger:
         ticks = itertools.count()
         return Ledger(now=lambda: TICK * next(ticks))
 

@@ -63,7 +63,7 @@ def sample(sdf, rays, beta, config=CONFIG, stochastic=False):
 # -------------------------------------------------------------------------------------------- simple samplers
 
 
-def test_uniform_samples_are_both_ends_and_the_centres_of_equal_parts():
+def test_uniform_samples_are_both_ends_and_the_centers_of_equal_parts():
     samples = uniform_samples(torch.tensor([0.0, 1.0]), torch.tensor([4.0, 1.0]), 6, False)
     assert samples.tolist() == [[0.0, 0.5, 1.5, 2.5, 3.5, 4.0], [1.0] * 6]
 

@@ -14,7 +14,7 @@ from neilfpp_method.cli import main
 from neilfpp_method.data.images import read_image
 from neilfpp_method.train.run import load_run
 from tests.calls import refused, train_tiny
-from tests.data.make_capture import CENTRE, RADIUS, SCALE, srgb
+from tests.data.make_capture import CENTER, RADIUS, SCALE, srgb
 from tests.train.small_runs import small_config, solved_light
 
 SMALL = ["--device", "cpu", "--texture-size", "128", "--faces", "400", "--resolution", "32"]
@@ -50,7 +50,7 @@ def test_an_asset_of_a_given_mesh(given, tmp_path, capfd):
     shape = trimesh.load(out / "asset.glb", process=False).geometry["surface"]
     assert len(shape.faces) <= 400
     world = np.array(shape.vertices)[:, [0, 2, 1]] * [1, -1, 1]
-    np.testing.assert_allclose(np.linalg.norm(world - CENTRE, axis=1), RADIUS, atol=0.04)
+    np.testing.assert_allclose(np.linalg.norm(world - CENTER, axis=1), RADIUS, atol=0.04)
     # The texture agrees with the material of the run.
     run = load_run(given)
     row = (1 - shape.visual.uv[:, 1]) * 128 - 0.5
@@ -58,7 +58,7 @@ def test_an_asset_of_a_given_mesh(given, tmp_path, capfd):
     texel = np.array(shape.visual.material.baseColorTexture)[
         row.round().astype(int), column.round().astype(int)
     ]
-    scene = torch.as_tensor((world - CENTRE) / SCALE, dtype=torch.float32)
+    scene = torch.as_tensor((world - CENTER) / SCALE, dtype=torch.float32)
     truth = 255 * srgb(run.model.materials(scene).base_color.detach().numpy())
     assert np.abs(texel - truth).mean() < 2
     described = json.loads((out / "scene.json").read_text())
@@ -97,4 +97,4 @@ def test_a_run_without_a_material(masked_capture, tmp_path, capfd):
     assert {path.name for path in out.iterdir()} - {"asset.usda"} == FILES | {"textures"}
     shape = trimesh.load(out / "asset.glb", process=False).geometry["surface"]
     world = np.array(shape.vertices)[:, [0, 2, 1]] * [1, -1, 1]
-    assert np.linalg.norm(world.mean(0) - CENTRE) < 0.4 * RADIUS
+    assert np.linalg.norm(world.mean(0) - CENTER) < 0.4 * RADIUS
