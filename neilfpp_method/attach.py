@@ -189,7 +189,7 @@ class AttachedNeilf(nn.Module):
         return self.model.parameter_groups()
 
     def materials(self, x: Float[Tensor, "N 3"]) -> Material:
-        """Base color, roughness and metallic at points of the scene frame."""
+        """Base colour, roughness and metallic at points of the scene frame."""
         check_points("x", x)
         self._check_device_and_dtype("x", x)
         return self.model.materials(x)

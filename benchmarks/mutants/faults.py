@@ -359,7 +359,7 @@ MUTANTS: Sequence[Mutant] = (
         "train/test_checkpoint.py",
     ),
     Mutant(
-        "the optimiser starts anew on resume",
+        "the optimizer starts anew on resume",
         "train/loop.py",
         '    optimizer.load_state_dict(saved["optimizer"])\n',
         "",

@@ -27,7 +27,7 @@ SHELL_RADIUS = 2.0
 MIN_START = 1e-2
 """Smallest distance of the initial radiance from both ends of the sigmoid's range, relative to the range."""
 START_SCALE = 1e-3
-"""Factor on the initial weights of the last layer, so that the field starts as an almost constant color."""
+"""Factor on the initial weights of the last layer, so that the field starts as an almost constant colour."""
 
 
 def background_field(
@@ -46,7 +46,7 @@ class InvertedSphere(nn.Module):
     """Radiance field outside of the scene sphere in the coordinates (x/r, 1/r), r the distance to the origin.
 
     Density is per unit of 1/r. Samples are the midpoints of equal steps of 1/r from the sphere to infinity.
-    Light that passes all samples has the color of the last one.
+    Light that passes all samples has the colour of the last one.
 
     Args:
         config: the settings.

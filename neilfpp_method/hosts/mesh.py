@@ -57,7 +57,7 @@ class MeshHost(nn.Module):
         config: the settings.
         radiance_scale: largest radiance of R.
         background: "inverted_sphere"; any other value means a constant background.
-        background_color: linear RGB of a constant background, and initial color of an inverted sphere.
+        background_color: linear RGB of a constant background, and initial colour of an inverted sphere.
         radiance_start: initial radiance of R.
     """
 

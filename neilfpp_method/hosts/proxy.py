@@ -204,7 +204,7 @@ class SurfaceProxy(nn.Module):
         crossed = camera_rays.rays.origins + traced.distance[:, None] * camera_rays.rays.directions
         stale = torch.zeros(self.resolution**3, dtype=torch.bool, device=crossed.device)
         stale[self._cells(crossed[through])] = True
-        # Points in neighboring cells are removed as well.
+        # Points in neighbouring cells are removed as well.
         volume = stale.view(1, 1, *[self.resolution] * 3).float()
         stale = nn.functional.max_pool3d(volume, 3, 1, 1).view(-1) > 0
         # `rows` is a view of the ring: this writes to the stored points.
@@ -244,7 +244,7 @@ class SurfaceProxy(nn.Module):
 
     @torch.no_grad()
     def render(self, rays: RayBatch) -> SurfaceHits:
-        """Hits of rays with the grid's surface, without gradient; the color of a miss is black."""
+        """Hits of rays with the grid's surface, without gradient; the colour of a miss is black."""
         surface = self._known_surface()
         nothing, zero = torch.zeros_like(rays.origins), torch.zeros_like(rays.origins[:, 0])
         if surface is None:

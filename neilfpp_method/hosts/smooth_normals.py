@@ -22,7 +22,7 @@ from neilfpp_method.shading.frame import local_frame, safe_normalize
 __all__ = ["NEIGHBORS", "smooth_normals"]
 
 RINGS = ((6, 1 / 3), (10, 2 / 3), (16, 1.0))
-"""Number of neighbors on each ring around the point, and the ring's radius relative to the outermost."""
+"""Number of neighbours on each ring around the point, and the ring's radius relative to the outermost."""
 NEIGHBORS = sum(count for count, _ in RINGS)
 """Number of points at which normals are evaluated, per shaded point."""
 UNLIKE = 0.2
@@ -30,7 +30,7 @@ UNLIKE = 0.2
 ROUNDS = 4
 """Rounds of iteratively reweighted least squares."""
 RIDGE = 1e-2
-"""Ridge penalty, relative to the weight of one neighbor, for slopes that no neighbor determines."""
+"""Ridge penalty, relative to the weight of one neighbour, for slopes that no neighbour determines."""
 
 
 @torch.no_grad()
@@ -46,8 +46,8 @@ def smooth_normals(
         gradient: gradient of the signed distance; called with `NEIGHBORS` points around each point.
         position: points on the surface, scene frame.
         normal: their unit normals, not smoothed.
-        radius: radius of the neighborhood, scene units. Relief that is finer than this and flatter than about
-            10° is lost.
+        radius: radius of the neighbourhood, scene units. Relief that is finer than this and flatter than
+            about 10° is lost.
     """
     ring = _rings(position)
     around = position[:, None] + radius * (ring @ local_frame(normal)[:, :2])
@@ -58,7 +58,7 @@ def smooth_normals(
     residual = normals - normal[:, None]
     for _ in range(ROUNDS):
         weighted = design * torch.exp(-residual.square().sum(-1, keepdim=True) / (2 * UNLIKE**2))
-        # The ridge makes the matrix regular. `solve` would synchronize with the device to check that.
+        # The ridge makes the matrix regular. `solve` would synchronise with the device to check that.
         coefficients = torch.linalg.solve_ex(weighted.mT @ design + ridge, weighted.mT @ normals).result
         residual = normals - design @ coefficients
     return safe_normalize(coefficients[:, 0])

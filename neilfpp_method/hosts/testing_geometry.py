@@ -25,11 +25,11 @@ NEAR = 0.05
 ASIDE = 0.6
 """Tangent of the angle between both views."""
 BESIDE = 0.01
-"""Distance between neighboring rays, scene units."""
+"""Distance between neighbouring rays, scene units."""
 STEEP = 8.0
 """Neighboring hits that are further apart than this multiple of their rays' distance lie on two surfaces."""
 TILTED = 10.0
-"""Largest median angle between normals and the surface through neighboring hits, degrees."""
+"""Largest median angle between normals and the surface through neighbouring hits, degrees."""
 SPHERE = 1.5
 """Largest median distance of hits from the origin, scene units; the object may stand on a ground."""
 
@@ -61,7 +61,7 @@ def _from_close_by(case: Case) -> None:
 
 
 def _normals_of_neighbors(case: Case) -> None:
-    """Compare normals with cross products of differences between the hits of four neighboring rays."""
+    """Compare normals with cross products of differences between the hits of four neighbouring rays."""
     d = case.rays.directions[case.hit]
     side = normalize(torch.linalg.cross(d, d.roll(1, dims=-1) + torch.tensor([0.3, 0.1, -0.2]).to(d)), dim=-1)
     up = torch.linalg.cross(d, side)
@@ -79,7 +79,7 @@ def _normals_of_neighbors(case: Case) -> None:
     implied = normalize(torch.linalg.cross(across, along), dim=-1)[rows]
     normal = case.hits.normal.detach()[case.hit][rows]
     angle = (implied * normal).sum(-1).abs().clamp_max(1.0).acos().rad2deg().median().item()
-    broken = f"half of its normals differ by {angle:.0f}° or more from the surface through neighboring hits"
+    broken = f"half of its normals differ by {angle:.0f}° or more from the surface through neighbouring hits"
     case.require(angle < TILTED, f"{broken}: take the gradient of the field that is rendered")
 
 

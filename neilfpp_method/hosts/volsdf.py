@@ -70,7 +70,7 @@ class VolSdfHost(nn.Module):
         config: the settings.
         radiance_scale: largest radiance of R.
         background: "none", "constant" or "inverted_sphere", after "auto" has been resolved.
-        background_color: linear RGB of a constant background, and initial color of an inverted sphere.
+        background_color: linear RGB of a constant background, and initial colour of an inverted sphere.
         points: oriented points on the surface, scene frame, for L_pcd.
         radiance_start: initial radiance of R.
         cameras: camera positions, scene frame; the space around them is empty (`volume.free_space`).

@@ -24,7 +24,7 @@ surface, and contributes little light.
 """
 MAX_START = 0.2
 """Largest distance of the start of a ray from its surface point, scene units (published code). A ray that has
-to start further away is left out: it could start behind a neighboring surface, and if it started closer, it
+to start further away is left out: it could start behind a neighbouring surface, and if it started closer, it
 would hit the soft layer of its own surface.
 """
 

@@ -29,7 +29,7 @@ RAY_PARTS = 128
 RESOLUTION = 64
 """Vertices along an edge of the grid."""
 MARGIN = 1.1
-"""Ratio of the bound on the slope to the largest slope between neighboring vertices."""
+"""Ratio of the bound on the slope to the largest slope between neighbouring vertices."""
 MISSED = 0.01
 """Largest opacity of skipped space in training."""
 HARDLY_MISSED = 1e-3
@@ -159,13 +159,13 @@ class EmptySpace(nn.Module):
         return torch.lerp(interval.near[:, None], interval.far[:, None], share)
 
     def _read(self, rays: RayBatch, edges: Float[Tensor, "N E"]) -> Float[Tensor, "N K"]:
-        """The grid's distance at the center of each part."""
+        """The grid's distance at the centre of each part."""
         middle = 0.5 * (edges[:, :-1] + edges[:, 1:])
         points = rays.origins[:, None] + middle[..., None] * rays.directions[:, None]
         return look_up(self.distance, self.radius, points.reshape(-1, 3)).view(middle.shape)
 
     def _doubt(self, edges: Float[Tensor, "N E"]) -> Float[Tensor, "N K"]:
-        """Bound on the difference between the field in a part and the grid's value at its center."""
+        """Bound on the difference between the field in a part and the grid's value at its centre."""
         # The error of interpolation in a cell is at most the slope times half of the cell's diagonal.
         reach = 0.5 * math.sqrt(3.0) * cell_size(self.distance, self.radius)
         return self.slope * (0.5 * edges.diff(dim=-1) + reach)

@@ -47,7 +47,7 @@ SignedDistance = Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]
 
 
 def strata(like: Float[Tensor, "N _"], count: int, stochastic: bool) -> Float[Tensor, "N {count}"]:
-    """Ascending numbers in [0, 1], one in each of `count` equal strata: random, or at the center."""
+    """Ascending numbers in [0, 1], one in each of `count` equal strata: random, or at the centre."""
     shape = (like.shape[0], count)
     within = like.new_empty(shape).uniform_() if stochastic else like.new_full(shape, 0.5)
     return (torch.arange(count, device=like.device, dtype=like.dtype) + within) / count
@@ -75,7 +75,7 @@ def inverse_cdf_samples(
         edges: bounds of the bins, ascending; a bin may have width 0.
         mass: probability mass of each bin, ≥ 0, up to a common factor.
         count: samples per ray, one in each of `count` equal shares of the mass.
-        stochastic: whether samples are random within their share; if False, they are at its center.
+        stochastic: whether samples are random within their share; if False, they are at its centre.
     """
     tiny = torch.finfo(edges.dtype).tiny
     mass = mass.to(edges.dtype)
@@ -88,7 +88,7 @@ def inverse_cdf_samples(
     u = strata(edges, count, stochastic).clamp_max(1.0 - torch.finfo(edges.dtype).eps)
     end = torch.searchsorted(cdf, u, right=True).clamp_max(mass.shape[-1])
     low, high = cdf.gather(-1, end - 1), cdf.gather(-1, end)
-    # The clamps only matter if a parallel sum has rounded neighboring values of the CDF out of order.
+    # The clamps only matter if a parallel sum has rounded neighbouring values of the CDF out of order.
     fraction = ((u - low) / (high - low).clamp_min(tiny)).clamp(0.0, 1.0)
     return torch.lerp(edges.gather(-1, end - 1), edges.gather(-1, end), fraction)
 
