@@ -35,6 +35,7 @@ from neilfpp_method.settings.presets import fixed_geometry, free_light, preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model
 from neilfpp_method.train.command import run_training
+from neilfpp_method.train.json_files import read_json, write_json
 from neilfpp_method.train.optimizer import make_optimizer, seed_step
 from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import (
@@ -43,9 +44,7 @@ from neilfpp_method.train.run import (
     load_checkpoint,
     load_run,
     read_description,
-    read_json,
     save_checkpoint,
-    write_json,
 )
 
 STAGES = {"material_init": "material stage", "joint": "joint stage"}

@@ -62,11 +62,9 @@ __all__ = [
     "load_run",
     "load_weights",
     "read_description",
-    "read_json",
     "rewrite_training",
     "run_folder",
     "save_checkpoint",
-    "write_json",
 ]
 
 FORMAT = 2
