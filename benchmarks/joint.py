@@ -76,7 +76,7 @@ def fitted_model(config: NeilfConfig, like: VolSdfHost | None = None) -> NeilfMo
     )
     torch.manual_seed(0)
     facts = SceneFacts("linear", 0.2, 3.0, "constant")
-    host = VolSdfHost(config, facts.radiance_scale, facts.background)
+    host = VolSdfHost(config, facts)
     if like is None:
         fit_table(host.sdf_field)
     else:

@@ -44,7 +44,7 @@ def sphere_model(
     torch.manual_seed(0)
     config = config or tiny_config()
     facts = SceneFacts(response, 0.2, 1.0 if response == "srgb" else 3.0, background)
-    return NeilfModel(VolSdfHost(config, facts.radiance_scale, background), config, facts)
+    return NeilfModel(VolSdfHost(config, facts), config, facts)
 
 
 def sphere_batch(count: int = 48, spread: float = 0.8, color: float = 0.3) -> PixelBatch:

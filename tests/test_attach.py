@@ -19,6 +19,7 @@ from neilfpp_method.hosts.capabilities import missing_capabilities
 from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import MapLightConfig
 from neilfpp_method.structures import PixelBatch
 from tests.hosts.balls import Ball, BallHost, ball_rays
@@ -143,7 +144,7 @@ def test_a_preset_can_be_named():
 def test_a_host_with_parameter_groups_is_trained_with_the_material():
     config = tiny_config()
     torch.manual_seed(0)
-    host = VolSdfHost(config, 3.0, "constant")
+    host = VolSdfHost(config, SceneFacts("linear", 0.2, 3.0, "constant"))
     neilf = attach_neilf(host, config)
     assert set(neilf.parameter_groups()) == {"geometry", "beta", "radiance", "brdf", "light"}
     assert {id(p) for p in host.parameters()} < {id(p) for p in neilf.parameters()}

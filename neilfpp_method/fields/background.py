@@ -18,7 +18,7 @@ from neilfpp_method.fields.mlp import Mlp
 from neilfpp_method.settings.types import BackgroundConfig, FrequencyConfig, HashGridConfig
 from neilfpp_method.volume.compositing import composite, render_weights
 
-__all__ = ["InvertedSphere", "background_field"]
+__all__ = ["InvertedSphere"]
 
 POSITION_OCTAVES, DIRECTION_OCTAVES = 10, 4
 """Octaves of the frequency encodings of positions and directions (NeRF++)."""
@@ -28,18 +28,6 @@ MIN_START = 1e-2
 """Smallest distance of the initial radiance from both ends of the sigmoid's range, relative to the range."""
 START_SCALE = 1e-3
 """Factor on the initial weights of the last layer, so that the field starts as an almost constant colour."""
-
-
-def background_field(
-    kind: str,
-    config: BackgroundConfig,
-    encoding: FrequencyConfig | HashGridConfig,
-    radius: float,
-    scale: float,
-    start: Float[Tensor, " 3"],
-) -> InvertedSphere | None:
-    """Make an `InvertedSphere` if `kind` is "inverted_sphere"; otherwise return None."""
-    return InvertedSphere(config, encoding, radius, scale, start) if kind == "inverted_sphere" else None
 
 
 class InvertedSphere(nn.Module):

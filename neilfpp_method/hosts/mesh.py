@@ -15,11 +15,11 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor, nn
 
 from neilfpp_method.data.mesh import Mesh
-from neilfpp_method.fields.background import background_field
-from neilfpp_method.fields.outgoing_radiance import MID_GRAY, OutgoingRadianceField
 from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_tracer, meet, tree_tracer
+from neilfpp_method.hosts.radiance import background_field, radiance_field
 from neilfpp_method.hosts.smooth_normals import NEIGHBORS, smooth_normals
 from neilfpp_method.schedule import FIXED_GEOMETRY
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import RayBatch, SceneLight, SurfaceHits
@@ -55,32 +55,17 @@ class MeshHost(nn.Module):
     Args:
         mesh: triangles in the scene frame.
         config: the settings.
-        radiance_scale: largest radiance of R.
-        background: "inverted_sphere"; any other value means a constant background.
-        background_color: linear RGB of a constant background, and initial colour of an inverted sphere.
-        radiance_start: initial radiance of R.
+        facts: the range and the initial value of R, and the background: "inverted_sphere", or constant for
+            any other value.
     """
 
     stages = FIXED_GEOMETRY
 
-    def __init__(
-        self,
-        mesh: Mesh,
-        config: NeilfConfig,
-        radiance_scale: float,
-        background: str = "constant",
-        background_color: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        radiance_start: float = MID_GRAY,
-    ) -> None:
+    def __init__(self, mesh: Mesh, config: NeilfConfig, facts: SceneFacts) -> None:
         super().__init__()
-        radius = config.volume.radius
-        self.radiance_field = OutgoingRadianceField(
-            config.radiance, config.encoding, 0, radius, radiance_scale, radiance_start
-        )
-        self.register_buffer("background_color", torch.tensor(background_color))
-        self.background = background_field(
-            background, config.background, config.encoding, radius, radiance_scale, self.background_color
-        )
+        self.radiance_field = radiance_field(config, facts, 0)
+        self.register_buffer("background_color", torch.tensor(facts.background_color))
+        self.background = background_field(config, facts)
         triangles = mesh.vertices[mesh.faces]
         across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         outward = safe_normalize(across, eps=TINY)

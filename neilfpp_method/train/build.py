@@ -127,10 +127,9 @@ def show_known_light(model: NeilfModel) -> None:
 
 
 def _volsdf(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> VolSdfHost:
-    scale, start, points = facts.radiance_scale, facts.median_radiance, _points(capture, config)
     poses = [capture.normalisation.camera(view.camera).c2w for view in capture.train_views]
     cameras = torch.from_numpy(np.stack(poses)[:, :, 3]).float()
-    return VolSdfHost(config, scale, facts.background, facts.background_color, points, start, cameras)
+    return VolSdfHost(config, facts, _points(capture, config), cameras)
 
 
 def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
@@ -140,8 +139,7 @@ def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
         raise UserError(
             f"{capture.root}: no inputs/model/mesh.ply for the mesh host", "name a mesh with --mesh PATH"
         )
-    scale, start = facts.radiance_scale, facts.median_radiance
-    host = MeshHost(mesh, config, scale, facts.background, facts.background_color, start)
+    host = MeshHost(mesh, config, facts)
     _check_visible(host, capture, path or "inputs/model/mesh.ply")
     return host
 

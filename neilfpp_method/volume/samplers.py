@@ -22,6 +22,7 @@ from neilfpp_method.settings.types import VolumeConfig
 from neilfpp_method.structures import Indexable, RayBatch
 from neilfpp_method.volume.compositing import render_weights
 from neilfpp_method.volume.density import laplace_density
+from neilfpp_method.volume.intersect import Interval
 
 __all__ = [
     "OPACITY_ERROR",
@@ -200,10 +201,8 @@ class ErrorBoundedSamples:
 @torch.no_grad()
 def error_bounded_samples(
     sdf: SignedDistance,
-    origins: Float[Tensor, "N 3"],
-    directions: Float[Tensor, "N 3"],
-    near: Float[Tensor, " N"],
-    far: Float[Tensor, " N"],
+    rays: RayBatch,
+    interval: Interval,
     beta: Float[Tensor, ""],
     config: VolumeConfig,
     stochastic: bool,
@@ -219,19 +218,19 @@ def error_bounded_samples(
 
     Args:
         sdf: signed distance at points of the scene frame, negative inside.
-        origins, directions: the rays, with unit directions.
-        near, far: distances at which rays enter and leave the scene; near = far for a ray that misses it.
+        rays: the rays.
+        interval: distances at which rays enter and leave the scene; near = far for a ray that misses it.
         beta: scale β of the density, scene units.
         config: `initial_samples`, `rounds` and `samples` are used.
         stochastic: whether the cuts and the samples are random; if False, they are central.
     """
-    rays = RayBatch(origins, directions)
+    near, count = interval.near, len(rays)
     beta = beta.to(near.dtype).reshape(1, 1)
-    samples = near.new_empty(len(rays), config.samples)
+    samples = near.new_empty(count, config.samples)
     error_bound = torch.empty_like(near)
 
-    rows = torch.arange(len(rays), device=near.device)
-    partition = first_cuts(sdf, rays, near, far, config.initial_samples, stochastic)
+    rows = torch.arange(count, device=near.device)
+    partition = first_cuts(sdf, rays, interval, config.initial_samples, stochastic)
     queries = partition.distances.numel()
     # The bound at this scale is ≤ ε even if the surface touched every interval (VolSDF Lemma 2).
     worst = partition.width.square().sum(dim=-1, keepdim=True).div(4.0 * math.log1p(OPACITY_ERROR)).sqrt()
@@ -256,7 +255,7 @@ def error_bounded_samples(
         queries += len(rows) * config.initial_samples
 
     samples[rows] = opacity_samples(partition, beta_plus, config.samples, stochastic)
-    return ErrorBoundedSamples(samples, error_bound, queries / max(len(origins), 1))
+    return ErrorBoundedSamples(samples, error_bound, queries / max(count, 1))
 
 
 def can_leave_early(device: torch.device) -> bool:
@@ -265,15 +264,10 @@ def can_leave_early(device: torch.device) -> bool:
 
 
 def first_cuts(
-    sdf: SignedDistance,
-    rays: RayBatch,
-    near: Float[Tensor, " N"],
-    far: Float[Tensor, " N"],
-    count: int,
-    stochastic: bool,
+    sdf: SignedDistance, rays: RayBatch, interval: Interval, count: int, stochastic: bool
 ) -> Partition:
     """Cut rays uniformly by `count` cuts, both ends included."""
-    distances = uniform_samples(near, far, count, stochastic)
+    distances = uniform_samples(interval.near, interval.far, count, stochastic)
     return cut(distances, query(sdf, rays, distances))
 
 

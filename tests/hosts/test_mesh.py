@@ -39,9 +39,13 @@ def mesh_config(**changes) -> NeilfConfig:
     return dataclasses.replace(fixed_geometry(tiny_config()), **changes)
 
 
+def mesh_facts() -> SceneFacts:
+    return SceneFacts("linear", 0.2, 3.0, "constant", background_color=(0.25, 0.5, 0.75))
+
+
 def mesh_host(shape: trimesh.Trimesh, **changes) -> MeshHost:
     torch.manual_seed(0)
-    return MeshHost(mesh_of(shape), mesh_config(**changes), 3.0, background_color=(0.25, 0.5, 0.75))
+    return MeshHost(mesh_of(shape), mesh_config(**changes), mesh_facts())
 
 
 def rays_at(count: int, spread: float, seed: int = 0, dtype: torch.dtype = torch.float32) -> RayBatch:
@@ -105,7 +109,7 @@ def test_a_miss_has_the_background_color_and_no_normal(tracer):
 
 def test_an_open_background_is_rendered_behind_the_mesh():
     torch.manual_seed(0)
-    host = MeshHost(mesh_of(SPHERE), mesh_config(), 3.0, background="inverted_sphere")
+    host = MeshHost(mesh_of(SPHERE), mesh_config(), SceneFacts("linear", 0.2, 3.0, "inverted_sphere"))
     rays = rays_at(100, 0.9)
     hits = host.render(rays)
     beyond = host.background(rays.origins, rays.directions)

@@ -131,9 +131,7 @@ def test_fewer_queries_find_the_same_surface(sdf):
 
     def run(interval):
         config = VolumeConfig(radius=RADIUS, samples=64)
-        found = error_bounded_samples(
-            sdf, rays.origins, rays.directions, interval.near, interval.far, torch.tensor(beta), config, False
-        )
+        found = error_bounded_samples(sdf, rays, interval, torch.tensor(beta), config, False)
         t = found.distances
         points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
         depth = laplace_depth(sdf(points.reshape(-1, 3)).view_as(t), t, torch.tensor(beta))

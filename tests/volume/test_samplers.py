@@ -11,9 +11,11 @@ import torch
 from scipy.stats import chisquare, kstest, laplace
 
 from neilfpp_method.settings.types import VolumeConfig
+from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume import samplers
 from neilfpp_method.volume.compositing import render_weights
 from neilfpp_method.volume.density import laplace_density
+from neilfpp_method.volume.intersect import Interval
 from neilfpp_method.volume.samplers import (
     OPACITY_ERROR,
     SPREAD,
@@ -57,7 +59,10 @@ def ray_bundle(count, dtype=F64):
 
 
 def sample(sdf, rays, beta, config=CONFIG, stochastic=False):
-    return error_bounded_samples(sdf, *rays, torch.tensor(beta, dtype=rays[0].dtype), config, stochastic)
+    origins, directions, near, far = rays
+    beta = torch.tensor(beta, dtype=near.dtype)
+    interval = Interval(near, far)
+    return error_bounded_samples(sdf, RayBatch(origins, directions), interval, beta, config, stochastic)
 
 
 # -------------------------------------------------------------------------------------------- simple samplers
@@ -330,6 +335,8 @@ def test_central_samples_are_deterministic_and_random_ones_depend_on_the_seed():
 
 def test_samples_have_no_gradient():
     beta = torch.tensor(0.02, dtype=F64, requires_grad=True)
-    found = error_bounded_samples(sphere_distance, *ray_bundle(2), beta, CONFIG, True)
+    origins, directions, near, far = ray_bundle(2)
+    rays, interval = RayBatch(origins, directions), Interval(near, far)
+    found = error_bounded_samples(sphere_distance, rays, interval, beta, CONFIG, True)
     assert not found.distances.requires_grad
     assert not found.error_bound.requires_grad
