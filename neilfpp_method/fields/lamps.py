@@ -97,7 +97,7 @@ class Lamps(nn.Module):
         """Radiance along rays from the lit lamps, without occlusion."""
         return rays.emission[..., None] * self.radiance()
 
-    def met(
+    def radiance_along(
         self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"], before: Float[Tensor, "N S"]
     ) -> Float[Tensor, "N S 3"]:
         """Radiance of the lamps that directions hit closer than `before`; overlapping lamps add up."""

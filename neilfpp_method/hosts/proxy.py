@@ -33,9 +33,9 @@ POINTS = 32_768
 EVERY = 64
 """Steps between two refreshes. The first refreshes are at steps 1, 2, 4, 8, …"""
 ROUNDS, ROUND = 16, 512
-"""Number of batches, and rays per batch, with which `look_around` explores the surface."""
+"""Number of batches, and rays per batch, with which `explore` explores the surface."""
 SPREAD = 0.2
-"""Largest offset of the targets of `look_around` from known hits, per axis, scene units."""
+"""Largest offset of the targets of `explore` from known hits, per axis, scene units."""
 START = 0.75
 """Height above the grid's surface at which rays start, in cells; tracing ends at a quarter cell."""
 APART = 2.0
@@ -79,7 +79,7 @@ class ProxyReport:
 
 
 @dataclass(frozen=True)
-class CameraRays:
+class ObservedRays:
     """Camera rays with the distances of the host's hits, infinite for a miss."""
 
     rays: RayBatch
@@ -128,9 +128,7 @@ class SurfaceProxy(nn.Module):
             self.refresh()
 
     @torch.no_grad()
-    def look_around(
-        self, render: Callable[[RayBatch], SurfaceHits], rays: RayBatch, hits: SurfaceHits
-    ) -> None:
+    def explore(self, render: Callable[[RayBatch], SurfaceHits], rays: RayBatch, hits: SurfaceHits) -> None:
         """Explore the surface before the first step, so that there is enough of it to trace.
 
         Rays go from the origins of the first batch to points near its hits.
@@ -165,7 +163,7 @@ class SurfaceProxy(nn.Module):
         self._pending.clear()
         if self._known_surface() is not None:
             rows = torch.nonzero(hit | clear)[:, 0]
-            self._measure(CameraRays(rays[rows], distance[rows]))
+            self._measure(ObservedRays(rays[rows], distance[rows]))
         stamp = torch.full_like(points[:, :1], float(self.steps))
         self.points.keep(torch.cat((points, stamp), -1)[hit].flip(0))
         self._surface = self._fused()
@@ -182,7 +180,7 @@ class SurfaceProxy(nn.Module):
         rows = rows[rows[:, 3:6].square().sum(-1) > 0]
         return fuse(rows[:, :3], rows[:, 3:6], rows[:, 6:9], self.radius, self.resolution)
 
-    def _measure(self, camera_rays: CameraRays) -> None:
+    def _measure(self, camera_rays: ObservedRays) -> None:
         """Compare new rays with the grid, and remove the points that they pass through."""
         traced = self._trace(camera_rays.rays)
         hit = camera_rays.distance.isfinite()

@@ -252,10 +252,13 @@ class VolSdfHost(nn.Module):
         if not len(rows):
             return missed
         part = Interval(span.interval.near[rows], span.interval.far[rows])
-        met = self._march(rays[rows], part).hits
+        visible = self._march(rays[rows], part).hits
         return replace(
             missed,
-            **{f.name: getattr(missed, f.name).index_put((rows,), getattr(met, f.name)) for f in fields(met)},
+            **{
+                f.name: getattr(missed, f.name).index_put((rows,), getattr(visible, f.name))
+                for f in fields(SurfaceHits)
+            },
         )
 
     def _march(self, rays: RayBatch, part: Interval | None = None) -> March:

@@ -44,7 +44,7 @@ BRIGHT_QUANTILE = 0.999
 """R also reaches this quantile of the radiance of HDR images. The brightest pixels are excluded because a
 single lamp in view should not set the scale of R.
 """
-SEEN_EVERY = 67
+VISIBILITY_STRIDE = 67
 """One in this many pixels of every view is traced to check that the cameras see the outside of a mesh."""
 
 
@@ -129,7 +129,7 @@ def show_known_light(model: NeilfModel) -> None:
 def _volsdf(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> VolSdfHost:
     poses = [capture.normalisation.camera(view.camera).c2w for view in capture.train_views]
     cameras = torch.from_numpy(np.stack(poses)[:, :, 3]).float()
-    return VolSdfHost(config, facts, _points(capture, config), cameras)
+    return VolSdfHost(config, facts, _cloud_points(capture, config), cameras)
 
 
 def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
@@ -163,7 +163,7 @@ def cloud_summary(capture: Capture, config: NeilfConfig) -> str | None:
 def _check_visible(host: MeshHost, capture: Capture, path: str) -> None:
     """Raise a `UserError` unless the cameras see the outside of the mesh."""
     cameras = [capture.normalisation.camera(view.camera) for view in capture.train_views]
-    outside = torch.cat([host.cross(camera_rays(camera)[::SEEN_EVERY]).outside for camera in cameras])
+    outside = torch.cat([host.cross(camera_rays(camera)[::VISIBILITY_STRIDE]).outside for camera in cameras])
     if not len(outside):
         raise UserError(f"{path}: no camera sees this mesh", "give it in the world frame of the capture")
     if outside.float().mean() < 0.5:
@@ -172,7 +172,7 @@ def _check_visible(host: MeshHost, capture: Capture, path: str) -> None:
         )
 
 
-def _points(capture: Capture, config: NeilfConfig) -> OrientedPoints | None:
+def _cloud_points(capture: Capture, config: NeilfConfig) -> OrientedPoints | None:
     if config.loss.point_cloud == 0.0 or capture.point_cloud is None:
         return None
     points = load_point_cloud(capture.point_cloud, capture.normalisation)

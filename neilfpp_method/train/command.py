@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -184,13 +184,13 @@ def _describe_new(
         console.print(line, style="yellow", soft_wrap=True, markup=False)
     if run.source.scale < 1:
         rays = training_rays(run.effects.config.train, processes)
-        console.print(_scaled(run.source.scale, len(pixels), rays), soft_wrap=True)
+        console.print(_scale_summary(run.source.scale, len(pixels), rays), soft_wrap=True)
     for line in (cloud_summary(run.capture, config), _exposures_summary(run.effects)):
         if line is not None:
             console.print(line, soft_wrap=True)
 
 
-def _scaled(scale: float, pixels: int, rays: int) -> str:
+def _scale_summary(scale: float, pixels: int, rays: int) -> str:
     return (
         f"images scaled to {scale:.3g} of their size: {pixels / 1e6:.1f} million pixels for "
         f"{rays / 1e6:.1f} million rays; --scale 1 uses the full size"
@@ -211,11 +211,16 @@ def _removed_on_failure(out: Path) -> Iterator[None]:
         yield
     except BaseException:
         if not (out / "config.json").exists():
-            shutil.rmtree(out / PIXELS, ignore_errors=True)
-            with suppress(OSError):
-                for folder in created:
-                    folder.rmdir()
+            _remove(out, created)
         raise
+
+
+def _remove(out: Path, created: Sequence[Path]) -> None:
+    """Remove the pixels of a run that does not exist yet, and those of the created folders that are empty."""
+    shutil.rmtree(out / PIXELS, ignore_errors=True)
+    with suppress(OSError):
+        for folder in created:
+            folder.rmdir()
 
 
 # --------------------------------------------------------------------------------------- training and its end

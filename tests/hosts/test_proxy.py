@@ -22,7 +22,7 @@ def gathered(host: TableTop, steps: int = 20, proxy: SurfaceProxy | None = None)
     if proxy is None:
         proxy = SurfaceProxy(SCENE, CELLS, 0.8)
         rays = camera_rays_above(512, seed=1000)
-        proxy.look_around(adapted.render, rays, adapted.render(rays))
+        proxy.explore(adapted.render, rays, adapted.render(rays))
     for step in range(steps):
         rays = camera_rays_above(512, seed=step)
         proxy.observe(rays, adapted.render(rays))
@@ -162,7 +162,7 @@ def test_a_checkpoint_between_two_refreshes_loses_no_ray():
 def test_the_radiance_method_of_a_host_is_used():
     proxy = SurfaceProxy(SCENE, CELLS, 0.8, radiance=lambda x, wo: wo.abs())
     adapted, rays = CallableHost(TableTop()), camera_rays_above(512)
-    proxy.look_around(adapted.render, rays, adapted.render(rays))
+    proxy.explore(adapted.render, rays, adapted.render(rays))
     light = proxy.scene_light(torch.tensor([[0.1, 0.0, -0.3]]), torch.tensor([[[0.0, 0.0, 1.0]]]))
     torch.testing.assert_close(light.radiance[0, 0], torch.tensor([0.0, 0.0, 1.0]))
 
