@@ -176,7 +176,7 @@ def test_a_material_is_learned_from_given_image_hits():
     batch = pixel_batch(rays.origins, rays.directions, hits.color)
     optimizer = torch.optim.Adam([{"params": g["params"], "lr": 3e-3} for g in neilf.param_groups()])
     physical = []
-    for _ in range(12):
+    for _ in range(60):
         rows = torch.randperm(len(batch))[:200]
         total = neilf.losses(batch[rows], "material_init", hits[rows])
         optimizer.zero_grad()

@@ -39,7 +39,6 @@ __all__ = [
     "SEARCH_AT",
     "SEARCH_SHARE",
     "SearchedMaterial",
-    "can_search",
     "is_search_due",
     "search_materials",
     "teach",
@@ -62,6 +61,10 @@ of the same look are often of one material.
 """
 MAX_RATIO = 0.8
 """A material replaces that of the field if its error is at most this share of the error of the field."""
+MIN_CHANGE = 0.5
+"""A material replaces that of the field only if its metallic differs by at least this much. Smaller
+differences, and those of roughness alone, are no local optima, and the field is more exact than the grid.
+"""
 MIN_LOSS = 0.005
 """Loss of the field below which its material is kept: that of relative errors of 3 %, which the steps of the
 grid cause as well.
@@ -76,13 +79,6 @@ BATCH = 4096
 """Points per training step of the field."""
 RATE = 5e-3
 """Learning rate of the field."""
-
-
-def is_search_due(position: StagePosition) -> bool:
-    """Whether materials are searched after `position.step` steps of a stage."""
-    return position.stage is Stage.MATERIAL_INIT and any(
-        position.step - 1 < share * position.length <= position.step for share in SEARCH_AT
-    )
 
 
 @dataclass(frozen=True)
@@ -104,9 +100,16 @@ class SearchedMaterial:
         return f"material search: {self.share:.0%} of the places have a better material"
 
 
-def can_search(model: NeilfModel) -> bool:
-    """Whether the light is an environment map and surfaces have a specular lobe."""
-    return model.lobe is not None and isinstance(model.light, EnvironmentLight)
+def is_search_due(model: NeilfModel, position: StagePosition) -> bool:
+    """Whether materials are searched after `position.step` steps of a stage.
+
+    They never are if the light is no environment map, or if surfaces have no specular lobe.
+    """
+    if model.lobe is None or not isinstance(model.light, EnvironmentLight):
+        return False
+    return position.stage is Stage.MATERIAL_INIT and any(
+        position.step - 1 < share * position.length <= position.step for share in SEARCH_AT
+    )
 
 
 @torch.no_grad()
@@ -114,7 +117,7 @@ def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
     """Search for better materials at places, under the current light of a model.
 
     Args:
-        model: gives the light, the scene, the lobe and the materials; see `can_search`.
+        model: gives the light, the scene, the lobe and the materials; its light is an environment map.
         places: places with their pixels in the training views, in linear radiance.
 
     Returns:
@@ -138,8 +141,9 @@ def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
     near = neighbours(torch.cat((position, look), -1), NEIGHBOURS_SHARE)
     best = best_materials(arriving, places, typical, METALLICS if model.brdf.metals else METALLICS[:1], near)
     loss = _loss_of(current, arriving, places, typical, near)
-    is_better = (loss > MIN_LOSS) & (best.loss < MAX_RATIO * loss)
     found = on_grid(best.base_color, best.roughness, best.metallic)
+    is_other = (found.metallic - current.metallic)[:, 0].abs() >= MIN_CHANGE
+    is_better = is_other & (loss > MIN_LOSS) & (best.loss < MAX_RATIO * loss)
     own = model.brdf(places.observed.position)
     material = _where(is_better[place], found[place], own)
     return SearchedMaterial(places.observed.position, material, is_better.float().mean().item())

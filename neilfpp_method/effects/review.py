@@ -13,7 +13,7 @@ from neilfpp_method.effects.exposure import Exposures
 from neilfpp_method.effects.first_light import MIN_PLACES, FirstLight, find_first_light
 from neilfpp_method.effects.lobes import lobe_evidence
 from neilfpp_method.effects.material import JUDGED, material_evidence
-from neilfpp_method.effects.material_search import can_search, search_materials, teach
+from neilfpp_method.effects.material_search import search_materials, teach
 from neilfpp_method.effects.measurement import Measurement
 from neilfpp_method.effects.metals import metals_evidence
 from neilfpp_method.effects.place_fit import place_transport
@@ -32,6 +32,7 @@ __all__ = [
     "MIN_TRAIN_VIEWS",
     "SURFACE_PIXELS",
     "improve_material",
+    "light_places",
     "needs_surface",
     "record_exposures",
     "record_facts",
@@ -117,9 +118,9 @@ def review_light(
         return _not_measured(plan, step, f"fewer than {MIN_TRAIN_VIEWS} training views"), None
     if most < MIN_PIXELS:
         return _not_measured(plan, step, "the budget leaves no time for it"), None
+    places = light_places(model, pixels, most)
     mode = model.training
     model.eval()
-    places = _light_places(model, pixels, most)
     typical, decisions = model.facts.median_radiance, []
     if len(places.place.unique()) < MIN_PLACES:
         model.train(mode)
@@ -141,21 +142,29 @@ def review_light(
     return decisions, first
 
 
-def improve_material(model: NeilfModel, pixels: PixelDataset, most: int = MAX_PIXELS) -> str | None:
-    """Search for better materials at places, and train the BRDF field on them (`effects.material_search`).
-
-    The arguments are those of `review_light`.
-
-    Returns:
-        One line for the console; None if nothing is searched: the light is no environment map, surfaces have
-        no specular lobe, or there are too few places.
-    """
-    if not can_search(model) or most < MIN_PIXELS:
-        return None
+@torch.no_grad()
+def light_places(model: NeilfModel, pixels: PixelDataset, most: int = MAX_PIXELS) -> Places:
+    """Places on the visible surface that several training views show, with at most `most` pixels."""
     mode = model.training
     model.eval()
-    places = _light_places(model, pixels, most)
+    surface = _rendered_surface(model, pixels.sample(LIGHT_PIXELS, gradients=False)).observed
+    count = min(PLACES, most // USUAL_VIEWS)
+    position, normal = surface.position[:count], surface.normal[:count]
+    places = gather_places(model, pixels, position, normal, VIEWS).in_views(MIN_VIEWS).first(most)
     model.train(mode)
+    return places
+
+
+def improve_material(model: NeilfModel, places: Places) -> str | None:
+    """Search for better materials at places, and train the BRDF field on them (`effects.material_search`).
+
+    Args:
+        model: see `material_search.can_search`.
+        places: places in the training views, with linear radiance.
+
+    Returns:
+        One line for the console; None if there are fewer than `MIN_PLACES` places.
+    """
     if len(places.place.unique()) < MIN_PLACES:
         return None
     searched = search_materials(model, places)
@@ -230,15 +239,6 @@ def record_lamps(plan: Plan, evidence: Evidence | None, count: int, step: int) -
     reason = measured.summary() if before is None else f"revised: {measured.summary()}"
     plan.decisions.append(Decision(step, "lamps", on, "evidence", reason, measured))
     return plan.decisions[-1:]
-
-
-@torch.no_grad()
-def _light_places(model: NeilfModel, pixels: PixelDataset, most: int = MAX_PIXELS) -> Places:
-    """Places on the visible surface that several training views show, with at most `most` pixels."""
-    surface = _rendered_surface(model, pixels.sample(LIGHT_PIXELS, gradients=False)).observed
-    count = min(PLACES, most // USUAL_VIEWS)
-    position, normal = surface.position[:count], surface.normal[:count]
-    return gather_places(model, pixels, position, normal, VIEWS).in_views(MIN_VIEWS).first(most)
 
 
 def _not_measured(plan: Plan, step: int, reason: str) -> list[Decision]:

@@ -69,7 +69,7 @@ class LightSolver(Protocol):
 
     @property
     def seeks_start(self) -> bool:
-        """Whether the solver fits a map and neither a fit nor an observed point exists yet."""
+        """Whether the solver fits a map and there has been neither a fit nor a start."""
         ...
 
     def start(
@@ -181,7 +181,7 @@ class MapSolver(nn.Module):
     def seeks_start(self) -> bool:
         """See `LightSolver.seeks_start`."""
         fits_map = self.config.map is None and not self.light.light.even
-        return fits_map and self.memory.age is None and self.points == 0
+        return fits_map and self.memory.age is None
 
     @torch.no_grad()
     def start(

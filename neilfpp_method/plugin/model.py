@@ -24,7 +24,7 @@ from neilfpp_method.effects.first_light import start_with
 from neilfpp_method.effects.material_search import is_search_due
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest
-from neilfpp_method.effects.review import improve_material, review_light
+from neilfpp_method.effects.review import improve_material, light_places, review_light
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.health.cases import Health
@@ -235,10 +235,10 @@ class NeilfMethod(Model):
     def _search_material(self, step: int) -> None:
         """Search for better materials when this is due, as in the standalone loop."""
         position = stage_at(step, self.config.neilf.train)
-        if not is_search_due(dataclasses.replace(position, step=position.step + 1)):
+        if not is_search_due(self.neilf, dataclasses.replace(position, step=position.step + 1)):
             return
         seed_step(self.config.neilf.train.seed, -6 - (step + 1))
-        summary = improve_material(self.neilf, self.pixels.on(self.device))
+        summary = improve_material(self.neilf, light_places(self.neilf, self.pixels.on(self.device)))
         if summary is not None:
             CONSOLE.log(summary)
 

@@ -14,7 +14,9 @@ from neilfpp_method.effects.material_search import is_search_due
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.review import (
     MAX_PIXELS,
+    MIN_PIXELS,
     improve_material,
+    light_places,
     needs_surface,
     record_lamps,
     review_light,
@@ -94,12 +96,13 @@ def search_material(run: Training, model: NeilfModel, position: StagePosition, s
 
     The first process does this for all.
     """
-    if not is_search_due(position):
+    most = _light_pixels(run)
+    if most < MIN_PIXELS or not is_search_due(model, position):
         return
     if run.fabric.is_global_zero:
         with timed("light_fits", apart=True):
             seed_step(run.config.train.seed, -6 - step)
-            summary = improve_material(model, run.pixels, _light_pixels(run))
+            summary = improve_material(model, light_places(model, run.pixels, most))
         if summary is not None:
             run.reporter.say(summary)
     if run.fabric.world_size > 1:

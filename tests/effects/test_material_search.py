@@ -11,7 +11,6 @@ import torch
 from neilfpp_method.effects.material_search import (
     SEARCH_AT,
     SearchedMaterial,
-    can_search,
     is_search_due,
     search_materials,
     teach,
@@ -91,21 +90,23 @@ def test_a_scene_without_metals_gets_none():
     assert search_materials(model, metal).material.metallic.max() == 0
 
 
-def test_nothing_is_searched_under_a_free_light_or_without_highlights():
-    model = sphere_model(preset("fast"))
-    assert can_search(model)
-    model.lobe = None
-    assert not can_search(model)
-    assert not can_search(sphere_model(preset("paper-ngp")))
+def due_after(model: NeilfModel, length: int) -> list[int]:
+    """The numbers of steps of material init after which a search is due."""
+    positions = [StagePosition(Stage.MATERIAL_INIT, n, length) for n in range(1, length + 1)]
+    return [position.step for position in positions if is_search_due(model, position)]
 
 
 def test_a_search_is_due_once_at_each_of_its_times():
+    model = sphere_model(preset("fast"))
     for length in (3, 7, 1500):
-        due = [
-            n for n in range(1, length + 1) if is_search_due(StagePosition(Stage.MATERIAL_INIT, n, length))
-        ]
-        assert due == [math.ceil(share * length) for share in SEARCH_AT]
-    assert not any(is_search_due(StagePosition(Stage.JOINT, n, 30)) for n in range(31))
+        assert due_after(model, length) == [math.ceil(share * length) for share in SEARCH_AT]
+    assert not any(is_search_due(model, StagePosition(Stage.JOINT, n, 30)) for n in range(31))
+
+
+def test_nothing_is_searched_under_a_free_light_or_without_highlights():
+    model = sphere_model(preset("fast"))
+    model.lobe = None
+    assert due_after(model, 30) == due_after(sphere_model(preset("paper-ngp")), 30) == []
 
 
 def test_a_field_learns_the_material_where_it_differs_and_keeps_it_elsewhere():
