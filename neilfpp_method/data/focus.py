@@ -70,7 +70,7 @@ def find_focus(views: Sequence[View]) -> Focus | None:
 
     Example:
         >>> focus = find_focus(capture.views)
-        >>> focus and focus.centre, focus and focus.distance
+        >>> focus and focus.center, focus and focus.distance
     """
     axes = axes_of(views)
     weights = np.ones(len(views))

@@ -68,7 +68,7 @@ class EnvironmentLight(nn.Module):
         self.register_load_state_dict_pre_hook(_take_size)
 
     @torch.no_grad()
-    def be_even(self, even: bool) -> None:
+    def set_even(self, even: bool) -> None:
         """Make the light even, with the mean radiance of the map over solid angle, or a map again."""
         self.even = even
         if even and (self.log_radiance != self.log_radiance[:, :1, :1]).any():

@@ -248,7 +248,7 @@ class VolSdfHost(nn.Module):
             opacity=zeros,
             concentration=zeros,
         )
-        rows = torch.nonzero(span.some)[:, 0]
+        rows = torch.nonzero(span.has_part)[:, 0]
         if not len(rows):
             return missed
         part = Interval(span.interval.near[rows], span.interval.far[rows])

@@ -131,8 +131,8 @@ def _prepare(run: OpenRun, fabric: Fabric, console: Console) -> _Prepared:
     """Read the pixels, build the model, and create the folder of a new run."""
     pixels = load_pixels(run.capture, run.out / PIXELS, fabric, console)
     facts = _measure_facts(run, pixels) if run.facts is None else run.facts
-    record_facts(run.effects, facts)
-    config = run.effects.config_of_model
+    record_facts(run.plan, facts)
+    config = run.plan.config_of_model
     untrained = not last_checkpoint(run.out).exists()
     build = initial_model if untrained else build_model
     model = build(run.capture, facts, config)
@@ -150,8 +150,8 @@ def _prepare(run: OpenRun, fabric: Fabric, console: Console) -> _Prepared:
 
 
 def _measure_facts(run: OpenRun, pixels: PixelDataset) -> SceneFacts:
-    gains = _log_gains(run.effects, run.capture, pixels)
-    return scene_facts(run.capture, pixels, run.effects.config, gains)
+    gains = _log_gains(run.plan, run.capture, pixels)
+    return scene_facts(run.capture, pixels, run.plan.config, gains)
 
 
 def _log_gains(plan: Plan, capture: Capture, pixels: PixelDataset) -> Tensor | None:
@@ -170,8 +170,8 @@ def _log_gains(plan: Plan, capture: Capture, pixels: PixelDataset) -> Tensor | N
 
 def _create(run: OpenRun, facts: SceneFacts) -> None:
     """Write the description of a new run into its folder."""
-    create_run(run.out, run.effects.settings, run.source, facts)
-    write_plan(run.out, run.effects)
+    create_run(run.out, run.plan.settings, run.source, facts)
+    write_plan(run.out, run.plan)
     if run.budget is not None:
         write_budget(run.out, run.budget)
 
@@ -183,9 +183,9 @@ def _describe_new(
     for line in problems_of_poses(run.capture):
         console.print(line, style="yellow", soft_wrap=True, markup=False)
     if run.source.scale < 1:
-        rays = training_rays(run.effects.config.train, processes)
+        rays = training_rays(run.plan.config.train, processes)
         console.print(_scale_summary(run.source.scale, len(pixels), rays), soft_wrap=True)
-    for line in (cloud_summary(run.capture, config), _exposures_summary(run.effects)):
+    for line in (cloud_summary(run.capture, config), _exposures_summary(run.plan)):
         if line is not None:
             console.print(line, soft_wrap=True)
 
@@ -251,7 +251,7 @@ def _train(
             continue_with=continue_with,
             light_solver=prepared.model.light_solver(),
             watch=_watch(pixels, config, reporter),
-            plan=run.effects,
+            plan=run.plan,
             quality=Quality(held_back, run.capture.hdr),
             ledger=ledger,
             pace=None if run.budget is None else Pace(run.budget, ledger),

@@ -55,7 +55,7 @@ class OpenRun:
 
     Attributes:
         out: the run folder.
-        effects: the effects, and the settings of the run before any decision on them.
+        plan: the effects, and the settings of the run before any decision on them.
         source: the location of the capture.
         capture: the capture, at the scale of the training.
         facts: the facts measured in the images; None for a new run, whose images are not read yet.
@@ -63,7 +63,7 @@ class OpenRun:
     """
 
     out: Path
-    effects: Plan
+    plan: Plan
     source: CaptureSource
     capture: Capture
     facts: SceneFacts | None
@@ -89,22 +89,20 @@ def open_run(request: TrainingRequest, ledger: Ledger) -> OpenRun | None:
     out = request.out
     described = read_description(out)
     _check_unchanged(request, out, described)
-    effects, budget = read_plan(out, described.config), read_budget(out)
-    if request.effects not in (None, effects.request):
-        raise UserError(
-            f"{out}: its effects are '{effects.request}'", "leave --effects out, or start a new run"
-        )
+    plan, budget = read_plan(out, described.config), read_budget(out)
+    if request.effects not in (None, plan.request):
+        raise UserError(f"{out}: its effects are '{plan.request}'", "leave --effects out, or start a new run")
     if request.budget not in (None, budget and budget.budget):
         has = "no budget" if budget is None else f"a budget of {format_duration(budget.budget)}"
         raise UserError(f"{out}: the run has {has}", "leave --budget out, or start a new run")
     ledger.add(read_work(out))
-    if _is_finished(out, effects.config):
+    if _is_finished(out, plan.config):
         if budget is not None and budget.took is None:
             # The command was stopped while it wrote the report.
             close_budget(out, budget, ledger.total)
         return None
     capture = described.source.load_again(out)
-    return OpenRun(out, effects, described.source, capture, described.facts, budget)
+    return OpenRun(out, plan, described.source, capture, described.facts, budget)
 
 
 def plan_run(
@@ -140,12 +138,12 @@ def plan_run(
         budget = plan_budget(request.budget, work, ledger)
         console.print(plan_summary(budget))
         settings = planned_settings(budget, settings)
-    effects = Plan.begin(wanted, settings)
+    plan = Plan.begin(wanted, settings)
     if budget is not None:
-        planned_effects(budget, effects)
-    rays = training_rays(effects.config.train, request.processes)
+        planned_effects(budget, plan)
+    rays = training_rays(plan.config.train, request.processes)
     scale = scale_for_rays(capture.train_views, rays) if request.scale is None else request.scale
-    return OpenRun(out, effects, replace(source, scale=scale), at_scale(capture, scale), None, budget)
+    return OpenRun(out, plan, replace(source, scale=scale), at_scale(capture, scale), None, budget)
 
 
 def training_rays(config: TrainConfig, processes: int) -> int:

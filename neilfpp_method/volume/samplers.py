@@ -11,7 +11,6 @@ Without the latter a ray that grazes a surface would be rendered too opaque.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -22,6 +21,7 @@ from neilfpp_method.settings.types import VolumeConfig
 from neilfpp_method.structures import Indexable, RayBatch
 from neilfpp_method.volume.compositing import render_weights
 from neilfpp_method.volume.density import laplace_density
+from neilfpp_method.volume.distance_grid import SignedDistance
 from neilfpp_method.volume.intersect import Interval
 
 __all__ = [
@@ -40,8 +40,6 @@ BISECTIONS = 10
 
 SPREAD = 1 / 3
 """Share of the rendered samples that are spread over the cuts of a ray: 32 of 96 in the published code."""
-
-SignedDistance = Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]
 
 
 # -------------------------------------------------------------------------------------------- simple samplers
