@@ -22,11 +22,7 @@ from torch import Tensor, nn
 
 from neilfpp_method.data.environment_map import read_environment
 from neilfpp_method.data.views import Camera
-from neilfpp_method.effects.first_light import MIN_PLACES, find_first_light, seconds_of_pixel, start_with
-from neilfpp_method.effects.material_search import is_search_due
-from neilfpp_method.effects.place_fit import place_transport
-from neilfpp_method.effects.place_memory import PlaceMemory
-from neilfpp_method.effects.review import improve_material
+from neilfpp_method.effects.place_solver import PlaceSolver
 from neilfpp_method.errors import UserError
 from neilfpp_method.health.cases import Health
 from neilfpp_method.health.guard import StepGuard
@@ -70,7 +66,7 @@ class AttachedNeilf(nn.Module):
         proxy: traces rays between surfaces if the host cannot do it cheaply; `proxy.report()` measures its
             error. None if the host traces these rays itself, or if the settings trace no rays.
         light_solver: stores surface points of the training steps and solves for the light at intervals.
-        places: stores more of them, for the initial light and the searches for materials.
+        places: stores more of them, finds an initial light, and searches for better materials.
         missing: the optional methods that the host does not have, and the consequence of each.
         step_guard: skips steps of guarded optimizers (`guard`) whose losses or gradients are not finite.
         watch: problems found so far; `health()` summarises them.
@@ -81,7 +77,7 @@ class AttachedNeilf(nn.Module):
         self.model = model
         self.proxy = proxy
         self.light_solver = model.light_solver()
-        self.places = PlaceMemory(model.facts.response)
+        self.places = PlaceSolver(model.facts.response, log.warning)
         self.missing = missing_capabilities(_inner(model.host))
         host, config, facts = model.host, model.config, model.facts
         traced = model.borrowed and config.inter_reflection.mode != "off"
@@ -90,7 +86,6 @@ class AttachedNeilf(nn.Module):
         self.step_guard = StepGuard(log.warning)
         self.watch = Watch(None, log.warning)
         self._steps, self._with_material = 0, False
-        self._start_tried, self._searched = False, -1
         self._last_rendered: tuple[PixelBatch, SurfaceHits] | None = None
         model.observers.append(self._observe)
 
@@ -125,10 +120,10 @@ class AttachedNeilf(nn.Module):
         if not weights:
             # A zero that requires a gradient: a loop without a loss of its own may still call backward.
             return Total(torch.zeros((), device=batch.origins.device, requires_grad=True), {})
-        if self.training:
-            self._before_step(position)
-        moves_host = self.model.stages[position.stage].moves_host
-        result = self.model(batch, position.stage, self._host_hits(batch.rays, hits, moves_host))
+        plan = self.model.stages[position.stage]
+        if self.training and plan.moves_material:
+            self.places.before_step(self.model, self.light_solver, position)
+        result = self.model(batch, position.stage, self._host_hits(batch.rays, hits, plan.moves_host))
         total = weigh(result.terms, weights)
         if self.training:
             number = self._steps if isinstance(step, str) else int(step)
@@ -228,46 +223,13 @@ class AttachedNeilf(nn.Module):
 
     # ------------------------------------------------------------------------------------------ inside a step
 
-    def _before_step(self, position: StagePosition) -> None:
-        """Start the light, or search for better materials, if this is due.
-
-        This changes parameters, which is not allowed between the losses of a step and their gradients.
-        """
-        if not self.model.stages[position.stage].moves_material:
-            return
-        if self.light_solver.seeks_start and self.places.is_ready and not self._start_tried:
-            self._start_tried = True
-            self._start_light()
-        if is_search_due(self.model, position) and position.step != self._searched:
-            self._searched = position.step
-            summary = improve_material(self.model, self.places.places())
-            if summary is not None:
-                log.warning("NeILF++ %s", summary)
-
-    def _start_light(self) -> None:
-        """Set an initial light and material that explain the remembered surface points (`first_light`).
-
-        If there are too few points, the first fit starts from an even light.
-        """
-        model, places = self.model, self.places.places()
-        if model.lobe is None or len(places.place.unique()) < MIN_PLACES:
-            return
-        rate = seconds_of_pixel(places.place.device, with_lobe=False, with_metals=False)
-        log.warning("NeILF++ searches for an initial light: about %.0f s", rate * len(places.place))
-        transport = place_transport(places, model.lobe, model.scene)
-        first = find_first_light(places, transport, model.facts.median_radiance, model.brdf.metals)
-        if first is not None:
-            log.warning("NeILF++ %s", first.summary())
-            start_with(model, first)
-            self.light_solver.start(first.observed, first.material, model.scene, first.lamp_trial)
-
     def _after_step(self, result: StepResult, position: StagePosition, number: int) -> None:
         """Solve for the light if that is due, and check the health of the training."""
         plan = self.model.stages[position.stage]
         if plan.moves_material:
-            self.places.remember(result.surface)
+            self.places.observe(result.surface)
         self.light_solver.observe(result)
-        if self._start_tried or not self.light_solver.seeks_start:
+        if not self.places.is_waiting(self.light_solver):
             if self.light_solver.due:
                 self.watch.after_fit(self.light_solver.points, number)
             self.light_solver.solve(self.model.brdf, self.model.scene)

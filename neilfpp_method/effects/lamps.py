@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.effects.place_fit import ROUGHNESSES, PlaceFit, place_errors
+from neilfpp_method.effects.material_grid import ROUGHNESSES
+from neilfpp_method.effects.place_fit import PlaceFit, place_errors
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.lamps import LampPlaces, Lamps
 from neilfpp_method.lighting.fit import Evidence, evidence

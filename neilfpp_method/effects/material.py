@@ -18,11 +18,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.effects.material_grid import ROUGHNESSES
 from neilfpp_method.effects.measurement import Measurement, mean_of
 from neilfpp_method.effects.noise import lobe_noise
 from neilfpp_method.effects.place_fit import (
     FIRST_STEPS,
-    ROUGHNESSES,
     ROUNDS,
     STEPS,
     PlaceFit,

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from neilfpp_method.effects.place_fit import (
+from neilfpp_method.effects.material_grid import (
     METALLICS,
     ROUGHNESSES,
     best_materials,
@@ -103,9 +103,9 @@ class SearchedMaterial:
 def is_search_due(model: NeilfModel, position: StagePosition) -> bool:
     """Whether materials are searched after `position.step` steps of a stage.
 
-    They never are if the light is no environment map, or if surfaces have no specular lobe.
+    They never are if the light is no environment map, or if the settings leave out highlights or metals.
     """
-    if model.lobe is None or not isinstance(model.light, EnvironmentLight):
+    if model.lobe is None or not model.brdf.metals or not isinstance(model.light, EnvironmentLight):
         return False
     return position.stage is Stage.MATERIAL_INIT and any(
         position.step - 1 < share * position.length <= position.step for share in SEARCH_AT
@@ -117,7 +117,7 @@ def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
     """Search for better materials at places, under the current light of a model.
 
     Args:
-        model: gives the light, the scene, the lobe and the materials; its light is an environment map.
+        model: gives the light, which is an environment map, the scene, the lobe and the materials.
         places: places with their pixels in the training views, in linear radiance.
 
     Returns:
@@ -126,27 +126,26 @@ def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
     numbers, place = places.place.unique(return_inverse=True)
     places = Places(len(numbers), place, places.view, places.observed)
     position = places.mean(places.observed.position)
-    normal = safe_normalize(places.mean(places.observed.normal))
-    points = Observed(position, normal, normal, torch.zeros_like(normal))
-    light = LightModel(model.light, model.lamps)
-    arriving = (
-        sum(
-            arriving_at(light, points, places.observed, place, ROUGHNESSES, model.lobe, model.scene)
-            for _ in range(DRAWS)
-        )
-        / DRAWS
-    )
     current, typical = model.brdf(position), model.facts.median_radiance
+    arriving = _arriving(model, places, position)
     look = COLOR_SCALE * current.base_color.clamp_min(MIN_BASE_COLOR).log()
     near = neighbours(torch.cat((position, look), -1), NEIGHBOURS_SHARE)
-    best = best_materials(arriving, places, typical, METALLICS if model.brdf.metals else METALLICS[:1], near)
     loss = _loss_of(current, arriving, places, typical, near)
+    best = best_materials(arriving, places, typical, METALLICS, near)
     found = on_grid(best.base_color, best.roughness, best.metallic)
     is_other = (found.metallic - current.metallic)[:, 0].abs() >= MIN_CHANGE
     is_better = is_other & (loss > MIN_LOSS) & (best.loss < MAX_RATIO * loss)
-    own = model.brdf(places.observed.position)
-    material = _where(is_better[place], found[place], own)
+    material = _where(is_better[place], found[place], model.brdf(places.observed.position))
     return SearchedMaterial(places.observed.position, material, is_better.float().mean().item())
+
+
+def _arriving(model: NeilfModel, places: Places, position: Float[Tensor, "P 3"]) -> Float[Tensor, "K N 3"]:
+    """The parts of outgoing radiance at the roughnesses of the grid, averaged over random directions."""
+    normal = safe_normalize(places.mean(places.observed.normal))
+    points = Observed(position, normal, normal, torch.zeros_like(normal))
+    arguments = (points, places.observed, places.place, ROUGHNESSES, model.lobe, model.scene)
+    draws = [arriving_at(LightModel(model.light, model.lamps), *arguments) for _ in range(DRAWS)]
+    return torch.stack(draws).mean(0)
 
 
 def _loss_of(
@@ -169,17 +168,21 @@ def _where(condition: Bool[Tensor, " N"], yes: Material, no: Material) -> Materi
 
 @torch.enable_grad()
 def teach(brdf: BrdfField, searched: SearchedMaterial) -> None:
-    """Train a BRDF field until it has the given material at the given points."""
+    """Train a BRDF field until it has the given material at the given points.
+
+    Gradients that the field has already are kept.
+    """
+    gradients = [parameter.grad for parameter in brdf.parameters()]
     optimizer = torch.optim.Adam(brdf.parameters(), lr=RATE, betas=(0.9, 0.99))
-    target = searched.material
     for _ in range(STEPS):
         rows = torch.randint(len(searched.position), (BATCH,), device=searched.position.device)
-        material = brdf(searched.position[rows])
+        material, target = brdf(searched.position[rows]), searched.material[rows]
         loss = sum(
-            functional.mse_loss(getattr(material, name), getattr(target, name)[rows])
+            functional.mse_loss(getattr(material, name), getattr(target, name))
             for name in ("base_color", "roughness", "metallic")
         )
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
-    optimizer.zero_grad(set_to_none=True)
+    for parameter, gradient in zip(brdf.parameters(), gradients, strict=True):
+        parameter.grad = gradient

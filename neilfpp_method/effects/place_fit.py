@@ -19,36 +19,33 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from neilfpp_method.effects.material_grid import (
+    METALLICS,
+    MIN_BASE_COLOR,
+    ROUGHNESSES,
+    best_materials,
+    neighbours,
+    on_grid,
+    outgoing_radiance,
+    relative_error,
+)
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.lighting.objective import FLOOR, OUTLIER, total_variation
+from neilfpp_method.lighting.objective import OUTLIER, total_variation
 from neilfpp_method.lighting.transport import Transport, from_texels_at
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import Material, Observed, SceneTracer
 
 __all__ = [
-    "METALLICS",
-    "ROUGHNESSES",
-    "BestMaterials",
     "PlaceFit",
     "any_map",
-    "best_materials",
     "fit_places",
-    "mean_loss",
-    "neighbours",
-    "on_grid",
-    "outgoing_radiance",
     "place_errors",
     "place_transport",
-    "relative_error",
     "seconds_of_step",
 ]
 
-ROUGHNESSES = (0.08, 0.14, 0.2, 0.28, 0.36, 0.45, 0.55, 0.66, 0.8, 1.0)
-"""Grid of roughness. The width of the lobe changes by about a half from one value to the next."""
-METALLICS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
-"""Grid of metallic."""
 ROWS = 16
 """Rows of the map, whose texels are 11° high. Finer detail is left to training, which uses more pixels."""
 DIRECTIONS = 4
@@ -77,14 +74,10 @@ NEIGHBOURS_SHARE = 1 / 200
 """Share of the places whose errors are added when roughness and metallic of a place are chosen. The views of
 one place hardly determine them, and neighbouring places are often of one material.
 """
-REWEIGHTED = 4
-"""Iterations of reweighted least squares for the base colour."""
 START_BASE_COLOR = 0.3
 """Initial base colour of all places."""
 START_ROUGHNESS = 4
 """Index of the initial roughness of all places."""
-MIN_BASE_COLOR = 0.01
-"""Smallest base colour, so that its logarithm is finite."""
 TRIED = 3
 """Number of descent steps that `seconds_of_step` times."""
 
@@ -113,34 +106,6 @@ class PlaceFit:
     def material(self, place: Int[Tensor, " N"]) -> Material:
         """Materials of the places with these numbers."""
         return on_grid(self.base_color[place], self.roughness[place], self.metallic[place])
-
-
-@dataclass(frozen=True)
-class BestMaterials:
-    """The materials of P places that explain their pixels best under a fixed light.
-
-    Attributes:
-        base_color: base colour of each place.
-        roughness: roughness of each place, as an index in `ROUGHNESSES`.
-        metallic: metallic of each place, as an index in `METALLICS`.
-        loss: mean loss of the pixels of each place and its neighbours.
-    """
-
-    base_color: Float[Tensor, "P 3"]
-    roughness: Int[Tensor, " P"]
-    metallic: Int[Tensor, " P"]
-    loss: Float[Tensor, " P"]
-
-
-def on_grid(
-    base_color: Float[Tensor, "N 3"], roughness: Int[Tensor, " N"], metallic: Int[Tensor, " N"]
-) -> Material:
-    """The material with these indices in `ROUGHNESSES` and `METALLICS`."""
-    values = [
-        torch.tensor(grid, device=index.device)[index][:, None]
-        for grid, index in ((ROUGHNESSES, roughness), (METALLICS, metallic))
-    ]
-    return Material(base_color, *values)
 
 
 @torch.no_grad()
@@ -229,12 +194,6 @@ def _even_start(places: Places, typical: float, base_color: float) -> PlaceFit:
     )
 
 
-def neighbours(features: Float[Tensor, "P F"], share: float) -> Int[Tensor, "P M"]:
-    """Indices of the nearest places of each place, including itself: this share of all places."""
-    count = max(1, min(len(features), round(share * len(features))))
-    return torch.cdist(features, features).topk(count, largest=False).indices
-
-
 @torch.no_grad()
 def place_errors(fit: PlaceFit, places: Places, transport: Transport, typical: float) -> Float[Tensor, " N"]:
     """Relative error of each pixel, clipped at 1 and averaged over the channels."""
@@ -250,21 +209,6 @@ def _at_roughness(transport: Transport, number: Int[Tensor, " N"]) -> Transport:
     rows = torch.arange(len(number), device=number.device)
     layers = torch.stack((torch.zeros_like(number), 1 + 2 * number, 2 + 2 * number))
     return Transport(transport.sources[layers, rows].float(), transport.scene[layers, rows])
-
-
-def outgoing_radiance(
-    sent: Float[Tensor, "3 N 3"], base_color: Float[Tensor, "N 3"], metallic: Float[Tensor, "N 1"]
-) -> Float[Tensor, "N 3"]:
-    """Outgoing radiance from the diffuse, facing and grazing parts (see `lighting.transport`)."""
-    diffuse, facing, grazing = sent
-    reflectance = 0.04 * (1 - metallic) + base_color * metallic
-    return (1 - metallic) * base_color * diffuse + reflectance * facing + grazing
-
-
-def relative_error(outgoing: Float[Tensor, "N 3"], places: Places, typical: float) -> Float[Tensor, "N 3"]:
-    """Error of rendered pixels relative to the recorded ones."""
-    pixel = places.observed.pixel
-    return (outgoing - pixel) / (pixel + FLOOR * typical)
 
 
 def _better_light(
@@ -304,57 +248,3 @@ def _better_light(
 
 def _log_mean(base_color: Float[Tensor, "P 3"]) -> Float[Tensor, ""]:
     return base_color.clamp_min(MIN_BASE_COLOR).log().mean()
-
-
-@torch.no_grad()
-def best_materials(
-    arriving: Float[Tensor, "K N 3"],
-    places: Places,
-    typical: float,
-    metallics: tuple[float, ...],
-    near: Int[Tensor, "P M"],
-) -> BestMaterials:
-    """Choose the material of each place from all pairs of the grids, under a fixed light.
-
-    For each pair of roughness and metallic, the base colour of a place is the best one by iteratively
-    reweighted least squares; outgoing radiance is linear in it. The pair with the smallest error at the place
-    and its neighbours is chosen.
-
-    Args:
-        arriving: the parts of outgoing radiance under the light (`lighting.transport.from_texels_at`).
-        places: the places with their pixels, in linear radiance.
-        typical: radiance of a typical pixel.
-        metallics: values of metallic that are tried, the first ones of `METALLICS`.
-        near: indices of the neighbours of each place, including itself (`neighbours`).
-    """
-    diffuse, unit = arriving[0], places.observed.pixel + FLOOR * typical
-    lowest = torch.full((places.count,), torch.inf, device=unit.device)
-    base_color = torch.full((places.count, 3), MIN_BASE_COLOR, device=unit.device)
-    roughness = torch.zeros(places.count, dtype=torch.long, device=unit.device)
-    metallic = torch.zeros_like(roughness)
-    for k in range(len(ROUGHNESSES)):
-        facing, grazing = arriving[1 + 2 * k], arriving[2 + 2 * k]
-        for j, m in enumerate(metallics):
-            # The relative error of a pixel is base_color · slope − target.
-            slope = ((1 - m) * diffuse + m * facing) / unit
-            target = (places.observed.pixel - 0.04 * (1 - m) * facing - grazing) / unit
-            weight = torch.ones_like(slope)
-            for _ in range(REWEIGHTED):
-                squares = places.mean(weight * slope.square()).clamp_min(1e-12)
-                candidate = (places.mean(weight * slope * target) / squares).clamp(MIN_BASE_COLOR, 1)
-                error = candidate[places.place] * slope - target
-                weight = 1 / error.abs().clamp_min(OUTLIER)
-            loss = mean_loss(error, places, near)
-            better = loss < lowest
-            lowest = torch.where(better, loss, lowest)
-            base_color = torch.where(better[:, None], candidate, base_color)
-            roughness, metallic = torch.where(better, k, roughness), torch.where(better, j, metallic)
-    return BestMaterials(base_color, roughness, metallic, lowest)
-
-
-def mean_loss(error: Float[Tensor, "N 3"], places: Places, near: Int[Tensor, "P M"]) -> Float[Tensor, " P"]:
-    """Mean Huber loss of the relative errors of all pixels of each place and its neighbours."""
-    zero = torch.zeros_like(error)
-    loss = functional.smooth_l1_loss(error, zero, beta=OUTLIER, reduction="none").mean(-1)
-    pixels = torch.bincount(places.place, minlength=places.count).to(loss.dtype)
-    return (pixels * places.mean(loss))[near].sum(1) / pixels[near].sum(1).clamp_min(1)

@@ -168,7 +168,8 @@ def improve_material(model: NeilfModel, places: Places) -> str | None:
     if len(places.place.unique()) < MIN_PLACES:
         return None
     searched = search_materials(model, places)
-    teach(model.brdf, searched)
+    if searched.share > 0:
+        teach(model.brdf, searched)
     return searched.summary()
 
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from neilfpp_method.effects.material import WORTH, judge_material
+from neilfpp_method.effects.material_grid import METALLICS
 from neilfpp_method.effects.noise import lobe_noise
 from neilfpp_method.effects.place_fit import (
     DIRECTIONS,
-    METALLICS,
     ROWS,
     PlaceFit,
     fit_places,

@@ -8,6 +8,7 @@ import math
 import pytest
 import torch
 
+from neilfpp_method.effects.material_grid import ROUGHNESSES
 from neilfpp_method.effects.material_search import (
     SEARCH_AT,
     SearchedMaterial,
@@ -15,7 +16,6 @@ from neilfpp_method.effects.material_search import (
     search_materials,
     teach,
 )
-from neilfpp_method.effects.place_fit import ROUGHNESSES
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
@@ -82,14 +82,6 @@ def test_the_right_material_is_kept(places: Places):
     assert kept > 0.8
 
 
-def test_a_scene_without_metals_gets_none():
-    one = torch.ones(COUNT, 1)
-    metal = ball(0.6 * one.expand(-1, 3), 0.3 * one, one, LOBE, VIEWS)
-    model = trained_to(PAINT, metal)
-    model.brdf.use(dataclasses.replace(model.config.brdf, metals=False))
-    assert search_materials(model, metal).material.metallic.max() == 0
-
-
 def due_after(model: NeilfModel, length: int) -> list[int]:
     """The numbers of steps of material init after which a search is due."""
     positions = [StagePosition(Stage.MATERIAL_INIT, n, length) for n in range(1, length + 1)]
@@ -103,10 +95,22 @@ def test_a_search_is_due_once_at_each_of_its_times():
     assert not any(is_search_due(model, StagePosition(Stage.JOINT, n, 30)) for n in range(31))
 
 
-def test_nothing_is_searched_under_a_free_light_or_without_highlights():
+def test_nothing_is_searched_under_a_free_light_or_without_highlights_or_metals():
+    matte, painted = sphere_model(preset("fast")), sphere_model(preset("fast"))
+    matte.lobe = None
+    painted.brdf.use(dataclasses.replace(painted.config.brdf, metals=False))
+    for model in (matte, painted, sphere_model(preset("paper-ngp"))):
+        assert due_after(model, 30) == []
+
+
+def test_gradients_that_the_field_has_are_kept():
     model = sphere_model(preset("fast"))
-    model.lobe = None
-    assert due_after(model, 30) == due_after(sphere_model(preset("paper-ngp")), 30) == []
+    position = torch.rand(50, 3)
+    model.brdf(position).base_color.sum().backward()
+    before = [parameter.grad.clone() for parameter in model.brdf.parameters()]
+    teach(model.brdf, SearchedMaterial(position, PAINT[torch.zeros(50, dtype=torch.long)], 1.0))
+    after = [parameter.grad for parameter in model.brdf.parameters()]
+    assert all(torch.equal(one, other) for one, other in zip(before, after, strict=True))
 
 
 def test_a_field_learns_the_material_where_it_differs_and_keeps_it_elsewhere():

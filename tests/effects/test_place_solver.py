@@ -8,12 +8,13 @@ import pytest
 import torch
 
 from neilfpp_method.attach import attach_neilf, pixel_batch
-from neilfpp_method.effects import place_memory
-from neilfpp_method.effects.place_memory import PlaceMemory
+from neilfpp_method.effects import place_solver
+from neilfpp_method.effects.place_solver import PlaceSolver
+from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.shading import LOBES
 from tests.effects.balls import ball
 from tests.hosts.balls import BallHost, ball_rays
-from tests.scenes import tiny_config
+from tests.scenes import sphere_model, tiny_config
 from tests.train.small_runs import solved_light
 
 COUNT, VIEWS = 200, 8
@@ -21,42 +22,48 @@ COUNT, VIEWS = 200, 8
 
 @pytest.fixture
 def small_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(place_memory, "PIXELS", COUNT * VIEWS)
-    monkeypatch.setattr(place_memory, "PLACES", COUNT)
+    monkeypatch.setattr(place_solver, "PIXELS", COUNT * VIEWS)
+    monkeypatch.setattr(place_solver, "PLACES", COUNT)
 
 
 def test_neighbouring_points_of_the_same_side_are_a_place(small_memory):
     color, one = torch.full((COUNT, 3), 0.5), torch.ones(COUNT, 1)
     observed = ball(color, 0.4 * one, 0 * one, LOBES["ggx"], VIEWS).observed
-    memory = PlaceMemory("linear")
+    solver = PlaceSolver("linear", print)
     for start in range(0, len(observed), 100):
-        assert not memory.is_ready
-        memory.remember(observed[start : start + 100])
-    assert memory.is_ready
-    places = memory.places()
+        assert not solver.points.full
+        solver.observe(observed[start : start + 100])
+    assert solver.points.full
+    places = solver.places()
     assert len(places.place.unique()) > COUNT // 4
-    assert torch.bincount(places.place)[places.place].min() >= place_memory.MIN_PIXELS
+    assert torch.bincount(places.place)[places.place].min() >= place_solver.MIN_PIXELS
     # A ball of radius 1 with 200 places: neighbours are about 0.1 apart.
     centre = places.mean(places.observed.position)
     assert (places.observed.position - centre[places.place]).norm(dim=-1).median() < 0.2
 
 
-def test_an_empty_memory_has_no_places():
-    memory = PlaceMemory("linear")
-    assert memory.places().count == 0
-    for _ in range(place_memory.MAX_WAIT):
-        memory.remember(ball(*[torch.ones(1, n) for n in (3, 1, 1)], None).observed[:0])
-    assert memory.is_ready
-    assert memory.places().count == 0
+def test_an_empty_solver_has_no_places():
+    solver = PlaceSolver("linear", print)
+    assert solver.places().count == 0
+    none = ball(*[torch.ones(1, n) for n in (3, 1, 1)], None).observed[:0]
+    model = sphere_model(solved_light(tiny_config()))
+    light_solver = model.light_solver()
+    for step in range(place_solver.MAX_WAIT + 1):
+        assert solver.is_waiting(light_solver)
+        solver.before_step(model, light_solver, StagePosition(Stage.MATERIAL_INIT, step, 1000))
+        solver.observe(none)
+    solver.before_step(model, light_solver, StagePosition(Stage.MATERIAL_INIT, step, 1000))
+    assert not solver.is_waiting(light_solver)
+    assert solver.places().count == 0
 
 
 def test_clipped_pixels_are_left_out_and_display_values_become_linear():
     observed = ball(*[0.5 * torch.ones(10, n) for n in (3, 1, 1)], None, VIEWS).observed
-    memory = PlaceMemory("srgb")
+    solver = PlaceSolver("srgb", print)
     observed.pixel[:] = 0.5
     observed.pixel[:20] = 1.0
-    memory.remember(observed)
-    kept = memory.points.kept()[:, 9:]
+    solver.observe(observed)
+    kept = solver.points.kept()[:, 9:]
     assert len(kept) == len(observed) - 20
     torch.testing.assert_close(kept, torch.full_like(kept, 0.2140), atol=1e-3, rtol=0)
 
@@ -79,7 +86,7 @@ def test_an_attached_model_starts_from_an_initial_light_and_searches_materials(s
             optimizer.zero_grad()
             total.loss.backward()
             optimizer.step()
-            if not neilf.places.is_ready:
+            if neilf.places.is_waiting(neilf.light_solver):
                 assert torch.equal(neilf.model.light.log_radiance, even)
     assert "initial light" in caplog.text
     assert "material search" in caplog.text

@@ -1,0 +1,115 @@
+"""Initial light and searches for materials in a training loop without a data set of images.
+
+`effects.places.gather_places` asks a data set for the pixels that show a place. A loop into which NeILF++ is
+attached hands over only batches of pixels. If many batches are remembered, most surface points have
+neighbours that other views showed, and neighbours together are a place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import nn
+
+from neilfpp_method.effects.first_light import MIN_PLACES, find_first_light, seconds_of_pixel, start_with
+from neilfpp_method.effects.material_search import is_search_due
+from neilfpp_method.effects.place_fit import place_transport
+from neilfpp_method.effects.places import MIN_COSINE, SAME_NORMAL, Places
+from neilfpp_method.effects.review import improve_material
+from neilfpp_method.lighting.ring import Ring
+from neilfpp_method.lighting.solver import LightSolver
+from neilfpp_method.model import NeilfModel
+from neilfpp_method.schedule import StagePosition
+from neilfpp_method.shading.color import CLIPPED, srgb_to_linear
+from neilfpp_method.structures import Observed
+
+__all__ = ["PlaceSolver"]
+
+PIXELS = 12_000
+"""Number of remembered points, ten per place."""
+PLACES = 1200
+"""Number of places, as many as `neilfpp train` uses."""
+MIN_PIXELS = 4
+"""Minimum number of points per place: fewer do not distinguish materials."""
+FOLDS = 20
+"""Number of groups of points that stand for views when some are held back."""
+MAX_WAIT = 40
+"""Steps after which the light starts even if fewer points are remembered."""
+
+
+class PlaceSolver(nn.Module):
+    """Remembers surface points of training steps, and fits light and material to the places they form.
+
+    Args:
+        response: response of the pixels, "linear" or "srgb".
+        say: prints a line.
+    """
+
+    def __init__(self, response: str, say: Callable[[str], object]) -> None:
+        super().__init__()
+        self.response, self.say = response, say
+        self.points = Ring(PIXELS, 12)
+        self._steps, self._tried, self._searched = 0, False, -1
+
+    def is_waiting(self, light_solver: LightSolver) -> bool:
+        """Whether more points are needed before the first fit of the light."""
+        return not self._tried and light_solver.seeks_start
+
+    @torch.no_grad()
+    def observe(self, surface: Observed) -> None:
+        """Remember the surface points of a step that trains material, in place of the oldest."""
+        usable = (surface.normal * surface.wo).sum(-1) > MIN_COSINE
+        pixel = surface.pixel
+        if self.response == "srgb":
+            usable = usable & (pixel.amax(-1) < CLIPPED)
+            pixel = srgb_to_linear(pixel)
+        self.points.keep(torch.cat((surface.position, surface.normal, surface.wo, pixel), -1)[usable])
+        self._steps += 1
+
+    def before_step(self, model: NeilfModel, light_solver: LightSolver, position: StagePosition) -> None:
+        """Start the light, or search for better materials, if this is due before a step with material.
+
+        This changes parameters, which is not allowed between the losses of a step and their gradients.
+        """
+        if self.is_waiting(light_solver) and (self.points.full or self._steps >= MAX_WAIT):
+            self._tried = True
+            self._start_light(model, light_solver)
+        if is_search_due(model, position) and position.step != self._searched:
+            self._searched = position.step
+            summary = improve_material(model, self.places())
+            if summary is not None:
+                self.say(summary)
+
+    @torch.no_grad()
+    def places(self) -> Places:
+        """Group the points: each belongs to the nearest of `PLACES` points drawn at random.
+
+        There are no places before the first point.
+        """
+        observed = Observed(*self.points.kept().split(3, -1))
+        count = len(observed)
+        centre = observed[torch.randperm(count, device=observed.position.device)[:PLACES]]
+        distance = torch.cdist(observed.position, centre.position)
+        place = distance.argmin(1) if count else distance.new_zeros(0, dtype=torch.long)
+        same = (observed.normal * centre.normal[place]).sum(-1) > SAME_NORMAL
+        fold = torch.arange(count, device=place.device) % FOLDS
+        places = Places(len(centre), place, fold, observed)
+        return places.where(torch.nonzero(same)[:, 0]).in_views(MIN_PIXELS)
+
+    def _start_light(self, model: NeilfModel, light_solver: LightSolver) -> None:
+        """Set an initial light and material that explain the places (`effects.first_light`).
+
+        If there are too few places, the first fit starts from an even light.
+        """
+        places = self.places()
+        if model.lobe is None or len(places.place.unique()) < MIN_PLACES:
+            return
+        rate = seconds_of_pixel(places.place.device, with_lobe=False, with_metals=False)
+        self.say(f"the search for an initial light takes about {rate * len(places.place):.0f} s")
+        transport = place_transport(places, model.lobe, model.scene)
+        first = find_first_light(places, transport, model.facts.median_radiance, model.brdf.metals)
+        if first is not None:
+            self.say(first.summary())
+            start_with(model, first)
+            light_solver.start(first.observed, first.material, model.scene, first.lamp_trial)
